@@ -1,0 +1,1 @@
+"""Controllers: functions of state and target."""

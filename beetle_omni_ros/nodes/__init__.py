@@ -1,0 +1,1 @@
+"""rclpy nodes: adapters between messages and the pure core."""

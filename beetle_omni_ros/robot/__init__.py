@@ -1,0 +1,1 @@
+"""What the robot is, free of ROS: parameters, dynamics, allocation, conventions."""

@@ -1,0 +1,210 @@
+"""The robot's parameters; the only reader of robot files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from beetle_omni_ros.robot import effects as catalogue
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+
+JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
+ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotorMapRow:
+    """Thrust-to-PWM polynomial measured at one pack voltage."""
+
+    voltage: float = parameter(doc='pack voltage under load', unit='V', low=5, high=60)
+    thrust_max: float = parameter(doc='largest thrust measured', unit='N', low=0.1, high=200)
+    coefficients: np.ndarray = parameter(
+        doc='duty [%] = sum_k c_k (thrust / 10 N)^k, k = 0..3', shape=(4,))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotorParameters:
+    """Four rotors: where they sit and how thrust arises."""
+
+    positions: np.ndarray = parameter(
+        doc='rotor centres from the centre of gravity', unit='m', shape=(4, 3), low=-5, high=5)
+    arm_yaw: np.ndarray = parameter(
+        doc='direction of each arm in base_link', unit='rad', shape=(4,), low=-7, high=7)
+    spin: np.ndarray = parameter(doc='spin direction, +1 or -1', shape=(4,), low=-1, high=1)
+    torque_to_thrust_ratio: float = parameter(
+        doc='reaction torque for each newton of thrust', unit='m', low=0, high=1)
+    thrust_min: float = parameter(0.0, doc='smallest thrust', unit='N', low=0, high=50)
+    thrust_max: float = parameter(doc='largest thrust', unit='N', low=0.1, high=200)
+    time_constant: float = parameter(
+        doc='first-order thrust response', unit='s', low=0.001, high=2)
+    map: tuple = parameter((), doc='thrust-to-PWM rows, one for each measured voltage')
+
+    def __post_init__(self):
+        """Bind the map's rows; refuse a thrust range that is empty."""
+        rows = tuple(row if isinstance(row, RotorMapRow) else
+                     schema.bind(RotorMapRow, row, prefix=f'rotors.map[{k}]')
+                     for k, row in enumerate(self.map))
+        object.__setattr__(self, 'map', rows)
+        if self.thrust_min >= self.thrust_max:
+            raise ParameterError(f'rotors.thrust_min ({self.thrust_min:g} N) must be below '
+                                 f'rotors.thrust_max ({self.thrust_max:g} N)')
+        if not np.all(np.abs(self.spin) == 1):
+            raise ParameterError(f'rotors.spin must hold +1 or -1, found {self.spin}')
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointParameters:
+    """One tilt servo: J q'' = Kp (q* - q) - Kd q', within limits."""
+
+    inertia: float = parameter(doc='effective inertia', unit='kg m^2', low=1e-7, high=1)
+    kp: float = parameter(doc='stiffness', unit='N m/rad', low=1e-4, high=1e3)
+    kd: float = parameter(doc='damping', unit='N m s/rad', low=0, high=1e2)
+    velocity_limit: float = parameter(doc='largest rate', unit='rad/s', low=0.1, high=100)
+    effort_limit: float = parameter(doc='largest torque', unit='N m', low=0.01, high=100)
+    position_limit: float = parameter(doc='travel to each side', unit='rad', low=0.1, high=100)
+
+    @property
+    def natural_frequency(self) -> float:
+        """Undamped natural frequency [rad/s], sqrt(Kp / J)."""
+        return float(np.sqrt(self.kp / self.inertia))
+
+    @property
+    def damping_ratio(self) -> float:
+        """Damping ratio [1], Kd / (2 sqrt(Kp J))."""
+        return float(self.kd / (2 * np.sqrt(self.kp * self.inertia)))
+
+    @property
+    def time_constant(self) -> float:
+        """Time constant [s] of the first-order reduction: the ramp lag Kd / Kp."""
+        return self.kd / self.kp
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatteryParameters:
+    """The pack."""
+
+    cells: int = parameter(doc='cells in series', low=1, high=20)
+    full_voltage: float = parameter(doc='open-circuit voltage when full', unit='V', low=3, high=90)
+    resistance: float = parameter(doc='pack resistance', unit='ohm', low=0, high=2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MainBodyParameters:
+    """The body that carries the arms."""
+
+    centre_of_mass: np.ndarray = parameter(doc='in its frame', unit='m', shape=(3,))
+    inertia: np.ndarray = parameter(doc='diagonal, there', unit='kg m^2', shape=(3,), low=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModuleParameters:
+    """One tilting rotor module."""
+
+    mass: float = parameter(doc='mass', unit='kg', low=0, high=20)
+    joint_offset: float = parameter(doc='|x| = |y| of the joint origin', unit='m', low=0, high=5)
+    joint_height: float = parameter(doc='z of the joint origin', unit='m', low=-5, high=5)
+    centre_of_mass: np.ndarray = parameter(
+        doc='outward, sideways, up from the joint axis', unit='m', shape=(3,))
+    inertia: np.ndarray = parameter(doc='diagonal, there', unit='kg m^2', shape=(3,), low=0)
+    rotor_offset: float = parameter(doc='rotor centre, outward on the axis', unit='m', low=-5,
+                                    high=5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EndEffectorParameters:
+    """A ball on a stalk above the body."""
+
+    mass: float = parameter(doc='mass', unit='kg', low=0, high=20)
+    height: float = parameter(doc='above the main body origin', unit='m', low=-5, high=5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MultibodyParameters:
+    """The parts that make up the rigid-body totals."""
+
+    main_body: MainBodyParameters = parameter(doc='main body')
+    module: ModuleParameters = parameter(doc='tilting module')
+    end_effector: EndEffectorParameters = parameter(doc='end-effector')
+    centre_of_gravity_height: float = parameter(
+        doc='of the robot above the main body origin', unit='m', low=-5, high=5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotParameters:
+    """
+    Everything that describes one robot.
+
+    Attributes:
+        mass: [kg].
+        gravity: [m/s^2].
+        inertia: (3,) diagonal about the centre of gravity [kg m^2].
+        effects: catalogue name -> parameter name -> value; deviations from the model.
+
+    """
+
+    mass: float = parameter(doc='total mass', unit='kg', low=0.05, high=200)
+    gravity: float = parameter(9.80665, doc='gravity', unit='m/s^2', low=0, high=30)
+    inertia: np.ndarray = parameter(doc='diagonal', unit='kg m^2', shape=(3,), low=1e-6, high=100)
+    rotors: RotorParameters = parameter(doc='rotors')
+    joints: JointParameters = parameter(doc='tilt servos')
+    battery: BatteryParameters = parameter(doc='battery')
+    multibody: MultibodyParameters = parameter(doc='parts')
+    name: str = parameter('robot', doc='name of the robot')
+    effects: dict = parameter({}, doc='known deviations from the model, by catalogue name')
+    provenance: dict = parameter({}, doc='where a written file comes from; free text')
+
+    def __post_init__(self):
+        """Refuse effects that the catalogue does not know."""
+        object.__setattr__(self, 'effects', catalogue.validated(self.effects))
+        hover = self.mass * self.gravity / 4
+        if hover > self.rotors.thrust_max:
+            raise ParameterError(f'mass {self.mass:g} kg needs {hover:.1f} N a rotor to hover, above '
+                                 f'rotors.thrust_max {self.rotors.thrust_max:g} N')
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> RobotParameters:
+        """
+        Read a robot file; without a path, the shipped one.
+
+        Raises:
+            ParameterError: naming file, key and what was expected.
+
+        """
+        return schema.load(cls, path if path else share_path('params/robot.yaml'))
+
+    @property
+    def tilt_axes(self) -> np.ndarray:
+        """(4, 3) unit tilt axes in base_link, outward along the arms."""
+        yaw = self.rotors.arm_yaw
+        return np.stack([np.cos(yaw), np.sin(yaw), np.zeros(4)], axis=1)
+
+    @property
+    def hover_thrust(self) -> float:
+        """Thrust of each rotor in level hover [N]."""
+        return self.mass * self.gravity / 4
+
+    def hash(self) -> str:
+        """Short digest of all physical values, for caches and policy contracts."""
+        return hashlib.sha256(yaml.safe_dump(self.as_dict(), sort_keys=True).encode()).hexdigest()[:16]
+
+    def as_dict(self) -> dict:
+        """All physical values as plain nested data (without name and provenance)."""
+        def plain(value):
+            if hasattr(value, '__dataclass_fields__'):
+                return {key: plain(getattr(value, key)) for key in value.__dataclass_fields__}
+            if isinstance(value, np.ndarray):
+                return value.tolist()
+            if isinstance(value, (list, tuple)):
+                return [plain(item) for item in value]
+            if isinstance(value, dict):
+                return {key: plain(item) for key, item in value.items()}
+            return value
+        data = plain(self)
+        del data['name'], data['provenance']
+        return data

@@ -1,0 +1,32 @@
+"""Where the package's data files lie: a checkout, a pip or a colcon installation."""
+
+import os
+from pathlib import Path
+import sys
+
+PACKAGE = 'beetle_omni_ros'
+
+
+def share_path(relative: str) -> Path:
+    """
+    Locate a shipped file such as ``params/robot.yaml``.
+
+    A source checkout wins over an installation, so that editing a parameter file
+    takes effect at once; then each prefix of ``AMENT_PREFIX_PATH`` (colcon, apt),
+    then the Python environment's prefix (pip).
+
+    Raises:
+        FileNotFoundError: no installation holds the file; the text lists where it looked.
+
+    """
+    roots = [Path(__file__).resolve().parents[2]]
+    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        if prefix:
+            roots.append(Path(prefix) / 'share' / PACKAGE)
+    roots.append(Path(sys.prefix) / 'share' / PACKAGE)
+    roots.append(Path(__file__).resolve().parents[4] / 'share' / PACKAGE)
+    for root in roots:
+        if (root / 'package.xml').is_file() and (root / relative).exists():
+            return root / relative
+    looked = ', '.join(str(root) for root in roots)
+    raise FileNotFoundError(f'{relative}: not found in any installation of {PACKAGE} ({looked})')

@@ -1,0 +1,91 @@
+"""
+Rotations in one convention: scipy's quaternion order (x, y, z, w), body to world.
+
+Small and allocation-light, because the estimator calls these hundreds of times a
+second; the tests hold them equal to scipy.spatial.transform.
+"""
+
+from math import atan2, cos, sin, sqrt
+
+import numpy as np
+
+
+def matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
+    x, y, z, w = quaternion
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Quaternion product: first ``b``, then ``a`` (R(a) R(b))."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return np.array([aw * bx + ax * bw + ay * bz - az * by,
+                     aw * by - ax * bz + ay * bw + az * bx,
+                     aw * bz + ax * by - ay * bx + az * bw,
+                     aw * bw - ax * bx - ay * by - az * bz])
+
+
+def conjugate(quaternion: np.ndarray) -> np.ndarray:
+    """Inverse of a unit quaternion."""
+    x, y, z, w = quaternion
+    return np.array([-x, -y, -z, w])
+
+
+def exp(vector: np.ndarray) -> np.ndarray:
+    """Unit quaternion of a rotation vector [rad]."""
+    x, y, z = vector
+    squared = x * x + y * y + z * z
+    if squared < 1e-12:
+        scale, w = 0.5 - squared / 48, 1 - squared / 8
+    else:
+        angle = sqrt(squared)
+        scale, w = sin(0.5 * angle) / angle, cos(0.5 * angle)
+    return np.array([scale * x, scale * y, scale * z, w])
+
+
+def log(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation vector [rad] of the shorter of the two rotations of a unit quaternion."""
+    x, y, z, w = quaternion if quaternion[3] >= 0 else -np.asarray(quaternion)
+    norm = sqrt(x * x + y * y + z * z)
+    scale = 2.0 if norm < 1e-9 else 2 * atan2(norm, w) / norm
+    return np.array([scale * x, scale * y, scale * z])
+
+
+def normalized(quaternion: np.ndarray) -> np.ndarray:
+    """``quaternion`` scaled to unit length."""
+    q = np.asarray(quaternion, dtype=float)
+    return q / sqrt(float(q @ q))
+
+
+def skew(vector: np.ndarray) -> np.ndarray:
+    """Matrix (3, 3) of the cross product: skew(a) @ b = a x b."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def geodesic_angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Angle [rad] of R(b)^T R(a), the package's orientation error, 0 to pi."""
+    x, y, z, w = multiply(conjugate(b), a)
+    return 2 * atan2(sqrt(x * x + y * y + z * z), abs(w))
+
+
+def from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Quaternion of R = Rz(yaw) Ry(pitch) Rx(roll), angles in rad."""
+    cr, sr = cos(roll / 2), sin(roll / 2)
+    cp, sp = cos(pitch / 2), sin(pitch / 2)
+    cy, sy = cos(yaw / 2), sin(yaw / 2)
+    return np.array([sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy,
+                     cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy])
+
+
+def to_rpy(quaternion: np.ndarray) -> np.ndarray:
+    """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    x, y, z, w = quaternion
+    sin_pitch = min(1.0, max(-1.0, 2 * (w * y - z * x)))
+    return np.array([atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+                     atan2(sin_pitch, sqrt(max(0.0, 1 - sin_pitch * sin_pitch))),
+                     atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))])

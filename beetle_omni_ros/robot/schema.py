@@ -1,0 +1,235 @@
+"""Parameter files bound to dataclasses, with units, ranges and one-line errors.
+
+A parameter file is YAML, either plain or in the ROS 2 form
+(``/**: ros__parameters: ...``), so that the same file serves a node's
+``--params-file`` and the tools that run without ROS.
+"""
+
+from dataclasses import MISSING, field, fields, is_dataclass
+from difflib import get_close_matches
+from pathlib import Path
+import types
+from typing import Any, get_args, get_origin, get_type_hints, Union
+
+import numpy as np
+import yaml
+
+
+class ParameterError(ValueError):
+    """A parameter file or value cannot be used; the text names file, key and expectation."""
+
+
+def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | None = None,
+              high: float | None = None, shape: tuple[int, ...] | None = None,
+              choices: tuple[str, ...] | None = None, read_only: bool = False):
+    """
+    Declare one dataclass field as a parameter.
+
+    Args:
+        default: value when the file does not name it; a list is copied into an array.
+        doc: what it does, one sentence.
+        unit: SI unit, '' for a pure number.
+        low: smallest legal value, inclusive (each element of an array).
+        high: largest legal value, inclusive.
+        shape: shape of an array parameter.
+        choices: the legal strings.
+        read_only: whether it can change only at start.
+
+    """
+    metadata = {'doc': doc, 'unit': unit, 'low': low, 'high': high, 'shape': shape,
+                'choices': choices, 'read_only': read_only}
+    if isinstance(default, (list, np.ndarray)):
+        value = np.array(default, dtype=float)
+        return field(default_factory=lambda: value.copy(), metadata=metadata)
+    if isinstance(default, dict):
+        return field(default_factory=lambda: dict(default), metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+def group(cls: type, doc: str = ''):
+    """Declare a nested dataclass of parameters that defaults to ``cls()``."""
+    return field(default_factory=cls, metadata={'doc': doc})
+
+
+def load_yaml(path: str | Path) -> dict:
+    """
+    Read a YAML mapping, unwrapped from ``ros__parameters`` where that form is used.
+
+    Raises:
+        ParameterError: missing or unreadable file, broken YAML, or no mapping in it.
+
+    """
+    path = Path(path)
+    try:
+        data = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise ParameterError(f'{path}: cannot be read ({error.strerror})') from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, 'problem_mark', None)
+        where = f' at line {mark.line + 1}, column {mark.column + 1}' if mark else ''
+        problem = getattr(error, 'problem', None) or str(error).splitlines()[0]
+        raise ParameterError(f'{path}: not valid YAML{where} ({problem})') from None
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise ParameterError(f'{path}: expected a mapping of keys, found {type(data).__name__}')
+    for value in data.values():
+        if isinstance(value, dict) and set(value) == {'ros__parameters'}:
+            return value['ros__parameters'] or {}
+    return data
+
+
+def load(cls: type, path: str | Path):
+    """Read ``path`` and bind it to the parameter dataclass ``cls``."""
+    return bind(cls, load_yaml(path), str(path))
+
+
+def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
+    """
+    Build ``cls`` from a nested mapping.
+
+    Args:
+        cls: a dataclass whose fields come from :func:`parameter` or :func:`group`.
+        mapping: keys to values, nested like the dataclass.
+        where: the file, for messages.
+        prefix: the dotted path of ``cls`` in the file, for messages.
+
+    Raises:
+        ParameterError: unknown or missing key, wrong type, shape or range.
+
+    """
+    if not isinstance(mapping, dict):
+        raise ParameterError(f'{_at(where, prefix)}: expected a mapping, '
+                             f'found {type(mapping).__name__}')
+    hints = get_type_hints(cls)
+    known = {f.name: f for f in fields(cls) if f.init}
+    for key in mapping:
+        if key not in known:
+            near = get_close_matches(str(key), known, n=1)
+            hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(known)}"
+            raise ParameterError(f'{_at(where, _join(prefix, key))}: unknown key{hint}')
+    values = {}
+    for name, entry in known.items():
+        key = _join(prefix, name)
+        if name not in mapping:
+            if entry.default is MISSING and entry.default_factory is MISSING:
+                raise ParameterError(f'{_at(where, key)}: missing'
+                                     f'{_unit_text(entry)}')
+            continue
+        if is_dataclass(hints[name]):
+            values[name] = bind(hints[name], mapping[name], where, key)
+        else:
+            values[name] = check(entry, hints[name], mapping[name], _at(where, key))
+    try:
+        return cls(**values)
+    except ParameterError as error:
+        raise ParameterError(f'{_at(where, prefix)}: {error}' if where else str(error)) from None
+
+
+def check(entry, hint: type, value: Any, at: str) -> Any:
+    """
+    Validate one value against its declaration; return it in its declared type.
+
+    Args:
+        entry: the dataclass field made by :func:`parameter`.
+        hint: its annotated type.
+        value: what the file or the user gave.
+        at: file and key, for messages.
+
+    """
+    meta = entry.metadata
+    optional = get_origin(hint) in (Union, types.UnionType)
+    if optional:
+        if value is None:
+            return None
+        hint = next(a for a in get_args(hint) if a is not type(None))
+    if meta.get('shape') is not None or hint is np.ndarray:
+        return _check_array(meta, value, at)
+    if hint is bool:
+        if not isinstance(value, bool):
+            raise ParameterError(f'{at}: expected true or false, found {value!r}')
+        return value
+    if hint in (int, float):
+        if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) \
+                or (hint is int and value != int(value)):
+            kind = 'an integer' if hint is int else 'a number'
+            raise ParameterError(f'{at}: expected {kind}{_unit_text(entry)}, found {value!r}')
+        _check_range(meta, float(value), at)
+        return hint(value)
+    if hint is str:
+        if not isinstance(value, str):
+            raise ParameterError(f'{at}: expected text, found {value!r}')
+        if meta.get('choices') and value not in meta['choices']:
+            raise ParameterError(f"{at}: expected one of {', '.join(meta['choices'])}, "
+                                 f'found {value!r}')
+        return value
+    return value
+
+
+def _check_array(meta, value, at):
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        raise ParameterError(f'{at}: expected numbers, found {value!r}') from None
+    shape = meta.get('shape')
+    if shape is not None and array.shape != tuple(shape):
+        raise ParameterError(f'{at}: expected shape {tuple(shape)}, found {array.shape}')
+    for element in array.ravel():
+        _check_range(meta, float(element), at)
+    return array
+
+
+def _check_range(meta, value, at):
+    low, high, unit = meta.get('low'), meta.get('high'), meta.get('unit')
+    if not np.isfinite(value):
+        raise ParameterError(f'{at}: {value} is not finite')
+    if (low is not None and value < low) or (high is not None and value > high):
+        span = f"{'-inf' if low is None else f'{low:g}'} to {'inf' if high is None else f'{high:g}'}"
+        raise ParameterError(f'{at}: {value:g} is outside {span}' + (f' {unit}' if unit else ''))
+
+
+def _unit_text(entry):
+    unit = entry.metadata.get('unit')
+    return f' [{unit}]' if unit else ''
+
+
+def _join(prefix, key):
+    return f'{prefix}.{key}' if prefix else str(key)
+
+
+def _at(where, key):
+    return ': '.join(part for part in (where, f"key '{key}'" if key else '') if part) or 'parameters'
+
+
+def flatten(instance, prefix: str = ''):
+    """
+    Walk a parameter dataclass.
+
+    Yields:
+        (dotted name, dataclass field, annotated type, value) for each leaf.
+
+    """
+    hints = get_type_hints(type(instance))
+    for entry in fields(instance):
+        value = getattr(instance, entry.name)
+        name = _join(prefix, entry.name)
+        if is_dataclass(hints[entry.name]):
+            yield from flatten(value, name)
+        else:
+            yield name, entry, hints[entry.name], value
+
+
+def nest(flat: dict[str, Any]) -> dict:
+    """Turn dotted names into the nested mapping that :func:`bind` takes."""
+    nested: dict = {}
+    for name, value in flat.items():
+        *path, leaf = name.split('.')
+        level = nested
+        for part in path:
+            level = level.setdefault(part, {})
+        level[leaf] = value
+    return nested
+
+
+__all__ = ['ParameterError', 'bind', 'check', 'flatten', 'group', 'load', 'load_yaml',
+           'nest', 'parameter']

@@ -1,0 +1,1 @@
+"""Recorded flights: bags, tasks, metrics, plots and reports."""

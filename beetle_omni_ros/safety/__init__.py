@@ -1,0 +1,1 @@
+"""Arming, command selection, limits and fallback."""
