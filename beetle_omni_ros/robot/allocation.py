@@ -1,0 +1,171 @@
+"""
+Allocation: which thrusts and tilts make a wished body wrench.
+
+In the rotor force components u = (f_1 cos q_1, f_1 sin q_1, ..., f_4 cos q_4, f_4 sin q_4) the
+wrench is linear, w = B u with B (6, 8), so the minimum-norm components are u = B^+ w. Thrust is
+the length of each rotor's component pair and tilt its angle, on the legal turn nearest the
+present angle: the joints wind, and the neighbouring turn is up to a full revolution away.
+
+The body's known effects (mass, thrust and torque coefficients, wind) are part of B and of the
+hover wrench, so that an identified robot file allocates for the identified robot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import atan2, copysign, cos, hypot, pi, sin
+
+import numpy as np
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+ROTORS = 4
+NEGLIGIBLE = 1e-6   # of the hover thrust: below it a rotor's direction is rounding noise
+SINGULAR = 1e-6     # of the largest singular value: a direction that no rotor can push
+
+
+@dataclass(frozen=True)
+class Allocation:
+    """
+    Actuator targets for one wrench.
+
+    Attributes:
+        tilt: (4,) tilt angles [rad], inside the joints' travel.
+        thrust: (4,) thrusts [N], inside the rotors' range.
+        saturated: (4,) bool, True where a limit cut the rotor off, so that the wrench is not met.
+
+    """
+
+    tilt: np.ndarray
+    thrust: np.ndarray
+    saturated: np.ndarray
+
+
+class Allocator:
+    """
+    Minimum-norm allocation for one robot, precomputed.
+
+    Args:
+        robot: the robot.
+
+    Attributes:
+        matrix: (6, 8) from (f_i cos q_i, f_i sin q_i), interleaved, to (force, torque) in base_link.
+        inverse: (8, 6) its pseudo-inverse.
+        mass: the mass that the hover wrench carries [kg].
+
+    """
+
+    def __init__(self, robot: RobotParameters):
+        rotors, effects = robot.rotors, robot.effects
+        ratio = effects.get('torque_coefficient', {}).get(
+            'torque_to_thrust_ratio', rotors.torque_to_thrust_ratio)
+        scale = np.full(ROTORS, effects.get('thrust_coefficient', {}).get('scale', 1.0)) \
+            * np.asarray(effects.get('rotor_thrust_coefficient', {}).get('scale', 1.0))
+        self.mass = effects.get('mass', {}).get('mass', robot.mass)
+        self._weight = np.array([0.0, 0.0, self.mass * robot.gravity]) \
+            - np.asarray(effects.get('wind', {}).get('force', (0.0, 0.0, 0.0)))
+        self.matrix = np.zeros((6, 2 * ROTORS))
+        up = np.array([0.0, 0.0, 1.0])
+        for i, axis in enumerate(robot.tilt_axes):
+            for column, direction in ((2 * i, up), (2 * i + 1, np.cross(axis, up))):
+                torque = np.cross(rotors.positions[i], direction) \
+                    - rotors.spin[i] * ratio * direction
+                self.matrix[:, column] = scale[i] * np.concatenate([direction, torque])
+        self.inverse = np.linalg.pinv(self.matrix, rcond=SINGULAR)
+        self._negligible = NEGLIGIBLE * robot.hover_thrust
+        self._thrust_min, self._thrust_max = rotors.thrust_min, rotors.thrust_max
+        self._tilt_limit = robot.joints.position_limit
+
+    def wrench(self, tilt: np.ndarray, thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Forward map.
+
+        Args:
+            tilt: (4,) [rad].
+            thrust: (4,) [N].
+
+        Returns:
+            force (3,) [N] and torque (3,) [N m] about the centre of gravity, in base_link.
+
+        """
+        components = np.empty(2 * ROTORS)
+        components[0::2] = thrust * np.cos(tilt)
+        components[1::2] = thrust * np.sin(tilt)
+        wrench = self.matrix @ components
+        return wrench[:3], wrench[3:]
+
+    def allocate(self, force: np.ndarray, torque: np.ndarray,
+                 present_tilt: np.ndarray) -> Allocation:
+        """
+        Minimum-norm thrusts and tilts for a body wrench.
+
+        A rotor with practically no thrust keeps its present angle, because its direction is
+        undetermined. A limit cuts thrust or tilt off and is reported, never exceeded.
+
+        Args:
+            force: (3,) in base_link [N].
+            torque: (3,) about the centre of gravity in base_link [N m].
+            present_tilt: (4,) angles from which the nearest turn is counted [rad].
+
+        """
+        components = self.inverse[:, :3] @ force + self.inverse[:, 3:] @ torque
+        tilt, thrust = np.empty(ROTORS), np.empty(ROTORS)
+        saturated = np.zeros(ROTORS, dtype=bool)
+        pairs = components.tolist()
+        for i, present in enumerate(np.asarray(present_tilt, dtype=float).tolist()):
+            along, across = pairs[2 * i], pairs[2 * i + 1]
+            length = hypot(along, across)
+            if length <= self._negligible:
+                angle, cut = self._inside(present)
+                length = max(0.0, along * cos(angle) + across * sin(angle))
+            else:
+                angle, cut = self._nearest_turn(atan2(across, along), present)
+            held = min(max(length, self._thrust_min), self._thrust_max)
+            tilt[i], thrust[i] = angle, held
+            saturated[i] = cut or abs(held - length) > self._negligible
+        return Allocation(tilt, thrust, saturated)
+
+    def hover(self, quaternion: np.ndarray, present_tilt: np.ndarray,
+              extra_force_world: np.ndarray | None = None,
+              extra_torque_body: np.ndarray | None = None) -> Allocation:
+        """
+        Allocate the wrench that holds the robot still at an attitude.
+
+        Args:
+            quaternion: (4,) body to world (x, y, z, w), unit.
+            present_tilt: (4,) [rad].
+            extra_force_world: (3,) beside the weight's support, in world [N].
+            extra_torque_body: (3,) in base_link [N m].
+
+        """
+        force = self._weight if extra_force_world is None else self._weight + extra_force_world
+        torque = np.zeros(3) if extra_torque_body is None else extra_torque_body
+        return self.allocate(force @ rotations.matrix(quaternion), torque, present_tilt)
+
+    def _nearest_turn(self, angle, present):
+        """Angle + 2 pi k nearest ``present`` inside the travel; (angle, whether cut off)."""
+        turned = angle + 2 * pi * round((present - angle) / (2 * pi))
+        if abs(turned) > self._tilt_limit:
+            other = turned - copysign(2 * pi, turned)
+            if abs(other) <= self._tilt_limit:
+                return other, False
+            return self._inside(min(turned, other, key=abs))
+        return turned, False
+
+    def _inside(self, angle):
+        limit = self._tilt_limit
+        return (angle, False) if abs(angle) <= limit else (copysign(limit, angle), True)
+
+
+def allocate(robot: RobotParameters, force: np.ndarray, torque: np.ndarray,
+             present_tilt: np.ndarray) -> Allocation:
+    """One allocation, see :meth:`Allocator.allocate`; keep an Allocator where it is repeated."""
+    return Allocator(robot).allocate(force, torque, present_tilt)
+
+
+def hover_allocation(robot: RobotParameters, quaternion: np.ndarray, present_tilt: np.ndarray,
+                     extra_force_world: np.ndarray | None = None,
+                     extra_torque_body: np.ndarray | None = None) -> Allocation:
+    """One hover allocation, see :meth:`Allocator.hover`; keep an Allocator where repeated."""
+    return Allocator(robot).hover(quaternion, present_tilt, extra_force_world, extra_torque_body)

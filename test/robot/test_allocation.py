@@ -1,0 +1,190 @@
+"""Allocation by its properties: residual, minimum norm, nearest legal turn, symmetry."""
+
+from dataclasses import replace
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.allocation import allocate, Allocator, hover_allocation
+from beetle_omni_ros.robot.parameters import RobotParameters
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+ROBOT = RobotParameters.load()
+ALLOCATOR = Allocator(ROBOT)
+LIMIT = ROBOT.joints.position_limit
+
+
+def independent_wrench(robot, tilt, thrust):
+    """Sum over rotors with scipy's rotation about the arm: the oracle of the forward map."""
+    force, torque = np.zeros(3), np.zeros(3)
+    for i in range(4):
+        turn = Rotation.from_rotvec(tilt[i] * robot.tilt_axes[i])
+        push = turn.apply([0.0, 0.0, thrust[i]])
+        force += push
+        torque += np.cross(robot.rotors.positions[i], push) \
+            - robot.rotors.spin[i] * robot.rotors.torque_to_thrust_ratio * push
+    return force, torque
+
+
+def random_quaternion(rng):
+    return rotations.normalized(rng.normal(size=4))
+
+
+def random_wrench(rng):
+    return rng.normal(size=3) * 12, rng.normal(size=3) * 0.8
+
+
+def test_forward_map_equals_sum_over_rotors():
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        tilt, thrust = rng.uniform(-LIMIT, LIMIT, 4), rng.uniform(0, 20, 4)
+        for ours, oracle in zip(ALLOCATOR.wrench(tilt, thrust),
+                                independent_wrench(ROBOT, tilt, thrust)):
+            np.testing.assert_allclose(ours, oracle, atol=1e-12)
+
+
+def test_allocation_leaves_no_residual_and_respects_the_limits():
+    rng = np.random.default_rng(2)
+    met = 0
+    for _ in range(300):
+        force, torque = random_wrench(rng)
+        got = ALLOCATOR.allocate(force, torque, rng.uniform(-LIMIT, LIMIT, 4))
+        assert np.all(np.abs(got.tilt) <= LIMIT)
+        assert np.all((got.thrust >= 0) & (got.thrust <= ROBOT.rotors.thrust_max))
+        if not got.saturated.any():
+            met += 1
+            made = independent_wrench(ROBOT, got.tilt, got.thrust)
+            np.testing.assert_allclose(made[0], force, atol=1e-4)
+            np.testing.assert_allclose(made[1], torque, atol=1e-4)
+    assert met > 100
+
+
+def test_each_tilt_is_the_legal_turn_nearest_the_present_angle():
+    rng = np.random.default_rng(3)
+    for _ in range(300):
+        force, torque = random_wrench(rng)
+        present = rng.uniform(-LIMIT, LIMIT, 4)
+        got = ALLOCATOR.allocate(force, torque, present)
+        for angle, now in zip(got.tilt, present):
+            turns = [angle + 2 * np.pi * k for k in range(-2, 3)]
+            legal = [turn for turn in turns if abs(turn) <= LIMIT]
+            assert abs(angle - now) == pytest.approx(min(abs(turn - now) for turn in legal))
+
+
+def test_solution_has_the_least_norm_of_all_that_make_the_wrench():
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        force, torque = random_wrench(rng)
+        got = ALLOCATOR.allocate(force / 2, torque / 2, np.zeros(4))
+
+        def made_error(u):
+            pair = u.reshape(4, 2)
+            thrust, tilt = np.hypot(*pair.T), np.arctan2(pair[:, 1], pair[:, 0])
+            made = independent_wrench(ROBOT, tilt, thrust)
+            return np.concatenate([made[0] - force / 2, made[1] - torque / 2])
+
+        best = minimize(lambda u: u @ u, rng.normal(size=8), jac=lambda u: 2 * u, method='SLSQP',
+                        constraints={'type': 'eq', 'fun': made_error},
+                        options={'maxiter': 300, 'ftol': 1e-12})
+        assert best.success
+        assert got.thrust @ got.thrust == pytest.approx(best.fun, rel=1e-5)
+
+
+def test_small_change_of_wrench_makes_a_small_change_of_the_targets():
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        attitude = random_quaternion(rng)
+        present = rng.uniform(-1.5, 1.5, 4)
+        first = ALLOCATOR.hover(attitude, present)
+        second = ALLOCATOR.hover(attitude, first.tilt, 1e-5 * rng.normal(size=3),
+                                 1e-6 * rng.normal(size=3))
+        if first.thrust.min() > 0.1:
+            np.testing.assert_allclose(second.tilt, first.tilt, atol=5e-3)
+        np.testing.assert_allclose(second.thrust, first.thrust, atol=1e-3)
+
+
+def test_following_a_full_roll_never_jumps_while_the_travel_allows():
+    present, path = np.zeros(4), []
+    for roll in np.linspace(0, np.pi, 400):
+        got = ALLOCATOR.hover(rotations.from_rpy(roll, 0.2, 0.3), present)
+        path.append(got.tilt)
+        present = got.tilt
+    assert np.abs(np.diff(path, axis=0)).max() < 0.3
+
+
+def test_mirrored_robot_and_wrench_give_mirrored_targets():
+    """Mirror y -> -y: rotors 1 and 4, 2 and 3 swap, tilt and spin change sign."""
+    rotors = replace(ROBOT.rotors, positions=np.array(
+        [[0.2, 0.2, 0.0], [-0.2, 0.2, 0.0], [-0.2, -0.2, 0.0], [0.2, -0.2, 0.0]]))
+    allocator = Allocator(replace(ROBOT, rotors=rotors))
+    rng, swap = np.random.default_rng(6), [3, 2, 1, 0]
+    for _ in range(50):
+        force, torque = random_wrench(rng)
+        present = rng.uniform(-LIMIT, LIMIT, 4)
+        got = allocator.allocate(force, torque, present)
+        mirrored = allocator.allocate(force * [1, -1, 1], torque * [-1, 1, -1], -present[swap])
+        np.testing.assert_allclose(mirrored.tilt, -got.tilt[swap], atol=1e-9)
+        np.testing.assert_allclose(mirrored.thrust, got.thrust[swap], atol=1e-9)
+
+
+def test_rotor_without_thrust_keeps_its_present_angle():
+    present = np.array([0.3, -1.2, 2.5, -3.9])
+    got = ALLOCATOR.allocate(np.zeros(3), np.zeros(3), present)
+    np.testing.assert_array_equal(got.tilt, present)
+    np.testing.assert_array_equal(got.thrust, np.zeros(4))
+    assert not got.saturated.any()
+
+
+def test_too_much_thrust_is_cut_off_and_reported():
+    got = ALLOCATOR.allocate(np.array([0.0, 0.0, 200.0]), np.zeros(3), np.zeros(4))
+    np.testing.assert_array_equal(got.thrust, np.full(4, ROBOT.rotors.thrust_max))
+    assert got.saturated.all()
+
+
+def test_tilt_without_a_legal_turn_is_cut_off_and_reported():
+    short = replace(ROBOT, joints=replace(ROBOT.joints, position_limit=1.0))
+    got = allocate(short, np.array([0.0, 0.0, -20.0]), np.zeros(3), np.zeros(4))
+    assert np.all(np.abs(got.tilt) <= 1.0)
+    assert got.saturated.all()
+
+
+def test_hover_carries_the_weight_within_the_thrust_that_the_paper_robot_needs():
+    rng = np.random.default_rng(7)
+    worst = 0.0
+    for _ in range(3000):
+        attitude = random_quaternion(rng)
+        got = ALLOCATOR.hover(attitude, np.zeros(4))
+        worst = max(worst, got.thrust.max())
+        force, torque = ALLOCATOR.wrench(got.tilt, got.thrust)
+        np.testing.assert_allclose(rotations.matrix(attitude) @ force,
+                                   [0, 0, ROBOT.mass * ROBOT.gravity], atol=1e-4)
+        np.testing.assert_allclose(torque, np.zeros(3), atol=1e-4)
+    # sup over attitudes: the largest gain from a unit force to one rotor's component pair
+    gain = max(np.linalg.norm(ALLOCATOR.inverse[2 * i:2 * i + 2, :3], 2) for i in range(4))
+    assert 0.98 * gain * ROBOT.mass * ROBOT.gravity < worst <= gain * ROBOT.mass * ROBOT.gravity
+    assert worst == pytest.approx(14.93, abs=0.02)
+
+
+def test_extra_force_is_in_world_and_extra_torque_in_base_link():
+    attitude = rotations.from_rpy(0.8, -0.4, 2.0)
+    got = hover_allocation(ROBOT, attitude, np.zeros(4), np.array([3.0, -2.0, 1.0]),
+                           np.array([0.1, 0.2, -0.3]))
+    force, torque = ALLOCATOR.wrench(got.tilt, got.thrust)
+    np.testing.assert_allclose(rotations.matrix(attitude) @ force,
+                               [3, -2, 1 + ROBOT.mass * ROBOT.gravity], atol=1e-4)
+    np.testing.assert_allclose(torque, [0.1, 0.2, -0.3], atol=1e-4)
+
+
+def test_known_effects_of_the_robot_file_are_allocated_for():
+    effects = {'mass': {'mass': 3.3}, 'thrust_coefficient': {'scale': 0.9},
+               'rotor_thrust_coefficient': {'scale': [1.0, 0.95, 1.0, 1.05]},
+               'torque_coefficient': {'torque_to_thrust_ratio': 0.02},
+               'wind': {'force': [1.0, 0.0, 0.0]}}
+    robot = replace(ROBOT, effects=effects)
+    got = Allocator(robot).hover(np.array([0, 0, 0, 1.0]), np.zeros(4))
+    true = replace(ROBOT, rotors=replace(ROBOT.rotors, torque_to_thrust_ratio=0.02))
+    scale = 0.9 * np.array([1.0, 0.95, 1.0, 1.05])
+    force, torque = independent_wrench(true, got.tilt, scale * got.thrust)
+    np.testing.assert_allclose(force, [-1.0, 0.0, 3.3 * ROBOT.gravity], atol=1e-4)
+    np.testing.assert_allclose(torque, np.zeros(3), atol=1e-4)
