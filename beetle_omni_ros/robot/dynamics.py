@@ -1,0 +1,158 @@
+"""
+The robot's dynamics, written once in CasADi: x' = f(x, u, p).
+
+Rigid body with four tilted thrusts and their reaction torques, first-order rotor
+lag and second-order tilt servos within limits, plus the robot file's named effects.
+The NMPC predicts with it, C code is generated from it, identification fits it.
+MuJoCo stays an independent description of the same robot.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from beetle_omni_ros.robot.effects import CATALOGUE, Terms
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+# Slices of the full state (25): world position [m] and velocity [m/s], attitude (x, y, z, w) body to
+# world, body rates [rad/s], tilt angles [rad] and rates [rad/s], thrusts [N].
+POSITION, VELOCITY, QUATERNION, RATE = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
+TILT, TILT_RATE, THRUST = slice(13, 17), slice(17, 21), slice(21, 25)
+STATE_SIZE, INPUT_SIZE = 25, 8
+# Slices of the input (8): tilt targets [rad], thrust targets [N].
+TILT_COMMAND, THRUST_COMMAND = slice(0, 4), slice(4, 8)
+# Slices of the disturbance (10): force in world [N], torque in body [N m], offset of each servo's
+# resting angle from its target [rad].
+FORCE, TORQUE, TILT_OFFSET = slice(0, 3), slice(3, 6), slice(6, 10)
+DISTURBANCE_SIZE = 10
+
+
+def rotation_matrix(quaternion):
+    """Rotation matrix (3, 3) of a unit quaternion (x, y, z, w), body to world."""
+    x, y, z, w = ca.vertsplit(quaternion)
+    return ca.vertcat(
+        ca.horzcat(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        ca.horzcat(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        ca.horzcat(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)))
+
+
+def quaternion_rate(quaternion, angular_velocity):
+    """Derivative of (x, y, z, w) for body rates [rad/s]: q' = q * (w, 0) / 2."""
+    x, y, z, w = ca.vertsplit(quaternion)
+    a, b, c = ca.vertsplit(angular_velocity)
+    return 0.5 * ca.vertcat(w * a + y * c - z * b, w * b - x * c + z * a,
+                            w * c + x * b - y * a, -x * a - y * b - z * c)
+
+
+def thrust_direction(arm_yaw: float, tilt):
+    """Unit thrust vector (3,) in base_link of a rotor tilted by ``tilt`` [rad] about its arm."""
+    return ca.vertcat(ca.sin(tilt) * np.sin(arm_yaw), -ca.sin(tilt) * np.cos(arm_yaw),
+                      ca.cos(tilt))
+
+
+def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, tilt, thrust,
+               force_world=0, torque_body=0):
+    """
+    Newton-Euler equations of the robot as one rigid body.
+
+    Args:
+        robot: parameters, with the effects that apply.
+        velocity: (3,) in world [m/s].
+        quaternion: (4,) body to world, (x, y, z, w).
+        angular_velocity: (3,) in body [rad/s].
+        tilt: (4,) [rad].
+        thrust: (4,) after the rotors' lag [N].
+        force_world: (3,) external force in world [N].
+        torque_body: (3,) external torque in body [N m].
+
+    Returns:
+        (3,) acceleration in world [m/s^2], (3,) angular acceleration in body [rad/s^2].
+
+    """
+    rotors = robot.rotors
+    terms = Terms(
+        mass=robot.mass, thrust=thrust, velocity=velocity, angular_velocity=angular_velocity,
+        rotation=rotation_matrix(quaternion),
+        thrust_directions=[thrust_direction(rotors.arm_yaw[i], tilt[i]) for i in range(4)],
+        rotor_positions=[ca.DM(rotors.positions[i]) for i in range(4)],
+        hover_thrust=robot.hover_thrust, force_world=force_world, rotor_forces=[0] * 4,
+        torque_ratio=rotors.torque_to_thrust_ratio)
+    for name, values in robot.effects.items():
+        CATALOGUE[name].apply(terms, **values)
+    force, torque = 0, torque_body
+    for i in range(4):
+        rotor_force = terms.thrust[i] * terms.thrust_directions[i] + terms.rotor_forces[i]
+        force = force + rotor_force
+        torque = torque + ca.cross(terms.rotor_positions[i], rotor_force) \
+            - rotors.spin[i] * terms.torque_ratio * terms.thrust[i] * terms.thrust_directions[i]
+    inertia = ca.DM(robot.inertia)
+    acceleration = (terms.rotation @ force + terms.force_world) / terms.mass \
+        + ca.DM([0, 0, -robot.gravity])
+    momentum = inertia * angular_velocity
+    return acceleration, (torque - ca.cross(angular_velocity, momentum)) / inertia
+
+
+def servo_acceleration(robot: RobotParameters, tilt, tilt_rate, target):
+    """
+    Second-order tilt servo within its torque and rate limits, [rad/s^2].
+
+    J q'' = Kp (q* - q) - Kd q', torque clipped to the effort limit; at the rate limit
+    the servo no longer accelerates outward.
+    """
+    joint = robot.joints
+    torque = joint.kp * (target - tilt) - joint.kd * tilt_rate
+    torque = ca.fmin(ca.fmax(torque, -joint.effort_limit), joint.effort_limit)
+    outward = ca.logic_and(ca.fabs(tilt_rate) >= joint.velocity_limit, torque * tilt_rate > 0)
+    return ca.if_else(outward, 0, torque / joint.inertia)
+
+
+def derivative(robot: RobotParameters, x, u, d):
+    """State derivative (25,) of the full model; see the slices of this module."""
+    limit = robot.joints.position_limit
+    target = ca.fmin(ca.fmax(u[TILT_COMMAND], -limit), limit) + d[TILT_OFFSET]
+    thrust_target = ca.fmin(ca.fmax(u[THRUST_COMMAND], robot.rotors.thrust_min),
+                            robot.rotors.thrust_max)
+    acceleration, angular_acceleration = rigid_body(
+        robot, x[VELOCITY], x[QUATERNION], x[RATE], x[TILT], x[THRUST], d[FORCE], d[TORQUE])
+    return ca.vertcat(
+        x[VELOCITY], acceleration, quaternion_rate(x[QUATERNION], x[RATE]), angular_acceleration,
+        x[TILT_RATE],
+        ca.vertcat(*[servo_acceleration(robot, x[TILT][i], x[TILT_RATE][i], target[i])
+                     for i in range(4)]),
+        (thrust_target - x[THRUST]) / robot.rotors.time_constant)
+
+
+def full_model(robot: RobotParameters) -> ca.Function:
+    """f(x (25), u (8), d (10)) -> x' (25): state, input, disturbance as in this module's slices."""
+    x, u, d = ca.SX.sym('x', STATE_SIZE), ca.SX.sym('u', INPUT_SIZE), \
+        ca.SX.sym('d', DISTURBANCE_SIZE)
+    return ca.Function('dynamics', [x, u, d], [derivative(robot, x, u, d)],
+                       ['x', 'u', 'd'], ['x_dot'])
+
+
+def body_acceleration(robot: RobotParameters) -> ca.Function:
+    """(velocity, quaternion, angular_velocity, tilt, thrust) -> world and angular acceleration."""
+    v, q, w = ca.SX.sym('v', 3), ca.SX.sym('q', 4), ca.SX.sym('w', 3)
+    tilt, thrust = ca.SX.sym('tilt', 4), ca.SX.sym('thrust', 4)
+    return ca.Function('body_acceleration', [v, q, w, tilt, thrust],
+                       list(rigid_body(robot, v, q, w, tilt, thrust)),
+                       ['velocity', 'quaternion', 'angular_velocity', 'tilt', 'thrust'],
+                       ['acceleration', 'angular_acceleration'])
+
+
+def integrator(robot: RobotParameters, substeps: int = 2) -> ca.Function:
+    """advance(x (25), u (8), d (10), dt) -> x after dt [s], fourth-order Runge-Kutta."""
+    x, u, d, dt = ca.SX.sym('x', STATE_SIZE), ca.SX.sym('u', INPUT_SIZE), \
+        ca.SX.sym('d', DISTURBANCE_SIZE), ca.SX.sym('dt')
+    f = full_model(robot)
+    h, state = dt / substeps, x
+    for _ in range(substeps):
+        k1 = f(state, u, d)
+        k2 = f(state + h / 2 * k1, u, d)
+        k3 = f(state + h / 2 * k2, u, d)
+        k4 = f(state + h * k3, u, d)
+        state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    quaternion = state[QUATERNION] / ca.norm_2(state[QUATERNION])
+    state = ca.vertcat(state[:6], quaternion, state[10:])
+    return ca.Function('advance', [x, u, d, dt], [state], ['x', 'u', 'd', 'dt'], ['x_next'])
