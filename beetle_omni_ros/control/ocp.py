@@ -1,0 +1,136 @@
+"""
+The NMPC's optimal control problem as stage functions, generated from the robot's model.
+
+One shooting interval: rigid body by Runge-Kutta 4, while the first-order lags of servos
+and rotors are evaluated in closed form at the start, middle and end of the interval. So
+an interval may be much longer than a servo's time constant, which an explicit rule on
+the whole state would not survive. The cost is least squares in position, velocity, the
+vector part of the attitude error quaternion, body rates, tilts, thrusts and command
+changes; with the reference attitude fixed it is linear in the state, so its
+Gauss-Newton Hessian is exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from beetle_omni_ros.robot import dynamics
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+# Order of the weight vector; see NmpcWeights for meanings and units.
+WEIGHTS = ('position_xy', 'position_z', 'velocity', 'attitude_xy', 'attitude_z', 'rate', 'tilt',
+           'thrust', 'tilt_change', 'thrust_change', 'thrust_command')
+INPUT_SIZE = 8
+REFERENCE_SIZE = 21  # position, velocity, quaternion, rate, tilt, thrust
+
+
+@dataclass(frozen=True)
+class Ocp:
+    """
+    Stage functions of one problem.
+
+    Attributes:
+        state_size: 21 with the rotor lag in the model, 17 with thrust as a direct input.
+        stage: (x, u, d, reference, weights, h) -> x_next, A, B, Q, R, S, q, r.
+        terminal: (x, reference, weights) -> Q, q.
+
+    """
+
+    state_size: int
+    stage: ca.Function
+    terminal: ca.Function
+
+
+def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool) -> Ocp:
+    """
+    Write the stage functions for a robot.
+
+    Args:
+        robot: parameters, with the effects that apply.
+        servo_lag: time constant of the servos' first-order reduction [s].
+        rotor_lag: whether thrust is a state with the robot's rotor time constant
+            (21 states) or follows its command at once (17 states).
+
+    """
+    size = 21 if rotor_lag else 17
+    x, u = ca.SX.sym('x', size), ca.SX.sym('u', INPUT_SIZE)
+    d = ca.SX.sym('d', dynamics.DISTURBANCE_SIZE)
+    reference, weights = ca.SX.sym('reference', REFERENCE_SIZE), ca.SX.sym('w', len(WEIGHTS))
+    h = ca.SX.sym('h')
+
+    x_next = _interval(robot, servo_lag, rotor_lag, x, u, d, h)
+    residual, weight = _residual(rotor_lag, x, u, reference, weights)
+    z = ca.vertcat(x, u)
+    jacobian = ca.jacobian(residual, z)
+    hessian = h * (jacobian.T @ ca.diag(weight) @ jacobian)
+    gradient = h * (jacobian.T @ (weight * residual))
+    stage = ca.Function('stage', [x, u, d, reference, weights, h], [ca.densify(e) for e in (
+        x_next, ca.jacobian(x_next, x), ca.jacobian(x_next, u),
+        hessian[:size, :size], hessian[size:, size:], hessian[size:, :size],
+        gradient[:size], gradient[size:])])
+
+    residual, weight = _residual(rotor_lag, x, None, reference, weights)
+    jacobian = ca.jacobian(residual, x)
+    terminal = ca.Function('terminal', [x, reference, weights], [ca.densify(e) for e in (
+        jacobian.T @ ca.diag(weight) @ jacobian, jacobian.T @ (weight * residual))])
+    return Ocp(size, stage, terminal)
+
+
+def _interval(robot, servo_lag, rotor_lag, x, u, d, h):
+    """State after one interval of length ``h`` under a constant command."""
+    tilt_target = u[:4] + d[dynamics.TILT_OFFSET]
+    tilt = x[13:17]
+
+    def actuators(time):
+        angle = tilt_target + (tilt - tilt_target) * ca.exp(-time / servo_lag)
+        if not rotor_lag:
+            return angle, u[4:]
+        decay = ca.exp(-time / robot.rotors.time_constant)
+        return angle, u[4:] + (x[17:21] - u[4:]) * decay
+
+    def body_derivative(body, time):
+        angle, thrust = actuators(time)
+        acceleration, angular_acceleration = dynamics.rigid_body(
+            robot, body[3:6], body[6:10], body[10:13], angle, thrust,
+            d[dynamics.FORCE], d[dynamics.TORQUE])
+        return ca.vertcat(body[3:6], acceleration,
+                          dynamics.quaternion_rate(body[6:10], body[10:13]),
+                          angular_acceleration)
+
+    body = x[:13]
+    k1 = body_derivative(body, 0)
+    k2 = body_derivative(body + h / 2 * k1, h / 2)
+    k3 = body_derivative(body + h / 2 * k2, h / 2)
+    k4 = body_derivative(body + h * k3, h)
+    angle, thrust = actuators(h)
+    parts = [body + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), angle]
+    return ca.vertcat(*parts, thrust) if rotor_lag else ca.vertcat(*parts)
+
+
+def _residual(rotor_lag, x, u, reference, weights):
+    """Least-squares residual and its weights; without ``u``, the terminal ones."""
+    w = dict(zip(WEIGHTS, ca.vertsplit(weights)))
+    xr, yr, zr, wr = ca.vertsplit(reference[6:10])
+    qx, qy, qz, qw = ca.vertsplit(x[6:10])
+    attitude = ca.vertcat(wr * qx - xr * qw - yr * qz + zr * qy,
+                          wr * qy - yr * qw - zr * qx + xr * qz,
+                          wr * qz - zr * qw - xr * qy + yr * qx)
+    residual = [x[0:3] - reference[0:3], x[3:6] - reference[3:6], attitude,
+                x[10:13] - reference[10:13], x[13:17] - reference[13:17]]
+    weight = [w['position_xy'], w['position_xy'], w['position_z'], *[w['velocity']] * 3,
+              w['attitude_xy'], w['attitude_xy'], w['attitude_z'], *[w['rate']] * 3,
+              *[w['tilt']] * 4]
+    if rotor_lag:
+        residual.append(x[17:21] - reference[17:21])
+        weight += [w['thrust']] * 4
+    if u is not None:
+        residual.append(u[:4] - x[13:17])
+        weight += [w['tilt_change']] * 4
+        if rotor_lag:
+            residual.append(u[4:] - x[17:21])
+            weight += [w['thrust_change']] * 4
+        residual.append(u[4:] - reference[17:21])
+        weight += [w['thrust_command']] * 4
+    return ca.vertcat(*residual), ca.vertcat(*weight)

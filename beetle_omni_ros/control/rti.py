@@ -1,0 +1,167 @@
+"""Real-time iteration: one Gauss-Newton QP a cycle around a stored, shifted trajectory."""
+
+from __future__ import annotations
+
+from ctypes import c_double, c_int, c_void_p, POINTER
+
+import numpy as np
+
+from beetle_omni_ros.control.compiler import compiled_library
+from beetle_omni_ros.control.hpipm import OcpQp
+from beetle_omni_ros.control.ocp import INPUT_SIZE, Ocp, REFERENCE_SIZE
+
+BOUNDED_STATES = [3, 4, 5, 10, 11, 12]  # velocity and body rates
+QUATERNION = slice(6, 10)
+_DOUBLES = POINTER(c_double)
+
+
+class CompiledRti:
+    """
+    The iteration in C; a call costs a fraction of a millisecond.
+
+    Args:
+        ocp: stage functions.
+        intervals: (N,) interval lengths [s].
+        soft: linear and quadratic slack weight of the velocity and rate limits, or None.
+        tolerance: residual at which the QP counts as solved.
+        max_iterations: of the QP.
+        extra: further CasADi functions to compile into the same library.
+
+    Raises:
+        CompilerError: there is no usable compiler.
+
+    """
+
+    def __init__(self, ocp: Ocp, intervals, soft, tolerance, max_iterations, extra=()):
+        """Compile (or load) and allocate; see the class."""
+        self.library = lib = compiled_library([ocp.stage, ocp.terminal, *extra])
+        lib.rti_create.restype = c_void_p
+        lib.rti_create.argtypes = [c_int, _DOUBLES, c_int, c_int, _DOUBLES, c_double, c_int]
+        for name in ('rti_states', 'rti_inputs'):
+            getattr(lib, name).restype = _DOUBLES
+            getattr(lib, name).argtypes = [c_void_p]
+        lib.rti_step.argtypes = [c_void_p] * 6
+        lib.rti_fill.argtypes = [c_void_p] * 3
+        lib.rti_shift.argtypes = [c_void_p, c_double]
+        lib.rti_iterations.argtypes = lib.rti_free.argtypes = [c_void_p]
+        n, size = len(intervals), ocp.state_size
+        interval = np.array(intervals, dtype=float)
+        weights = np.array(soft if soft else (0.0, 0.0), dtype=float)
+        self._handle = lib.rti_create(n, interval.ctypes.data_as(_DOUBLES), size, int(bool(soft)),
+                                      weights.ctypes.data_as(_DOUBLES), tolerance, max_iterations)
+        if not self._handle:
+            raise MemoryError(f'the NMPC could not be allocated for {n} intervals')
+        self.states = np.ctypeslib.as_array(lib.rti_states(self._handle), (n + 1, size))
+        self.inputs = np.ctypeslib.as_array(lib.rti_inputs(self._handle), (n, INPUT_SIZE))
+
+    def __del__(self):
+        """Free the C side."""
+        if getattr(self, '_handle', None):
+            self.library.rti_free(self._handle)
+            self._handle = None
+
+    def fill(self, x, u):
+        """Store one state and one input over the whole horizon."""
+        self.states[:], self.inputs[:] = x, u
+
+    def shift(self, part: float):
+        """Move the stored trajectory forward by ``part`` of each interval."""
+        self.library.rti_shift(self._handle, part)
+
+    def step(self, x0, references, disturbance, weights, bounds) -> tuple[int, int]:
+        """
+        One iteration; the result stands in ``states`` and ``inputs``.
+
+        Args:
+            x0: (nx,) present state.
+            references: (N + 1, 21).
+            disturbance: (10,) force in world, torque in body, tilt offsets.
+            weights: (11,) in the order of ``ocp.WEIGHTS``.
+            bounds: (18,) lower and upper input bounds, limits of |v| and |w|.
+
+        Returns:
+            QP status (0 solved) and iterations; above 1 nothing has changed.
+
+        """
+        status = self.library.rti_step(
+            self._handle, x0.ctypes.data, references.ctypes.data, disturbance.ctypes.data,
+            weights.ctypes.data, bounds.ctypes.data)
+        return status, self.library.rti_iterations(self._handle)
+
+
+class InterpretedRti:
+    """The same iteration without a compiler: CasADi's interpreter and HPIPM through ctypes."""
+
+    def __init__(self, ocp: Ocp, intervals, soft, tolerance, max_iterations):
+        """Allocate; arguments as for :class:`CompiledRti`."""
+        n, size = len(intervals), ocp.state_size
+        self._ocp, self._intervals = ocp, np.array(intervals, dtype=float)
+        self.states, self.inputs = np.zeros((n + 1, size)), np.zeros((n, INPUT_SIZE))
+        self._qp = OcpQp([0] + [size] * n, [INPUT_SIZE] * n + [0], [[]] + [BOUNDED_STATES] * n,
+                         soft, tolerance, max_iterations)
+        self._buffer, self._evaluate = ocp.stage.buffer()
+        shapes = [ocp.stage.size_out(i) for i in range(ocp.stage.n_out())]
+        flat = [np.zeros(rows * columns) for rows, columns in shapes]
+        self._outputs = [array.reshape(shape, order='F') for array, shape in zip(flat, shapes)]
+        self._inputs = [np.zeros(ocp.stage.numel_in(i)) for i in range(6)]
+        for i, array in enumerate(self._inputs):
+            self._buffer.set_arg(i, memoryview(array))
+        for i, array in enumerate(flat):
+            self._buffer.set_res(i, memoryview(array))
+
+    def fill(self, x, u):
+        """Store one state and one input over the whole horizon."""
+        self.states[:], self.inputs[:] = x, u
+
+    def shift(self, part: float):
+        """Move the stored trajectory forward by ``part`` of each interval."""
+        self.states[:-1] += part * np.diff(self.states, axis=0)
+        self.inputs[:-1] += part * np.diff(self.inputs, axis=0)
+
+    def step(self, x0, references, disturbance, weights, bounds) -> tuple[int, int]:
+        """As :meth:`CompiledRti.step`."""
+        qp, n = self._qp, len(self._intervals)
+        x, u = self.states.copy(), self.inputs.copy()
+        if x0[QUATERNION] @ x[0, QUATERNION] < 0:
+            x[:, QUATERNION] *= -1
+        x[0] = x0
+        for k in range(n):
+            f = self._linearise(x[k], u[k], disturbance, references[k], weights, k)
+            qp.set('b', k, f.ravel() - x[k + 1])
+            qp.set('lbu', k, bounds[:INPUT_SIZE] - u[k])
+            qp.set('ubu', k, bounds[INPUT_SIZE:2 * INPUT_SIZE] - u[k])
+        hessian, gradient = self._ocp.terminal(x[n], references[n], weights)
+        qp.set('Q', n, np.array(hessian))
+        qp.set('q', n, np.array(gradient).ravel())
+        limit = np.repeat(bounds[2 * INPUT_SIZE:], 3)
+        for k in range(1, n + 1):
+            qp.set('lbx', k, -limit - x[k, BOUNDED_STATES])
+            qp.set('ubx', k, limit - x[k, BOUNDED_STATES])
+        status, iterations = qp.solve()
+        for k in range(n):
+            u[k] += qp.get('u', k, INPUT_SIZE)
+            x[k + 1] += qp.get('x', k + 1, x.shape[1])
+        if not (np.isfinite(x).all() and np.isfinite(u).all()):
+            status = 3
+        if status <= 1:
+            self.states[:], self.inputs[:] = x, u
+        return status, iterations
+
+    def _linearise(self, x, u, disturbance, reference, weights, k):
+        values = (x, u, disturbance, reference, weights, self._intervals[k])
+        for array, value in zip(self._inputs, values):
+            array[:] = value
+        self._evaluate()
+        f, a, b, q_xx, r_uu, s_ux, q, r = self._outputs
+        self._qp.set('B', k, b)
+        self._qp.set('R', k, r_uu)
+        self._qp.set('r', k, r.ravel())
+        if k > 0:
+            self._qp.set('A', k, a)
+            self._qp.set('Q', k, q_xx)
+            self._qp.set('S', k, s_ux)
+            self._qp.set('q', k, q.ravel())
+        return f
+
+
+__all__ = ['BOUNDED_STATES', 'CompiledRti', 'InterpretedRti', 'REFERENCE_SIZE']
