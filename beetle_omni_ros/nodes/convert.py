@@ -1,0 +1,327 @@
+"""
+Messages to the core's dataclasses and back.
+
+Every scalar that goes into a message passes through ``float``: a wrong Python type in
+a float field would be serialised as garbage without a word. What comes in is checked
+for shape and finiteness here, once, and refused with :class:`MessageError`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, PoseStamped, Quaternion, Transform, Twist, Vector3, WrenchStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+from sensor_msgs.msg import BatteryState, Imu, JointState
+from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
+
+from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
+from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
+
+WORLD, BODY = 'world', 'base_link'
+COMMAND_NAMES = [*JOINT_NAMES, *ROTOR_NAMES]
+NO_VALUE = [float('nan')] * 4
+# A quaternion further from unit length than this is a broken message, not a rounded one.
+UNIT_TOLERANCE = 0.01
+
+
+class MessageError(ValueError):
+    """A message cannot be used; the text is the reason under which it is counted."""
+
+
+@dataclass(frozen=True)
+class Joints:
+    """Measured tilt joints: capture time [s], (4,) angles [rad], (4,) rates [rad/s]."""
+
+    stamp: float
+    position: np.ndarray
+    velocity: np.ndarray
+
+
+@dataclass(frozen=True)
+class Wrench:
+    """External force in world (3,) [N] and torque in base_link (3,) [N m]."""
+
+    stamp: float
+    force: np.ndarray
+    torque: np.ndarray
+
+
+@dataclass(frozen=True)
+class Odom:
+    """Pose in world and velocities as :class:`State` has them (linear world, angular body)."""
+
+    stamp: float
+    position: np.ndarray
+    velocity: np.ndarray
+    quaternion: np.ndarray
+    angular_velocity: np.ndarray
+
+
+def seconds(stamp: Time) -> float:
+    """Time message to seconds."""
+    return stamp.sec + stamp.nanosec * 1e-9
+
+
+def time_message(stamp: float) -> Time:
+    """Seconds to a time message, rounded to a nanosecond."""
+    nanoseconds = max(0, round(stamp * 1e9))
+    return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
+
+
+def imu_sample(message: Imu) -> ImuSample:
+    """Read one IMU message."""
+    return ImuSample(seconds(message.header.stamp),
+                     _finite(_xyz(message.linear_acceleration), 'linear_acceleration'),
+                     _finite(_xyz(message.angular_velocity), 'angular_velocity'))
+
+
+def imu_message(sample) -> Imu:
+    """Write one IMU reading (REP-145: no orientation)."""
+    message = Imu()
+    _header(message, sample.stamp, BODY)
+    message.orientation_covariance[0] = -1.0
+    message.linear_acceleration = vector(sample.specific_force)
+    message.angular_velocity = vector(sample.angular_velocity)
+    return message
+
+
+def pose_sample(message: PoseStamped) -> PoseSample:
+    """Read one motion-capture pose; the estimator judges the quaternion by its own tolerance."""
+    return PoseSample(seconds(message.header.stamp),
+                      _finite(_xyz(message.pose.position), 'position'),
+                      _finite(_xyzw(message.pose.orientation), 'orientation'))
+
+
+def pose_message(stamp: float, position: np.ndarray, rotation: np.ndarray) -> PoseStamped:
+    """Write one pose in world."""
+    message = PoseStamped()
+    _header(message, stamp, WORLD)
+    _set_pose(message.pose, position, rotation)
+    return message
+
+
+def pose_target(message: PoseStamped) -> PoseTarget:
+    """Read a target pose."""
+    position, rotation = _pose(message.pose)
+    if message.header.frame_id not in ('', WORLD):
+        raise MessageError(f"frame_id '{message.header.frame_id}' is not '{WORLD}'")
+    return PoseTarget(position, rotation, seconds(message.header.stamp))
+
+
+def trajectory_target(message: MultiDOFJointTrajectory) -> TrajectoryTarget:
+    """Read a trajectory; times count from the header's stamp."""
+    start, points = seconds(message.header.stamp), message.points
+    if len(points) < 2:
+        raise MessageError(f'a trajectory needs 2 points or more, found {len(points)}')
+    for point in points:
+        if len(point.transforms) != 1 or len(point.velocities) != 1:
+            raise MessageError('each trajectory point needs one transform and one velocity')
+    times = np.array([start + p.time_from_start.sec + p.time_from_start.nanosec * 1e-9
+                      for p in points])
+    if np.any(np.diff(times) <= 0):
+        raise MessageError('trajectory times do not increase')
+    rotation = np.array([_xyzw(p.transforms[0].rotation) for p in points])
+    return TrajectoryTarget(
+        times,
+        _finite(np.array([_xyz(p.transforms[0].translation) for p in points]), 'translation'),
+        np.array([_unit(q) for q in rotation]),
+        _finite(np.array([_xyz(p.velocities[0].linear) for p in points]), 'velocity'),
+        _finite(np.array([_xyz(p.velocities[0].angular) for p in points]), 'angular velocity'),
+        stamp=start)
+
+
+def target_message(target: PoseTarget | TrajectoryTarget) -> PoseStamped | MultiDOFJointTrajectory:
+    """Write a target; a trajectory's angular velocities stay in the reference's body frame."""
+    if isinstance(target, PoseTarget):
+        return pose_message(target.stamp, target.position, target.quaternion)
+    message = MultiDOFJointTrajectory(joint_names=[BODY])
+    _header(message, target.stamp, WORLD)
+    for k, time in enumerate(target.times):
+        point = MultiDOFJointTrajectoryPoint()
+        offset = round((time - target.stamp) * 1e9)
+        point.time_from_start.sec = offset // 1_000_000_000
+        point.time_from_start.nanosec = offset % 1_000_000_000
+        point.transforms = [Transform(translation=vector(target.positions[k]),
+                                      rotation=quaternion(target.quaternions[k]))]
+        point.velocities = [Twist(linear=vector(target.velocities[k]),
+                                  angular=vector(target.angular_velocities[k]))]
+        message.points.append(point)
+    return message
+
+
+def odometry_message(stamp, position, velocity, rotation, angular_velocity,
+                     pose_covariance=None, twist_covariance=None) -> Odometry:
+    """
+    Write an odometry message.
+
+    Args:
+        stamp: time [s].
+        position: (3,) in world [m].
+        velocity: (3,) in world [m/s]; the message carries it in base_link.
+        rotation: (4,) body to world.
+        angular_velocity: (3,) in base_link [rad/s].
+        pose_covariance: (6, 6) of position (world) and small rotation (world axes), or None.
+        twist_covariance: (6, 6) of the twist in base_link, or None.
+
+    """
+    message = Odometry()
+    _header(message, stamp, WORLD)
+    message.child_frame_id = BODY
+    _set_pose(message.pose.pose, position, rotation)
+    message.twist.twist.linear = vector(rotations.matrix(rotation).T @ velocity)
+    message.twist.twist.angular = vector(angular_velocity)
+    if pose_covariance is not None:
+        message.pose.covariance = np.ascontiguousarray(pose_covariance, dtype=float).reshape(36)
+    if twist_covariance is not None:
+        message.twist.covariance = np.ascontiguousarray(twist_covariance, dtype=float).reshape(36)
+    return message
+
+
+def odom(message: Odometry) -> Odom:
+    """Read an odometry message into world velocity."""
+    position, rotation = _pose(message.pose.pose)
+    velocity = _finite(_xyz(message.twist.twist.linear), 'linear velocity')
+    rate = _finite(_xyz(message.twist.twist.angular), 'angular velocity')
+    return Odom(seconds(message.header.stamp), position,
+                rotations.matrix(rotation) @ velocity, rotation, rate)
+
+
+def state(estimate: Odom, joints: Joints, command: Command | None) -> State:
+    """Join the estimate, the measured joints and the command in force."""
+    return State(estimate.stamp, estimate.position, estimate.velocity, estimate.quaternion,
+                 estimate.angular_velocity, joints.position, joints.velocity, joints.stamp,
+                 command)
+
+
+def joints(message: JointState) -> Joints:
+    """Read the four tilt joints, in whatever order the message names them."""
+    order = _order(message.name, JOINT_NAMES)
+    position = _values(message.position, order, 'position')
+    velocity = _values(message.velocity, order, 'velocity') if len(message.velocity) \
+        else np.zeros(4)
+    return Joints(seconds(message.header.stamp), _finite(position, 'position'),
+                  _finite(velocity, 'velocity'))
+
+
+def joint_message(stamp, position, velocity, effort=()) -> JointState:
+    """Write the four measured tilt joints."""
+    message = JointState(name=list(JOINT_NAMES), position=_floats(position),
+                         velocity=_floats(velocity), effort=_floats(effort))
+    _header(message, stamp, '')
+    return message
+
+
+def command(message: JointState) -> Command:
+    """Read a command: four tilt positions and four thrust efforts, NaN where not used."""
+    order = _order(message.name, COMMAND_NAMES)
+    tilt = _values(message.position, order[:4], 'position')
+    thrust = _values(message.effort, order[4:], 'effort')
+    return Command(seconds(message.header.stamp), _finite(tilt, 'tilt'),
+                   _finite(thrust, 'thrust'))
+
+
+def command_message(value: Command) -> JointState:
+    """Write a command as INTERFACES lays it out."""
+    message = JointState(name=COMMAND_NAMES, position=_floats(value.tilt) + NO_VALUE,
+                         effort=NO_VALUE + _floats(value.thrust))
+    _header(message, value.stamp, '')
+    return message
+
+
+def battery_message(stamp: float, voltage: float, current: float, cells: int) -> BatteryState:
+    """Write the pack's voltage [V] and current [A, negative when discharging]."""
+    nan = float('nan')
+    message = BatteryState(
+        voltage=float(voltage), current=float(current), charge=nan, capacity=nan,
+        design_capacity=nan, percentage=nan, temperature=nan, present=True,
+        power_supply_status=BatteryState.POWER_SUPPLY_STATUS_DISCHARGING,
+        power_supply_technology=BatteryState.POWER_SUPPLY_TECHNOLOGY_LIPO,
+        cell_voltage=[nan] * cells)
+    _header(message, stamp, '')
+    return message
+
+
+def wrench(message: WrenchStamped) -> Wrench:
+    """Read an external wrench: force in world, torque in base_link, whatever the frame_id."""
+    return Wrench(seconds(message.header.stamp), _finite(_xyz(message.wrench.force), 'force'),
+                  _finite(_xyz(message.wrench.torque), 'torque'))
+
+
+def wrench_message(stamp: float, force: np.ndarray, torque: np.ndarray) -> WrenchStamped:
+    """Write an external wrench: force in world, torque in base_link."""
+    message = WrenchStamped()
+    _header(message, stamp, WORLD)
+    message.wrench.force = vector(force)
+    message.wrench.torque = vector(torque)
+    return message
+
+
+def vector(values) -> Vector3:
+    """Three numbers as a message."""
+    return Vector3(x=float(values[0]), y=float(values[1]), z=float(values[2]))
+
+
+def quaternion(values) -> Quaternion:
+    """(x, y, z, w) as a message."""
+    return Quaternion(x=float(values[0]), y=float(values[1]), z=float(values[2]),
+                      w=float(values[3]))
+
+
+def _header(message, stamp, frame):
+    message.header.stamp = time_message(stamp)
+    message.header.frame_id = frame
+
+
+def _set_pose(pose, position, rotation):
+    pose.position = Point(x=float(position[0]), y=float(position[1]), z=float(position[2]))
+    pose.orientation = quaternion(rotation)
+
+
+def _pose(pose):
+    return _finite(_xyz(pose.position), 'position'), _unit(_xyzw(pose.orientation))
+
+
+def _xyz(v) -> np.ndarray:
+    return np.array([v.x, v.y, v.z])
+
+
+def _xyzw(q) -> np.ndarray:
+    return np.array([q.x, q.y, q.z, q.w])
+
+
+def _unit(q):
+    norm = float(q @ q) ** 0.5
+    if not abs(norm - 1) < UNIT_TOLERANCE:      # catches NaN as well
+        raise MessageError('orientation is not a unit quaternion')
+    return q / norm
+
+
+def _finite(values, what):
+    if not np.isfinite(values).all():
+        raise MessageError(f'{what} is not finite')
+    return values
+
+
+def _floats(values) -> list[float]:
+    return [float(v) for v in values]
+
+
+def _order(names, wanted):
+    if tuple(names) == tuple(wanted):
+        return range(len(wanted))
+    try:
+        return [names.index(name) for name in wanted]
+    except ValueError:
+        raise MessageError(f"names are not {', '.join(wanted)}") from None
+
+
+def _values(values, order, what):
+    try:
+        return np.array([values[k] for k in order], dtype=float)
+    except IndexError:
+        raise MessageError(f'{what} has {len(values)} values, too few for the names') from None

@@ -1,0 +1,168 @@
+"""Diagnostics of one node: rates, ages, rejected messages, compute times, faults."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+from beetle_omni_ros.nodes import qos
+
+OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR,
+                          DiagnosticStatus.STALE)
+PERIOD = 1.0            # s between two diagnostics
+
+
+class Distribution:
+    """Quantiles of durations in constant memory: a histogram with 2 % wide bins."""
+
+    LOW, RATIO, BINS = 1e-6, 1.02, 1000     # 1 us to 400 s
+
+    def __init__(self):
+        """Start empty."""
+        self.counts = np.zeros(self.BINS, dtype=np.int64)
+        self.count, self.max = 0, 0.0
+
+    def add(self, seconds: float) -> None:
+        """Count one duration [s]."""
+        k = int(np.log(max(seconds, self.LOW) / self.LOW) / np.log(self.RATIO))
+        self.counts[min(k, self.BINS - 1)] += 1
+        self.count += 1
+        self.max = max(self.max, seconds)
+
+    def quantile(self, fraction: float) -> float:
+        """Return the duration [s] below which ``fraction`` of all lie, within 1 %."""
+        if not self.count:
+            return float('nan')
+        k = int(np.searchsorted(np.cumsum(self.counts), fraction * self.count))
+        return min(self.LOW * self.RATIO ** (k + 0.5), self.max)
+
+
+@dataclass
+class Input:
+    """Counts of one subscribed topic."""
+
+    stale_after: float | None
+    received: int = 0
+    reported: int = 0
+    age: float = float('nan')
+    seen: float | None = None           # steady time of the last good message
+    rejected: Counter = field(default_factory=Counter)
+    rejected_reported: int = 0
+
+
+class Health:
+    """
+    Collects what happened and publishes it on ``diagnostics`` once a second.
+
+    A topic that came and then stayed away is an error of the node that reads it; a
+    topic that never came is waited for without complaint.
+    """
+
+    def __init__(self, node: Node):
+        """Attach to ``node``."""
+        self._node = node
+        self._inputs: dict[str, Input] = {}
+        self._compute: Distribution | None = None
+        self._deadline = float('inf')
+        self._misses = 0
+        self._wall_max = 0.0
+        self._extra = []
+        self._publisher = node.create_publisher(DiagnosticArray, 'diagnostics', qos.EVENT)
+        self._timer = node.create_timer(PERIOD, self._publish,
+                                        clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._last = time.monotonic()
+
+    def watch(self, topic: str, stale_after: float | None) -> None:
+        """Report ``topic``; an error when it is silent for ``stale_after`` [s] once it came."""
+        self._inputs[topic] = Input(stale_after)
+
+    def received(self, topic: str, age: float) -> None:
+        """Count a good message whose stamp is ``age`` [s] old."""
+        entry = self._inputs[topic]
+        entry.received += 1
+        entry.age = age
+        entry.seen = time.monotonic()
+
+    def rejected(self, topic: str, reason: str) -> None:
+        """Count a refused message; the first of a kind is logged at once."""
+        entry = self._inputs[topic]
+        if reason not in entry.rejected:
+            self._node.get_logger().warning(f'{topic}: message refused, {reason}')
+        entry.rejected[reason] += 1
+
+    def track_compute(self, deadline: float) -> None:
+        """Report compute times against a ``deadline`` [s] under '<node>: compute'."""
+        self._compute, self._deadline = Distribution(), deadline
+
+    def computed(self, cpu: float, wall: float) -> None:
+        """Count one cycle: its CPU time and the time that passed [s]."""
+        self._compute.add(cpu)
+        self._misses += cpu > self._deadline
+        self._wall_max = max(self._wall_max, wall)
+
+    def report(self, name: str, source) -> None:
+        """Add a status '<node>: <name>'; ``source()`` returns (level, message, values)."""
+        self._extra.append((name, source))
+
+    def _publish(self):
+        now = time.monotonic()
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        if self._inputs:
+            message.status.append(self._input_status(now))
+        if self._compute is not None:
+            message.status.append(self._compute_status())
+        for name, source in self._extra:
+            message.status.append(self._status(name, *source()))
+        if not message.status:
+            message.status.append(self._status('node', OK, 'running', {}))
+        self._last = now
+        self._publisher.publish(message)
+
+    def _input_status(self, now):
+        level, faults, values = OK, [], {}
+        for topic, entry in self._inputs.items():
+            values[f'{topic} rate_hz'] = (entry.received - entry.reported) / (now - self._last)
+            values[f'{topic} age_ms'] = 1e3 * entry.age
+            values[f'{topic} received'] = entry.received
+            values[f'{topic} rejected'] = entry.rejected.total()
+            for reason, count in entry.rejected.items():
+                values[f'{topic} rejected: {reason}'] = count
+            silent = entry.seen is not None and entry.stale_after is not None \
+                and now - entry.seen > entry.stale_after
+            if silent:
+                level = ERROR
+                faults.append(f'{topic} silent for {now - entry.seen:.1f} s')
+            elif entry.rejected.total() > entry.rejected_reported:
+                level = max(level, WARN, key=ord)
+                new = entry.rejected.total() - entry.rejected_reported
+                faults.append(f'{topic}: {new} rejected')
+            elif entry.seen is None and entry.stale_after is not None:
+                faults.append(f'waiting for {topic}')
+            entry.reported = entry.received
+            entry.rejected_reported = entry.rejected.total()
+        return self._status('inputs', level, '; '.join(faults) or 'all arriving', values)
+
+    def _compute_status(self):
+        times = self._compute
+        values = {'median_ms': 1e3 * times.quantile(0.5), 'p99_ms': 1e3 * times.quantile(0.99),
+                  'max_ms': 1e3 * times.max, 'deadline_misses': self._misses,
+                  'count': times.count, 'wall_max_ms': 1e3 * self._wall_max}
+        level = WARN if self._misses else OK
+        return self._status('compute', level, f'{self._misses} deadline misses', values)
+
+    def _status(self, name, level, text, values):
+        return DiagnosticStatus(
+            level=level, name=f'{self._node.get_name()}: {name}', message=text,
+            hardware_id='beetle_omni',
+            values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()])
+
+
+def _text(value):
+    return f'{value:.6g}' if isinstance(value, float) else str(value)

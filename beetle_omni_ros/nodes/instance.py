@@ -1,0 +1,62 @@
+"""
+One instance of a node at a time.
+
+Two supervisors, or two estimators, on one set of topics would take turns with the
+robot. A lock file names the holder at once on the same computer and goes with its
+process, however that ends; a node on another computer is seen in the ROS graph.
+"""
+
+import fcntl
+import os
+from pathlib import Path
+import tempfile
+
+from rclpy.node import Node
+
+
+class StartError(RuntimeError):
+    """A node cannot start or go on; the text is one line for the operator."""
+
+
+def claim(node: Node):
+    """
+    Take the node's lock for as long as the returned file stays open.
+
+    Raises:
+        StartError: another process of this computer holds it.
+
+    """
+    domain = node.context.get_domain_id()
+    name = node.get_fully_qualified_name()
+    folder = Path(tempfile.gettempdir()) / f'beetle_omni_{os.getuid()}'
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        file = open(folder / f"{domain}{name.replace('/', '.')}.lock", 'a+')
+    except OSError:
+        return None     # no place for a lock: the graph check still stands
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.seek(0)
+        holder = file.read().strip() or 'unknown'
+        file.close()
+        raise StartError(f'{name} runs already (process {holder}, ROS domain {domain}); '
+                         'stop it first') from None
+    file.truncate(0)
+    file.write(str(os.getpid()))
+    file.flush()
+    return file
+
+
+def refuse_twin(node: Node) -> None:
+    """
+    Look for a node of the same name elsewhere in the ROS graph.
+
+    Raises:
+        StartError: there is one.
+
+    """
+    own = (node.get_name(), node.get_namespace())
+    if node.get_node_names_and_namespaces().count(own) > 1:
+        raise StartError(f'{node.get_fully_qualified_name()} runs already on another computer '
+                         f'(ROS domain {node.context.get_domain_id()}); stop it first')

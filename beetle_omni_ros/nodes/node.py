@@ -1,0 +1,101 @@
+"""What every node of the package shares: parameters, guarded inputs, diagnostics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import time
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from beetle_omni_ros.nodes import convert, instance, parameters, qos
+from beetle_omni_ros.nodes.health import Health
+
+# A stamp this far ahead of the clock comes from another clock.
+FUTURE = 0.05
+TWIN_CHECKS = 3
+
+
+class FlightNode(Node):
+    """A node whose inputs are checked before its code sees them."""
+
+    def __init__(self, name: str, parameter_class: type, file: str | None = None,
+                 on_change: Callable | None = None):
+        """
+        Claim the name, read the parameters, start diagnostics.
+
+        Args:
+            name: default node name.
+            parameter_class: see :func:`parameters.declare`, as for the next two.
+            file: shipped parameter file.
+            on_change: takes a changed instance.
+
+        Raises:
+            ParameterError, StartError: with one line for the operator.
+
+        """
+        super().__init__(name)
+        self._claim = instance.claim(self)
+        self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.parameters = parameters.declare(self, parameter_class, file, on_change)
+        self.health = Health(self)
+        self._twin_checks = 0
+        self._twin_timer = self.create_timer(1.0, self._look_for_twin, clock=self.steady_clock)
+
+    def now(self) -> float:
+        """ROS time [s]."""
+        return self.get_clock().now().nanoseconds * 1e-9
+
+    def listen(self, message_type: type, topic: str, read: Callable, handle: Callable,
+               profile: QoSProfile = qos.SENSOR, max_age: float | None = None,
+               stale_after: float | None = 0.5) -> None:
+        """
+        Subscribe ``topic``: convert with ``read``, refuse what is bad, pass to ``handle``.
+
+        Args:
+            message_type: ROS message class.
+            topic: relative name.
+            read: message -> dataclass with a ``stamp``; raises MessageError.
+            handle: called with the dataclass.
+            profile: quality of service.
+            max_age: refuse stamps older than this, or ahead of the clock [s]; None: any.
+            stale_after: silence that is an error, once the topic came [s]; None: none.
+
+        """
+        health = self.health
+        health.watch(topic, stale_after)
+
+        def callback(message):
+            try:
+                value = read(message)
+            except convert.MessageError as error:
+                health.rejected(topic, str(error))
+                return
+            age = self.now() - value.stamp
+            if max_age is not None and age > max_age:
+                health.rejected(topic, 'stale stamp')
+            elif max_age is not None and age < -FUTURE:
+                health.rejected(topic, 'stamp in the future')
+            else:
+                health.received(topic, age)
+                handle(value)
+
+        self.create_subscription(message_type, topic, callback, profile)
+
+    def timed(self, function: Callable, *args):
+        """Call ``function`` and count its CPU and wall time."""
+        cpu, wall = time.thread_time(), time.perf_counter()
+        result = function(*args)
+        self.health.computed(time.thread_time() - cpu, time.perf_counter() - wall)
+        return result
+
+    def _look_for_twin(self):
+        # Discovery takes its time: look a few times after the start, then never again.
+        instance.refuse_twin(self)
+        self._twin_checks += 1
+        if self._twin_checks >= TWIN_CHECKS:
+            self._twin_timer.cancel()
+
+    def close(self) -> None:
+        """Release what destroy_node does not."""

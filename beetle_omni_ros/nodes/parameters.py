@@ -1,0 +1,153 @@
+"""
+A parameter dataclass declared as ROS parameters.
+
+ROS ignores an override key that nobody declares, and answers a bad value with a
+traceback. Here both are refused before the node does anything, in one line with the
+key's name, by the same checks that read the parameter files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import get_args, get_origin, get_type_hints, Union
+import types
+
+import numpy as np
+from rcl_interfaces.msg import (FloatingPointRange, IntegerRange, ParameterDescriptor,
+                                SetParametersResult)
+from rclpy.node import Node
+
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import ParameterError
+
+# ROS itself puts these into the overrides of a node.
+ROS_OWN = ('use_sim_time', 'start_type_description_service')
+ROS_OWN_PREFIX = 'qos_overrides.'
+UNBOUNDED = 1e300       # FloatingPointRange needs both ends
+
+
+def declare(node: Node, cls: type, file: str | None = None,
+            on_change: Callable | None = None):
+    """
+    Declare every leaf of the parameter dataclass ``cls`` on ``node``.
+
+    Values come from the class, then from the shipped ``file``, then from the overrides
+    of the command line (``--params-file``, ``-p``).
+
+    Args:
+        node: made with automatically_declare_parameters_from_overrides off.
+        cls: a dataclass of :func:`schema.parameter` and :func:`schema.group` fields.
+        file: shipped file with the values to start from, such as ``params/ekf.yaml``.
+        on_change: called with the new instance when parameters were set in flight; may
+            raise ParameterError to refuse. Without it every parameter is read-only.
+
+    Returns:
+        The validated instance of ``cls``.
+
+    Raises:
+        ParameterError: one line with the file, the key and what was expected.
+
+    """
+    mapping = schema.load_yaml(share_path(file)) if file else {}
+    overrides = {name: value.value for name, value in node._parameter_overrides.items()
+                 if name not in ROS_OWN and not name.startswith(ROS_OWN_PREFIX)}
+    leaves = _leaves(cls)
+    for name, value in overrides.items():
+        _put(mapping, name, _shaped(leaves.get(name), value))
+    instance = schema.bind(cls, mapping)
+    for name, entry, hint, value in schema.flatten(instance):
+        if isinstance(value, (dict, tuple)):
+            continue    # structured values live in files only
+        node.declare_parameter(name, _plain(value, hint), _descriptor(entry, hint, on_change),
+                               ignore_override=True)
+    if on_change:
+        _validate_changes(node, cls, instance, on_change)
+    return instance
+
+
+def _leaves(cls, prefix=''):
+    """Dotted name -> dataclass field, without an instance."""
+    found, hints = {}, get_type_hints(cls)
+    for name, entry in cls.__dataclass_fields__.items():
+        dotted = f'{prefix}.{name}' if prefix else name
+        if hasattr(hints[name], '__dataclass_fields__'):
+            found.update(_leaves(hints[name], dotted))
+        else:
+            found[dotted] = entry
+    return found
+
+
+def _shaped(entry, value):
+    """ROS has flat arrays only: give a matrix its shape back."""
+    shape = entry.metadata.get('shape') if entry is not None else None
+    if shape and len(shape) > 1 and np.size(value) == np.prod(shape):
+        return np.reshape(value, shape)
+    if not isinstance(value, (str, bytes)) and hasattr(value, '__len__'):
+        return list(value)
+    return value
+
+
+def _put(mapping, name, value):
+    *path, leaf = name.split('.')
+    for part in path:
+        level = mapping.setdefault(part, {})
+        mapping = level if isinstance(level, dict) else mapping
+    mapping[leaf] = value
+
+
+def _plain(value, hint):
+    if isinstance(value, np.ndarray):
+        return [float(v) for v in value.ravel()]
+    if value is None:       # an optional value that nobody set
+        return '' if _kind(hint) is str else float('nan')
+    return _kind(hint)(value) if _kind(hint) in (int, float, bool, str) else value
+
+
+def _kind(hint):
+    if get_origin(hint) in (Union, types.UnionType):
+        return next(a for a in get_args(hint) if a is not type(None))
+    return hint
+
+
+def _descriptor(entry, hint, on_change) -> ParameterDescriptor:
+    meta = entry.metadata
+    unit = f" [{meta['unit']}]" if meta.get('unit') else ''
+    descriptor = ParameterDescriptor(
+        description=meta.get('doc', '') + unit,
+        read_only=bool(meta.get('read_only')) or on_change is None,
+        additional_constraints=f"one of {', '.join(meta['choices'])}" if meta.get('choices')
+        else '')
+    low, high = meta.get('low'), meta.get('high')
+    if (low is None and high is None) or _kind(hint) not in (int, float):
+        return descriptor
+    if _kind(hint) is int:
+        descriptor.integer_range = [IntegerRange(
+            from_value=int(-2**31 if low is None else low),
+            to_value=int(2**31 if high is None else high), step=0)]
+    else:
+        descriptor.floating_point_range = [FloatingPointRange(
+            from_value=float(-UNBOUNDED if low is None else low),
+            to_value=float(UNBOUNDED if high is None else high), step=0.0)]
+    return descriptor
+
+
+def _validate_changes(node, cls, instance, on_change):
+    current = {name: value for name, _, _, value in schema.flatten(instance)}
+
+    def changed(parameters):
+        # Read-only and unknown names never get here: ROS refuses them itself.
+        leaves = _leaves(cls)
+        proposed = dict(current)
+        for parameter in parameters:
+            if parameter.name in leaves:
+                proposed[parameter.name] = _shaped(leaves[parameter.name], parameter.value)
+        try:
+            new = schema.bind(cls, schema.nest(proposed), node.get_name())
+            on_change(new)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        current.update(proposed)
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(changed)

@@ -1,0 +1,20 @@
+"""ROS tests: field types checked, nothing leaves this computer, a domain of its own for each."""
+
+import os
+
+os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from beetle_omni_ros.nodes import domain  # noqa: E402
+
+
+@pytest.fixture
+def ros_domain(monkeypatch):
+    """Hold a free ROS domain for one test, so that tests can run at the same time."""
+    with domain.reserved() as number:
+        monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
+        yield number

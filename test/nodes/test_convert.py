@@ -1,0 +1,104 @@
+"""Messages and dataclasses carry the same numbers, and bad messages are refused by name."""
+
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import JointState
+
+from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.estimation.samples import ImuSample
+from beetle_omni_ros.nodes import convert
+from beetle_omni_ros.robot import rotations
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(3)
+
+
+def over_the_wire(message):
+    return deserialize_message(serialize_message(message), type(message))
+
+
+def unit(rng):
+    return rotations.normalized(rng.normal(size=4))
+
+
+def test_stamps_survive_to_the_nanosecond():
+    for stamp in (0.0, 1e-9, 1.999999999, 1_790_000_000.123456789):
+        assert convert.seconds(convert.time_message(stamp)) == pytest.approx(stamp, abs=3e-7)
+    assert convert.time_message(2 - 1e-12).nanosec == 0      # rounds up into the next second
+
+
+@pytest.mark.parametrize('kind', [float, np.float32, int])
+def test_scalars_of_any_number_type_arrive_as_sent(kind):
+    values = [kind(1), kind(2), kind(3)]
+    message = over_the_wire(convert.imu_message(ImuSample(4.0, values, values)))
+    sample = convert.imu_sample(message)
+    assert sample.specific_force.tolist() == [1, 2, 3]
+    assert sample.angular_velocity.tolist() == [1, 2, 3]
+    assert message.orientation_covariance[0] == -1
+
+
+def test_command_round_trip_and_layout(rng):
+    command = Command(12.5, rng.normal(size=4), rng.uniform(0, 20, size=4).astype(np.float32))
+    message = over_the_wire(convert.command_message(command))
+    assert list(message.name) == [f'gimbal{k}' for k in '1234'] + [f'rotor{k}' for k in '1234']
+    assert np.isnan(message.position[4:]).all() and np.isnan(message.effort[:4]).all()
+    assert len(message.velocity) == 0
+    back = convert.command(message)
+    assert np.array_equal(back.tilt, command.tilt)
+    assert np.array_equal(back.thrust, command.thrust)
+    assert back.stamp == pytest.approx(12.5)
+
+
+def test_joints_are_found_by_name_not_by_place(rng):
+    position = rng.normal(size=4)
+    message = convert.joint_message(1.0, position, -position)
+    shuffled = JointState(name=[message.name[k] for k in (2, 0, 3, 1)],
+                          position=[message.position[k] for k in (2, 0, 3, 1)],
+                          velocity=[message.velocity[k] for k in (2, 0, 3, 1)])
+    assert np.array_equal(convert.joints(shuffled).position, position)
+    assert np.array_equal(convert.joints(shuffled).velocity, -position)
+
+
+def test_odometry_carries_the_twist_in_base_link(rng):
+    rotation, velocity, rate = unit(rng), rng.normal(size=3), rng.normal(size=3)
+    message = convert.odometry_message(3.0, rng.normal(size=3), velocity, rotation, rate,
+                                       np.eye(6), 2 * np.eye(6))
+    twist = over_the_wire(message).twist.twist
+    assert np.allclose(rotations.matrix(rotation) @ [twist.linear.x, twist.linear.y,
+                                                     twist.linear.z], velocity)
+    back = convert.odom(message)
+    assert np.allclose(back.velocity, velocity)
+    assert np.allclose(back.angular_velocity, rate)
+    assert message.twist.covariance[7] == 2
+
+
+def test_targets_round_trip(rng):
+    pose = PoseTarget(rng.normal(size=3), unit(rng), 8.0)
+    back = convert.pose_target(over_the_wire(convert.target_message(pose)))
+    assert np.allclose(back.quaternion, pose.quaternion) and back.stamp == pytest.approx(8)
+    times = 100 + np.cumsum(rng.uniform(0.01, 0.2, size=30))
+    path = TrajectoryTarget(times, rng.normal(size=(30, 3)),
+                            np.array([unit(rng) for _ in times]), rng.normal(size=(30, 3)),
+                            rng.normal(size=(30, 3)), stamp=100.0)
+    back = convert.trajectory_target(over_the_wire(convert.target_message(path)))
+    for name in ('times', 'positions', 'quaternions', 'velocities', 'angular_velocities'):
+        assert np.allclose(getattr(back, name), getattr(path, name), atol=1e-8), name
+
+
+def test_bad_messages_are_refused_with_a_reason(rng):
+    command = convert.command_message(Command(1.0, np.zeros(4), np.full(4, 7.0)))
+    command.effort[5] = float('nan')
+    with pytest.raises(convert.MessageError, match='thrust is not finite'):
+        convert.command(command)
+    with pytest.raises(convert.MessageError, match='names are not'):
+        convert.command(JointState(name=['gimbal1'], position=[0.0]))
+    with pytest.raises(convert.MessageError, match='too few'):
+        convert.joints(JointState(name=['gimbal1', 'gimbal2', 'gimbal3', 'gimbal4'],
+                                  position=[0.0]))
+    with pytest.raises(convert.MessageError, match='unit quaternion'):
+        convert.pose_target(convert.pose_message(0.0, np.zeros(3), [0, 0, 0, 0.9]))
+    with pytest.raises(convert.MessageError, match='position is not finite'):
+        convert.pose_sample(convert.pose_message(0.0, [0, float('inf'), 0], [0, 0, 0, 1]))

@@ -1,0 +1,106 @@
+"""Parameters: files and overrides in, one-line refusals out, changes in flight validated."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from beetle_omni_ros.nodes import parameters
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gains:
+    """Nested group."""
+
+    kp: float = parameter(2.0, doc='stiffness', unit='1/s', low=0, high=10)
+    axes: np.ndarray = parameter([[1, 0], [0, 1]], doc='axes', shape=(2, 2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Example:
+    """All kinds of leaves."""
+
+    gains: Gains = group(Gains)
+    mode: str = parameter('slow', doc='speed', choices=('slow', 'fast'))
+    count: int = parameter(3, doc='number', low=1, high=5)
+    active: bool = parameter(True, doc='switch')
+    seed: int = parameter(0, doc='seed', read_only=True)
+
+
+@pytest.fixture
+def make_node(ros_domain):
+    """Make nodes with command line arguments; clean up after them."""
+    made = []
+
+    def make(*arguments):
+        context = rclpy.Context()
+        rclpy.init(args=['--ros-args', *arguments], context=context, domain_id=ros_domain)
+        node = Node('example', context=context)
+        made.append((node, context))
+        return node
+
+    yield make
+    for node, context in made:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def test_overrides_arrive_in_the_dataclass(make_node):
+    node = make_node('-p', 'gains.kp:=4', '-p', 'mode:=fast', '-p', 'gains.axes:=[1.,2.,3.,4.]')
+    given = parameters.declare(node, Example)
+    assert given.gains.kp == 4.0 and given.mode == 'fast' and given.count == 3
+    assert given.gains.axes.tolist() == [[1, 2], [3, 4]]
+    assert node.get_parameter('gains.kp').value == 4.0
+    descriptor = node.describe_parameter('gains.kp')
+    assert 'stiffness' in descriptor.description
+    assert descriptor.floating_point_range[0].to_value == 10
+
+
+def test_a_file_serves_the_node_as_it_serves_the_tools(make_node, tmp_path):
+    file = tmp_path / 'example.yaml'
+    file.write_text('/**/example:\n  ros__parameters:\n    gains: {kp: 6.5}\n    count: 2\n')
+    given = parameters.declare(make_node('--params-file', str(file)), Example)
+    assert given.gains.kp == 6.5 and given.count == 2
+
+
+@pytest.mark.parametrize('override, named', [
+    ('gains.kq:=1.0', "'gains.kq': unknown key; known: kp, axes"),
+    ('gain.kp:=1.0', "'gain': unknown key; did you mean 'gains'"),
+    ('gains.kp:=11.0', "'gains.kp': 11 is outside 0 to 10 1/s"),
+    ('gains.kp:=fast', "'gains.kp': expected a number"),
+    ('gains.axes:=[1.0, 2.0]', "'gains.axes': expected shape (2, 2)"),
+    ('mode:=warp', "'mode': expected one of slow, fast"),
+    ('count:=2.5', "'count': expected an integer"),
+    ('gains:=3', "'gains': expected a mapping"),
+])
+def test_bad_overrides_are_refused_in_one_line_with_the_key(make_node, override, named):
+    with pytest.raises(ParameterError) as refusal:
+        parameters.declare(make_node('-p', override), Example)
+    assert named in str(refusal.value) and '\n' not in str(refusal.value)
+
+
+def test_changes_in_flight_are_validated(make_node):
+    node, seen = make_node(), []
+    parameters.declare(node, Example, on_change=seen.append)
+
+    def set_to(name, value):
+        return node.set_parameters([Parameter(name, value=value)])[0]
+
+    assert set_to('gains.kp', 5.0).successful and seen[-1].gains.kp == 5.0
+    assert set_to('mode', 'fast').successful and seen[-1].gains.kp == 5.0
+    refused = set_to('mode', 'warp')
+    assert not refused.successful and 'slow, fast' in refused.reason
+    assert not set_to('gains.kp', 11.0).successful
+    assert not set_to('seed', 4).successful
+    assert node.get_parameter('gains.kp').value == 5.0
+    assert len(seen) == 2
+
+
+def test_without_a_handler_everything_is_read_only(make_node):
+    node = make_node()
+    parameters.declare(node, Example)
+    assert not node.set_parameters([Parameter('gains.kp', value=5.0)])[0].successful
