@@ -1,0 +1,142 @@
+"""
+Offset-free control: what the model does not explain, estimated and predicted with.
+
+Three slow estimates from the model's own prediction error: an external force in world,
+an external torque in body and an offset of each servo's resting angle. A wrong mass or
+thrust coefficient, a shifted centre of mass, wind and servo sag under load all end in
+one of them, and the controller that predicts with them leaves no steady error. Beside
+these it carries what no sensor reports, the rotors' thrust, and the tilts at the present
+moment, of which the encoders tell only the past.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Command, State
+from beetle_omni_ros.control.call import FunctionCall
+from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
+HISTORY = 64        # states and commands kept, far more than any latency needs
+
+
+class DisturbanceEstimator:
+    """
+    Follows the robot's full state and the disturbances on it.
+
+    Args:
+        robot: what the controller believes.
+        parameters: of the controller.
+        advance: :func:`dynamics.integrator` of the robot.
+
+    Attributes:
+        disturbance: (10,) force in world [N], torque in body [N m], servo offsets [rad].
+
+    """
+
+    def __init__(self, robot: RobotParameters, parameters: NmpcParameters, advance: FunctionCall):
+        """See the class."""
+        self._robot, self._advance = robot, advance
+        self._delay = parameters.model.command_delay
+        p = parameters.disturbance
+        self._limit = np.r_[np.full(3, p.force_limit), np.full(3, p.torque_limit),
+                            np.full(4, p.tilt_limit)]
+        # bandwidth times inertia: turns a velocity error of one step into a change of force
+        self._force_gain = p.force_bandwidth * robot.mass
+        self._torque_gain = p.torque_bandwidth * robot.inertia
+        self._tilt_bandwidth, self._tilt_correction = p.tilt_bandwidth, p.tilt_correction
+        self.reset()
+
+    def reset(self):
+        """Forget everything."""
+        self.disturbance = np.zeros(model.DISTURBANCE_SIZE)
+        self._state: np.ndarray | None = None
+        self._stamp = -np.inf
+        self._commands: deque[Command] = deque(maxlen=HISTORY)
+        self._tilts: deque[tuple[float, np.ndarray]] = deque(maxlen=HISTORY)
+
+    def update(self, state: State) -> np.ndarray:
+        """
+        Take in one state estimate.
+
+        Returns:
+            (25,) full state predicted to the moment at which a command answering ``state``
+            reaches the actuators; slices as in :mod:`robot.dynamics`.
+
+        """
+        if state.command is not None and (
+                not self._commands or state.command.stamp > self._commands[-1].stamp):
+            self._commands.append(state.command)
+        step = state.stamp - self._stamp
+        if self._state is None or not 0 < step <= LONGEST_STEP:
+            present = self._restart(state)
+        else:
+            predicted = self._advance(self._state, self._input(self._stamp, step),
+                                      self.disturbance, step)
+            self._learn(state, predicted, step)
+            present = self._measured(state, predicted)
+            self._correct_tilt(state, present, step)
+        self._state, self._stamp = present, state.stamp
+        self._tilts.append((state.stamp, present[model.TILT].copy()))
+        if self._delay == 0:
+            return present
+        return self._advance(present, self._input(state.stamp, self._delay), self.disturbance,
+                             self._delay)
+
+    def _restart(self, state):
+        thrust = np.zeros(4) if state.command is None else state.command.thrust
+        self._tilts.clear()
+        return np.concatenate([state.position, state.velocity, state.quaternion,
+                               state.angular_velocity, state.tilt, state.tilt_velocity, thrust])
+
+    def _measured(self, state, predicted):
+        present = predicted.copy()
+        present[:13] = np.concatenate([state.position, state.velocity, state.quaternion,
+                                       state.angular_velocity])
+        return present
+
+    def _input(self, start, duration):
+        """Command (8,) that acts on the robot around the middle of a time span."""
+        middle = start + duration / 2 - self._delay
+        for command in reversed(self._commands):
+            if command.stamp <= middle:
+                return np.concatenate([command.tilt, command.thrust])
+        if self._commands:
+            return np.concatenate([self._commands[0].tilt, self._commands[0].thrust])
+        return np.concatenate([self._state[model.TILT] if self._state is not None
+                               else np.zeros(4), np.zeros(4)])
+
+    def _learn(self, state, predicted, step):
+        change = np.zeros(model.DISTURBANCE_SIZE)
+        change[model.FORCE] = self._force_gain * (state.velocity - predicted[model.VELOCITY])
+        change[model.TORQUE] = self._torque_gain * (
+            state.angular_velocity - predicted[model.RATE])
+        self.disturbance = np.clip(self.disturbance + change, -self._limit, self._limit)
+
+    def _correct_tilt(self, state, present, step):
+        """Compare the encoders with what the tilt model said at their capture time."""
+        modelled = self._modelled_tilt(state.tilt_stamp)
+        if modelled is None:
+            return
+        error = np.clip(state.tilt - modelled, -self._limit[model.TILT_OFFSET],
+                        self._limit[model.TILT_OFFSET])
+        present[model.TILT] += self._tilt_correction * error
+        offset = self.disturbance[model.TILT_OFFSET] + self._tilt_bandwidth * step * error
+        limit = self._limit[model.TILT_OFFSET]
+        self.disturbance[model.TILT_OFFSET] = np.clip(offset, -limit, limit)
+
+    def _modelled_tilt(self, stamp):
+        later = None
+        for time, tilt in reversed(self._tilts):
+            if time <= stamp + 1e-6:
+                if later is None or later[0] <= time:
+                    return tilt
+                part = (stamp - time) / (later[0] - time)
+                return tilt + part * (later[1] - tilt)
+            later = (time, tilt)
+        return None

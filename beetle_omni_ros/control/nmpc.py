@@ -1,0 +1,126 @@
+"""Nonlinear model predictive control by real-time iteration."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from beetle_omni_ros.control import ocp
+from beetle_omni_ros.control.base import Command, State, Target
+from beetle_omni_ros.control.call import FunctionCall
+from beetle_omni_ros.control.compiler import CompilerError
+from beetle_omni_ros.control.disturbance import DisturbanceEstimator
+from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.control.references import ReferencePlanner
+from beetle_omni_ros.control.rti import CompiledRti, InterpretedRti
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+log = logging.getLogger(__name__)
+FIRST_ITERATIONS = 5     # from a cold start, before the first command
+FAILURES_TO_RESTART = 5  # unsolved cycles in a row after which the horizon starts anew
+
+
+class NmpcController:
+    """
+    The model-based controller: a :class:`control.base.Controller`.
+
+    Each step estimates disturbances, predicts the state to the moment the command will
+    act, shifts the stored horizon, and solves one QP. An unsolved QP leaves the shifted
+    previous plan in force; after several in a row the horizon is initialised anew.
+
+    Args:
+        robot: what the controller believes about the robot.
+        parameters: weights, limits, horizon.
+
+    Attributes:
+        compiled: whether the solver runs as machine code.
+
+    """
+
+    name = 'nmpc'
+    period = 0.01  # [s] 100 Hz, as published
+
+    def __init__(self, robot: RobotParameters, parameters: NmpcParameters | None = None):
+        """Build or load the solver; the first time takes some seconds of compilation."""
+        p = self._parameters = parameters or NmpcParameters.load()
+        self._robot = robot
+        problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag)
+        intervals = np.full(p.horizon.intervals, p.horizon.interval)
+        soft = (p.limits.slack_linear, p.limits.slack_quadratic) if p.limits.soft else None
+        options = (problem, intervals, soft, p.solver.tolerance, p.solver.max_iterations)
+        advance = model.integrator(robot)
+        self._rti, self.compiled = self._make_solver(options, advance, p.solver.compile)
+        library = self._rti.library if self.compiled else None
+        self._estimator = DisturbanceEstimator(robot, p, FunctionCall(advance, library))
+        self._planner = ReferencePlanner(robot, np.r_[0.0, np.cumsum(intervals)], p.nearest_turn)
+        self._state_size = problem.state_size
+        self._weights = p.weights.vector()
+        thrust_max = p.limits.thrust_max
+        tilt = min(p.limits.tilt, robot.joints.position_limit)
+        self._bounds = np.r_[np.full(4, -tilt), np.full(4, robot.rotors.thrust_min),
+                             np.full(4, tilt), np.full(4, thrust_max),
+                             p.limits.velocity, p.limits.rate]
+        self.reset()
+
+    @staticmethod
+    def _make_solver(options, advance, compile_allowed):
+        if compile_allowed:
+            try:
+                return CompiledRti(*options, extra=(advance,)), True
+            except CompilerError as error:
+                log.warning('NMPC runs interpreted, about five times slower: %s', error)
+        return InterpretedRti(*options), False
+
+    def reset(self) -> None:
+        """Forget estimates and horizon."""
+        self._estimator.reset()
+        self._started, self._failures = False, 0
+        self._statuses: dict[int, int] = {}
+        self._iterations = 0
+
+    @property
+    def disturbance(self) -> np.ndarray:
+        """(10,) estimated force in world [N], torque in body [N m], servo offsets [rad]."""
+        return self._estimator.disturbance.copy()
+
+    @property
+    def predicted_states(self) -> np.ndarray:
+        """(N + 1, 17 or 21) states of the present plan."""
+        return self._rti.states.copy()
+
+    def step(self, state: State, target: Target) -> Command:
+        """One command for one state; see the class."""
+        full = self._estimator.update(state)
+        x0 = full[:13]
+        x0 = np.concatenate([x0, full[model.TILT], full[model.THRUST]])[:self._state_size]
+        start = state.stamp + self._parameters.model.command_delay
+        disturbance = self._estimator.disturbance
+        references = self._planner.plan(target, start, full[model.TILT], disturbance)
+        if not self._started:
+            self._rti.fill(x0, np.clip(references[0, 13:21], self._bounds[:8], self._bounds[8:16]))
+            for _ in range(FIRST_ITERATIONS):
+                self._rti.step(x0, references, disturbance, self._weights, self._bounds)
+        else:
+            self._rti.shift(self.period / self._parameters.horizon.interval)
+        status, self._iterations = self._rti.step(x0, references, disturbance, self._weights,
+                                                  self._bounds)
+        self._statuses[status] = self._statuses.get(status, 0) + 1
+        self._failures = 0 if status == 0 else self._failures + 1
+        self._started = self._failures < FAILURES_TO_RESTART
+        command = np.clip(self._rti.inputs[0], self._bounds[:8], self._bounds[8:16])
+        rotors = self._robot.rotors
+        return Command(state.stamp, command[:4],
+                       np.clip(command[4:], rotors.thrust_min, rotors.thrust_max))
+
+    def diagnostics(self) -> dict[str, float | int | str]:
+        """Solver health and estimated disturbances."""
+        steps = sum(self._statuses.values())
+        unsolved = steps - self._statuses.get(0, 0)
+        d = self._estimator.disturbance
+        return {'solver': 'compiled' if self.compiled else 'interpreted', 'steps': steps,
+                'unsolved': unsolved, 'iterations': self._iterations,
+                'force_estimate_N': float(np.linalg.norm(d[model.FORCE])),
+                'torque_estimate_Nm': float(np.linalg.norm(d[model.TORQUE])),
+                'servo_offset_rad': float(np.max(np.abs(d[model.TILT_OFFSET])))}

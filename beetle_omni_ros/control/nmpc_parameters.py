@@ -1,0 +1,127 @@
+"""Parameters of the NMPC, as read from params/nmpc.yaml or nmpc_published.yaml."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.control.ocp import WEIGHTS
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import group, parameter
+
+
+@dataclass(frozen=True, kw_only=True)
+class HorizonParameters:
+    """How far and how finely the controller looks ahead."""
+
+    intervals: int = parameter(10, doc='number of shooting intervals', low=2, high=60,
+                               read_only=True)
+    interval: float = parameter(0.1, doc='length of each', unit='s', low=0.005, high=0.5,
+                                read_only=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelParameters:
+    """What the prediction model holds."""
+
+    servo_lag: float = parameter(0.03, doc='time constant of the first-order servo model', unit='s',
+                                 low=0.002, high=0.5, read_only=True)
+    rotor_lag: bool = parameter(True, doc='thrust as a state with the rotor time constant '
+                                '(21 states) instead of a direct input (17)', read_only=True)
+    command_delay: float = parameter(0.01, doc='from the state stamp to the actuators; predicted '
+                                     'and cancelled', unit='s', low=0, high=0.1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitParameters:
+    """Constraints of the optimisation."""
+
+    velocity: float = parameter(2.0, doc='of each component of the world velocity', unit='m/s',
+                                low=0.05, high=20)
+    rate: float = parameter(6.0, doc='of each component of the body rate', unit='rad/s', low=0.1,
+                            high=50)
+    tilt: float = parameter(3.96, doc='of the tilt targets', unit='rad', low=0.1, high=20)
+    thrust_max: float = parameter(20.0, doc='upper bound inside the optimisation', unit='N',
+                                  low=0.1, high=200)
+    soft: bool = parameter(True, doc='velocity and rate limits give way at a cost, which keeps the '
+                           'QP feasible', read_only=True)
+    slack_linear: float = parameter(10.0, doc='cost of exceeding a soft limit', unit='', low=0,
+                                    high=1e6, read_only=True)
+    slack_quadratic: float = parameter(100.0, doc='cost of exceeding a soft limit, squared', low=0,
+                                       high=1e6, read_only=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NmpcWeights:
+    """Weights of the squared errors."""
+
+    position_xy: float = parameter(300.0, doc='horizontal position', unit='1/m^2', low=0, high=1e5)
+    position_z: float = parameter(400.0, doc='height', unit='1/m^2', low=0, high=1e5)
+    velocity: float = parameter(10.0, doc='linear velocity', unit='s^2/m^2', low=0, high=1e5)
+    attitude_xy: float = parameter(300.0, doc='x and y of the error quaternion', low=0, high=1e5)
+    attitude_z: float = parameter(600.0, doc='z of the error quaternion', low=0, high=1e5)
+    rate: float = parameter(5.0, doc='body rate', unit='s^2/rad^2', low=0, high=1e5)
+    tilt: float = parameter(20.0, doc='tilt against the hover allocation', unit='1/rad^2', low=0,
+                            high=1e5)
+    thrust: float = parameter(1.0, doc='thrust against the hover allocation', unit='1/N^2', low=0,
+                              high=1e5)
+    tilt_change: float = parameter(250.0, doc='tilt target against present tilt', unit='1/rad^2',
+                                   low=0, high=1e5)
+    thrust_change: float = parameter(1.0, doc='thrust target against present thrust',
+                                     unit='1/N^2', low=0, high=1e5)
+    thrust_command: float = parameter(0.0, doc='thrust target against the hover allocation',
+                                      unit='1/N^2', low=0, high=1e5)
+
+    def vector(self) -> np.ndarray:
+        """In the order of :data:`ocp.WEIGHTS`."""
+        return np.array([getattr(self, name) for name in WEIGHTS])
+
+
+@dataclass(frozen=True, kw_only=True)
+class DisturbanceParameters:
+    """Estimation of what the model does not explain; a bandwidth of 0 switches one off."""
+
+    force_bandwidth: float = parameter(3.0, doc='of the external force', unit='rad/s', low=0,
+                                       high=50)
+    torque_bandwidth: float = parameter(4.0, doc='of the external torque', unit='rad/s', low=0,
+                                        high=50)
+    tilt_bandwidth: float = parameter(3.0, doc='of the servo offsets', unit='rad/s', low=0,
+                                      high=50)
+    tilt_correction: float = parameter(0.2, doc='part of a measured tilt error that corrects the '
+                                       'tilt model each step', low=0, high=1)
+    force_limit: float = parameter(60.0, doc='largest estimate', unit='N', low=0, high=1000)
+    torque_limit: float = parameter(5.0, doc='largest estimate', unit='N m', low=0, high=100)
+    tilt_limit: float = parameter(0.3, doc='largest estimate', unit='rad', low=0, high=2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverParameters:
+    """Numerics."""
+
+    tolerance: float = parameter(1e-6, doc='residual at which a QP counts as solved', low=1e-12,
+                                 high=1e-2, read_only=True)
+    max_iterations: int = parameter(30, doc='of the interior-point method', low=1, high=500,
+                                    read_only=True)
+    compile: bool = parameter(True, doc='use a C compiler where there is one', read_only=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NmpcParameters:
+    """All of them; one file, one controller."""
+
+    horizon: HorizonParameters = group(HorizonParameters, 'look-ahead')
+    model: ModelParameters = group(ModelParameters, 'prediction')
+    limits: LimitParameters = group(LimitParameters, 'constraints')
+    weights: NmpcWeights = group(NmpcWeights, 'cost')
+    disturbance: DisturbanceParameters = group(DisturbanceParameters, 'offset-free control')
+    solver: SolverParameters = group(SolverParameters, 'numerics')
+    nearest_turn: bool = parameter(True, doc='tilt references on the legal turn nearest the '
+                                   'present angle, instead of the raw arctangent')
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> NmpcParameters:
+        """Read a file; without a path, the shipped params/nmpc.yaml."""
+        return schema.load(cls, path if path else share_path('params/nmpc.yaml'))
