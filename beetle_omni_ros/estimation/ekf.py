@@ -1,0 +1,178 @@
+"""
+Error-state EKF: IMU prediction and MoCap correction at capture time.
+
+The guard decides what may enter, a track carries one hypothesis of the motion, and the
+filter here decides which hypothesis is believed: the first one, or a new one after a long
+dropout or a persistent jump, is a candidate until enough poses agree with it and the IMU.
+Agreement of the IMU with gravity is part of that: an IMU with wrong axes or units predicts
+a motion that the poses contradict.
+"""
+
+from collections import Counter, deque
+
+import numpy as np
+
+from beetle_omni_ros.estimation.guard import InputGuard
+from beetle_omni_ros.estimation.model import ErrorStateModel
+from beetle_omni_ros.estimation.mounting import Mounting
+from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.estimation.samples import Estimate, ImuSample, PoseSample
+from beetle_omni_ros.estimation.track import interpolate, SAME_INSTANT, Track
+
+__all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuSample', 'PoseSample']
+
+
+class ErrorStateEkf:
+    """Position, velocity, attitude and IMU biases of base_link, at any attitude."""
+
+    def __init__(self, parameters: EkfParameters, gravity: float):
+        """
+        Begin without a state.
+
+        Args:
+            parameters: noise, extrinsics, gates and times.
+            gravity: magnitude, along world -z [m/s^2].
+
+        """
+        self._parameters = parameters
+        self._model = ErrorStateModel(parameters, gravity)
+        self._mounting = Mounting(parameters.imu)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, as before the first sample."""
+        self._guard = InputGuard(self._parameters)
+        self._readings: deque = deque()  # (stamp, force, rate) in base_link axes, newest last
+        self._early: deque = deque()     # poses that wait for the IMU to reach their capture
+        self._track: Track | None = None
+        self._candidate: Track | None = None
+        self._estimate: Estimate | None = None
+
+    @property
+    def rejected(self) -> Counter:
+        """Reason -> how many inputs were refused for it since :meth:`reset`."""
+        return self._guard.rejected
+
+    @property
+    def status(self) -> str:
+        """'uninitialised', 'tracking', 'dead_reckoning' or 'lost', at the newest IMU sample."""
+        if self._track is None:
+            return 'uninitialised'
+        limits = self._parameters.status
+        newest = self._track.newest
+        age = newest.stamp - self._track.last_fix
+        if age <= limits.dead_reckoning_after:
+            return 'tracking'
+        variance = max(newest.covariance[0, 0], newest.covariance[1, 1], newest.covariance[2, 2])
+        if age > limits.lost_after or not variance <= limits.lost_position_std ** 2:
+            return 'lost'
+        return 'dead_reckoning'
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """The state at the newest IMU sample; None while uninitialised."""
+        if self._estimate is None and self._track is not None:
+            self._estimate = self._mounting.estimate(self._track.newest)
+        return self._estimate
+
+    def imu(self, sample: ImuSample) -> bool:
+        """
+        Predict to the sample's stamp.
+
+        Returns:
+            False when it was refused; the reason is counted in ``rejected``.
+
+        """
+        checked = self._guard.reading(sample)
+        if checked is None:
+            return False
+        stamp = checked[0]
+        reading = (stamp, self._mounting.aligned(checked[1]), self._mounting.aligned(checked[2]))
+        self._estimate = None
+        if self._guard.clock_jumped:
+            self._restart(reading)
+            return True
+        self._readings.append(reading)
+        oldest = stamp - self._parameters.mocap.delay_limit
+        while self._readings[0][0] < oldest:
+            self._readings.popleft()
+        for track in (self._track, self._candidate):
+            if track is not None:
+                track.predict(*reading)
+        while self._early and self._early[0][0] <= stamp + SAME_INSTANT:
+            self._apply(*self._early.popleft())
+        return True
+
+    def pose(self, sample: PoseSample) -> bool:
+        """
+        Correct the state at the capture time of a MoCap pose.
+
+        A pose slightly ahead of the newest IMU sample waits for the IMU.
+
+        Returns:
+            False when it was refused; the reason is counted in ``rejected``.
+
+        """
+        checked = self._guard.pose(sample, self._readings[0][0] if self._readings else 0.0)
+        if checked is None:
+            return False
+        if checked[0] > self._readings[-1][0] + SAME_INSTANT:
+            self._early.append(checked)
+            return True
+        return self._apply(*checked)
+
+    def _apply(self, stamp, position, quaternion) -> bool:
+        self._estimate = None
+        believed = self.status in ('tracking', 'dead_reckoning')
+        if believed:
+            if self._track.correct(stamp, position, quaternion):
+                self._candidate = None
+                return True
+            self.rejected['outlier'] += 1
+        agrees = self._consider(stamp, position, quaternion, believed)
+        if not agrees and not believed:
+            self.rejected['inconsistent_start'] += 1
+        return agrees and not believed
+
+    def _consider(self, stamp, position, quaternion, believed) -> bool:
+        """
+        Let a candidate follow poses that the track cannot use, and believe it in time.
+
+        Returns:
+            False when the pose contradicts the candidate, which then starts anew from it.
+
+        """
+        agrees = self._candidate is None
+        if not agrees:
+            agrees = self._candidate.correct(stamp, position, quaternion)
+            if agrees:
+                limits = self._parameters.status
+                needed = limits.jump_poses if believed else limits.start_poses
+                if self._candidate.fixes >= needed:
+                    self._track, self._candidate = self._candidate, None
+                return True
+        self._candidate = self._started(stamp, position, quaternion)
+        return agrees
+
+    def _started(self, stamp, position, quaternion) -> Track:
+        """Start a track at a pose and bring it to the newest reading; known biases stay."""
+        later = [reading for reading in self._readings if reading[0] > stamp + SAME_INSTANT]
+        before = self._readings[len(self._readings) - len(later) - 1]
+        at_pose = interpolate(stamp, before, later[0]) if later else before[1:]
+        biases = self._track.newest if self._track is not None else None
+        first = self._model.start(stamp, *at_pose, position, quaternion, biases)
+        track = Track(self._model, first, self._parameters.mocap.delay_limit)
+        for reading in later:
+            track.predict(*reading)
+        return track
+
+    def _restart(self, reading) -> None:
+        """Go on after a jump of the clock: what happened meanwhile is unknown."""
+        self._readings.clear()
+        self._readings.append(reading)
+        self._early.clear()
+        self._candidate = None
+        if self._track is not None:
+            first = self._model.forget(self._track.newest, *reading)
+            self._track = Track(self._model, first, self._parameters.mocap.delay_limit)
+            self._track.last_fix = -np.inf

@@ -1,0 +1,105 @@
+"""What may enter the filter: finite, plausible, new and in time."""
+
+from collections import Counter
+from math import inf, isfinite, sqrt
+
+import numpy as np
+
+from beetle_omni_ros.estimation.parameters import EkfParameters
+
+
+class InputGuard:
+    """
+    Checks every sample before it can touch the state.
+
+    Attributes:
+        rejected: reason -> count.
+        clock_jumped: whether the reading just accepted begins a new time line.
+
+    """
+
+    def __init__(self, parameters: EkfParameters):
+        """Take limits from the parameters."""
+        self._imu, self._mocap = parameters.imu, parameters.mocap
+        self.rejected: Counter = Counter()
+        self.clock_jumped = False
+        self._last_reading: float | None = None
+        self._last_pose = -inf
+        self._refused: list[float] = []  # stamps refused in a row, each shortly after the last
+
+    def reading(self, sample) -> tuple[float, np.ndarray, np.ndarray] | None:
+        """
+        Check an IMU sample.
+
+        Returns:
+            (stamp, specific force, angular rate) in copies, or None when it is refused.
+
+        """
+        stamp = float(sample.stamp)
+        force = np.array(sample.specific_force, dtype=float)
+        rate = np.array(sample.angular_velocity, dtype=float)
+        squared_force, squared_rate = float(force @ force), float(rate @ rate)
+        if not isfinite(stamp + squared_force + squared_rate):
+            finite = np.all(np.isfinite(force)) and np.all(np.isfinite(rate)) and isfinite(stamp)
+            return self._refuse('out_of_range' if finite else 'not_finite')
+        if (squared_force > self._imu.specific_force_limit ** 2
+                or squared_rate > self._imu.angular_velocity_limit ** 2):
+            return self._refuse('out_of_range')
+        self.clock_jumped = False
+        if self._last_reading is not None:
+            step = stamp - self._last_reading
+            if not 0 < step <= self._imu.gap_limit:
+                if not self._new_time_line(stamp):
+                    return self._refuse('duplicate' if step == 0 else
+                                        'backwards' if step < 0 else 'forward_gap')
+                self.clock_jumped = True
+                self._last_pose = -inf
+        self._last_reading = stamp
+        self._refused.clear()
+        return stamp, force, rate
+
+    def _new_time_line(self, stamp) -> bool:
+        """Whether refused stamps have gone on so consistently that the clock itself jumped."""
+        refused = self._refused
+        if refused and not 0 < stamp - refused[-1] <= self._imu.gap_limit:
+            refused.clear()
+        refused.append(stamp)
+        return len(refused) >= self._imu.resync_samples
+
+    def pose(self, sample, oldest: float) -> tuple[float, np.ndarray, np.ndarray] | None:
+        """
+        Check a MoCap pose.
+
+        Args:
+            sample: stamp, position and quaternion.
+            oldest: stamp of the oldest IMU reading kept [s].
+
+        Returns:
+            (stamp on the IMU's clock, position, unit quaternion), or None when it is refused.
+
+        """
+        stamp = float(sample.stamp) + self._mocap.time_offset
+        position = np.array(sample.position, dtype=float)
+        quaternion = np.array(sample.quaternion, dtype=float)
+        if not (isfinite(stamp) and np.all(np.isfinite(position))
+                and np.all(np.isfinite(quaternion))):
+            return self._refuse('not_finite')
+        if np.max(np.abs(position)) > self._mocap.position_limit:
+            return self._refuse('out_of_range')
+        with np.errstate(over='ignore'):
+            norm = sqrt(float(quaternion @ quaternion))
+        if not abs(norm - 1) <= self._mocap.quaternion_tolerance:
+            return self._refuse('quaternion_norm')
+        if self._last_reading is None:
+            return self._refuse('no_imu')
+        if stamp <= self._last_pose:
+            return self._refuse('duplicate' if stamp == self._last_pose else 'backwards')
+        if stamp < oldest or stamp < self._last_reading - self._mocap.delay_limit:
+            return self._refuse('too_old')
+        if stamp > self._last_reading + self._imu.gap_limit:
+            return self._refuse('future')
+        self._last_pose = stamp
+        return stamp, position, quaternion / norm
+
+    def _refuse(self, reason) -> None:
+        self.rejected[reason] += 1

@@ -1,0 +1,126 @@
+"""
+Strapdown propagation between two IMU samples, and its exact linearisation.
+
+The samples are taken as values of a signal that is linear in between. Attitude takes the
+mean rate and the first commutator (Magnus) term, so that coning motion does not drift;
+velocity and position take the trapezoidal rule in world, which needs no midpoint.
+The navigated point is the IMU itself: its accelerometer then needs no correction by an
+angular acceleration, which nobody measures.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.estimation.samples import (
+    ACCELEROMETER_BIAS, ATTITUDE, ERROR_STATES, GYROSCOPE_BIAS, POSITION, VELOCITY)
+from beetle_omni_ros.robot import rotations
+
+
+@dataclass(slots=True, eq=False)
+class Node:
+    """
+    One instant of the history: the IMU reading and the state there; never changed in place.
+
+    Attributes:
+        stamp: [s].
+        force: (3,) specific force as measured, base_link axes [m/s^2].
+        rate: (3,) angular rate as measured, base_link axes [rad/s].
+        position: (3,) of the IMU in world [m].
+        velocity: (3,) of the IMU in world [m/s].
+        quaternion: (4,) base_link to world.
+        rotation: (3, 3) the same.
+        accelerometer_bias: (3,) base_link axes [m/s^2].
+        gyroscope_bias: (3,) base_link axes [rad/s].
+        covariance: (15, 15) of the error state.
+
+    """
+
+    stamp: float
+    force: np.ndarray
+    rate: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    quaternion: np.ndarray
+    rotation: np.ndarray
+    accelerometer_bias: np.ndarray
+    gyroscope_bias: np.ndarray
+    covariance: np.ndarray | None = None
+
+
+def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
+              gravity: float) -> Node:
+    """
+    Carry the state, without its covariance, to the next IMU reading.
+
+    Args:
+        node: where to start.
+        stamp: of the next reading [s].
+        force: (3,) its specific force, base_link axes [m/s^2].
+        rate: (3,) its angular rate, base_link axes [rad/s].
+        gravity: magnitude, along world -z [m/s^2].
+
+    """
+    dt = stamp - node.stamp
+    rate0 = node.rate - node.gyroscope_bias
+    rate1 = rate - node.gyroscope_bias
+    ax, ay, az = rate0.tolist()
+    bx, by, bz = rate1.tolist()
+    h, c = 0.5 * dt, dt * dt / 12
+    turn = rotations.exp((h * (ax + bx) + c * (ay * bz - az * by),
+                          h * (ay + by) + c * (az * bx - ax * bz),
+                          h * (az + bz) + c * (ax * by - ay * bx)))
+    x, y, z, w = rotations.multiply(node.quaternion.tolist(), turn.tolist()).tolist()
+    scale = 1.5 - 0.5 * (x * x + y * y + z * z + w * w)  # Newton step of 1 / norm near 1
+    unit = (scale * x, scale * y, scale * z, scale * w)
+    rotation = rotations.matrix(unit)
+
+    acceleration0 = node.rotation @ (node.force - node.accelerometer_bias)
+    acceleration1 = rotation @ (force - node.accelerometer_bias)
+    velocity = node.velocity + h * (acceleration0 + acceleration1)
+    velocity[2] -= gravity * dt
+    position = (node.position + dt * node.velocity
+                + (dt * dt / 6) * (acceleration0 + acceleration0 + acceleration1))
+    position[2] -= 0.5 * gravity * dt * dt
+    return Node(stamp, force, rate, position, velocity, np.array(unit), rotation,
+                node.accelerometer_bias, node.gyroscope_bias)
+
+
+def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
+    """
+    Linearise :func:`propagate`: error after = ``out`` @ error before.
+
+    Args:
+        before: where the step started.
+        after: what :func:`propagate` made of it.
+        out: (15, 15) buffer; holds the identity wherever no block is written.
+
+    """
+    dt = after.stamp - before.stamp
+    r0, r1 = before.rotation, after.rotation
+    lever0 = r0 @ rotations.skew((before.force - before.accelerometer_bias).tolist())
+    lever1 = r1 @ rotations.skew((after.force - after.accelerometer_bias).tolist())
+    back = r1.T @ r0
+    out[0, 3] = out[1, 4] = out[2, 5] = dt
+    out[ATTITUDE, ATTITUDE] = back
+    # the right Jacobian of SO(3) over the step, to second order: the mean of both ends
+    drift = (-0.5 * dt) * back
+    drift[0, 0] -= 0.5 * dt
+    drift[1, 1] -= 0.5 * dt
+    drift[2, 2] -= 0.5 * dt
+    out[ATTITUDE, GYROSCOPE_BIAS] = drift
+
+    end_attitude, end_drift = lever1 @ back, lever1 @ drift
+    half, sixth = -0.5 * dt, -dt * dt / 6
+    out[VELOCITY, ATTITUDE] = half * (lever0 + end_attitude)
+    out[VELOCITY, ACCELEROMETER_BIAS] = half * (r0 + r1)
+    out[VELOCITY, GYROSCOPE_BIAS] = half * end_drift
+    out[POSITION, ATTITUDE] = sixth * (lever0 + lever0 + end_attitude)
+    out[POSITION, ACCELEROMETER_BIAS] = sixth * (r0 + r0 + r1)
+    out[POSITION, GYROSCOPE_BIAS] = sixth * end_drift
+    return out
+
+
+def identity() -> np.ndarray:
+    """Make a buffer for :func:`transition`."""
+    return np.eye(ERROR_STATES)

@@ -1,0 +1,75 @@
+"""What goes into the estimator and what comes out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# The 15 error states, in this order everywhere: position and velocity of base_link in world,
+# attitude as rotation vector in base_link (R_true = R exp(theta)), then the two biases.
+POSITION = slice(0, 3)
+VELOCITY = slice(3, 6)
+ATTITUDE = slice(6, 9)
+ACCELEROMETER_BIAS = slice(9, 12)
+GYROSCOPE_BIAS = slice(12, 15)
+ERROR_STATES = 15
+
+
+@dataclass(frozen=True)
+class ImuSample:
+    """
+    One IMU reading (REP-145), in the IMU's own axes.
+
+    Attributes:
+        stamp: when it was measured [s].
+        specific_force: (3,) acceleration minus gravity [m/s^2]; +g along up at rest.
+        angular_velocity: (3,) [rad/s].
+
+    """
+
+    stamp: float
+    specific_force: np.ndarray
+    angular_velocity: np.ndarray
+
+
+@dataclass(frozen=True)
+class PoseSample:
+    """
+    One MoCap pose of the tracked body in world.
+
+    Attributes:
+        stamp: when it was captured [s], not when it arrived.
+        position: (3,) [m].
+        quaternion: (4,) body to world (x, y, z, w); its sign is free.
+
+    """
+
+    stamp: float
+    position: np.ndarray
+    quaternion: np.ndarray
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """
+    The state of base_link at the newest IMU sample.
+
+    Attributes:
+        stamp: time of that sample [s].
+        position: (3,) in world [m].
+        velocity: (3,) in world [m/s].
+        quaternion: (4,) body to world (x, y, z, w), unit.
+        angular_velocity: (3,) in base_link, bias removed [rad/s].
+        accelerometer_bias: (3,) in base_link axes [m/s^2].
+        gyroscope_bias: (3,) in base_link axes [rad/s].
+        covariance: (15, 15) of the error, in the order of this module's slices.
+
+    """
+
+    stamp: float
+    position: np.ndarray
+    velocity: np.ndarray
+    quaternion: np.ndarray
+    angular_velocity: np.ndarray
+    accelerometer_bias: np.ndarray
+    gyroscope_bias: np.ndarray
+    covariance: np.ndarray

@@ -1,0 +1,90 @@
+"""One hypothesis of the motion: a short history that delayed poses can correct."""
+
+from bisect import bisect_right
+
+import numpy as np
+
+from beetle_omni_ros.estimation.model import ErrorStateModel
+from beetle_omni_ros.estimation.propagation import Node
+
+SAME_INSTANT = 1e-6  # [s] well below a sample period, well above the resolution of a stamp
+
+
+def interpolate(stamp, before, after):
+    """Force and rate at ``stamp`` on the line between two readings (stamp, force, rate)."""
+    share = (stamp - before[0]) / (after[0] - before[0])
+    return (before[1] + share * (after[1] - before[1]),
+            before[2] + share * (after[2] - before[2]))
+
+
+class Track:
+    """
+    States from the last correction (or as far back as poses may come) to the newest reading.
+
+    A pose is applied to the state at its capture time; the readings after it are then
+    replayed, so that the result is the same as if it had arrived at once.
+    """
+
+    def __init__(self, model: ErrorStateModel, first: Node, history: float):
+        """
+        Begin with one state.
+
+        Args:
+            model: predicts and corrects.
+            first: the state and its covariance.
+            history: how far back a pose may lie [s].
+
+        """
+        self._model = model
+        self._history = history
+        self.nodes = [first]
+        self.last_fix = first.stamp
+        self.fixes = 1
+
+    @property
+    def newest(self) -> Node:
+        """The state at the newest reading."""
+        return self.nodes[-1]
+
+    def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray) -> None:
+        """Append the state at the next reading."""
+        nodes = self.nodes
+        nodes.append(self._model.predict(nodes[-1], stamp, force, rate))
+        while nodes[1].stamp < stamp - self._history:
+            del nodes[0]
+
+    def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
+        """
+        Apply a pose at its capture time and replay what came after.
+
+        Args:
+            stamp: capture time, from the oldest to the newest node [s].
+            position: (3,) of the marker body in world [m].
+            quaternion: (4,) marker body to world.
+
+        Returns:
+            False when the pose does not fit; the track is then unchanged.
+
+        """
+        nodes = self.nodes
+        index = bisect_right(nodes, stamp + SAME_INSTANT, key=_stamp) - 1
+        prior = nodes[index]
+        if stamp - prior.stamp > SAME_INSTANT:
+            after = nodes[index + 1]
+            prior = self._model.predict(prior, stamp, *interpolate(
+                stamp, (prior.stamp, prior.force, prior.rate),
+                (after.stamp, after.force, after.rate)))
+        posterior = self._model.correct(prior, position, quaternion)
+        if posterior is None:
+            return False
+        replayed = [posterior]
+        for node in nodes[index + 1:]:
+            replayed.append(self._model.predict(replayed[-1], node.stamp, node.force, node.rate))
+        self.nodes = replayed
+        self.last_fix = stamp
+        self.fixes += 1
+        return True
+
+
+def _stamp(node):
+    return node.stamp
