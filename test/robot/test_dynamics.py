@@ -1,0 +1,174 @@
+"""The CasADi model against Newton and Euler written out with numpy and scipy."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+ROBOT = RobotParameters.load()
+
+
+def random_state(seed):
+    rng = np.random.default_rng(seed)
+    return (rng.normal(size=3), Rotation.random(random_state=seed).as_quat(),
+            rng.normal(size=3), rng.uniform(-3.9, 3.9, 4), rng.uniform(0, 20, 4))
+
+
+def newton_euler(robot, velocity, quaternion, rate, tilt, thrust):
+    """Textbook equations, rotor by rotor, with scipy's rotations."""
+    attitude = Rotation.from_quat(quaternion)
+    force, torque = np.zeros(3), np.zeros(3)
+    for i in range(4):
+        axis = [np.cos(robot.rotors.arm_yaw[i]), np.sin(robot.rotors.arm_yaw[i]), 0]
+        up = Rotation.from_rotvec(tilt[i] * np.array(axis)).apply([0, 0, 1])
+        force += thrust[i] * up
+        torque += np.cross(robot.rotors.positions[i], thrust[i] * up) \
+            - robot.rotors.spin[i] * robot.rotors.torque_to_thrust_ratio * thrust[i] * up
+    acceleration = attitude.apply(force) / robot.mass - [0, 0, robot.gravity]
+    inertia = np.diag(robot.inertia)
+    return acceleration, np.linalg.solve(inertia, torque - np.cross(rate, inertia @ rate))
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_accelerations_agree_with_newton_and_euler(seed):
+    state = random_state(seed)
+    ours = model.body_acceleration(ROBOT)(*state)
+    theirs = newton_euler(ROBOT, *state)
+    for a, b in zip(ours, theirs):
+        assert np.allclose(np.array(a).ravel(), b, rtol=1e-12, atol=1e-11)
+
+
+def test_quaternion_rate_is_the_derivative_of_the_attitude():
+    _, quaternion, rate, _, _ = random_state(3)
+    dt = 1e-6
+    ahead = (Rotation.from_quat(quaternion) * Rotation.from_rotvec(dt * rate)).as_quat()
+    behind = (Rotation.from_quat(quaternion) * Rotation.from_rotvec(-dt * rate)).as_quat()
+    numeric = (ahead * np.sign(ahead @ quaternion) - behind * np.sign(behind @ quaternion))
+    ours = np.array(model.quaternion_rate(ca.DM(quaternion), ca.DM(rate))).ravel()
+    assert np.allclose(ours, numeric / (2 * dt), atol=1e-8)
+
+
+def test_integrator_agrees_with_an_adaptive_solver():
+    rng = np.random.default_rng(1)
+    v, q, w, tilt, thrust = random_state(5)
+    x = np.concatenate([rng.normal(size=3), v, q, w, tilt, rng.normal(size=4), thrust])
+    u = np.concatenate([tilt + 0.05 * rng.normal(size=4), rng.uniform(5, 15, 4)])
+    d = 0.1 * rng.normal(size=10)
+    f = model.full_model(ROBOT)
+    reference = solve_ivp(lambda _, y: np.array(f(y, u, d)).ravel(), (0, 0.01), x,
+                          rtol=1e-11, atol=1e-12).y[:, -1]
+    errors = [np.abs(np.array(model.integrator(ROBOT, n)(x, u, d, 0.01)).ravel()
+                     - reference).max() for n in (2, 4, 8)]
+    assert errors[0] < 5e-3   # servo rates; the body's states are a hundred times closer
+    assert errors[1] < errors[0] / 10   # fourth order: 16 times for half the step
+    assert errors[2] < errors[1] / 10
+
+
+def test_servo_is_the_published_second_order_system():
+    joint = ROBOT.joints
+    step = 0.05
+    wn, zeta = joint.natural_frequency, joint.damping_ratio
+    wd, t = wn * np.sqrt(1 - zeta ** 2), 0.03
+    analytic = step * (1 - np.exp(-zeta * wn * t) * (
+        np.cos(wd * t) + zeta / np.sqrt(1 - zeta ** 2) * np.sin(wd * t)))
+    x = np.zeros(25)
+    x[9] = 1
+    u = np.r_[np.full(4, step), np.zeros(4)]
+    advance = model.integrator(ROBOT, substeps=30)
+    assert np.array(advance(x, u, np.zeros(10), t)).ravel()[13] == pytest.approx(analytic, rel=1e-4)
+
+
+def test_servo_keeps_its_rate_limit_and_torque_limit():
+    weak = replace(ROBOT, joints=replace(ROBOT.joints, effort_limit=0.01))
+    for robot, limit in ((ROBOT, ROBOT.joints.velocity_limit), (weak, None)):
+        step = model.integrator(robot, 5)
+        x = np.zeros(25)
+        x[9] = 1
+        u = np.r_[np.full(4, 3.5), np.zeros(4)]
+        before, fastest, hardest = x, 0.0, 0.0
+        for _ in range(200):
+            after = np.array(step(before, u, np.zeros(10), 0.002)).ravel()
+            fastest = max(fastest, abs(after[17]))
+            hardest = max(hardest, abs(after[17] - before[17]) / 0.002 * robot.joints.inertia)
+            before = after
+        if limit:
+            assert 0.95 * limit < fastest < 1.35 * limit
+        else:
+            assert hardest <= 0.01 * (1 + 1e-9)
+
+
+def test_thrust_follows_with_the_rotor_time_constant():
+    x = np.zeros(25)
+    x[9] = 1
+    u = np.r_[np.zeros(4), np.full(4, 10.0)]
+    tau = ROBOT.rotors.time_constant
+    after = np.array(model.integrator(ROBOT, 20)(x, u, np.zeros(10), tau)).ravel()
+    assert after[21:] == pytest.approx(10 * (1 - np.exp(-1)), rel=1e-5)
+
+
+def test_targets_beyond_the_limits_act_as_the_limits():
+    f = model.full_model(ROBOT)
+    x = np.zeros(25)
+    x[9] = 1
+    wild = f(x, np.r_[np.full(4, 9.0), np.full(4, 99.0)], np.zeros(10))
+    held = f(x, np.r_[np.full(4, 3.96), np.full(4, 20.0)], np.zeros(10))
+    assert np.allclose(np.array(wild), np.array(held))
+
+
+def with_effect(**effects):
+    return replace(ROBOT, effects=effects)
+
+
+@pytest.mark.parametrize('name', list(CATALOGUE))
+def test_an_effect_at_its_neutral_value_changes_nothing(name):
+    own = {'mass': ROBOT.mass, 'torque_to_thrust_ratio': ROBOT.rotors.torque_to_thrust_ratio}
+    values = {key: own.get(key, spec.neutral) for key, spec in CATALOGUE[name].parameters.items()}
+    state = random_state(7)
+    plain = model.body_acceleration(ROBOT)(*state)
+    neutral = model.body_acceleration(with_effect(**{name: values}))(*state)
+    for a, b in zip(plain, neutral):
+        assert np.allclose(np.array(a), np.array(b), atol=1e-12)
+
+
+def test_thrust_scale_scales_force_and_torque():
+    v, q, _, tilt, thrust = random_state(8)
+    state = (v, q, np.zeros(3), tilt, thrust)
+    weaker = model.body_acceleration(with_effect(thrust_coefficient={'scale': 0.93}))(*state)
+    reference = newton_euler(ROBOT, v, q, np.zeros(3), tilt, 0.93 * thrust)
+    for a, b in zip(weaker, reference):
+        assert np.allclose(np.array(a).ravel(), b)
+
+
+def test_drags_oppose_motion_and_lose_energy():
+    for effect in ({'body_drag': {'coefficient': 0.1}}, {'rotor_drag': {'coefficient': 0.4}}):
+        for seed in range(5):
+            v, q, _, tilt, thrust = random_state(seed)
+            state = (v, q, np.zeros(3), tilt, thrust)
+            drag = np.array(model.body_acceleration(with_effect(**effect))(*state)[0]).ravel() \
+                - np.array(model.body_acceleration(ROBOT)(*state)[0]).ravel()
+            assert drag @ v < 0
+
+
+def test_body_drag_grows_with_the_square_of_speed():
+    robot = with_effect(body_drag={'coefficient': 0.1})
+    _, q, _, tilt, thrust = random_state(2)
+    at_rest = np.array(model.body_acceleration(robot)(np.zeros(3), q, np.zeros(3), tilt, thrust)[0])
+    drag = [np.linalg.norm(np.array(model.body_acceleration(robot)(
+        np.array([s, 0, 0]), q, np.zeros(3), tilt, thrust)[0]) - at_rest) for s in (1.0, 3.0)]
+    assert drag[1] / drag[0] == pytest.approx(9, rel=1e-5)
+    assert drag[0] * ROBOT.mass == pytest.approx(0.1, rel=1e-5)
+
+
+def test_wind_is_a_force_in_world():
+    v, q, w, tilt, thrust = random_state(4)
+    robot = with_effect(wind={'force': [1.0, -2.0, 0.5]})
+    change = np.array(model.body_acceleration(robot)(v, q, w, tilt, thrust)[0]) \
+        - np.array(model.body_acceleration(ROBOT)(v, q, w, tilt, thrust)[0])
+    assert np.allclose(change.ravel() * ROBOT.mass, [1.0, -2.0, 0.5])

@@ -1,0 +1,71 @@
+"""The robot file: consistent by itself, and refused where it is not."""
+
+import numpy as np
+import pytest
+import yaml
+
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import ParameterError
+
+
+@pytest.fixture
+def content():
+    """The shipped robot file as plain data."""
+    return yaml.safe_load(share_path('params/robot.yaml').read_text())
+
+
+def load(tmp_path, content):
+    path = tmp_path / 'robot.yaml'
+    path.write_text(yaml.safe_dump(content))
+    return RobotParameters.load(path)
+
+
+def test_parts_put_the_rotors_where_the_totals_say():
+    robot = RobotParameters.load()
+    parts = robot.multibody
+    for i in range(4):
+        axis = robot.tilt_axes[i]
+        joint = parts.module.joint_offset * np.sign(axis) + [0, 0, parts.module.joint_height]
+        rotor = joint + parts.module.rotor_offset * axis \
+            - [0, 0, parts.centre_of_gravity_height]
+        assert np.allclose(rotor, robot.rotors.positions[i], atol=5e-4)
+
+
+def test_the_rotor_map_grows_with_thrust_at_every_voltage():
+    for row in RobotParameters.load().rotors.map:
+        g = np.linspace(0, row.thrust_max / 10, 200)
+        duty = np.polynomial.polynomial.polyval(g, row.coefficients)
+        assert np.all(np.diff(duty) > 0)
+        assert 50 < duty[0] < duty[-1] <= 100
+
+
+def test_the_hash_follows_physics_and_not_the_name(tmp_path, content):
+    original = RobotParameters.load().hash()
+    content['name'] = 'sister'
+    assert load(tmp_path, content).hash() == original
+    content['mass'] = 3.1
+    assert load(tmp_path, content).hash() != original
+
+
+@pytest.mark.parametrize('change, says', [
+    (lambda c: c.update(mass=9.0), 'needs 22.1 N a rotor to hover'),
+    (lambda c: c.update(mass=-1), "key 'mass': -1 is outside"),
+    (lambda c: c['rotors'].pop('thrust_max'), "key 'rotors.thrust_max': missing [N]"),
+    (lambda c: c['rotors'].update(thrust_min=30), 'rotors.thrust_min'),
+    (lambda c: c['rotors'].update(spin=[1, 0, 1, 0]), 'must hold +1 or -1'),
+    (lambda c: c['rotors']['map'][1].pop('voltage'), "key 'rotors.map[1].voltage': missing [V]"),
+    (lambda c: c['joints'].update(stiffness=1), "key 'joints.stiffness': unknown key"),
+    (lambda c: c.update(effects={'thrust_coeficient': {'scale': 1}}),
+     "effects.thrust_coeficient: unknown effect; did you mean 'thrust_coefficient'?"),
+    (lambda c: c.update(effects={'thrust_coefficient': {'factor': 1}}), 'expected the keys scale'),
+    (lambda c: c.update(effects={'thrust_coefficient': {'scale': 93}}), 'is outside 0.2 to 2'),
+    (lambda c: c.update(effects={'wind': {'force': [1, 2]}}), 'expected shape (3,)'),
+])
+def test_a_bad_robot_file_is_refused_by_name(tmp_path, content, change, says):
+    change(content)
+    with pytest.raises(ParameterError) as error:
+        load(tmp_path, content)
+    assert says in str(error.value)
+    assert 'robot.yaml' in str(error.value)
+    assert '\n' not in str(error.value)
