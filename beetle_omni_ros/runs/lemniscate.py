@@ -1,0 +1,83 @@
+"""
+The 3D lemniscate: a figure of eight whose height and attitude change along the way.
+
+With the phase phi, one round of which is 2 pi:
+    x = A sin(phi),  y = B sin(2 phi) / 2,  z = H + C cos(phi)
+    roll = D sin(phi),  pitch = D sin(2 phi),  yaw = phi
+Roll and pitch stay within D = 0.5 rad and yaw runs over [0, 2 pi] in each round, as
+published; the other numbers are ours, chosen to fit a 4 m room. The phase starts and
+ends at rest: its rate rises with a quintic smoothstep over the ramp before the first
+round and falls in the same way after the last, so that all rounds are flown at one speed.
+"""
+
+from __future__ import annotations
+
+from math import cos, pi, sin
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Reference, TrajectoryTarget
+from beetle_omni_ros.robot import rotations
+
+LENGTH = 1.2  # [m] A, half the extent in x
+WIDTH = 1.2  # [m] B, the extent in y
+HEIGHT = 1.3  # [m] H, mean height
+RISE = 0.3  # [m] C, half the extent in z
+TILT = 0.5  # [rad] D, largest roll and pitch
+PERIOD = 16.0  # [s] of one round
+ROUNDS = 5
+RAMP = 4.0  # [s] from rest to full speed
+DURATION = 2 * RAMP + ROUNDS * PERIOD  # [s]
+SAMPLE_PERIOD = 0.02  # [s] between the samples of the published trajectory
+
+
+def phase(time: float) -> tuple[float, float]:
+    """Phase [rad] and its rate [rad/s] at ``time`` since the start [s]; 0 as round one begins."""
+    rate = 2 * pi / PERIOD
+    if time < RAMP:
+        return -_ramp_phase(RAMP, rate) + _ramp_phase(max(time, 0.0), rate), \
+            rate * _smoothstep(time / RAMP)
+    rest = DURATION - time
+    if rest < RAMP:
+        total = 2 * pi * ROUNDS + _ramp_phase(RAMP, rate)
+        return total - _ramp_phase(max(rest, 0.0), rate), rate * _smoothstep(rest / RAMP)
+    return rate * (time - RAMP), rate
+
+
+def _smoothstep(s):
+    s = min(max(s, 0.0), 1.0)
+    return s ** 3 * (10 - 15 * s + 6 * s * s)
+
+
+def _ramp_phase(time, rate):
+    """Integral of ``rate * smoothstep`` over the ramp, from rest."""
+    s = time / RAMP
+    return rate * RAMP * s ** 4 * (2.5 - 3 * s + s * s)
+
+
+def sample(time: float) -> Reference:
+    """Pose in world, velocity in world and body rates at ``time`` since the start [s]."""
+    phi, rate = phase(time)
+    position = np.array([LENGTH * sin(phi), WIDTH / 2 * sin(2 * phi), HEIGHT + RISE * cos(phi)])
+    velocity = rate * np.array([LENGTH * cos(phi), WIDTH * cos(2 * phi), -RISE * sin(phi)])
+    roll, pitch, yaw = TILT * sin(phi), TILT * sin(2 * phi), phi
+    roll_rate, pitch_rate, yaw_rate = (rate * TILT * cos(phi), 2 * rate * TILT * cos(2 * phi),
+                                       rate)
+    angular_velocity = np.array([  # body rates of R = Rz(yaw) Ry(pitch) Rx(roll)
+        roll_rate - yaw_rate * sin(pitch),
+        pitch_rate * cos(roll) + yaw_rate * cos(pitch) * sin(roll),
+        -pitch_rate * sin(roll) + yaw_rate * cos(pitch) * cos(roll)])
+    return Reference(position, rotations.from_rpy(roll, pitch, yaw), velocity, angular_velocity)
+
+
+def target(start: float) -> TrajectoryTarget:
+    """Make the whole trajectory, beginning at ``start`` [s]."""
+    times = np.linspace(0.0, DURATION, round(DURATION / SAMPLE_PERIOD) + 1)
+    samples = [sample(float(t)) for t in times]
+    return TrajectoryTarget(
+        times=start + times,
+        positions=np.array([s.position for s in samples]),
+        quaternions=np.array([s.quaternion for s in samples]),
+        velocities=np.array([s.velocity for s in samples]),
+        angular_velocities=np.array([s.angular_velocity for s in samples]),
+        stamp=start)

@@ -1,0 +1,89 @@
+"""Pose files: CSV with one target pose a line, and errors that name the row."""
+
+from __future__ import annotations
+
+import csv
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.robot.schema import ParameterError
+
+COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
+
+
+class TaskError(ParameterError):
+    """A task cannot be used; the text names file, row, column and expectation."""
+
+
+def read_poses(path: str | Path) -> np.ndarray:
+    """
+    Read a pose file with the header ``x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg``.
+
+    Blank lines and spaces around fields do not matter; columns may stand in any order.
+
+    Returns:
+        (N, 6) x, y, z [m], roll, pitch, yaw [deg].
+
+    Raises:
+        TaskError: naming file, row (counted as in an editor), column and expectation.
+
+    """
+    try:
+        with open(path, newline='', encoding='utf-8-sig') as file:
+            rows = [(reader.line_num, [cell.strip() for cell in row])
+                    for reader in [csv.reader(file)] for row in reader]
+    except FileNotFoundError:
+        raise TaskError(f'{path}: no such file') from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = getattr(error, 'strerror', None) or f'not a CSV text file ({error})'
+        raise TaskError(f'{path}: {reason}') from None
+    rows = [(line, row) for line, row in rows if any(row)]
+    if not rows:
+        raise TaskError(f"{path}: empty; expected the header {','.join(COLUMNS)} and poses")
+    order = _column_order(path, *rows[0])
+    if len(rows) == 1:
+        raise TaskError(f'{path}: no pose below the header; expected at least one row')
+    return np.array([_pose(path, line, row, order) for line, row in rows[1:]])
+
+
+def _column_order(path, line, header):
+    expected = ','.join(COLUMNS)
+    if all(_number(cell) is not None for cell in header):
+        raise TaskError(f'{path}: row {line}: the header is missing; expected {expected}')
+    unknown = [cell for cell in header if cell not in COLUMNS]
+    if unknown:
+        raise TaskError(f"{path}: row {line}: unknown column '{unknown[0]}'; expected {expected}")
+    missing = [name for name in COLUMNS if name not in header]
+    if missing:
+        raise TaskError(f"{path}: row {line}: column '{missing[0]}' is missing; "
+                        f'expected {expected}')
+    if len(header) != len(COLUMNS):
+        twice = next(name for name in header if header.count(name) > 1)
+        raise TaskError(f"{path}: row {line}: column '{twice}' stands there twice; "
+                        f'expected {expected}')
+    return [header.index(name) for name in COLUMNS]
+
+
+def _pose(path, line, row, order):
+    if len(row) != len(COLUMNS):
+        raise TaskError(f'{path}: row {line}: expected {len(COLUMNS)} values, found {len(row)}')
+    pose = []
+    for name, index in zip(COLUMNS, order, strict=True):
+        value = _number(row[index])
+        if value is None or not isfinite(value):
+            raise TaskError(f'{path}: row {line}, column {name}: expected a finite number, '
+                            f"found '{row[index]}'")
+        pose.append(value)
+    if pose[2] <= 0:
+        raise TaskError(f'{path}: row {line}, column z_m: expected a height above the floor, '
+                        f'found {pose[2]:g}')
+    return pose
+
+
+def _number(text):
+    try:
+        return float(text)
+    except ValueError:
+        return None

@@ -1,0 +1,289 @@
+"""Tasks: which target, external wrench and payload at which time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+import re
+
+import numpy as np
+
+from beetle_omni_ros.control.base import PoseTarget, Target
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.runs import lemniscate, pose_file
+from beetle_omni_ros.runs.pose_file import TaskError
+
+POSE_DURATION = 8.0  # [s] of one pose
+HOVER_DURATION = 60.0  # [s]
+DISTURBANCE_PERIOD = 2.0  # [s] between disturbance levels
+TORQUE_IMPULSE = 0.05  # [s]
+FORCE_LEVELS = np.arange(10.0, 101.0, 10.0)  # [N] upwards
+TORQUE_LEVELS = np.arange(2.5, 30.1, 2.5)  # [N m]
+PAYLOADS = (0.0, 0.25, 0.5, 0.75, 1.0)  # [kg]
+LOST_POSITION = 1.5  # [m] from the target: control is lost
+LOST_ORIENTATION = np.radians(90)  # [rad] still, when the next level is due
+GROUND_HEIGHT = 0.25  # [m] of base_link: below, the robot lies on the ground
+
+# The poses of the real-world experiment: x, y, z [m], roll, pitch, yaw [deg].
+WAYPOINTS = np.array([[0.0, 0.0, 0.8, 0.0, 0.0, 0.0],
+                      [1.0, 0.0, 1.0, 45.0, 0.0, 0.0],
+                      [0.0, 1.0, 1.0, 0.0, -25.0, 0.0],
+                      [-1.0, 0.0, 1.0, -25.0, 0.0, 0.0],
+                      [0.0, 0.0, 0.8, 0.0, 0.0, 90.0]])
+WAYPOINT_ROUNDS = 3
+
+NAMES = ('waypoints', 'random100', 'lemniscate', 'hover', 'force', 'torque', 'payload')
+
+
+@dataclass(frozen=True)
+class Segment:
+    """
+    A stretch of a task with constant disturbance.
+
+    Attributes:
+        duration: [s].
+        target: builds the target to publish at the segment's start from that time;
+            None keeps the one in force.
+        force_world: (3,) external force in world [N].
+        torque_body: (3,) external torque in base_link [N m].
+        payload: mass attached below the body [kg].
+        level: magnitude of the disturbance that this segment belongs to, 0 for none.
+
+    """
+
+    duration: float
+    target: Callable[[float], Target] | None = None
+    force_world: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    torque_body: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    payload: float = 0.0
+    level: float = 0.0
+
+
+@dataclass(frozen=True)
+class Task:
+    """
+    A named sequence of segments.
+
+    Attributes:
+        name: as the user gave it.
+        kind: 'poses', 'trajectory', 'hover', 'force', 'torque' or 'payload'.
+        segments: in their order.
+        poses: (P, 6) the pose targets in their order: x, y, z [m], roll, pitch, yaw [deg].
+        rounds: (start, end) of each round of a trajectory, since the task's start [s].
+
+    """
+
+    name: str
+    kind: str
+    segments: tuple[Segment, ...]
+    poses: np.ndarray
+    rounds: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def ends(self) -> np.ndarray:
+        """(S,) end of each segment since the task's start [s]."""
+        return np.cumsum([segment.duration for segment in self.segments])
+
+    @property
+    def duration(self) -> float:
+        """Of the whole task [s]."""
+        return float(self.ends[-1])
+
+    def targets(self, start: float) -> list[Target]:
+        """All targets of a flight of this task that starts at ``start`` [s]."""
+        begins = start + np.concatenate([[0.0], self.ends[:-1]])
+        return [segment.target(float(begin))
+                for begin, segment in zip(begins, self.segments, strict=True) if segment.target]
+
+
+@dataclass(frozen=True)
+class Moment:
+    """
+    What a task asks for at one time.
+
+    Attributes:
+        target: to publish now, or None when nothing changed.
+        force_world: (3,) external force in world [N].
+        torque_body: (3,) external torque in base_link [N m].
+        payload: [kg].
+        changed: whether wrench or payload differ from the previous moment.
+        finished: the task is over.
+        lost: control was lost, which ends the task.
+
+    """
+
+    target: Target | None
+    force_world: np.ndarray
+    torque_body: np.ndarray
+    payload: float
+    changed: bool = False
+    finished: bool = False
+    lost: bool = False
+
+
+class TaskPlayer:
+    """
+    Plays a task in time; call :meth:`update` at every tick, with the same clock throughout.
+
+    Targets are stamped with the time at which they are due, not with the tick at which
+    they are noticed, so that a pose's 8 s are exact.
+    """
+
+    def __init__(self, task: Task, start: float):
+        self.task = task
+        self.start = start
+        self.lost_level: float | None = None
+        self._ends = task.ends
+        self._index = -1
+        self._target: Target | None = None
+
+    def update(self, now: float, position: np.ndarray | None = None,
+               quaternion: np.ndarray | None = None) -> Moment:
+        """
+        Ask what holds at ``now``.
+
+        Args:
+            now: [s].
+            position: (3,) of the robot in world, to notice a loss of control.
+            quaternion: (4,) of the robot.
+
+        """
+        index = int(np.searchsorted(self._ends, now - self.start + 1e-6, side='right'))
+        if position is not None and self._lost(position, quaternion, index):
+            self.lost_level = self.task.segments[max(self._index, 0)].level
+        if index >= len(self._ends) or self.lost_level is not None:
+            changed, self._index = self._index != len(self._ends), len(self._ends)
+            return Moment(None, np.zeros(3), np.zeros(3), 0.0, changed=changed, finished=True,
+                          lost=self.lost_level is not None)
+        target = None
+        changed = index != self._index
+        for k in range(self._index + 1, index + 1):
+            segment = self.task.segments[k]
+            if segment.target:
+                begin = self.start + (self._ends[k - 1] if k else 0.0)
+                target = self._target = segment.target(float(begin))
+        self._index = index
+        segment = self.task.segments[index]
+        return Moment(target, segment.force_world, segment.torque_body, segment.payload, changed)
+
+    def _lost(self, position, quaternion, index):
+        if self.task.kind not in ('force', 'torque') or self._target is None \
+                or not 0 <= self._index < len(self._ends) or self.lost_level is not None:
+            return False
+        segments = self.task.segments
+        if segments[self._index].level == 0:
+            return False
+        due = index >= len(segments) or segments[index].level != segments[self._index].level
+        return control_lost(self._target, position, quaternion if due else None)
+
+
+def control_lost(target: PoseTarget, position: np.ndarray,
+                 quaternion: np.ndarray | None = None) -> bool:
+    """
+    Whether a robot that should hold ``target`` is out of control.
+
+    It is when it is more than 1.5 m away or on the ground. With ``quaternion``, given
+    at the end of a disturbance level, also when it is turned by more than 90 deg: it did
+    not recover before the next level.
+    """
+    if np.linalg.norm(position - target.position) > LOST_POSITION or position[2] < GROUND_HEIGHT:
+        return True
+    return quaternion is not None and \
+        rotations.geodesic_angle(quaternion, target.quaternion) > LOST_ORIENTATION
+
+
+def make_task(name: str | Path, seed: int = 0) -> Task:
+    """
+    Make a task from its name or from a pose file.
+
+    Args:
+        name: one of ``NAMES``, ``randomN`` for N random poses, or the path of a CSV file.
+        seed: of the random poses.
+
+    Raises:
+        TaskError: unknown name, or an unusable file: file, row, column and expectation.
+
+    """
+    name = str(name)
+    if name == 'waypoints':
+        return _pose_task(name, np.tile(WAYPOINTS, (WAYPOINT_ROUNDS, 1)))
+    if match := re.fullmatch(r'random([1-9]\d{0,5})', name):
+        return _pose_task(name, random_poses(int(match[1]), seed))
+    if name == 'lemniscate':
+        return _lemniscate_task(name)
+    if name in ('hover', 'force', 'torque', 'payload'):
+        return {'hover': _hover_task, 'force': _force_task, 'torque': _torque_task,
+                'payload': _payload_task}[name](name)
+    if name.lower().endswith('.csv') or Path(name).exists():
+        return _pose_task(name, pose_file.read_poses(name))
+    raise TaskError(f"task '{name}': expected a CSV file of poses or one of {', '.join(NAMES)}")
+
+
+def random_poses(count: int, seed: int) -> np.ndarray:
+    """(count, 6) poses: x, y in [-2, 2] m, z in [0.6, 2] m, angles in [-180, 180] deg."""
+    low = [-2.0, -2.0, 0.6, -180.0, -180.0, -180.0]
+    high = [2.0, 2.0, 2.0, 180.0, 180.0, 180.0]
+    return np.random.default_rng(seed).uniform(low, high, (count, 6))
+
+
+def pose_target(pose: np.ndarray, stamp: float = 0.0) -> PoseTarget:
+    """Target of (6,) x, y, z [m], roll, pitch, yaw [deg]."""
+    return PoseTarget(np.array(pose[:3], dtype=float),
+                      rotations.from_rpy(*np.radians(pose[3:])), stamp)
+
+
+def _builder(pose):
+    return lambda start: pose_target(pose, start)
+
+
+def _pose_task(name, poses):
+    segments = tuple(Segment(POSE_DURATION, _builder(pose)) for pose in poses)
+    return Task(name, 'poses', segments, poses)
+
+
+def _hover_task(name):
+    pose = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    return Task(name, 'hover', (Segment(HOVER_DURATION, _builder(pose)),), pose[None])
+
+
+def _disturbance_pose():
+    return np.array([0.0, 0.0, 1.5, 25.0, 0.0, 0.0])
+
+
+def _force_task(name):
+    pose = _disturbance_pose()
+    levels = (Segment(DISTURBANCE_PERIOD, force_world=np.array([0.0, 0.0, level]), level=level)
+              for level in FORCE_LEVELS)
+    return Task(name, 'force', (Segment(POSE_DURATION, _builder(pose)), *levels), pose[None])
+
+
+def _torque_task(name):
+    pose = _disturbance_pose()
+    segments = [Segment(POSE_DURATION, _builder(pose))]
+    for level in TORQUE_LEVELS:
+        segments += [Segment(TORQUE_IMPULSE, torque_body=np.array([level, 0.0, 0.0]), level=level),
+                     Segment(DISTURBANCE_PERIOD - TORQUE_IMPULSE, level=level)]
+    return Task(name, 'torque', tuple(segments), pose[None])
+
+
+def _payload_task(name):
+    pose = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    segments = tuple(Segment(POSE_DURATION, _builder(pose), payload=mass, level=mass)
+                     for mass in PAYLOADS)
+    return Task(name, 'payload', segments, np.tile(pose, (len(PAYLOADS), 1)))
+
+
+def _lemniscate_task(name):
+    first = lemniscate.sample(0.0)
+    pose = np.concatenate([first.position, np.degrees(rotations.to_rpy(first.quaternion))])
+    hold = Segment(POSE_DURATION, _builder(pose))
+    track = Segment(lemniscate.DURATION, lemniscate.target)
+    begin = POSE_DURATION + lemniscate.RAMP
+    rounds = tuple((begin + k * lemniscate.PERIOD, begin + (k + 1) * lemniscate.PERIOD)
+                   for k in range(lemniscate.ROUNDS))
+    return Task(name, 'trajectory', (hold, track), pose[None], rounds)
+
+
+__all__ = ['control_lost', 'make_task', 'Moment', 'NAMES', 'pose_target', 'random_poses',
+           'Segment', 'Task', 'TaskError', 'TaskPlayer']
