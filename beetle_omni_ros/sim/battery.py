@@ -1,0 +1,81 @@
+"""The pack: rest voltage that falls with charge, resistance, and what thrust it still allows."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from math import sqrt
+
+import numpy as np
+
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.sim.parameters import PackParameters
+
+
+class Battery:
+    """
+    Charge, voltage and current of one pack.
+
+    Attributes:
+        charge: what is left, as a fraction of a full pack.
+        voltage: under the present load [V].
+        current: drawn [A], positive.
+
+    """
+
+    def __init__(self, robot: RobotParameters, pack: PackParameters):
+        """Tabulate the discharge curve and the thrust limit."""
+        self._pack = pack
+        self._resistance = robot.battery.resistance
+        self._levels = pack.charge_levels.tolist()
+        self._rest_voltages = (robot.battery.full_voltage * pack.relative_voltages).tolist()
+        rows = sorted(robot.rotors.map, key=lambda row: row.voltage)
+        self._map_voltages = [row.voltage for row in rows]
+        self._map_thrusts = [row.thrust_max for row in rows]
+        self._thrust_max = robot.rotors.thrust_max
+        self.reset()
+
+    def reset(self) -> None:
+        """Put in a pack of the initial charge."""
+        self.charge = self._pack.initial_charge
+        self.current = 0.0
+        self.voltage = self.rest_voltage
+
+    @property
+    def rest_voltage(self) -> float:
+        """Open-circuit voltage [V]."""
+        return _interpolate(self._levels, self._rest_voltages, min(1.0, max(0.0, self.charge)))
+
+    def step(self, thrust: np.ndarray, duration: float) -> None:
+        """Draw what ``thrust`` (4,) [N] needs for ``duration`` [s]."""
+        pack = self._pack
+        power = pack.idle_power + pack.rotor_power * sum(
+            f * sqrt(f) for f in thrust.tolist() if f > 0)
+        rest = self.rest_voltage
+        # power = V (rest - V) / R; beyond the pack's largest power it gives that, at rest / 2
+        self.voltage = 0.5 * (rest + sqrt(max(0.0, rest * rest - 4 * self._resistance * power)))
+        self.current = power / self.voltage
+        if self._resistance:
+            self.current = min(self.current, (rest - self.voltage) / self._resistance)
+        self.charge = max(0.0, self.charge - self.current * duration / (3600 * pack.capacity))
+
+    @property
+    def thrust_limit(self) -> float:
+        """
+        Largest thrust of a rotor at the present voltage [N].
+
+        The rotor map's limits, linear between its voltages and beyond the lowest; without a
+        map the robot's own limit.
+        """
+        if not self._map_voltages:
+            return self._thrust_max
+        if len(self._map_voltages) == 1:
+            return min(self._thrust_max, self._map_thrusts[0])
+        limit = _interpolate(self._map_voltages, self._map_thrusts,
+                             min(self.voltage, self._map_voltages[-1]))
+        return min(self._thrust_max, max(0.0, limit))
+
+
+def _interpolate(xs, ys, x):
+    """Piecewise linear, continued along the first and last pieces."""
+    k = min(max(bisect_right(xs, x) - 1, 0), len(xs) - 2)
+    return ys[k] + (ys[k + 1] - ys[k]) * (x - xs[k]) / (xs[k + 1] - xs[k])

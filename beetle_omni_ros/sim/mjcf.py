@@ -1,0 +1,167 @@
+"""The robot's parameters as a MuJoCo model: free base, four hinged modules, actuators, floor."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.sim.mass_properties import combined, mass_properties, RigidPart, Variation
+from beetle_omni_ros.sim.parameters import PlantParameters
+
+BASE = 1                        # body index of base_link; 0 is the world
+TINY_MASS = 1e-12               # [kg] MuJoCo refuses a moving body without mass ...
+TINY_INERTIA = 1e-13            # [kg m^2] ... or inertia
+MOTOR_HEIGHT = 0.02             # [m] half height of the disc in which a propeller can touch
+
+
+def build_model(robot: RobotParameters, plant: PlantParameters,
+                variation: Variation | None = None, scenery: str = '') -> mujoco.MjModel:
+    """
+    Compile the plant.
+
+    Generalised velocities: base_link's velocity in world (3) and angular velocity in
+    base_link (3), then the four tilt rates. Controls: four thrust commands [N], four tilt
+    targets [rad]; activations: the four lagged thrusts [N].
+
+    Args:
+        robot: what is true in the simulation.
+        plant: time steps and ground.
+        variation: this robot's difference from its file.
+        scenery: further MJCF text for <worldbody>, for pictures.
+
+    """
+    model = mujoco.MjModel.from_xml_string(_mjcf(robot, plant, variation, scenery))
+    _reflect_servo_inertia(model, robot)
+    return model
+
+
+def base_part(robot: RobotParameters, plant: PlantParameters, variation: Variation | None,
+              payload: float) -> RigidPart:
+    """Everything that is rigid with base_link: main body, end-effector, payload of ``payload`` kg."""
+    parts = mass_properties(robot, variation)
+    rigid = [parts.main_body, parts.end_effector]
+    if payload:
+        radius = (3 * payload / (4 * np.pi * plant.payload_density)) ** (1 / 3)
+        rigid.append(RigidPart(payload, np.array([0.0, 0.0, -plant.payload_depth]),
+                               0.4 * payload * radius ** 2 * np.eye(3)))
+    return combined(rigid)
+
+
+def set_base_part(model: mujoco.MjModel, part: RigidPart) -> None:
+    """Change mass, centre of mass and inertia of base_link in a compiled model."""
+    moments, axes = np.linalg.eigh(part.inertia)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    model.body_mass[BASE] = part.mass
+    model.body_ipos[BASE] = part.centre
+    model.body_inertia[BASE] = moments
+    mujoco.mju_mat2Quat(model.body_iquat[BASE], axes.ravel())
+    model.body_sameframe[BASE] = 0      # the inertial frame is its own, whatever the compiler saw
+    armature = model.dof_armature.copy()
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    model.dof_armature[:] = armature
+
+
+def _reflect_servo_inertia(model, robot):
+    """
+    Make an unloaded joint answer as J q'' = Kp (q* - q) - Kd q' asks.
+
+    J is what a servo with its module showed in step responses, but the module's inertia
+    about the joint axis alone is already more. The difference (negative here) goes into the
+    joint's armature, an inner torque between module and body: response and stiffness are
+    then those identified, and momentum still balances.
+    """
+    module = robot.multibody.module
+    sideways, up = module.centre_of_mass[1:]
+    own = module.inertia[0] + module.mass * (sideways ** 2 + up ** 2)
+    model.dof_armature[6:] = robot.joints.inertia - own
+
+
+def _text(*numbers):
+    return ' '.join(repr(float(x)) for x in np.ravel(numbers))
+
+
+def _inertial(part: RigidPart) -> str:
+    i = part.inertia
+    return (f'<inertial pos="{_text(part.centre)}" mass="{part.mass!r}" '
+            f'fullinertia="{_text(i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2])}"/>')
+
+
+def _module(robot, plant, parts, k):
+    module, joints = robot.multibody.module, robot.joints
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, parts.module_rotations[k].ravel())
+    inertia = np.maximum(module.inertia, TINY_INERTIA)
+    return f'''
+      <body name="module{k + 1}" pos="{_text(parts.joint_origins[k])}" quat="{_text(quaternion)}">
+        <joint name="gimbal{k + 1}" axis="1 0 0" limited="true"
+               range="{_text(-joints.position_limit, joints.position_limit)}"/>
+        <inertial pos="{_text(module.centre_of_mass)}" mass="{max(module.mass, TINY_MASS)!r}"
+                  diaginertia="{_text(inertia)}"/>
+        <site name="rotor{k + 1}" pos="{_text(module.rotor_offset, 0, 0)}"/>
+        <geom name="propeller{k + 1}" type="cylinder" pos="{_text(module.rotor_offset, 0, 0)}"
+              size="{_text(plant.propeller_radius, MOTOR_HEIGHT)}"/>
+      </body>'''
+
+
+def _actuators(robot):
+    rotors, joints, effects = robot.rotors, robot.joints, robot.effects
+    ratio = effects.get('torque_coefficient', {}).get('torque_to_thrust_ratio',
+                                                      rotors.torque_to_thrust_ratio)
+    scale = thrust_scale(robot)
+    rotor = ''.join(
+        f'<general name="rotor{k + 1}" site="rotor{k + 1}" dyntype="filterexact" '
+        f'dynprm="{rotors.time_constant!r}" gear="{_text(0, 0, scale[k], 0, 0)} '
+        f'{_text(-rotors.spin[k] * ratio * scale[k])}"/>\n' for k in range(4))
+    servo = ''.join(
+        f'<general name="servo{k + 1}" joint="gimbal{k + 1}" gainprm="{joints.kp!r}" '
+        f'biastype="affine" biasprm="{_text(0, -joints.kp, -joints.kd)}" '
+        f'forcelimited="true" forcerange="{_text(-joints.effort_limit, joints.effort_limit)}"/>\n'
+        for k in range(4))
+    return rotor + servo
+
+
+def thrust_scale(robot: RobotParameters) -> np.ndarray:
+    """(4,) true thrust for each newton that the actuators believe to give."""
+    effects = robot.effects
+    return (effects.get('thrust_coefficient', {}).get('scale', 1.0)
+            * np.array(effects.get('rotor_thrust_coefficient', {}).get('scale', (1.0,) * 4)))
+
+
+def _mjcf(robot, plant, variation, scenery):
+    parts = mass_properties(robot, variation)
+    foot_z = plant.foot_radius - plant.foot_depth
+    feet = ''.join(f'<geom name="foot{k + 1}" type="sphere" size="{plant.foot_radius!r}" '
+                   f'pos="{_text(x * plant.foot_spread, y * plant.foot_spread, foot_z)}"/>\n'
+                   for k, (x, y) in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)]))
+    modules = ''.join(_module(robot, plant, parts, k) for k in range(4))
+    ball = parts.main_origin + [0, 0, robot.multibody.end_effector.height]
+    return f'''
+<mujoco model="{robot.name}">
+  <compiler angle="radian" autolimits="true" inertiafromgeom="false"/>
+  <option timestep="{plant.tick / plant.substeps!r}" integrator="RK4"
+          gravity="{_text(0, 0, -robot.gravity)}">
+    <flag midphase="disable" island="disable" sensor="disable"/>
+  </option>
+  <default>
+    <geom contype="1" conaffinity="0" condim="3" friction="{_text(plant.floor_friction, 0.005, 1e-4)}"
+          solref="{_text(plant.contact_time_constant, plant.contact_damping_ratio)}"
+          rgba="0.3 0.3 0.32 1"/>
+  </default>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1" contype="0" conaffinity="1"/>
+    {scenery}
+    <body name="base_link">
+      <freejoint name="base"/>
+      {_inertial(base_part(robot, plant, variation, 0.0))}
+      <geom name="main_body" type="cylinder" size="{_text(0.5 * plant.foot_spread, 0.03)}"/>
+      <geom name="end_effector" type="sphere" size="{plant.end_effector_radius!r}"
+            pos="{_text(ball)}"/>
+      {feet}{modules}
+    </body>
+  </worldbody>
+  <actuator>
+    {_actuators(robot)}
+  </actuator>
+</mujoco>'''

@@ -1,0 +1,233 @@
+"""The multibody plant: MuJoCo's equations of motion, stepped one tick at a time."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.sim.effects import check_supported, MotionForces
+from beetle_omni_ros.sim.mass_properties import Variation
+from beetle_omni_ros.sim.mjcf import base_part, BASE, build_model, set_base_part, thrust_scale
+from beetle_omni_ros.sim.parameters import PlantParameters
+
+NO_CONSTRAINT = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+WXYZ = np.array([6, 3, 4, 5])       # where (w, x, y, z) stand in position + quaternion xyzw
+XYZW = np.array([4, 5, 6, 3])       # where (x, y, z, w) stand in qpos
+
+
+class Plant:
+    """
+    One true robot over a floor.
+
+    MuJoCo integrates with Runge-Kutta 4. The contact and joint-stop solver runs only in
+    ticks in which something could touch, and the tilt-rate limit is watched only in ticks in
+    which a joint could reach it: both bounds are conservative, and the plant costs half.
+    """
+
+    def __init__(self, robot: RobotParameters, parameters: PlantParameters,
+                 variation: Variation | None = None):
+        """
+        Build the model.
+
+        Raises:
+            ParameterError: an effect that the plant lacks, or impossible mass properties.
+
+        """
+        check_supported(robot)
+        self._robot, self._parameters, self._variation = robot, parameters, variation
+        self._forces = MotionForces(robot)
+        self._scale = thrust_scale(robot)
+        self.model = build_model(robot, parameters, variation)
+        self.data = mujoco.MjData(self.model)
+        self._tick, self._substeps = parameters.tick, parameters.substeps
+        self._substep = parameters.tick / parameters.substeps
+        self._flags = int(self.model.opt.disableflags)
+        self._reach = _reach(self.model)
+        # A servo can change its rate by at most this in a tick, for each rad (rad/s) of error.
+        joints = robot.joints
+        self._rate_gain = np.array([joints.kp, joints.kd]) * self._tick / joints.inertia
+        self._ground_height: float | None = None
+        self._wrench = np.zeros(6)
+        self._payload = 0.0
+        self.reset()
+
+    def reset(self, position: np.ndarray | None = None,
+              quaternion: np.ndarray | None = None) -> None:
+        """
+        Put the robot at rest, tilts zero, rotors off; wrench and payload go.
+
+        Args:
+            position: (3,) of base_link in world [m]; by default standing at the origin.
+            quaternion: (4,) base_link to world, xyzw; by default level.
+
+        """
+        self.set_payload(0.0)
+        self._wrench[:] = 0.0
+        if position is None:
+            position = (0.0, 0.0, self._standing_height())
+        self._place(position, (0.0, 0.0, 0.0, 1.0) if quaternion is None else quaternion)
+
+    def _place(self, position, quaternion):
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:3] = position
+        self.data.qpos[3:7] = rotations.normalized(quaternion)[[3, 0, 1, 2]]
+        self._update()
+
+    def _standing_height(self):
+        """Where base_link comes to rest on its feet [m]; found once, by letting it settle."""
+        if self._ground_height is None:
+            self._place((0.0, 0.0, self._parameters.foot_depth), (0.0, 0.0, 0.0, 1.0))
+            self.model.opt.disableflags = self._flags
+            settle = 100 * self._parameters.contact_time_constant
+            mujoco.mj_step(self.model, self.data, int(np.ceil(settle / self._substep)))
+            self._ground_height = float(self.data.qpos[2])
+        return self._ground_height
+
+    def set_targets(self, tilt: np.ndarray, thrust: np.ndarray) -> None:
+        """Tilt targets (4,) [rad] and thrust commands (4,) [N], both within their limits."""
+        self.data.ctrl[:4] = thrust
+        self.data.ctrl[4:] = tilt
+
+    def set_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
+        """External force (3,) in world [N] and torque (3,) in base_link [N m] at base_link."""
+        self._wrench[:3] = force
+        self._wrench[3:] = torque
+
+    def set_payload(self, mass: float) -> None:
+        """Attach a ball of ``mass`` [kg] below the body, in place of the one before."""
+        if mass != self._payload:
+            self._payload = mass
+            set_base_part(self.model, base_part(self._robot, self._parameters, self._variation,
+                                                mass))
+
+    def step(self) -> None:
+        """Advance one tick with the present targets."""
+        model, data = self.model, self.data
+        touching = self._may_touch()
+        model.opt.disableflags = self._flags if touching else self._flags | NO_CONSTRAINT
+        fast = not self._may_reach_rate_limit()
+        if fast and not self._forces.depends_on_motion:
+            data.qfrc_applied[:6] = self._wrench
+            data.qfrc_applied[:3] += self._forces.wind
+            mujoco.mj_step(model, data, self._substeps)
+        else:
+            for _ in range(self._substeps):
+                if not fast:
+                    self._limit_rates()
+                self._apply_forces()
+                mujoco.mj_step(model, data)
+            if not fast:
+                effort = self._robot.joints.effort_limit
+                model.actuator_forcerange[4:] = (-effort, effort)
+        self._update()
+
+    def _may_touch(self):
+        qpos, qvel = self.data.qpos, self.data.qvel
+        drop = self._reach + 2 * self._tick * abs(qvel[2]) + 0.01
+        travel = self._robot.joints.position_limit - 2 * self._tick * np.abs(qvel[6:])
+        return qpos[2] < drop or bool((np.abs(qpos[7:]) > travel - 0.01).any())
+
+    def _may_reach_rate_limit(self):
+        data = self.data
+        rate = np.abs(data.qvel[6:])
+        error = np.abs(data.ctrl[4:] - data.qpos[7:])
+        bound = rate + self._rate_gain[0] * error
+        return bool((bound > 0.9 * self._robot.joints.velocity_limit).any())
+
+    def _limit_rates(self):
+        """Cap each servo's torque at what takes its joint to the rate limit, and no further."""
+        joints = self._robot.joints
+        gain = joints.inertia / self._substep
+        rate = self.data.qvel[6:]
+        limits = self.model.actuator_forcerange
+        effort, rate_limit = joints.effort_limit, joints.velocity_limit
+        limits[4:, 0] = np.clip(gain * (-rate_limit - rate), -effort, effort)
+        limits[4:, 1] = np.clip(gain * (rate_limit - rate), -effort, effort)
+
+    def _apply_forces(self):
+        data = self.data
+        force, torque = self._forces(rotations.matrix(data.qpos[XYZW]), data.qvel[:3],
+                                     data.qvel[3:6], data.qpos[7:], self.thrust)
+        data.qfrc_applied[:3] = self._wrench[:3] + force
+        data.qfrc_applied[3:6] = self._wrench[3:] + torque
+
+    def _update(self):
+        """Accelerations and contacts of the state just reached."""
+        if self._forces.depends_on_motion:
+            self._apply_forces()
+        mujoco.mj_forward(self.model, self.data)
+
+    @property
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Copies of position, quaternion wxyz, tilts (11,) and velocities (10,)."""
+        return self.data.qpos.copy(), self.data.qvel.copy()
+
+    @property
+    def thrust(self) -> np.ndarray:
+        """(4,) true thrusts [N]."""
+        return self._scale * self.data.act
+
+    @property
+    def effort(self) -> np.ndarray:
+        """(4,) servo torques [N m]."""
+        return self.data.actuator_force[4:].copy()
+
+    @property
+    def contact(self) -> bool:
+        """Whether any part touches the floor."""
+        return self.data.ncon > 0
+
+    @property
+    def specific_force(self) -> np.ndarray:
+        """(3,) acceleration of base_link less gravity, in base_link [m/s^2]."""
+        acceleration = self.data.qacc[:3].copy()
+        acceleration[2] += self._robot.gravity
+        return self.data.xmat[BASE].reshape(3, 3).T @ acceleration
+
+    def acceleration(self, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray,
+                     angular_velocity: np.ndarray, tilt: np.ndarray, tilt_velocity: np.ndarray,
+                     thrust: np.ndarray, tilt_target: np.ndarray | None = None) -> np.ndarray:
+        """
+        Accelerations in any one state, away from the floor; the plant is left in it.
+
+        Args:
+            position: (3,) of base_link in world [m].
+            quaternion: (4,) xyzw.
+            velocity: (3,) in world [m/s].
+            angular_velocity: (3,) in base_link [rad/s].
+            tilt: (4,) [rad].
+            tilt_velocity: (4,) [rad/s].
+            thrust: (4,) thrusts before the effects' scales [N].
+            tilt_target: (4,) [rad]; by default the present tilt.
+
+        Returns:
+            (10,) linear in world [m/s^2], angular in base_link [rad/s^2], tilts [rad/s^2].
+
+        """
+        data = self.data
+        data.qpos[:] = np.concatenate([position, quaternion, tilt])[
+            np.concatenate([np.arange(3), WXYZ, np.arange(7, 11)])]
+        data.qvel[:] = np.concatenate([velocity, angular_velocity, tilt_velocity])
+        data.act[:] = thrust
+        self.set_targets(tilt if tilt_target is None else tilt_target, thrust)
+        self.model.opt.disableflags = self._flags | NO_CONSTRAINT
+        self._apply_forces()
+        self._update()
+        return data.qacc.copy()
+
+
+def _reach(model):
+    """How far the robot's geometry extends from base_link in any posture [m]."""
+    reach = 0.0
+    for geom in range(model.ngeom):
+        body = int(model.geom_bodyid[geom])
+        if body == 0:
+            continue
+        distance = np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom]
+        while body != BASE:
+            distance += np.linalg.norm(model.body_pos[body])
+            body = int(model.body_parentid[body])
+        reach = max(reach, float(distance))
+    return reach

@@ -1,0 +1,93 @@
+"""What the simulator hands out: sensor readings and the truth. Seconds since reset, SI units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class ImuReading:
+    """
+    One IMU reading.
+
+    Attributes:
+        stamp: [s].
+        specific_force: (3,) in base_link [m/s^2]; +gravity along z when level at rest.
+        angular_velocity: (3,) in base_link [rad/s].
+
+    """
+
+    stamp: float
+    specific_force: np.ndarray
+    angular_velocity: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class PoseReading:
+    """One motion capture frame: capture time [s], (3,) [m] in world, (4,) quaternion xyzw."""
+
+    stamp: float
+    position: np.ndarray
+    quaternion: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class JointReading:
+    """Servo feedback: capture time [s], tilts [rad], rates [rad/s], torques [N m], each (4,)."""
+
+    stamp: float
+    position: np.ndarray
+    velocity: np.ndarray
+    effort: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class BatteryReading:
+    """Pack voltage under load [V] and current [A], negative while discharging (REP convention)."""
+
+    stamp: float
+    voltage: float
+    current: float
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """
+    The true state.
+
+    Attributes:
+        stamp: [s].
+        position: (3,) of base_link in world [m].
+        velocity: (3,) of base_link's origin in world [m/s].
+        quaternion: (4,) base_link to world, xyzw.
+        angular_velocity: (3,) in base_link [rad/s].
+        tilt: (4,) [rad].
+        tilt_velocity: (4,) [rad/s].
+        thrust: (4,) present thrusts [N].
+        contact: whether any part touches the floor.
+
+    """
+
+    stamp: float
+    position: np.ndarray
+    velocity: np.ndarray
+    quaternion: np.ndarray
+    angular_velocity: np.ndarray
+    tilt: np.ndarray
+    tilt_velocity: np.ndarray
+    thrust: np.ndarray
+    contact: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What became available in one tick; None where nothing did."""
+
+    time: float
+    imu: ImuReading | None
+    mocap: PoseReading | None
+    joints: JointReading | None
+    battery: BatteryReading | None
+    truth: Truth

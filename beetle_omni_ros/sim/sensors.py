@@ -1,0 +1,141 @@
+"""Sensors: what the truth looks like through noise, bias, resolution and latency."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim.battery import Battery
+from beetle_omni_ros.sim.conditions import Conditions
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.plant import Plant
+from beetle_omni_ros.sim.readings import BatteryReading, ImuReading, JointReading, PoseReading, Truth
+
+BLOCK = 1024            # noise is drawn this many readings at a time, because one by one is slow
+
+
+class Noise:
+    """Rows of bias + normal + uniform noise from one generator, drawn in blocks."""
+
+    def __init__(self, generator: np.random.Generator, bias: np.ndarray, deviation: np.ndarray,
+                 half_width: np.ndarray | float):
+        """Describe one row: all arrays of its length."""
+        self._generator = generator
+        self._bias, self._deviation, self._half_width = bias, deviation, half_width
+        self._rows = iter(())
+
+    def next(self) -> np.ndarray:
+        """The next row."""
+        for row in self._rows:
+            return row
+        shape = (BLOCK, len(self._bias))
+        rows = self._bias + self._deviation * self._generator.standard_normal(shape)
+        rows += self._half_width * self._generator.uniform(-1.0, 1.0, shape)
+        self._rows = iter(rows)
+        return next(self._rows)
+
+
+class Sensors:
+    """All sensors of one robot in one flight."""
+
+    def __init__(self, parameters: SimulatorParameters, conditions: Conditions,
+                 seeds: list[np.random.SeedSequence], first: Truth, effort: np.ndarray):
+        """
+        Start with a robot that has been at rest in its ``first`` state.
+
+        Args:
+            parameters: noise and latencies.
+            conditions: this flight's biases and latencies.
+            seeds: four, for IMU, MoCap, encoders and battery, so that a sensor's noise does
+                not depend on another's rate.
+            first: the state at reset.
+            effort: (4,) servo torques there [N m].
+
+        Raises:
+            ParameterError: a period or latency is no multiple of the tick.
+
+        """
+        self._tick = parameters.plant.tick
+        generators = [np.random.Generator(np.random.PCG64(seed)) for seed in seeds]
+        imu, mocap, pack = parameters.imu, parameters.mocap, parameters.battery
+        self._imu_noise = Noise(
+            generators[0], conditions.imu_bias,
+            np.repeat([imu.specific_force_noise, imu.angular_velocity_noise], 3),
+            conditions.imu_uniform_noise)
+        self._mocap_noise = Noise(
+            generators[1], np.concatenate([conditions.position_bias, conditions.orientation_bias]),
+            np.repeat([mocap.position_noise, mocap.orientation_noise], 3),
+            conditions.mocap_uniform_noise)
+        self._tilt_noise = Noise(generators[2], conditions.tilt_bias, np.zeros(4),
+                                 conditions.tilt_uniform_noise)
+        self._battery_noise = Noise(generators[3], np.zeros(2),
+                                    np.array([pack.voltage_noise, pack.current_noise]), 0.0)
+        self._mocap_period = self._ticks('mocap.period', mocap.period, least=1)
+        self._battery_period = self._ticks('battery.period', pack.period, least=1)
+        self._count = 2 * np.pi / parameters.encoders.counts_per_turn
+        self._velocity_step = parameters.encoders.velocity_step
+        self._imu = _delay_line(self._ticks('imu latency', conditions.imu_latency))
+        self._joints = _delay_line(self._ticks('encoder latency', conditions.tilt_latency))
+        self._mocap = _delay_line(self._ticks('mocap.latency', mocap.latency))
+        at_rest = np.zeros(6)
+        for _ in range(self._imu.maxlen):
+            self._imu.append(at_rest)
+        for k in range(self._joints.maxlen):
+            stamp = first.stamp - self._tick * (self._joints.maxlen - 1 - k)
+            self._joints.append((stamp, first.tilt, first.tilt_velocity, effort))
+        for _ in range(self._mocap.maxlen - 1):
+            self._mocap.append(None)
+        self._mocap.append(self._capture(first))
+
+    def _ticks(self, name, seconds, least=0):
+        ticks = round(seconds / self._tick)
+        if ticks < least or abs(ticks * self._tick - seconds) > 1e-6:
+            raise ParameterError(f'{name}: {seconds:g} s must be a multiple of the simulator tick '
+                                 f'{self._tick:g} s' + (', one or more' if least else ''))
+        return ticks
+
+    def start_imu(self, specific_force: np.ndarray, angular_velocity: np.ndarray) -> None:
+        """Fill the IMU's latency with the reading at reset."""
+        for _ in range(self._imu.maxlen):
+            self._imu.append(np.concatenate([specific_force, angular_velocity]))
+
+    def read(self, tick: int, truth: Truth, plant: Plant, battery: Battery) -> tuple:
+        """
+        Readings that become available at ``truth.stamp``, the end of tick number ``tick``.
+
+        Returns:
+            (imu, mocap, joints, battery), None where there is none.
+
+        """
+        self._imu.append(np.concatenate([plant.specific_force, truth.angular_velocity]))
+        imu = self._imu[0] + self._imu_noise.next()
+        self._mocap.append(self._capture(truth) if tick % self._mocap_period == 0 else None)
+        self._joints.append((truth.stamp, truth.tilt, truth.tilt_velocity, plant.effort))
+        return (ImuReading(truth.stamp, imu[:3], imu[3:]), self._mocap[0],
+                self._joint_reading(), self._battery_reading(tick, truth.stamp, battery))
+
+    def _capture(self, truth):
+        noise = self._mocap_noise.next()
+        return PoseReading(truth.stamp, truth.position + noise[:3],
+                           rotations.multiply(truth.quaternion, rotations.exp(noise[3:])))
+
+    def _joint_reading(self):
+        stamp, tilt, velocity, effort = self._joints[0]
+        tilt = np.rint((tilt + self._tilt_noise.next()) / self._count) * self._count
+        if self._velocity_step:
+            velocity = np.rint(velocity / self._velocity_step) * self._velocity_step
+        return JointReading(stamp, tilt, velocity, effort)
+
+    def _battery_reading(self, tick, stamp, battery):
+        if tick % self._battery_period:
+            return None
+        voltage, current = self._battery_noise.next().tolist()
+        return BatteryReading(stamp, battery.voltage + voltage, -(battery.current + current))
+
+
+def _delay_line(ticks):
+    """A queue whose first element is ``ticks`` older than its last, once it is full."""
+    return deque(maxlen=ticks + 1)

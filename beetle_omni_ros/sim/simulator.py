@@ -1,0 +1,144 @@
+"""The simulated robot as the flight stack meets it: commands in, sensor readings out."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim.battery import Battery
+from beetle_omni_ros.sim.command_link import CommandLink
+from beetle_omni_ros.sim.conditions import draw
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.plant import Plant, XYZW
+from beetle_omni_ros.sim.readings import Frame, Truth
+from beetle_omni_ros.sim.sensors import Sensors
+
+
+class Simulator:
+    """
+    Plant, actuator timing, battery and sensors, advanced tick by tick.
+
+    The same robot, parameters, conditions, seed and calls give the same numbers.
+
+    Attributes:
+        time: since reset [s].
+        tick: of one step [s].
+        conditions: what the seed made of biases, latencies and the robot.
+
+    """
+
+    def __init__(self, robot: RobotParameters, parameters: SimulatorParameters | None = None,
+                 conditions: str = 'nominal', seed: int = 0):
+        """
+        Build the world and reset it.
+
+        Args:
+            robot: what is true in the simulation.
+            parameters: by default params/simulator.yaml.
+            conditions: 'nominal' or 'published'.
+            seed: of everything random.
+
+        Raises:
+            ParameterError: an effect that the plant lacks, impossible mass properties, unknown
+                conditions, a latency that is no multiple of the tick.
+
+        """
+        self._robot = robot
+        self._parameters = parameters or SimulatorParameters.load()
+        if not isinstance(seed, (int, np.integer)) or seed < 0:
+            raise ParameterError(f'seed: expected a whole number from 0, found {seed!r}')
+        self._seed = seed
+        self.tick = self._parameters.plant.tick
+        self.conditions = draw(conditions, self._parameters,
+                               np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]))
+        self._plant = Plant(robot, self._parameters.plant, self.conditions.variation)
+        self._battery = Battery(robot, self._parameters.battery)
+        self.reset()
+
+    def reset(self, position: np.ndarray | None = None,
+              quaternion: np.ndarray | None = None) -> None:
+        """
+        Begin anew: at rest, rotors off, full battery, the seed's noise from its start.
+
+        Args:
+            position: (3,) of base_link in world [m]; by default standing on the floor.
+            quaternion: (4,) base_link to world, xyzw; by default level.
+
+        """
+        self._ticks = 0
+        self.time = 0.0
+        self._plant.reset(position, quaternion)
+        self._battery.reset()
+        self._link = CommandLink(self._robot, self._parameters.actuators, self.conditions)
+        self.truth = self._truth()
+        seeds = np.random.SeedSequence(self._seed).spawn(5)[1:]
+        self._sensors = Sensors(self._parameters, self.conditions, seeds, self.truth,
+                                self._plant.effort)
+        self._sensors.start_imu(self._plant.specific_force, self.truth.angular_velocity)
+
+    def command(self, command) -> bool:
+        """
+        Send a command (stamp, tilt (4,), thrust (4,)); it acts at its stamp plus the delay.
+
+        Returns:
+            whether it was taken; refusals are counted in :attr:`rejected`.
+
+        """
+        return self._link.push(command, self.time)
+
+    @property
+    def rejected(self) -> Counter:
+        """Reason -> number of commands refused since reset."""
+        return self._link.rejected
+
+    def set_wrench(self, force_world: np.ndarray, torque_body: np.ndarray) -> None:
+        """
+        Apply an external wrench at base_link until changed.
+
+        Args:
+            force_world: (3,) [N].
+            torque_body: (3,) in base_link [N m].
+
+        Raises:
+            ValueError: not three finite numbers each.
+
+        """
+        force, torque = (np.asarray(v, dtype=float) for v in (force_world, torque_body))
+        if force.shape != (3,) or torque.shape != (3,) \
+                or not (np.isfinite(force).all() and np.isfinite(torque).all()):
+            raise ValueError(f'wrench: expected three finite numbers each, found force '
+                             f'{force_world!r} N and torque {torque_body!r} N m')
+        self._plant.set_wrench(force, torque)
+
+    def set_payload(self, mass: float) -> None:
+        """
+        Attach a ball of ``mass`` [kg] rigidly below the body, in place of the one before.
+
+        Raises:
+            ValueError: negative or not finite.
+
+        """
+        if not (np.isfinite(mass) and mass >= 0):
+            raise ValueError(f'payload: expected a mass of 0 kg or more, found {mass!r}')
+        self._plant.set_payload(float(mass))
+
+    def step(self) -> Frame:
+        """Advance one tick; return what became available in it."""
+        plant, link, battery = self._plant, self._link, self._battery
+        link.update(self.time)
+        plant.set_targets(link.tilt, np.minimum(link.thrust, battery.thrust_limit))
+        plant.step()
+        self._ticks += 1
+        self.time = self._ticks * self.tick
+        self.truth = truth = self._truth()
+        battery.step(truth.thrust, self.tick)
+        imu, mocap, joints, pack = self._sensors.read(self._ticks, truth, plant, battery)
+        return Frame(self.time, imu, mocap, joints, pack, truth)
+
+    def _truth(self):
+        qpos, qvel = self._plant.state
+        return Truth(self.time, qpos[:3], qvel[:3], qpos[XYZW], qvel[3:6], qpos[7:], qvel[6:],
+                     self._plant.thrust, self._plant.contact)
