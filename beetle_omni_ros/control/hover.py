@@ -1,0 +1,226 @@
+"""
+Hover: PD (and a slow, bounded integral) on the pose, then allocation.
+
+The null controller to compare with, and the fallback that the supervisor flies when nothing
+better answers. It needs the robot's parameters, no compiler and no solver, and it is stable
+from any attitude because translation and rotation do not couple on this robot.
+
+    acceleration = Kp e_p + Kd e_v + Ki int e_p           (world)
+    angular acceleration = Kp e_R + Kd e_w + Ki int e_R   (base_link)
+
+with e_R the geodesic attitude error. The rotors' slow thrust response is sped up by a lead on a
+thrust model, the tilt targets move at a limited rate from the command in force, and a rotor
+whose joint is still on its way pushes only as far as its present direction helps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Command, State, Target
+from beetle_omni_ros.robot import rotations, schema
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import group, parameter
+
+DAMPING = 1e-2   # [(1/kg)^2] keeps the thrusts near the plain projection where directions agree
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisGains:
+    """Gains of three axes as accelerations, so that they hold for any mass and inertia."""
+
+    kp: float = parameter(6.0, doc='acceleration for each unit of error', unit='1/s^2', low=0,
+                          high=100)
+    kd: float = parameter(4.5, doc='acceleration for each unit of rate error', unit='1/s', low=0,
+                          high=50)
+    ki: float = parameter(2.0, doc='acceleration for each unit of integrated error',
+                          unit='1/s^3', low=0, high=50)
+    error_limit: float = parameter(0.6, doc='longer errors are shortened to this', unit='m or rad',
+                                   low=0.01, high=10)
+    rate_limit: float = parameter(3.0, doc='longer rate errors are shortened to this',
+                                  unit='m/s or rad/s', low=0.1, high=50)
+    integral_limit: float = parameter(2.0, doc='largest acceleration of the integral',
+                                      unit='m/s^2 or rad/s^2', low=0, high=50)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HoverParameters:
+    """Tuning of the hover controller; params/hover.yaml says why."""
+
+    period: float = parameter(0.01, doc='time between commands', unit='s', low=0.001, high=0.1)
+    position: AxisGains = group(AxisGains, 'position and velocity in world')
+    attitude: AxisGains = group(AxisGains, 'attitude and rate in base_link')
+    thrust_response: float = parameter(
+        0.04, doc='time constant that the lead gives the thrust', unit='s', low=0.005, high=1)
+    thrust_rate: float = parameter(300.0, doc='fastest change of a thrust target', unit='N/s',
+                                   low=1, high=1e5)
+    tilt_rate: float = parameter(9.0, doc='fastest change of a tilt target', unit='rad/s', low=0.1,
+                                 high=100)
+    tilt_full_thrust: float = parameter(
+        1.0, doc='a rotor with less thrust turns its joint proportionally slower', unit='N',
+        low=0, high=20)
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> HoverParameters:
+        """Read a hover file; without a path, the shipped one."""
+        return schema.load(cls, path if path else share_path('params/hover.yaml'))
+
+
+class HoverController:
+    """
+    Holds a pose, see the module's text.
+
+    Args:
+        robot: what the controller believes about the robot.
+        parameters: tuning; default the shipped file.
+
+    """
+
+    name = 'hover'
+
+    def __init__(self, robot: RobotParameters, parameters: HoverParameters | None = None):
+        self.parameters = parameters or HoverParameters.load()
+        self.period = self.parameters.period
+        self._robot = robot
+        self._allocator = Allocator(robot)
+        self._scaled = self._allocator.matrix / np.concatenate(
+            [np.full(3, self._allocator.mass), robot.inertia])[:, None]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget integrals and the thrust model; the next step starts from state.command."""
+        self._stamp = None
+        self._command = None
+        self._thrust = None          # (4,) modelled thrust [N]
+        self._force_integral = np.zeros(3)
+        self._torque_integral = np.zeros(3)
+        self._saturated = False
+        self._errors = (0.0, 0.0)
+        self._saturations = 0
+
+    def step(self, state: State, target: Target) -> Command:
+        """
+        One command for one state.
+
+        The time since the previous step is taken from the stamps, so the controller may be
+        called at any rate; a repeated stamp repeats the command.
+        """
+        if self._stamp is not None and state.stamp <= self._stamp and self._command is not None:
+            return self._command
+        gap = state.stamp - self._stamp if self._stamp is not None else self.period
+        dt = min(gap, 5 * self.period)   # after a pause, not one long blind leap
+        in_force = state.command
+        own = in_force is not None and _same(in_force, self._command)   # integrate only what this controller flies
+        self._follow_thrust(in_force, dt)
+        force, torque = self._wrench(state, target, dt if own and not self._saturated else 0.0)
+        present = in_force.tilt if in_force is not None else state.tilt
+        wished = self._allocator.hover(state.quaternion, present, force, torque)
+        self._saturated = bool(wished.saturated.any())
+        self._saturations += self._saturated
+        self._command = Command(state.stamp, *self._targets(state, wished, present, dt))
+        self._stamp = state.stamp
+        return self._command
+
+    def diagnostics(self) -> dict[str, float | int | str]:
+        """Errors of the last step, integrals and saturated steps since reset."""
+        return {'position_error_m': self._errors[0], 'attitude_error_rad': self._errors[1],
+                'force_integral_m_s2': float(np.linalg.norm(self._force_integral)),
+                'torque_integral_rad_s2': float(np.linalg.norm(self._torque_integral)),
+                'saturated_steps': int(self._saturations)}
+
+    def _wrench(self, state, target, integrate_for):
+        """Force beside the weight's support (world) and torque (base_link)."""
+        reference = target.at(state.stamp)
+        to_body = rotations.conjugate(state.quaternion)
+        attitude_error = rotations.log(rotations.multiply(to_body, reference.quaternion))
+        relative = rotations.matrix(rotations.multiply(to_body, reference.quaternion))
+        position_error = reference.position - state.position
+        self._errors = (float(np.linalg.norm(position_error)),
+                        float(np.linalg.norm(attitude_error)))
+        acceleration, self._force_integral = _pid(
+            self.parameters.position, position_error, reference.velocity - state.velocity,
+            self._force_integral, integrate_for)
+        angular, self._torque_integral = _pid(
+            self.parameters.attitude, attitude_error,
+            relative @ reference.angular_velocity - state.angular_velocity,
+            self._torque_integral, integrate_for)
+        inertia, rate = self._robot.inertia, state.angular_velocity
+        gyroscopic = np.cross(rate, inertia * rate)
+        return self._allocator.mass * acceleration, inertia * angular + gyroscopic
+
+    def _follow_thrust(self, in_force, dt):
+        """First-order model of the thrusts that the command in force has built up."""
+        if in_force is None:
+            self._thrust = np.zeros(4)
+        elif self._thrust is None:
+            self._thrust = np.array(in_force.thrust, dtype=float)
+        else:
+            keep = exp(-dt / self._robot.rotors.time_constant)
+            self._thrust = in_force.thrust + keep * (self._thrust - in_force.thrust)
+
+    def _targets(self, state, wished, present, dt):
+        """Tilt and thrust targets after rate limits, projection and lead."""
+        p, rotors = self.parameters, self._robot.rotors
+        busy = np.ones(4) if p.tilt_full_thrust == 0 else \
+            np.minimum(1.0, wished.thrust / p.tilt_full_thrust)
+        limit = self._robot.joints.position_limit
+        reach = p.tilt_rate * dt * busy
+        tilt = np.clip(present + np.clip(wished.tilt - present, -reach, reach), -limit, limit)
+        thrust = self._thrust_on_the_way(wished, state.tilt)
+        lead = rotors.time_constant / p.thrust_response
+        thrust = self._thrust + max(lead, 1.0) * (thrust - self._thrust)
+        if state.command is not None:
+            reach = p.thrust_rate * dt
+            thrust = np.clip(thrust, state.command.thrust - reach, state.command.thrust + reach)
+        return tilt, np.clip(thrust, rotors.thrust_min, rotors.thrust_max)
+
+    def _thrust_on_the_way(self, wished, tilt):
+        """
+        Thrusts that, along the rotors' present directions, come nearest the wished wrench.
+
+        Least squares in linear and angular acceleration within the thrust range: a rotor that
+        points elsewhere is throttled, and with it those whose torque it no longer balances.
+        """
+        rotors, matrix = self._robot.rotors, self._scaled
+        now = matrix[:, 0::2] * np.cos(tilt) + matrix[:, 1::2] * np.sin(tilt)
+        wrench = matrix[:, 0::2] @ (wished.thrust * np.cos(wished.tilt)) \
+            + matrix[:, 1::2] @ (wished.thrust * np.sin(wished.tilt))
+        helpful = wished.thrust * np.maximum(0.0, np.cos(wished.tilt - tilt))
+        thrust, free = helpful.copy(), np.ones(4, dtype=bool)
+        for _ in range(4):
+            columns = now[:, free]
+            rest = wrench - now[:, ~free] @ thrust[~free]
+            thrust[free] = np.linalg.solve(columns.T @ columns + DAMPING * np.eye(free.sum()),
+                                           columns.T @ rest + DAMPING * helpful[free])
+            outside = (thrust < rotors.thrust_min) | (thrust > rotors.thrust_max)
+            thrust = np.clip(thrust, rotors.thrust_min, rotors.thrust_max)
+            if not np.any(outside & free):
+                break
+            free &= ~outside
+            if not free.any():
+                break
+        return thrust
+
+
+def _same(a, b):
+    return a is b if a is None or b is None else (
+        np.array_equal(a.tilt, b.tilt) and np.array_equal(a.thrust, b.thrust))
+
+
+def _pid(gains, error, rate_error, integral, integrate_for):
+    """Acceleration (3,) and the new integral; integrates only small errors, for dt seconds."""
+    if integrate_for > 0.0 and np.linalg.norm(error) < gains.error_limit:
+        integral = _shortened(integral + gains.ki * integrate_for * error, gains.integral_limit)
+    return (gains.kp * _shortened(error, gains.error_limit)
+            + gains.kd * _shortened(rate_error, gains.rate_limit) + integral), integral
+
+
+def _shortened(vector, limit):
+    length = float(np.sqrt(vector @ vector))
+    return vector if length <= limit else vector * (limit / length)
