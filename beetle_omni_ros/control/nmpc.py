@@ -78,7 +78,7 @@ class NmpcController:
         self._estimator.reset()
         self._started, self._failures = False, 0
         self._statuses: dict[int, int] = {}
-        self._iterations = 0
+        self._iterations = self._rejected = 0
 
     @property
     def disturbance(self) -> np.ndarray:
@@ -91,7 +91,10 @@ class NmpcController:
         return self._rti.states.copy()
 
     def step(self, state: State, target: Target) -> Command:
-        """One command for one state; see the class."""
+        """One command for one state; see the class. A non-finite state repeats the plan."""
+        if self._started and not _finite(state):
+            self._rejected += 1
+            return self._command(state.stamp)
         full = self._estimator.update(state)
         x0 = full[:13]
         x0 = np.concatenate([x0, full[model.TILT], full[model.THRUST]])[:self._state_size]
@@ -109,9 +112,12 @@ class NmpcController:
         self._statuses[status] = self._statuses.get(status, 0) + 1
         self._failures = 0 if status == 0 else self._failures + 1
         self._started = self._failures < FAILURES_TO_RESTART
+        return self._command(state.stamp)
+
+    def _command(self, stamp):
         command = np.clip(self._rti.inputs[0], self._bounds[:8], self._bounds[8:16])
         rotors = self._robot.rotors
-        return Command(state.stamp, command[:4],
+        return Command(stamp, command[:4],
                        np.clip(command[4:], rotors.thrust_min, rotors.thrust_max))
 
     def diagnostics(self) -> dict[str, float | int | str]:
@@ -120,7 +126,13 @@ class NmpcController:
         unsolved = steps - self._statuses.get(0, 0)
         d = self._estimator.disturbance
         return {'solver': 'compiled' if self.compiled else 'interpreted', 'steps': steps,
-                'unsolved': unsolved, 'iterations': self._iterations,
+                'unsolved': unsolved, 'rejected_states': self._rejected, 'iterations': self._iterations,
                 'force_estimate_N': float(np.linalg.norm(d[model.FORCE])),
                 'torque_estimate_Nm': float(np.linalg.norm(d[model.TORQUE])),
                 'servo_offset_rad': float(np.max(np.abs(d[model.TILT_OFFSET])))}
+
+
+def _finite(state):
+    return all(np.isfinite(part).all() for part in (
+        state.position, state.velocity, state.quaternion, state.angular_velocity, state.tilt,
+        state.tilt_velocity))

@@ -1,0 +1,164 @@
+"""The NMPC in closed loop with the CasADi model as plant, delay and all."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
+from beetle_omni_ros.control.call import FunctionCall
+from beetle_omni_ros.control.nmpc import NmpcController
+from beetle_omni_ros.control.nmpc_parameters import (HorizonParameters, NmpcParameters,
+                                                     SolverParameters)
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+
+ROBOT = RobotParameters.load()
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def hovering(position=(0.0, 0.0, 1.0)):
+    x = np.zeros(25)
+    x[:3], x[9], x[21:] = position, 1.0, ROBOT.hover_thrust
+    return x
+
+
+def fly(controller, target, seconds, x=None, plant=ROBOT, disturbance=np.zeros(10), start=0.0):
+    """Closed loop at 100 Hz; a command acts 10 ms after the state that it answers."""
+    advance = FunctionCall(model.integrator(plant, 4), None)
+    x = hovering() if x is None else x
+    command = Command(start - 0.01, x[13:17], x[21:25])
+    trace = []
+    for k in range(round(seconds / 0.01)):
+        time = start + 0.01 * k
+        state = State(time, x[:3], x[3:6], x[6:10], x[10:13], x[13:17], x[17:21], time, command)
+        following = controller.step(state, target)
+        x = advance(x, np.r_[command.tilt, command.thrust], disturbance, 0.01)
+        command = following
+        trace.append((time + 0.01, x, command))
+    return trace
+
+
+def errors(trace, target):
+    time, x, _ = trace[-1]
+    reference = target.at(time)
+    return (np.linalg.norm(x[:3] - reference.position),
+            np.degrees(rotations.geodesic_angle(x[6:10], reference.quaternion)))
+
+
+@pytest.fixture(scope='module')
+def controller():
+    return NmpcController(ROBOT, NmpcParameters.load())
+
+
+@pytest.fixture(autouse=True)
+def fresh(controller):
+    controller.reset()
+
+
+def test_hover_is_an_equilibrium(controller):
+    target = PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL)
+    trace = fly(controller, target, 1.0)
+    assert errors(trace, target) == pytest.approx((0, 0), abs=5e-3)
+    assert np.allclose(trace[-1][2].thrust, ROBOT.hover_thrust, atol=0.1)
+
+
+@pytest.mark.parametrize('rpy', [(180, 0, 0), (0, 180, 0), (0, 0, 180), (90, 0, 0), (-60, 80, 170)])
+def test_reaches_turned_over_poses_exactly(controller, rpy):
+    target = PoseTarget(np.array([1.0, -1.0, 1.5]), rotations.from_rpy(*np.radians(rpy)))
+    position, angle = errors(fly(controller, target, 6.0), target)
+    assert position < 2e-3
+    assert angle < 0.2
+
+
+@pytest.mark.parametrize('changes', [
+    {'effects': {'thrust_coefficient': {'scale': 0.93}}},
+    {'effects': {'mass': {'mass': 1.05 * ROBOT.mass}}},
+    {'effects': {'rotor_thrust_coefficient': {'scale': [0.95, 1.0, 1.03, 1.0]}}},
+    {'effects': {'wind': {'force': [2.0, -1.0, 1.0]}}},
+], ids=['weak rotors', 'heavy', 'uneven rotors', 'wind'])
+def test_an_unknown_steady_change_leaves_no_steady_error(controller, changes):
+    target = PoseTarget(np.array([0.5, 0.0, 1.2]), rotations.from_rpy(0.6, -0.3, 0.2))
+    plant = replace(ROBOT, **changes)
+    position, angle = errors(fly(controller, target, 7.0, plant=plant), target)
+    assert position < 2e-3
+    assert angle < 0.1
+
+
+def test_servo_offsets_and_torque_are_estimated(controller):
+    target = PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL)
+    disturbance = np.r_[np.zeros(3), [0.1, -0.05, 0.03], [0.02, -0.01, 0.015, 0.0]]
+    trace = fly(controller, target, 6.0, disturbance=disturbance)
+    assert errors(trace, target) == pytest.approx((0, 0), abs=5e-2)
+    assert np.allclose(controller.disturbance[6:], disturbance[6:], atol=2e-3)
+    assert np.allclose(controller.disturbance[3:6], disturbance[3:6], atol=1e-2)
+
+
+def test_a_moving_reference_is_tracked_with_its_future(controller):
+    time = np.arange(0, 8, 0.02)
+    phase = 2 * np.pi * time / 8
+    positions = np.stack([np.sin(phase), np.zeros_like(time), 1 + 0 * time], axis=1)
+    velocities = np.stack([2 * np.pi / 8 * np.cos(phase), 0 * time, 0 * time], axis=1)
+    target = TrajectoryTarget(time, positions, np.tile(LEVEL, (len(time), 1)), velocities,
+                              np.zeros_like(positions))
+    x = hovering((0.0, 0.0, 1.0))
+    x[3] = 2 * np.pi / 8
+    trace = fly(controller, target, 6.0, x=x)
+    assert errors(trace, target)[0] < 0.02
+
+
+def test_commands_keep_the_limits_whatever_the_target(controller):
+    target = PoseTarget(np.array([50.0, 0.0, 80.0]), rotations.from_rpy(3.0, 0.2, 1.0))
+    for _, _, command in fly(controller, target, 0.5):
+        assert np.all((command.thrust >= 0) & (command.thrust <= ROBOT.rotors.thrust_max))
+        assert np.all(np.abs(command.tilt) <= ROBOT.joints.position_limit)
+
+
+def test_reset_makes_the_same_flight_again(controller):
+    target = PoseTarget(np.array([1.0, 0.0, 1.0]), rotations.from_rpy(1.0, 0, 0))
+    first = fly(controller, target, 0.5)
+    controller.reset()
+    second = fly(controller, target, 0.5)
+    assert np.array_equal(first[-1][1], second[-1][1])
+
+
+def test_without_a_compiler_it_flies_the_same(controller, monkeypatch, caplog):
+    monkeypatch.setenv('CC', 'no-such-compiler')
+    target = PoseTarget(np.array([0.5, 0.0, 1.0]), rotations.from_rpy(0.8, 0, 0))
+    interpreted = NmpcController(ROBOT, NmpcParameters.load())
+    assert not interpreted.compiled
+    assert 'no C compiler' in caplog.text
+    ours, theirs = fly(interpreted, target, 0.5)[-1][1], fly(controller, target, 0.5)[-1][1]
+    assert np.allclose(ours, theirs, atol=1e-7)
+
+
+def test_a_nan_state_repeats_the_plan_and_does_not_poison_the_next_cycles(controller):
+    target = PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL)
+    _, x, command = fly(controller, target, 0.2)[-1]
+    bad = State(0.2, np.full(3, np.nan), x[3:6], x[6:10], x[10:13], x[13:17], x[17:21], 0.2, None)
+    repeated = controller.step(bad, target)
+    assert np.allclose(repeated.thrust, command.thrust, atol=0.2)
+    assert controller.diagnostics()['rejected_states'] == 1
+    moved = PoseTarget(np.array([0.5, 0.0, 1.0]), rotations.from_rpy(0.5, 0, 0))
+    assert errors(fly(controller, moved, 5.0, start=0.21), moved) == pytest.approx((0, 0), abs=2e-2)
+
+
+def test_a_horizon_of_another_length_works_too():
+    parameters = NmpcParameters(horizon=HorizonParameters(intervals=14, interval=0.08),
+                                solver=SolverParameters(compile=False))
+    target = PoseTarget(np.array([0.5, 0.5, 1.2]), rotations.from_rpy(0.4, 0.4, 0))
+    position, angle = errors(fly(NmpcController(ROBOT, parameters), target, 4.0), target)
+    assert position < 5e-3
+    assert angle < 0.5
+
+
+def test_the_published_settings_stay_the_published_ones():
+    p = NmpcParameters.load(share_path('params/nmpc_published.yaml'))
+    assert not p.model.rotor_lag
+    assert (p.horizon.intervals * p.horizon.interval, p.limits.velocity) == (2.0, 1.0)
+    assert (p.weights.position_xy, p.weights.position_z, p.weights.tilt) == (300, 400, 2)
+    assert (p.weights.tilt_change, p.weights.thrust_command) == (250, 2)
+    assert not p.limits.soft
+    assert not p.nearest_turn

@@ -1,0 +1,110 @@
+"""Stage functions: derivatives against finite differences, the interval against fine steps."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control import ocp
+from beetle_omni_ros.control.nmpc_parameters import NmpcWeights
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+ROBOT = RobotParameters.load()
+WEIGHTS = NmpcWeights(thrust_command=0.7).vector()
+SERVO_LAG = 0.03
+
+
+def random_point(seed, size):
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=size)
+    x[6:10] = rotations.normalized(rng.normal(size=4))
+    u = np.r_[rng.uniform(-3, 3, 4), rng.uniform(2, 18, 4)]
+    reference = rng.normal(size=21)
+    reference[6:10] = rotations.normalized(rng.normal(size=4))
+    return x, u, 0.1 * rng.normal(size=10), reference
+
+
+@pytest.fixture(scope='module', params=[True, False], ids=['21 states', '17 states'])
+def problem(request):
+    return ocp.build(ROBOT, SERVO_LAG, request.param)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_jacobians_agree_with_finite_differences(problem, seed):
+    x, u, d, reference = random_point(seed, problem.state_size)
+    _, a, b, *_ = problem.stage(x, u, d, reference, WEIGHTS, 0.1)
+
+    def f(z):
+        n = problem.state_size
+        return np.array(problem.stage(z[:n], z[n:], d, reference, WEIGHTS, 0.1)[0]).ravel()
+
+    z, eps = np.r_[x, u], 1e-6
+    numeric = np.stack([(f(z + eps * e) - f(z - eps * e)) / (2 * eps)
+                        for e in np.eye(len(z))], axis=1)
+    assert np.allclose(np.hstack([np.array(a), np.array(b)]), numeric, atol=1e-7)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_cost_gradient_and_hessian_belong_to_one_quadratic_cost(problem, seed):
+    x, u, d, reference = random_point(seed, problem.state_size)
+    n = problem.state_size
+
+    def parts(z):
+        _, _, _, q_xx, r_uu, s_ux, q, r = problem.stage(z[:n], z[n:], d, reference, WEIGHTS, 0.1)
+        hessian = np.block([[np.array(q_xx), np.array(s_ux).T],
+                            [np.array(s_ux), np.array(r_uu)]])
+        return hessian, np.concatenate([np.array(q).ravel(), np.array(r).ravel()])
+
+    z = np.r_[x, u]
+    hessian, gradient = parts(z)
+    assert np.allclose(hessian, hessian.T)
+    assert np.linalg.eigvalsh(hessian).min() > -1e-9
+    # with the reference fixed the residual is linear, so the gradient is exactly affine
+    step = np.random.default_rng(9).normal(size=len(z))
+    assert np.allclose(parts(z + step)[1], gradient + hessian @ step, atol=1e-8)
+
+
+def test_the_cost_vanishes_at_the_reference_and_ignores_the_quaternion_sign():
+    problem = ocp.build(ROBOT, SERVO_LAG, True)
+    _, _, d, reference = random_point(1, 21)
+    u = np.r_[reference[13:17], reference[17:21]]
+    for sign in (1, -1):
+        x = reference.copy()
+        x[6:10] *= sign
+        *_, q, r = problem.stage(x, u, d, reference, WEIGHTS, 0.1)
+        assert np.allclose(np.array(q), 0, atol=1e-9)
+        assert np.allclose(np.array(r), 0, atol=1e-9)
+
+
+def test_one_interval_agrees_with_fine_integration_of_the_lagged_model():
+    problem = ocp.build(ROBOT, SERVO_LAG, True)
+    x, u, d, reference = random_point(4, 21)
+    x[10:13] *= 0.5
+    coarse = np.array(problem.stage(x, u, d, reference, WEIGHTS, 0.05)[0]).ravel()
+    fine = x.copy()
+    fine_step = 0.05 / 200
+    for _ in range(200):  # midpoint rule on all states, lags included
+        def rate(y):
+            a, w_dot = model.rigid_body(ROBOT, ca.DM(y[3:6]), ca.DM(y[6:10]), ca.DM(y[10:13]),
+                                        ca.DM(y[13:17]), ca.DM(y[17:21]), ca.DM(d[:3]),
+                                        ca.DM(d[3:6]))
+            return np.concatenate([
+                y[3:6], np.array(a).ravel(),
+                np.array(model.quaternion_rate(ca.DM(y[6:10]), ca.DM(y[10:13]))).ravel(),
+                np.array(w_dot).ravel(), (u[:4] + d[6:] - y[13:17]) / SERVO_LAG,
+                (u[4:] - y[17:21]) / ROBOT.rotors.time_constant])
+        fine = fine + fine_step * rate(fine + fine_step / 2 * rate(fine))
+    # lags are exact; the body sees them at three points of the interval only
+    assert np.allclose(coarse[13:], fine[13:], atol=1e-4)
+    assert np.allclose(coarse[:13], fine[:13], atol=0.02)
+
+
+def test_an_effect_of_the_robot_file_reaches_the_prediction():
+    x, u, d, reference = random_point(2, 21)
+    weaker = replace(ROBOT, effects={'thrust_coefficient': {'scale': 0.8}})
+    plain = ocp.build(ROBOT, SERVO_LAG, True).stage(x, u, d, reference, WEIGHTS, 0.1)[0]
+    changed = ocp.build(weaker, SERVO_LAG, True).stage(x, u, d, reference, WEIGHTS, 0.1)[0]
+    assert np.abs(np.array(plain) - np.array(changed)).max() > 1e-2

@@ -1,0 +1,154 @@
+"""The real-time iteration: compiled, interpreted and an independent QP solver agree."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control import compiler, ocp
+from beetle_omni_ros.control.nmpc_parameters import NmpcWeights
+from beetle_omni_ros.control.rti import BOUNDED_STATES, CompiledRti, InterpretedRti
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+ROBOT = RobotParameters.load()
+WEIGHTS = NmpcWeights().vector()
+INTERVALS = np.full(4, 0.1)
+SOFT = (10.0, 100.0)
+needs_compiler = pytest.mark.skipif(
+    not compiler.shutil.which('gcc') and not compiler.shutil.which('cc'), reason='no C compiler')
+
+
+@pytest.fixture(scope='module')
+def problem():
+    return ocp.build(ROBOT, 0.03, True)
+
+
+def setting(thrust=None):
+    x = np.zeros(21)
+    x[2], x[9], x[17:] = 1.0, 1.0, ROBOT.hover_thrust
+    references = np.tile(x, (len(INTERVALS) + 1, 1))
+    references[:, 0] = 1.5
+    references[:, 6:10] = [np.sin(0.5), 0, 0, np.cos(0.5)]
+    bounds = np.r_[np.full(4, -3.96), np.zeros(4), np.full(4, 3.96), np.full(4, 20.0), 0.2, 1.0]
+    return x, references, 0.05 * np.ones(10), bounds
+
+
+def qp_by_casadi(problem, x, u, x0, references, disturbance, bounds):
+    """The same QP, written as one dense program and solved by qpOASES-like active sets (qrqp)."""
+    n, size, nu = len(INTERVALS), problem.state_size, 8
+    opti_x = [ca.MX.sym(f'x{k}', size) for k in range(n + 1)]
+    opti_u = [ca.MX.sym(f'u{k}', nu) for k in range(n)]
+    slack = [ca.MX.sym(f's{k}', 12) for k in range(1, n + 1)]
+    cost, equal, low, high, inequality = 0, [opti_x[0] - (x0 - x[0])], [], [], []
+    for k in range(n):
+        f, a, b, q_xx, r_uu, s_ux, q, r = problem.stage(
+            x[k] if k else x0, u[k], disturbance, references[k], WEIGHTS, INTERVALS[k])
+        dx = opti_x[k] if k else ca.MX.zeros(size)
+        du = opti_u[k]
+        cost += 0.5 * dx.T @ q_xx @ dx + 0.5 * du.T @ r_uu @ du + du.T @ s_ux @ dx \
+            + q.T @ dx + r.T @ du
+        equal.append(a @ dx + b @ du + f - x[k + 1] - opti_x[k + 1])
+        inequality.append(du)
+        low.append(bounds[:nu] - u[k])
+        high.append(bounds[nu:2 * nu] - u[k])
+    hessian, gradient = problem.terminal(x[n], references[n], WEIGHTS)
+    cost += 0.5 * opti_x[n].T @ hessian @ opti_x[n] + gradient.T @ opti_x[n]
+    limit = np.repeat(bounds[2 * nu:], 3)
+    for k in range(1, n + 1):
+        s = slack[k - 1]
+        cost += SOFT[0] * ca.sum1(s) + 0.5 * SOFT[1] * ca.sumsqr(s)
+        value = opti_x[k][BOUNDED_STATES] + x[k, BOUNDED_STATES]
+        inequality += [value + s[:6], value - s[6:], s]
+        low += [-limit, np.full(6, -np.inf), np.zeros(12)]
+        high += [np.full(6, np.inf), limit, np.full(12, np.inf)]
+    variables = ca.vertcat(*opti_x, *opti_u, *slack)
+    solver = ca.qpsol('qp', 'qrqp', {'x': variables, 'f': cost,
+                                     'g': ca.vertcat(*equal, *inequality)},
+                      {'print_iter': False, 'print_header': False, 'error_on_fail': True})
+    zeros = np.zeros(sum(e.numel() for e in equal))
+    solution = solver(lbg=np.r_[zeros, np.concatenate(low)], ubg=np.r_[zeros, np.concatenate(high)])
+    values = np.array(solution['x']).ravel()
+    return values[size * (n + 1):size * (n + 1) + nu].reshape(nu) + u[0]
+
+
+def test_the_first_command_is_that_of_an_independent_qp_solver(problem):
+    x0, references, disturbance, bounds = setting()
+    rti = InterpretedRti(problem, INTERVALS, SOFT, 1e-9, 60)
+    rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
+    x, u = rti.states.copy(), rti.inputs.copy()
+    status, _ = rti.step(x0, references, disturbance, WEIGHTS, bounds)
+    assert status == 0
+    reference = qp_by_casadi(problem, x, u, x0, references, disturbance, bounds)
+    assert np.allclose(rti.inputs[0], reference, atol=1e-5)
+
+
+@needs_compiler
+def test_compiled_and_interpreted_iterations_are_the_same(problem, tmp_path, monkeypatch):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    x0, references, disturbance, bounds = setting()
+    both = [CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50),
+            InterpretedRti(problem, INTERVALS, SOFT, 1e-6, 50)]
+    results = []
+    for rti in both:
+        rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
+        trace = []
+        for k in range(12):
+            rti.shift(0.1)
+            start = x0 if k % 2 else np.r_[x0[:6], -x0[6:10], x0[10:]]
+            trace.append(rti.step(start, references, disturbance, WEIGHTS, bounds))
+        results.append((trace, rti.states.copy(), rti.inputs.copy()))
+    assert results[0][0] == results[1][0]
+    assert np.allclose(results[0][1], results[1][1], atol=1e-9)
+    assert np.allclose(results[0][2], results[1][2], atol=1e-9)
+
+
+@needs_compiler
+def test_a_compiled_solver_is_built_once_and_found_again(problem, tmp_path, monkeypatch):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50)
+    built = {p: p.stat().st_mtime_ns for p in compiler.cache_folder().iterdir()}
+    CompiledRti(problem, INTERVALS[:2], None, 1e-6, 50)
+    assert {p: p.stat().st_mtime_ns for p in compiler.cache_folder().iterdir()} == built
+    CompiledRti(ocp.build(ROBOT, 0.05, True), INTERVALS, SOFT, 1e-6, 50)
+    assert len(list(compiler.cache_folder().iterdir())) == 2
+
+
+def test_an_unsolved_qp_leaves_the_plan_as_it_was(problem):
+    x0, references, disturbance, bounds = setting()
+    rti = InterpretedRti(problem, INTERVALS, SOFT, 1e-6, 50)
+    rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
+    rti.step(x0, references, disturbance, WEIGHTS, bounds)
+    before = rti.states.copy(), rti.inputs.copy()
+    broken = references.copy()
+    broken[2, 0] = np.nan
+    status, _ = rti.step(x0, broken, disturbance, WEIGHTS, bounds)
+    assert status > 1
+    assert np.array_equal(before[0], rti.states)
+    assert np.array_equal(before[1], rti.inputs)
+
+
+def test_inputs_stay_inside_their_bounds(problem):
+    x0, references, disturbance, bounds = setting()
+    references[:, 2] = 30.0
+    rti = InterpretedRti(problem, INTERVALS, SOFT, 1e-8, 80)
+    rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
+    for _ in range(5):
+        rti.step(x0, references, disturbance, WEIGHTS, bounds)
+        assert np.all(rti.inputs <= bounds[8:16] + 1e-6)
+        assert np.all(rti.inputs >= bounds[:8] - 1e-6)
+
+
+@pytest.mark.parametrize('compilers, says', [('no-such-cc', 'no C compiler'), ('false', 'failed')])
+def test_an_unusable_compiler_is_named(problem, tmp_path, monkeypatch, compilers, says):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    monkeypatch.setenv('CC', compilers)
+    with pytest.raises(compiler.CompilerError, match=says):
+        CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50)
+
+
+@needs_compiler
+def test_an_unwritable_cache_is_named(problem, tmp_path, monkeypatch):
+    blocked = tmp_path / 'file'
+    blocked.write_text('')
+    monkeypatch.setenv('XDG_CACHE_HOME', str(blocked))
+    with pytest.raises(compiler.CompilerError, match='cannot build in'):
+        CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50)
