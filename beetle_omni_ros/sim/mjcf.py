@@ -58,9 +58,7 @@ def set_base_part(model: mujoco.MjModel, part: RigidPart) -> None:
     model.body_inertia[BASE] = moments
     mujoco.mju_mat2Quat(model.body_iquat[BASE], axes.ravel())
     model.body_sameframe[BASE] = 0      # the inertial frame is its own, whatever the compiler saw
-    armature = model.dof_armature.copy()
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    model.dof_armature[:] = armature
 
 
 def _reflect_servo_inertia(model, robot):

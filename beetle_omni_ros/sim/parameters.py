@@ -18,6 +18,7 @@ class PlantParameters:
 
     tick: float = parameter(doc='time of one simulator step', unit='s', low=0.0005, high=0.05)
     substeps: int = parameter(doc='integration steps in one tick', low=1, high=100)
+    floor_substeps: int = parameter(doc='the same while touching the floor', low=1, high=100)
     floor_friction: float = parameter(doc='sliding friction with the floor', low=0, high=5)
     contact_time_constant: float = parameter(
         doc='time in which a penetration is pushed out', unit='s', low=0.002, high=0.2)

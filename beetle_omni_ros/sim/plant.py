@@ -42,12 +42,14 @@ class Plant:
         self.model = build_model(robot, parameters, variation)
         self.data = mujoco.MjData(self.model)
         self._tick, self._substeps = parameters.tick, parameters.substeps
-        self._substep = parameters.tick / parameters.substeps
+        self._floor_substeps = min(parameters.substeps, parameters.floor_substeps)
         self._flags = int(self.model.opt.disableflags)
         self._reach = _reach(self.model)
-        # A servo can change its rate by at most this in a tick, for each rad (rad/s) of error.
-        joints = robot.joints
-        self._rate_gain = np.array([joints.kp, joints.kd]) * self._tick / joints.inertia
+        # A servo changes its rate by at most this in a tick, for each rad of error.
+        self._rate_gain = robot.joints.kp * self._tick / robot.joints.inertia
+        # Views into MuJoCo's state, taken once because each look-up costs.
+        self._qpos, self._qvel = self.data.qpos, self.data.qvel
+        self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
         self._ground_height: float | None = None
         self._wrench = np.zeros(6)
         self._payload = 0.0
@@ -81,7 +83,7 @@ class Plant:
             self._place((0.0, 0.0, self._parameters.foot_depth), (0.0, 0.0, 0.0, 1.0))
             self.model.opt.disableflags = self._flags
             settle = 100 * self._parameters.contact_time_constant
-            mujoco.mj_step(self.model, self.data, int(np.ceil(settle / self._substep)))
+            mujoco.mj_step(self.model, self.data, int(np.ceil(settle / self.model.opt.timestep)))
             self._ground_height = float(self.data.qpos[2])
         return self._ground_height
 
@@ -108,12 +110,14 @@ class Plant:
         touching = self._may_touch()
         model.opt.disableflags = self._flags if touching else self._flags | NO_CONSTRAINT
         fast = not self._may_reach_rate_limit()
+        substeps = self._floor_substeps if fast and data.ncon else self._substeps
+        model.opt.timestep = self._tick / substeps
         if fast and not self._forces.depends_on_motion:
             data.qfrc_applied[:6] = self._wrench
             data.qfrc_applied[:3] += self._forces.wind
-            mujoco.mj_step(model, data, self._substeps)
+            mujoco.mj_step(model, data, substeps)
         else:
-            for _ in range(self._substeps):
+            for _ in range(substeps):
                 if not fast:
                     self._limit_rates()
                 self._apply_forces()
@@ -124,23 +128,25 @@ class Plant:
         self._update()
 
     def _may_touch(self):
-        qpos, qvel = self.data.qpos, self.data.qvel
-        drop = self._reach + 2 * self._tick * abs(qvel[2]) + 0.01
-        travel = self._robot.joints.position_limit - 2 * self._tick * np.abs(qvel[6:])
-        return qpos[2] < drop or bool((np.abs(qpos[7:]) > travel - 0.01).any())
+        """Whether a contact or a joint stop is possible within the next tick."""
+        drop = self._reach + 2 * self._tick * abs(self._qvel[2]) + 0.01
+        if self._qpos[2] < drop:
+            return True
+        stop = self._robot.joints.position_limit - 0.01
+        return any(abs(tilt) + 2 * self._tick * abs(rate) > stop
+                   for tilt, rate in zip(self._tilt.tolist(), self._rate.tolist()))
 
     def _may_reach_rate_limit(self):
-        data = self.data
-        rate = np.abs(data.qvel[6:])
-        error = np.abs(data.ctrl[4:] - data.qpos[7:])
-        bound = rate + self._rate_gain[0] * error
-        return bool((bound > 0.9 * self._robot.joints.velocity_limit).any())
+        """Whether a servo's torque could take its joint to the rate limit within the next tick."""
+        limit, gain = 0.9 * self._robot.joints.velocity_limit, self._rate_gain
+        return any(abs(rate) + gain * abs(target - tilt) > limit for tilt, rate, target in zip(
+            self._tilt.tolist(), self._rate.tolist(), self._target.tolist()))
 
     def _limit_rates(self):
         """Cap each servo's torque at what takes its joint to the rate limit, and no further."""
         joints = self._robot.joints
-        gain = joints.inertia / self._substep
-        rate = self.data.qvel[6:]
+        gain = joints.inertia / self.model.opt.timestep
+        rate = self._rate
         limits = self.model.actuator_forcerange
         effort, rate_limit = joints.effort_limit, joints.velocity_limit
         limits[4:, 0] = np.clip(gain * (-rate_limit - rate), -effort, effort)
@@ -162,7 +168,7 @@ class Plant:
     @property
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Copies of position, quaternion wxyz, tilts (11,) and velocities (10,)."""
-        return self.data.qpos.copy(), self.data.qvel.copy()
+        return self._qpos.copy(), self._qvel.copy()
 
     @property
     def thrust(self) -> np.ndarray:
