@@ -21,14 +21,15 @@ class FlightNode(Node):
     """A node whose inputs are checked before its code sees them."""
 
     def __init__(self, name: str, parameter_class: type, file: str | None = None,
-                 on_change: Callable | None = None):
+                 file_key: str | None = None, on_change: Callable | None = None):
         """
         Claim the name, read the parameters, start diagnostics.
 
         Args:
             name: default node name.
-            parameter_class: see :func:`parameters.declare`, as for the next two.
+            parameter_class: see :func:`parameters.declare`, as for the rest.
             file: shipped parameter file.
+            file_key: parameter that names another one.
             on_change: takes a changed instance.
 
         Raises:
@@ -38,7 +39,8 @@ class FlightNode(Node):
         super().__init__(name)
         self._claim = instance.claim(self)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self.parameters = parameters.declare(self, parameter_class, file, on_change)
+        self.parameters = parameters.declare(self, parameter_class, file, file_key,
+                                             on_change)
         self.health = Health(self)
         self._twin_checks = 0
         self._twin_timer = self.create_timer(1.0, self._look_for_twin, clock=self.steady_clock)

@@ -27,7 +27,7 @@ ROS_OWN_PREFIX = 'qos_overrides.'
 UNBOUNDED = 1e300       # FloatingPointRange needs both ends
 
 
-def declare(node: Node, cls: type, file: str | None = None,
+def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,
             on_change: Callable | None = None):
     """
     Declare every leaf of the parameter dataclass ``cls`` on ``node``.
@@ -39,6 +39,7 @@ def declare(node: Node, cls: type, file: str | None = None,
         node: made with automatically_declare_parameters_from_overrides off.
         cls: a dataclass of :func:`schema.parameter` and :func:`schema.group` fields.
         file: shipped file with the values to start from, such as ``params/ekf.yaml``.
+        file_key: the parameter that names another file to start from.
         on_change: called with the new instance when parameters were set in flight; may
             raise ParameterError to refuse. Without it every parameter is read-only.
 
@@ -49,9 +50,10 @@ def declare(node: Node, cls: type, file: str | None = None,
         ParameterError: one line with the file, the key and what was expected.
 
     """
-    mapping = schema.load_yaml(share_path(file)) if file else {}
     overrides = {name: value.value for name, value in node._parameter_overrides.items()
                  if name not in ROS_OWN and not name.startswith(ROS_OWN_PREFIX)}
+    start_from = overrides.get(file_key) or (share_path(file) if file else None)
+    mapping = schema.load_yaml(start_from) if start_from else {}
     leaves = _leaves(cls)
     for name, value in overrides.items():
         _put(mapping, name, _shaped(leaves.get(name), value))

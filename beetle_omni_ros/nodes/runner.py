@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import ctypes
 import gc
+import os
+import re
 import signal
 import sys
 
@@ -13,18 +16,19 @@ from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
 from beetle_omni_ros.nodes.instance import StartError
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
 OK, FAILED, UNUSABLE = 0, 1, 2
 # The events executor of Jazzy dispatches nothing in the calls that take no timeout.
 FOREVER = 1e8
+PR_SET_PDEATHSIG = 1    # of linux/prctl.h
 
 
 def main(node_class: type, args: Sequence[str] | None = None) -> None:
     """Entry point of a node's executable."""
     argv = list(sys.argv if args is None else args)
-    rest = remove_ros_args(argv)[1:]
-    name = node_class.__module__.rsplit('.', 1)[-1]
+    name = executable(node_class)
+    rest = own_arguments(argv, name)
     if rest:
         usage = f'usage: {name} [--ros-args -p KEY:=VALUE --params-file FILE ...]'
         if rest[0] in ('-h', '--help'):
@@ -49,11 +53,12 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
 
     """
     nodes, status = [], OK
+    _end_with_parent()
     try:
         rclpy.init(args=list(argv))
         executor = make_executor()
         for node_class in node_classes:
-            name = node_class.__module__.rsplit('.', 1)[-1]
+            name = executable(node_class)
             node = node_class()
             nodes.append(node)
             executor.add_node(node)
@@ -68,12 +73,6 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
         status = _fail(name, error, UNUSABLE)
     except (StartError, OSError) as error:
         status = _fail(name, error, FAILED)
-    except rclpy.exceptions.ROSInterruptException:
-        pass
-    except Exception as error:
-        if rclpy.ok() and not _of_ros_arguments(error):
-            raise
-        status = _fail(name, error, UNUSABLE)
     finally:
         # A second signal, forwarded by a launch system, must not cut the clean-up short.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -87,18 +86,50 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
     return status
 
 
-def make_executor():
+def own_arguments(argv: Sequence[str], name: str) -> list[str]:
+    """Arguments that are not for ROS; ends the process when those for ROS are unusable."""
+    try:
+        _check_parameter_files(argv)
+        return remove_ros_args(list(argv))[1:]
+    except Exception as error:
+        # rclpy does not export the class of what it raises on bad arguments.
+        if not isinstance(error, ParameterError) and 'ROSArgs' not in type(error).__name__:
+            raise
+        sys.exit(_fail(name, error, UNUSABLE))
+
+
+def executable(node_class: type) -> str:
+    """Name of a node's executable: EkfNode -> ekf_node."""
+    return re.sub(r'(?<=[a-z])(?=[A-Z])', '_', node_class.__name__).lower()
+
+
+def make_executor(context=None):
     """Make the events executor, or the plain one on a distribution without it."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
         from rclpy.executors import SingleThreadedExecutor
-        return SingleThreadedExecutor()
-    return EventsExecutor()
+        return SingleThreadedExecutor(context=context)
+    return EventsExecutor(context=context)
 
 
-def _of_ros_arguments(error):
-    return type(error).__name__ in ('RCLInvalidROSArgsError', 'UnknownROSArgsError')
+def _end_with_parent():
+    """Let Linux stop this process when the one that started the graph dies, even by SIGKILL."""
+    parent = os.environ.get('BEETLE_OMNI_PARENT')
+    if parent and sys.platform == 'linux':
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != int(parent):     # it was gone already
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _check_parameter_files(argv):
+    """Refuse unusable files by file and line; ROS would answer with a traceback."""
+    for flag, path in zip(argv, argv[1:]):
+        if flag == '--params-file':
+            for section, content in load_yaml(path).items():
+                if not isinstance(content, dict):
+                    raise ParameterError(f"{path}: key '{section}': expected ros__parameters "
+                                         'below a node name')
 
 
 def _fail(name, error, status):

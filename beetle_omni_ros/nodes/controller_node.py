@@ -1,0 +1,98 @@
+"""A controller as a node: state and target in, its command out; the same for each controller."""
+
+from __future__ import annotations
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from trajectory_msgs.msg import MultiDOFJointTrajectory
+
+from beetle_omni_ros.control.base import Controller, PoseTarget
+from beetle_omni_ros.nodes import convert, health, qos
+from beetle_omni_ros.nodes.node import FlightNode
+
+ODOM_AGE = 0.05         # s, an older estimate is not worth a command
+JOINT_AGE = 0.1         # s
+# A step is due when the stamps say so, within half of the smallest estimate interval.
+STEP_TOLERANCE = 0.0025
+
+
+class ControllerNode(FlightNode):
+    """
+    Steps a controller once a period, triggered by the estimate.
+
+    Before the first target it holds the pose at which it took over; while another is in
+    charge it follows along, so that it can take over without a jump.
+    """
+
+    def __init__(self, controller_name: str, parameter_class: type, file: str, file_key: str):
+        """
+        Subscribe the controller's inputs.
+
+        Args:
+            controller_name: 'nmpc' or 'rl'; commands go to '<controller_name>/command'.
+            parameter_class: of the node; ``self.make_controller(parameters)`` builds from it.
+            file: shipped parameter file of the controller.
+            file_key: parameter that names another one.
+
+        """
+        super().__init__(f'{controller_name}_node', parameter_class, file, file_key)
+        self._controller: Controller = self.make_controller(self.parameters)
+        self._target = self._joints = self._command = None
+        self._hold = None
+        self._mode = ''
+        self._last_step = 0.0
+        self._publisher = self.create_publisher(JointState, f'{controller_name}/command',
+                                                qos.COMMAND)
+        self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.ESTIMATE,
+                    max_age=ODOM_AGE)
+        self.listen(JointState, 'joint_states', convert.joints, self._on_joints,
+                    max_age=JOINT_AGE)
+        self.listen(JointState, 'command', convert.command, self._on_command, qos.COMMAND,
+                    stale_after=None)
+        # Latched by those who follow INTERFACES, volatile from a quick tool: both are heard.
+        for profile in (qos.LATCHED, qos.EVENT):
+            self.listen(PoseStamped, 'target_pose', convert.pose_target, self._on_target,
+                        profile, stale_after=None)
+            self.listen(MultiDOFJointTrajectory, 'target_trajectory', convert.trajectory_target,
+                        self._on_target, profile, stale_after=None)
+        self.create_subscription(String, 'supervisor/state', self._on_mode, qos.LATCHED)
+        self.health.track_compute(self._controller.period)
+        self.health.report('controller', self._controller_status)
+
+    def make_controller(self, parameters) -> Controller:
+        """Build the controller; each node says how."""
+        raise NotImplementedError
+
+    def _on_joints(self, joints):
+        self._joints = joints
+
+    def _on_command(self, command):
+        self._command = command
+
+    def _on_target(self, target):
+        # Targets may arrive out of order (latched and volatile copies): the newest stamp counts.
+        if self._target is None or target.stamp >= self._target.stamp:
+            self._target = target
+
+    def _on_mode(self, message):
+        if message.data in ('disarmed', 'emergency_stop') and self._mode != message.data:
+            self._controller.reset()
+            self._command = self._hold = None
+        self._mode = message.data
+
+    def _on_odom(self, odom):
+        due = odom.stamp - self._last_step
+        if self._joints is None or 0 <= due < self._controller.period - STEP_TOLERANCE:
+            return
+        self._last_step = odom.stamp
+        state = convert.state(odom, self._joints, self._command)
+        if self._target is None:
+            if self._hold is None or not self._mode.startswith('flying'):
+                self._hold = PoseTarget(odom.position, odom.quaternion, odom.stamp)
+        command = self.timed(self._controller.step, state, self._target or self._hold)
+        self._publisher.publish(convert.command_message(command))
+
+    def _controller_status(self):
+        return health.OK, self._controller.name, dict(self._controller.diagnostics())

@@ -1,0 +1,92 @@
+"""The state estimator as a node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+from sensor_msgs.msg import Imu
+
+from beetle_omni_ros.estimation.ekf import ErrorStateEkf
+from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.estimation.samples import ATTITUDE, GYROSCOPE_BIAS, POSITION, VELOCITY
+from beetle_omni_ros.nodes import convert, health, qos, runner
+from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import parameter
+
+SENSOR_AGE = 0.2        # s, older samples come from a stuck driver or another clock
+
+
+@dataclass(frozen=True, kw_only=True)
+class EkfNodeParameters(EkfParameters):
+    """Parameters of ekf_node: the estimator's own and the robot."""
+
+    robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
+    ekf_file: str = parameter(
+        '', doc='estimator file to start from; empty: the shipped params/ekf.yaml',
+        read_only=True)
+
+
+class EkfNode(FlightNode):
+    """Publishes odom for every IMU sample, corrected by MoCap poses at their capture time."""
+
+    def __init__(self):
+        """Wait for the first poses."""
+        super().__init__('ekf_node', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')
+        robot = RobotParameters.load(self.parameters.robot_file or None)
+        self._ekf = ErrorStateEkf(self.parameters, robot.gravity)
+        self._status = self._ekf.status
+        self._rate_variance = self.parameters.imu.gyroscope_noise ** 2
+        self._publisher = self.create_publisher(Odometry, 'odom', qos.ESTIMATE)
+        self.listen(Imu, 'imu/data_raw', convert.imu_sample, self._on_imu, max_age=SENSOR_AGE)
+        self.listen(PoseStamped, 'mocap/pose', convert.pose_sample, self._on_pose,
+                    max_age=SENSOR_AGE)
+        self.health.track_compute(1 / self.parameters.imu.rate)
+        self.health.report('estimator', self._estimator_status)
+
+    def _on_pose(self, sample):
+        self.timed(self._ekf.pose, sample)
+
+    def _on_imu(self, sample):
+        accepted = self.timed(self._ekf.imu, sample)
+        status = self._ekf.status
+        if status != self._status:
+            self.get_logger().info(f'{self._status} -> {status}')
+            self._status = status
+        # A lost or empty estimate is no estimate: silence tells every reader, in time.
+        if accepted and status in ('tracking', 'dead_reckoning'):
+            self._publish(self._ekf.estimate)
+
+    def _publish(self, estimate):
+        body_to_world = rotations.matrix(estimate.quaternion)
+        twist = np.zeros((6, 6))
+        covariance = estimate.covariance
+        # ROS states rotation errors about fixed axes, the filter about body axes.
+        turn = np.eye(6)
+        turn[3:, 3:] = body_to_world
+        both = np.r_[POSITION, ATTITUDE]
+        pose = turn @ covariance[np.ix_(both, both)] @ turn.T
+        twist[:3, :3] = body_to_world.T @ covariance[VELOCITY, VELOCITY] @ body_to_world
+        twist[3:, 3:] = covariance[GYROSCOPE_BIAS, GYROSCOPE_BIAS] \
+            + self._rate_variance * np.eye(3)
+        self._publisher.publish(convert.odometry_message(
+            estimate.stamp, estimate.position, estimate.velocity, estimate.quaternion,
+            estimate.angular_velocity, pose, twist))
+
+    def _estimator_status(self):
+        level = {'tracking': health.OK, 'dead_reckoning': health.WARN, 'lost': health.ERROR}
+        values = {f'rejected: {reason}': count for reason, count in self._ekf.rejected.items()}
+        return level.get(self._status, health.OK), self._status, values
+
+
+def main(args=None):
+    """Run the node."""
+    runner.main(EkfNode, args)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,131 @@
+"""The nodes of one flight as processes of this computer: start, watch, measure, stop."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import yaml
+
+import beetle_omni_ros
+
+COMPOSED = 'composed'
+STOP_TIMEOUT = 8.0      # s for a process to stop by itself before it is killed
+
+
+class Graph:
+    """
+    Processes that run nodes.
+
+    Args:
+        parameters: node name -> parameters that differ from the shipped ones.
+        folder: for the parameter file and what the processes print; must exist.
+        domain: ROS domain.
+        composed: one process for all, or one for each.
+
+    """
+
+    def __init__(self, parameters: dict[str, dict], folder: Path, domain: int,
+                 composed: bool = True):
+        """Prepare; :meth:`start` starts."""
+        self.folder, self.domain = Path(folder), domain
+        self.nodes = list(parameters)
+        self._file = self.folder / 'parameters.yaml'
+        self._file.write_text(yaml.safe_dump(
+            {f'/**/{node}': {'ros__parameters': values}
+             for node, values in parameters.items() if values}) if any(parameters.values())
+            else '/**: {ros__parameters: {}}\n')
+        self._commands = {COMPOSED: [COMPOSED, *self.nodes]} if composed \
+            else {node: [node] for node in self.nodes}
+        self.processes: dict[str, subprocess.Popen] = {}
+
+    def start(self) -> None:
+        """Start every process; each ends with this one, however this one ends."""
+        for name in self._commands:
+            self.start_process(name)
+
+    def start_process(self, name: str) -> subprocess.Popen:
+        """Start one process, also again after it died."""
+        root = str(Path(beetle_omni_ros.__file__).resolve().parents[1])
+        environment = dict(
+            os.environ, ROS_DOMAIN_ID=str(self.domain), BEETLE_OMNI_PARENT=str(os.getpid()),
+            PYTHONPATH=os.pathsep.join(filter(None, [root, os.environ.get('PYTHONPATH')])))
+        environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        module, *arguments = self._commands[name]
+        with open(self.log(name), 'a') as log:
+            self.processes[name] = subprocess.Popen(
+                [sys.executable, '-m', f'{__package__}.{module}', *arguments, '--ros-args',
+                 '--params-file', str(self._file)],
+                env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                start_new_session=True)     # Ctrl-C is for the one that stops all in order
+        return self.processes[name]
+
+    def log(self, name: str) -> Path:
+        """File with what the process printed."""
+        return self.folder / f'{name}.log'
+
+    def dead(self) -> dict[str, str]:
+        """Name -> how it ended, of each process that runs no more."""
+        return {name: _ending(process.returncode, self.log(name))
+                for name, process in self.processes.items() if process.poll() is not None}
+
+    def cpu_seconds(self) -> float:
+        """CPU time that the living processes have used."""
+        return sum(_cpu_seconds(p.pid) for p in self.processes.values() if p.poll() is None)
+
+    def kill(self, name: str) -> None:
+        """End one process as a crash would."""
+        self.processes[name].send_signal(signal.SIGKILL)
+        self.processes[name].wait()
+
+    def stop(self) -> list[str]:
+        """
+        Stop everything, the recorder last so that the bag has the end.
+
+        Returns:
+            Names of the processes that had to be killed.
+
+        """
+        stubborn = []
+        last = [name for name in self.processes if name == 'recorder_node']
+        for group in ([n for n in self.processes if n not in last], last):
+            for name in group:
+                if self.processes[name].poll() is None:
+                    self.processes[name].send_signal(signal.SIGINT)
+            deadline = time.monotonic() + STOP_TIMEOUT
+            for name in group:
+                try:
+                    self.processes[name].wait(max(0.0, deadline - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    stubborn.append(name)
+                    self.kill(name)
+        return stubborn
+
+    def warnings(self) -> list[str]:
+        """Lines that the processes logged as warning or error, once each."""
+        lines = {}
+        for name in self.processes:
+            for line in self.log(name).read_text(errors='replace').splitlines():
+                if '[WARN]' in line or '[ERROR]' in line or ': error: ' in line:
+                    lines[line.split(']: ', 1)[-1]] = line
+        return list(lines.values())
+
+
+def _ending(code: int, log: Path) -> str:
+    if code < 0:
+        return f'ended by {signal.Signals(-code).name}'
+    lines = log.read_text(errors='replace').strip().splitlines()
+    return f"exit status {code}{': ' + lines[-1] if lines else ''}"
+
+
+def _cpu_seconds(pid: int) -> float:
+    """User and system time from /proc; 0 where that does not exist."""
+    try:
+        fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')

@@ -1,0 +1,110 @@
+"""The operator's side of a flight: arm, land, and see how it goes."""
+
+from __future__ import annotations
+
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from beetle_omni_ros.nodes import qos, runner
+
+SERVICES = ('arm', 'disarm', 'land', 'emergency_stop')
+
+
+class Operator:
+    """
+    A small node with a context of its own, spun only while it is asked something.
+
+    Attributes:
+        state: the supervisor's state, '' before it is known.
+        progress: the reference's progress, '' before it is known.
+        commands: messages of the watched controller so far.
+        diagnostics: status name -> newest DiagnosticStatus.
+
+    """
+
+    def __init__(self, domain: int, controller: str = 'nmpc'):
+        """Join ``domain`` and watch the flight of ``controller``."""
+        self._context = rclpy.Context()
+        rclpy.init(args=[], context=self._context, domain_id=domain,
+                   signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node('operator', context=self._context)
+        self._executor = runner.make_executor(self._context)
+        self._executor.add_node(self._node)
+        self.state = self.progress = ''
+        self.states: list[str] = []
+        self.commands = 0
+        self.diagnostics: dict[str, DiagnosticStatus] = {}
+        node = self._node
+        node.create_subscription(String, 'supervisor/state', self._on_state, qos.LATCHED)
+        node.create_subscription(String, 'reference/state', self._on_progress, qos.LATCHED)
+        node.create_subscription(JointState, f'{controller}/command', self._on_command,
+                                 qos.SENSOR, raw=True)
+        node.create_subscription(DiagnosticArray, 'diagnostics', self._on_diagnostics, qos.EVENT)
+        self._diagnostics = node.create_publisher(DiagnosticArray, 'diagnostics', qos.EVENT)
+        self._clients = {name: node.create_client(Trigger, f'supervisor_node/{name}')
+                         for name in SERVICES}
+
+    def _on_state(self, message):
+        self.state = message.data
+        self.states.append(message.data)
+
+    def _on_progress(self, message):
+        self.progress = message.data
+
+    def _on_command(self, _):
+        self.commands += 1
+
+    def _on_diagnostics(self, message):
+        for status in message.status:
+            self.diagnostics[status.name] = status
+
+    @property
+    def ready(self) -> bool:
+        """Whether the supervisor can be called and the controller commands."""
+        return self.commands > 0 and self._clients['arm'].service_is_ready()
+
+    def spin(self, seconds: float) -> None:
+        """Take in messages for so long."""
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def wait(self, condition, timeout: float) -> bool:
+        """Take in messages until ``condition()`` or ``timeout`` [s]; whether it came true."""
+        deadline = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            self.spin(0.05)
+        return True
+
+    def call(self, name: str, timeout: float = 2.0) -> tuple[bool, str]:
+        """Call a service of the supervisor: (accepted, its answer)."""
+        future = self._clients[name].call_async(Trigger.Request())
+        if not self.wait(future.done, timeout):
+            return False, f'supervisor_node does not answer to {name}'
+        return future.result().success, future.result().message
+
+    def values(self, status: str) -> dict[str, str]:
+        """Values of a diagnostic status by key; empty when it never came."""
+        found = self.diagnostics.get(status)
+        return {pair.key: pair.value for pair in found.values} if found else {}
+
+    def report(self, name: str, text: str, values: dict[str, float]) -> None:
+        """Put a status of the operator's own into ``diagnostics``, and so into the bag."""
+        message = DiagnosticArray(status=[DiagnosticStatus(
+            level=DiagnosticStatus.OK, name=name, message=text, hardware_id='beetle_omni',
+            values=[KeyValue(key=k, value=f'{v:.6g}') for k, v in values.items()])])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._node.destroy_node()
+        self._context.try_shutdown()

@@ -1,0 +1,140 @@
+"""Flies a task: publishes its targets, disturbances and payloads in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from std_msgs.msg import String
+from trajectory_msgs.msg import MultiDOFJointTrajectory
+
+from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
+from beetle_omni_ros.nodes import convert, health, qos, runner
+from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.runs.tasks import make_task, TaskPlayer
+
+PERIOD = 0.02           # s between looks at the task
+IMPULSE_PERIOD = 0.005  # s, the same for tasks with impulses of some 50 ms
+# A trajectory goes out in overlapping windows: one long message would take every reader
+# tenths of a second to unpack, and who joins late hears the next window soon.
+WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 4.0, 2.0, 0.05   # s
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceNodeParameters:
+    """Parameters of reference_node."""
+
+    task: str = parameter('hover', doc='name of a task, or a CSV file of poses', read_only=True)
+    seed: int = parameter(0, doc='of random poses', low=0, high=2**31 - 1, read_only=True)
+
+
+class ReferenceNode(FlightNode):
+    """
+    Plays the task from the moment in which the supervisor reports flying.
+
+    ``reference/state`` (latched) says 'waiting', 'flying 3/15', 'done',
+    'done: control lost at level 60', or 'aborted' when the flight ended before the task.
+    """
+
+    def __init__(self):
+        """Read the task; wait for take-off."""
+        super().__init__('reference_node', ReferenceNodeParameters)
+        self._task = make_task(self.parameters.task, self.parameters.seed)
+        self._player = self._odom = self._trajectory = None
+        self._window_end = 0.0
+        self._state = ''
+        self._poses = self.create_publisher(PoseStamped, 'target_pose', qos.LATCHED)
+        self._trajectories = self.create_publisher(MultiDOFJointTrajectory, 'target_trajectory',
+                                                   qos.EVENT)
+        self._wrenches = self.create_publisher(WrenchStamped, 'disturbance', qos.EVENT)
+        self._states = self.create_publisher(String, 'reference/state', qos.LATCHED)
+        self._payload = self.create_client(SetParameters, 'sim_node/set_parameters')
+        self._set_state('waiting')
+        self.create_subscription(String, 'supervisor/state', self._on_supervisor, qos.LATCHED)
+        disturbed = self._task.kind in ('force', 'torque')
+        if disturbed:       # the loss of control ends these tasks
+            self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.SENSOR)
+        self.health.report('task', lambda: (health.OK, self._state, {'task': self._task.name}))
+        self.create_timer(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer,
+                          clock=self.steady_clock)
+
+    def _set_state(self, state):
+        if state != self._state:
+            self._state = state
+            self._states.publish(String(data=state))
+
+    def _on_odom(self, odom):
+        self._odom = odom
+
+    def _on_supervisor(self, message):
+        if self._state == 'waiting' and message.data.startswith('flying'):
+            self._player = TaskPlayer(self._task, self.now())
+            self.get_logger().info(f"task '{self._task.name}', {self._task.ends[-1]:g} s")
+        elif self._player and message.data in ('landing', 'disarmed', 'emergency_stop'):
+            self._player = None
+            self._set_state('aborted')
+
+    def _on_timer(self):
+        if self._player is None:
+            return
+        now = self.now()
+        moment = self._player.update(now, *((self._odom.position, self._odom.quaternion)
+                                            if self._odom else ()))
+        if moment.target is not None:
+            self._start_target(moment.target)
+        if self._trajectory is not None and now > self._window_end - WINDOW_PERIOD:
+            self._publish_window(now)
+        if moment.changed:
+            self._disturb(now, moment)
+        if moment.finished:
+            lost = f': control lost at level {self._player.lost_level:g}' if moment.lost else ''
+            self._player = self._trajectory = None
+            self._set_state(f'done{lost}')
+        else:
+            current = 1 + int(np.searchsorted(self._task.ends, now - self._player.start, 'right'))
+            self._set_state(f'flying {min(current, len(self._task.ends))}/{len(self._task.ends)}')
+
+    def _start_target(self, target):
+        self._trajectory = None
+        if isinstance(target, PoseTarget):
+            self._poses.publish(convert.target_message(target))
+        else:
+            self._trajectory, self._window_end = target, target.times[0]
+
+    def _publish_window(self, now):
+        path = self._trajectory
+        first = self._window_end == path.times[0]
+        start = min(path.times[0] if first else now, path.times[-1] - WINDOW_SAMPLE)
+        end = min(start + WINDOW, path.times[-1])
+        times = np.linspace(start, end, max(2, round((end - start) / WINDOW_SAMPLE) + 1))
+        samples = [path.at(float(time)) for time in times]
+        window = TrajectoryTarget(times, *(
+            np.array([getattr(sample, name) for sample in samples])
+            for name in ('position', 'quaternion', 'velocity', 'angular_velocity')),
+            stamp=float(times[0]))
+        self._trajectories.publish(convert.target_message(window))
+        self._window_end = end if end < path.times[-1] else float('inf')
+
+    def _disturb(self, now, moment):
+        if self._task.kind in ('force', 'torque'):
+            self._wrenches.publish(convert.wrench_message(now, moment.force_world,
+                                                          moment.torque_body))
+        if self._task.kind == 'payload':
+            value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE,
+                                   double_value=float(moment.payload))
+            request = SetParameters.Request(parameters=[Parameter(name='payload', value=value)])
+            self._payload.call_async(request)
+
+
+def main(args=None):
+    """Run the node."""
+    runner.main(ReferenceNode, args)
+
+
+if __name__ == '__main__':
+    main()

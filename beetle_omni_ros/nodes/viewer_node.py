@@ -1,0 +1,132 @@
+"""What RViz and Foxglove need: the robot's description, its frame, and drawn forces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from geometry_msgs.msg import Point, PoseStamped, TransformStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+from sensor_msgs.msg import JointState
+from std_msgs.msg import ColorRGBA, String
+from visualization_msgs.msg import Marker, MarkerArray
+
+from beetle_omni_ros.nodes import convert, qos, runner
+from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import parameter, ParameterError
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:         # not on every installation; the markers need no transform
+    TFMessage = None
+
+BODY_COLOUR, THRUST_COLOUR, TARGET_COLOUR = (0.3, 0.3, 0.35), (0.9, 0.5, 0.1), (0.2, 0.7, 0.3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewerNodeParameters:
+    """Parameters of viewer_node."""
+
+    robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
+    urdf_file: str = parameter('', doc='robot description; empty: the shipped one',
+                               read_only=True)
+    rate: float = parameter(20.0, doc='of the markers', unit='Hz', low=0.5, high=100,
+                            read_only=True)
+    newton_per_metre: float = parameter(40.0, doc='thrust that is drawn as one metre',
+                                        unit='N/m', low=1, high=1000)
+
+
+class ViewerNode(FlightNode):
+    """Publishes robot_description (latched), tf and markers; reads, never commands."""
+
+    def __init__(self):
+        """Publish the description at once, the rest as it comes."""
+        super().__init__('viewer_node', ViewerNodeParameters, on_change=self._changed)
+        given = self.parameters
+        self._robot = RobotParameters.load(given.robot_file or None)
+        self._description = self.create_publisher(String, 'robot_description', qos.LATCHED)
+        self._description.publish(String(data=_text(given.urdf_file)))
+        self._transforms = self.create_publisher(TFMessage, '/tf', qos.EVENT) if TFMessage \
+            else None
+        self._markers = self.create_publisher(MarkerArray, 'markers', qos.EVENT)
+        self._odom = self._joints = self._command = self._target = None
+        self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.SENSOR)
+        self.listen(JointState, 'joint_states', convert.joints, self._keep('_joints'))
+        self.listen(JointState, 'command', convert.command, self._keep('_command'), qos.SENSOR,
+                    stale_after=None)
+        self.listen(PoseStamped, 'target_pose', convert.pose_target, self._keep('_target'),
+                    qos.LATCHED, stale_after=None)
+        self.create_timer(1 / given.rate, self._draw, clock=self.steady_clock)
+
+    def _changed(self, new):
+        self.parameters = new
+
+    def _keep(self, name):
+        return lambda value: setattr(self, name, value)
+
+    def _on_odom(self, odom):
+        self._odom = odom
+        if self._transforms is None:
+            return
+        transform = TransformStamped(child_frame_id=convert.BODY)
+        transform.header.stamp = convert.time_message(odom.stamp)
+        transform.header.frame_id = convert.WORLD
+        transform.transform.translation = convert.vector(odom.position)
+        transform.transform.rotation = convert.quaternion(odom.quaternion)
+        self._transforms.publish(TFMessage(transforms=[transform]))
+
+    def _draw(self):
+        if self._odom is None:
+            return
+        odom, markers = self._odom, MarkerArray()
+        to_world = rotations.matrix(odom.quaternion)
+        centres = odom.position + self._robot.rotors.positions @ to_world.T
+        lines = [point for centre in centres for point in (odom.position, centre)]
+        markers.markers.append(self._marker('body', Marker.LINE_LIST, lines, 0.02, BODY_COLOUR))
+        if self._joints is not None and self._command is not None:
+            thrust = self._command.thrust / self.parameters.newton_per_metre
+            for k, axis in enumerate(self._robot.tilt_axes):
+                tilt = rotations.matrix(rotations.exp(axis * self._joints.position[k]))
+                tip = centres[k] + thrust[k] * to_world @ tilt[:, 2]
+                markers.markers.append(self._marker(
+                    f'rotor{k + 1}', Marker.ARROW, [centres[k], tip], 0.03, THRUST_COLOUR))
+        if self._target is not None:
+            axes = rotations.matrix(self._target.quaternion)
+            ends = [end for axis in axes.T
+                    for end in (self._target.position, self._target.position + 0.3 * axis)]
+            markers.markers.append(
+                self._marker('target', Marker.LINE_LIST, ends, 0.01, TARGET_COLOUR))
+        self._markers.publish(markers)
+
+    def _marker(self, name, kind, points, width, colour):
+        marker = Marker(ns=name, type=kind, action=Marker.ADD)
+        marker.header.frame_id = convert.WORLD
+        marker.header.stamp = convert.time_message(self._odom.stamp)
+        marker.scale.x = width
+        marker.scale.y = marker.scale.z = 2 * width
+        marker.pose.orientation.w = 1.0
+        marker.color = ColorRGBA(r=colour[0], g=colour[1], b=colour[2], a=1.0)
+        marker.points = [Point(x=float(p[0]), y=float(p[1]), z=float(p[2]))
+                         for p in np.asarray(points)]
+        return marker
+
+
+def _text(path):
+    path = path or share_path('description/beetle_omni.urdf')
+    try:
+        with open(path) as file:
+            return file.read()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterError(f"key 'urdf_file': {path} cannot be read ({error})") from None
+
+
+def main(args=None):
+    """Run the node."""
+    runner.main(ViewerNode, args)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,103 @@
+"""
+Start the flight stack: ``ros2 launch beetle_omni_ros bringup.launch.py``.
+
+The robot stays on the ground until ``supervisor_node/arm`` is called.
+"""
+
+import shutil
+import subprocess
+import sys
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+PACKAGE = 'beetle_omni_ros'
+ARGUMENTS = {
+    # name: (default, choices or None, description)
+    'backend': ('sim', ['sim', 'none'],
+                'who provides sensors and actuators: the simulator, or nodes started elsewhere'),
+    'controller': ('nmpc', ['nmpc'], 'the active controller'),
+    'task': ('', None, 'task for reference_node; empty: targets come from elsewhere'),
+    'record': ('', None, 'folder for a bag; empty: no recording'),
+    'namespace': ('', None, 'namespace of every node and topic'),
+    'composed': ('true', ['true', 'false'], 'all nodes in one process'),
+    'viewer': ('false', ['true', 'false'], 'description, tf and markers for RViz and Foxglove'),
+    'robot_file': ('', None, 'robot file that estimator and controller believe'),
+    'plant_file': ('', None, 'robot file that is true in the simulation'),
+    'conditions': ('nominal', ['nominal', 'published'], 'of the simulation'),
+    'seed': ('0', None, 'of simulation and task'),
+}
+
+
+def has_ros2_bag():
+    """Whether ``ros2 bag record`` can be called here."""
+    if not shutil.which('ros2'):
+        return False
+    return subprocess.run(['ros2', 'bag', 'record', '--help'], capture_output=True,
+                          check=False).returncode == 0
+
+
+def node_parameters(given):
+    """Node name -> parameters, for the nodes that the arguments ask for."""
+    robot = {'robot_file': given['robot_file']} if given['robot_file'] else {}
+    seed = int(given['seed'])
+    nodes = {}
+    if given['backend'] == 'sim':
+        nodes['sim_node'] = {'conditions': given['conditions'], 'seed': seed}
+        if given['plant_file'] or given['robot_file']:
+            nodes['sim_node']['robot_file'] = given['plant_file'] or given['robot_file']
+    nodes['ekf_node'] = robot
+    nodes[f"{given['controller']}_node"] = robot
+    nodes['supervisor_node'] = {**robot, 'controller': given['controller']}
+    if given['task']:
+        nodes['reference_node'] = {'task': given['task'], 'seed': seed}
+    if given['viewer'] == 'true':
+        nodes['viewer_node'] = robot
+    return nodes
+
+
+def recorded_topics(namespace):
+    """Absolute names of the topics of INTERFACES."""
+    from beetle_omni_ros.nodes.topics import TOPICS
+    prefix = f"/{namespace.strip('/')}/" if namespace.strip('/') else '/'
+    return [prefix + topic for topic in TOPICS]
+
+
+def actions(context):
+    """Turn the arguments into processes."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    nodes = node_parameters(given)
+    processes = []
+    if given['record']:
+        if has_ros2_bag():
+            processes.append(ExecuteProcess(
+                cmd=['ros2', 'bag', 'record', '-s', 'mcap', '-o', given['record'],
+                     *recorded_topics(given['namespace'])], output='screen'))
+        else:
+            nodes['recorder_node'] = {'bag': given['record']}
+    if given['composed'] == 'true':
+        overrides = [argument for node, values in nodes.items() for key, value in values.items()
+                     for argument in ('-p', f'{node}:{key}:={value}')]
+        namespace = given['namespace'].strip('/')
+        if namespace:
+            overrides += ['-r', f'__ns:=/{namespace}']
+        processes.append(ExecuteProcess(
+            cmd=[sys.executable, '-m', f'{PACKAGE}.nodes.composed', *nodes, '--ros-args',
+                 *overrides], output='screen'))
+    else:
+        processes += [Node(package=PACKAGE, executable=name, name=name, parameters=[values],
+                           namespace=given['namespace'], output='screen')
+                      for name, values in nodes.items()]
+    return processes
+
+
+def generate_launch_description():
+    """Declare the arguments; the rest follows from them."""
+    declared = []
+    for name, (default, choices, description) in ARGUMENTS.items():
+        options = {'choices': choices} if choices else {}
+        declared.append(DeclareLaunchArgument(name, default_value=default,
+                                              description=description, **options))
+    return LaunchDescription([*declared, OpaqueFunction(function=actions)])

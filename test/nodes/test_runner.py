@@ -1,0 +1,126 @@
+"""Processes: one-line refusals, one instance, clean ends, quiet waiting."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+MODULE = 'beetle_omni_ros.nodes'
+
+
+def start(node, *arguments, **popen):
+    """Start a node's process with its output in a pipe."""
+    return subprocess.Popen([sys.executable, '-m', f'{MODULE}.{node}', *arguments],
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **popen)
+
+
+def finish(process, timeout=20):
+    """Wait for the end: (exit status, what it printed on standard error)."""
+    try:
+        _, error = process.communicate(timeout=timeout)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        raise
+    return process.returncode, error
+
+
+def wait_until_it_spins(process):
+    """The runner ignores no signal before that; a node is up when it holds its lock."""
+    from beetle_omni_ros.nodes.operator import Operator
+    operator = Operator(int(os.environ['ROS_DOMAIN_ID']))
+    try:
+        assert operator.wait(lambda: operator.diagnostics, 15), 'no diagnostics'
+    finally:
+        operator.close()
+    assert process.poll() is None
+
+
+@pytest.mark.parametrize('node, arguments, named', [
+    ('ekf_node', ['-p', 'imu.rat:=100.0'], "'imu.rat': unknown key; did you mean 'rate'"),
+    ('ekf_node', ['-p', 'imu.rate:=1e9'], "'imu.rate': 1e+09 is outside 20 to 4000 Hz"),
+    ('sim_node', ['-p', 'conditions:=stormy'], "'conditions': expected one of nominal"),
+    ('ekf_node', ['--params-file', '/nowhere.yaml'], '/nowhere.yaml: cannot be read'),
+    ('ekf_node', ['-p', 'imu.rate'], 'imu.rate'),
+    ('reference_node', ['-p', 'task:=somersault'], "task 'somersault': expected"),
+    ('ekf_node', ['-p', 'robot_file:=/nowhere.yaml'], '/nowhere.yaml: cannot be read'),
+])
+def test_unusable_parameters_end_in_one_line_and_status_2(ros_domain, node, arguments, named):
+    status, error = finish(start(node, '--ros-args', *arguments))
+    assert status == 2
+    assert len(error.strip().splitlines()) == 1, error
+    assert error.startswith(f'{node}: error: ') and named in error
+
+
+def test_a_broken_parameter_file_is_refused_with_its_line(ros_domain, tmp_path):
+    file = tmp_path / 'broken.yaml'
+    file.write_text('/**/ekf_node:\n  ros__parameters:\n    imu: {rate: [}\n')
+    status, error = finish(start('ekf_node', '--ros-args', '--params-file', str(file)))
+    assert status == 2 and 'line 3' in error and len(error.strip().splitlines()) == 1
+
+
+def test_an_unknown_argument_is_refused_and_help_is_given(ros_domain):
+    status, error = finish(start('ekf_node', 'imu.rate=100'))
+    assert status == 2 and "unknown argument 'imu.rate=100'" in error
+    status, error = finish(start('ekf_node', '--help'))
+    assert status == 0 and not error
+    status, error = finish(start('composed', 'sim_node', 'ekv_node'))
+    assert status == 2 and "unknown node 'ekv_node'" in error
+
+
+def test_a_node_waits_quietly_is_alone_and_ends_cleanly(ros_domain):
+    first = start('ekf_node')
+    try:
+        wait_until_it_spins(first)
+        status, error = finish(start('ekf_node'))
+        assert status == 1
+        assert len(error.strip().splitlines()) == 1
+        assert '/ekf_node runs already' in error and str(first.pid) in error
+        first.send_signal(signal.SIGINT)
+        first.send_signal(signal.SIGINT)     # as a launch system does
+        status, error = finish(first)
+        assert status == 0 and not error
+    finally:
+        first.kill()
+        first.communicate()
+
+
+def test_sigterm_ends_a_node_cleanly(ros_domain):
+    process = start('composed', 'ekf_node', 'reference_node')
+    try:
+        wait_until_it_spins(process)
+        process.send_signal(signal.SIGTERM)
+        status, error = finish(process)
+        assert status == 0 and 'Traceback' not in error
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_node_ends_with_the_process_that_started_its_graph(ros_domain):
+    script = ('import os, subprocess, sys, time\n'
+              'os.environ["BEETLE_OMNI_PARENT"] = str(os.getpid())\n'
+              f'child = subprocess.Popen([sys.executable, "-m", "{MODULE}.ekf_node"])\n'
+              'print(child.pid, flush=True)\n'
+              'time.sleep(60)\n')
+    parent = subprocess.Popen([sys.executable, '-c', script], stdout=subprocess.PIPE, text=True)
+    child = int(parent.stdout.readline())
+    wait_until_it_spins(parent)
+    parent.kill()
+    parent.communicate()
+    deadline = time.monotonic() + 10
+    while running(child):
+        assert time.monotonic() < deadline, 'the node outlived its starter'
+        time.sleep(0.05)
+
+
+def running(pid):
+    """Whether the process exists and is no zombie."""
+    try:
+        with open(f'/proc/{pid}/stat') as file:
+            return file.read().rsplit(')', 1)[1].split()[0] != 'Z'
+    except OSError:
+        return False
