@@ -1,0 +1,214 @@
+"""Reading rosbag2 MCAP bags without ROS, also those that a crash cut off."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.exceptions import InvalidMagic
+from mcap.reader import NonSeekingReader
+import yaml
+
+from beetle_omni_ros.runs import messages
+from beetle_omni_ros.runs.log import FlightLog, LogRecorder
+from beetle_omni_ros.runs.topics import split_topic, TOPICS
+
+META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
+
+
+class BagError(ValueError):
+    """A bag cannot be written or read; the text names the folder or file."""
+
+
+class RawMessage(NamedTuple):
+    """One message: full topic, ROS type, CDR bytes, time of recording [s]."""
+
+    topic: str
+    type: str
+    data: bytes
+    received: float
+
+
+class _WholeReads:
+    """A stream whose reads are complete or fail, so that a cut is seen where it is."""
+
+    def __init__(self, stream):
+        self._stream = stream
+
+    def read(self, size):
+        data = self._stream.read(size)
+        if len(data) < size:
+            raise EOFError
+        return data
+
+
+def bag_files(path: str | Path) -> list[Path]:
+    """
+    Find the MCAP files of a RUN.
+
+    Args:
+        path: a rosbag2 folder, its metadata.yaml or one of its ``.mcap`` files.
+
+    Raises:
+        BagError: nothing there that can be read.
+
+    """
+    path = Path(path)
+    if not path.exists():
+        raise BagError(f'{path}: no such bag')
+    if path.name == 'metadata.yaml':
+        path = path.absolute().parent
+    if path.is_file():
+        if path.suffix != '.mcap':
+            raise BagError(f'{path}: expected a rosbag2 folder or a .mcap file')
+        return [path]
+    files = sorted(path.glob('*.mcap'), key=_split_number)
+    if not files:
+        other = sorted(p.name for pattern in ('*.db3', '*.mcap.*', '*.bag')
+                       for p in path.glob(pattern))
+        hint = f' (found {other[0]}; convert it with ros2 bag convert)' if other else ''
+        raise BagError(f'{path}: no .mcap file in this folder{hint}')
+    return files
+
+
+def _split_number(file):
+    """Order of a split bag: name_2.mcap comes before name_10.mcap."""
+    number = file.stem.rpartition('_')[2]
+    return (int(number) if number.isdigit() else -1, file.name)
+
+
+def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterator[RawMessage]:
+    """
+    Yield the messages of a bag in the order in which they were recorded, up to a cut.
+
+    Args:
+        path: folder or file, see :func:`bag_files`.
+        warnings: takes a line for each file that ends early.
+
+    Raises:
+        BagError: no such bag, unreadable, or not MCAP.
+
+    """
+    warnings = [] if warnings is None else warnings
+    for file in bag_files(path):
+        try:
+            with file.open('rb') as stream:
+                reader = NonSeekingReader(_WholeReads(stream), validate_crcs=True)
+                for schema, channel, message in reader.iter_messages(log_time_order=False):
+                    yield RawMessage(channel.topic, schema.name if schema else '', message.data,
+                                     message.log_time * 1e-9)
+        except OSError as error:
+            raise BagError(f'{file}: {error.strerror}') from None
+        except InvalidMagic:
+            raise BagError(f'{file}: not an MCAP file') from None
+        except GeneratorExit:
+            raise
+        except Exception as error:  # whatever broken bytes provoke in the library
+            kind = 'cut off' if isinstance(error, EOFError) else f'damaged ({error})'
+            warnings.append(f'{file.name}: {kind}; read up to there')
+
+
+def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
+    """
+    Read a flight.
+
+    Args:
+        path: rosbag2 folder, or one of its files.
+        namespace: of the robot, where the bag holds several.
+
+    Returns:
+        The flight; what was missing or wrong stands in its ``warnings``.
+
+    Raises:
+        BagError: no such bag, unreadable, not MCAP, or several robots in it.
+
+    """
+    reading = _Reading(str(path), namespace)
+    for message in read_messages(path, reading.warnings):
+        reading.take(message)
+    recorder = reading.recorder
+    recorder.write_meta(_metadata(path, reading.warnings))
+    log = recorder.log()
+    log.warnings = reading.finish()
+    log.source = str(path)
+    return log
+
+
+class _Reading:
+    """Sorts messages by topic and namespace, and counts what cannot be used."""
+
+    def __init__(self, path, namespace):
+        self.recorder = LogRecorder()
+        self.warnings: list[str] = []
+        self._path = path
+        self._namespace = None if namespace is None else _rooted(namespace)
+        self._chosen = namespace is not None
+        self._split = {}
+        self._counts: Counter = Counter()
+        self._bad: Counter = Counter()
+        self._reason: dict[str, str] = {}
+
+    def take(self, message):
+        if message.topic not in self._split:
+            self._split[message.topic] = self._recognise(message.topic)
+        name = self._split[message.topic]
+        if name is None:
+            return
+        try:
+            if message.type != TOPICS[name].type:
+                raise messages.LayoutError(f'type is {message.type}, not {TOPICS[name].type}')
+            decoded = messages.TYPESTORE.deserialize_cdr(message.data, message.type)
+            messages.record(self.recorder, name, decoded, message.received)
+            self._counts[name] += 1
+        except Exception as error:  # one message that cannot be used must not lose the others
+            self._bad[name] += 1
+            self._reason.setdefault(name, str(error) or type(error).__name__)
+
+    def _recognise(self, topic):
+        split = split_topic(topic)
+        if split is None:
+            return None
+        namespace, name = split
+        if name == 'diagnostics' and namespace == '':
+            return name
+        if self._namespace is None:
+            self._namespace = namespace
+        if namespace != self._namespace:
+            if self._chosen or name == 'diagnostics':
+                return None
+            raise BagError(f"{self._path}: holds several robots ('{self._namespace}' and "
+                           f"'{namespace}'); choose one namespace")
+        return name
+
+    def finish(self):
+        missing = [name for name, topic in TOPICS.items()
+                   if topic.required and not self._counts[name]]
+        if 'target_pose' in missing and self._counts['target_trajectory']:
+            missing.remove('target_pose')
+        if missing:
+            self.warnings.append(f"no message on {', '.join(missing)}")
+        for name, count in self._bad.items():
+            self.warnings.append(f'{name}: {count} messages not used ({self._reason[name]})')
+        return self.warnings
+
+
+def _rooted(namespace):
+    return '/' + namespace.strip('/') if namespace.strip('/') else ''
+
+
+def _metadata(path, warnings):
+    """Meta data that a finished bag carries; empty where there is none."""
+    path = Path(path)
+    file = (path if path.is_dir() else path.absolute().parent) / 'metadata.yaml'
+    if not file.is_file():
+        warnings.append('metadata.yaml is missing: the recorder did not finish')
+        return {}
+    try:
+        custom = yaml.safe_load(file.read_text())['rosbag2_bagfile_information']['custom_data']
+        return json.loads((custom or {}).get(META_KEY, '{}'))
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError, OSError):
+        warnings.append('metadata.yaml is not readable')
+        return {}
