@@ -163,10 +163,8 @@ class FlightLog:
 
         """
         if not self.states:
-            name = self.meta.get('controller')
-            if name is None:
-                name = next(iter(self.requests), 'unknown') if len(self.requests) < 2 else 'unknown'
-            return [(self.start, name)]
+            only = next(iter(self.requests)) if len(self.requests) == 1 else 'unknown'
+            return [(self.start, self.meta.get('controller', only))]
         changes: list[tuple[float, str | None]] = []
         for t, state in zip(self.state_t, self.states, strict=True):
             if state.startswith('flying:'):

@@ -1,0 +1,280 @@
+"""
+Metrics of one flight, as ``evaluate --json`` and ``fly --json`` hold them.
+
+A pose lasts 8 s. U, the mean error over 7.0 to 7.5 s, says how accurate the hover is; L,
+the mean over 1.0 to 7.0 s, how fast it was reached (docs/metrics.md). The same function
+judges a flight in memory and one read back from its bag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.runs import task_metrics
+from beetle_omni_ros.runs.body import (errors, geodesic_angles, hold, inside, motion, Motion,
+                                       target_ends)
+from beetle_omni_ros.runs.log import FlightLog
+from beetle_omni_ros.runs.tasks import GROUND_HEIGHT, make_task, POSE_DURATION, Task, TaskError
+
+U_WINDOW = (7.0, 7.5)  # [s] after the pose was asked for
+L_WINDOW = (1.0, 7.0)  # [s]
+REACHED_POSITION = 0.10  # [m]
+REACHED_ORIENTATION = 10.0  # [deg]
+COMMAND_PERIOD = 0.010  # [s] to which changes of the command refer
+POSE_KEYS = ('U_position_m', 'U_orientation_deg', 'L_position_m', 'L_orientation_deg')
+
+
+@dataclass(frozen=True)
+class Flown:
+    """
+    The part of a flight that one controller flew.
+
+    Attributes:
+        name: of the controller.
+        poses: indices into the log's targets, of pose targets that lasted.
+        intervals: (begin, end) of the time that counts [s].
+
+    """
+
+    name: str
+    poses: list[int]
+    intervals: list[tuple[float, float]]
+
+
+def metrics(log: FlightLog, task: Task | None = None) -> dict:
+    """
+    Judge a flight of one controller.
+
+    Args:
+        log: the flight.
+        task: what was flown; None takes it from the log's meta data, where it says.
+
+    Returns:
+        The dictionary that INTERFACES gives for a controller, with None for what the log
+        does not hold. Lengths in m, angles in deg or rad as the keys say, times in ms.
+
+    """
+    results = metrics_by_controller(log, task)
+    if not results:
+        return _judge(log, task or task_of(log), Flown('unknown', [], []), None)
+    return next(iter(results.values()))
+
+
+def metrics_by_controller(log: FlightLog, task: Task | None = None) -> dict[str, dict]:
+    """Judge each controller of a flight on what it flew; see :func:`metrics`."""
+    task = task or task_of(log)
+    flown = _split(log, task)
+    # A task that one controller flew alone is complete: poses never asked for count as missed.
+    expected = len(task.poses) if task and len(flown) == 1 else None
+    return {part.name: _judge(log, task, part, expected) for part in flown}
+
+
+def task_of(log: FlightLog) -> Task | None:
+    """Rebuild the named task from a log's meta data; None for pose files and free flights."""
+    name = str(log.meta.get('task', ''))
+    if not name or name.lower().endswith('.csv'):
+        return None
+    try:
+        return make_task(name, int(log.meta.get('seed') or 0))
+    except (TaskError, ValueError):
+        return None
+
+
+def _split(log, task):
+    last = POSE_DURATION
+    if task and log.targets:
+        last = max(0.0, log.targets[0].stamp + task.duration - log.targets[-1].stamp)
+    ends = target_ends(log, last)
+    changes = log.active_controller()
+    poses: dict[str, list[int]] = {}
+    intervals: dict[str, list] = {}
+    for name in log.controllers():
+        poses[name], intervals[name] = [], []
+    previous = next(iter(poses), None)
+    for k, (target, end) in enumerate(zip(log.targets, ends, strict=True)):
+        shares = _shares(changes, target.stamp, end)
+        name = max(shares, key=shares.get) if shares else previous
+        previous = name
+        if name is None:
+            continue
+        lasted = end >= target.stamp + U_WINDOW[1] - 1e-3
+        if isinstance(target, PoseTarget) and lasted:
+            poses[name].append(k)
+        landing = _landing(log, target.stamp)
+        if landing > target.stamp:
+            intervals[name].append((target.stamp, min(end, log.end, landing)))
+    return [Flown(name, poses[name], intervals[name]) for name in poses
+            if poses[name] or intervals[name]]
+
+
+def _shares(changes, begin, end):
+    """How long each controller flew between ``begin`` and ``end`` [s]."""
+    shares: dict[str, float] = {}
+    for k, (t, name) in enumerate(changes):
+        until = changes[k + 1][0] if k + 1 < len(changes) else np.inf
+        time = min(until, end) - max(t, begin)
+        if name and time > 0:
+            shares[name] = shares.get(name, 0.0) + time
+    return shares
+
+
+def _landing(log, after):
+    """When the robot began to land or was switched off, after ``after`` [s]."""
+    return next((float(t) for t, state in zip(log.state_t, log.states, strict=True)
+                 if t > after and state in ('landing', 'disarmed')), np.inf)
+
+
+def _judge(log, task, flown, expected):
+    body = motion(log)
+    poses = [_pose(body, log.targets[k], task) for k in flown.poses]
+    for missing in (task.poses[len(poses):] if expected else ()):
+        poses.append({'target': [float(v) for v in missing], **dict.fromkeys(POSE_KEYS),
+                      'reached': False})
+    result: dict = {'poses': poses}
+    for name, reduce in (('mean', np.mean), ('median', np.median), ('max', np.max),
+                         ('min', np.min)):
+        result[name] = {key: _reduced(reduce, [pose[key] for pose in poses]) for key in POSE_KEYS}
+    result['success_rate'] = float(np.mean([p['reached'] for p in poses])) if poses else None
+    result['crashed'] = _crashed(log, body, flown)
+    compute = log.compute.get(flown.name, {})
+    result['compute_ms'] = {key: compute.get(key)
+                            for key in ('median', 'p99', 'max', 'deadline_misses')}
+    windows = [(log.targets[k].stamp + U_WINDOW[0], log.targets[k].stamp + U_WINDOW[1])
+               for k in flown.poses]
+    result.update(_effort(log, flown.intervals, windows))
+    result.update(_stillness(body, windows))
+    result.update(_timing(log, flown.intervals))
+    result.update(_estimation(log, flown.intervals))
+    if task:
+        result.update(task_metrics.extras(log, body, task, U_WINDOW))
+    return result
+
+
+def _pose(body: Motion, target, task):
+    means = []
+    for window in (U_WINDOW, L_WINDOW):
+        begin, end = target.stamp + window[0], target.stamp + window[1]
+        if body.covers(begin, end):
+            means += [float(np.mean(e)) for e in errors(body, target, body.window(begin, end))]
+        else:
+            means += [None, None]
+    result = {'target': _numbers(target, task), **dict(zip(POSE_KEYS, means, strict=True))}
+    result['reached'] = bool(means[0] is not None and means[0] < REACHED_POSITION
+                             and means[1] < REACHED_ORIENTATION)
+    return result
+
+
+def _numbers(target, task):
+    """x, y, z [m], roll, pitch, yaw [deg] as the task gives them, where it has this pose."""
+    for pose in task.poses if task else ():
+        if np.allclose(pose[:3], target.position, atol=1e-6) and rotations.geodesic_angle(
+                rotations.from_rpy(*np.radians(pose[3:])), target.quaternion) < 1e-6:
+            return [float(v) for v in pose]
+    return [float(v) for v in (*target.position, *np.degrees(rotations.to_rpy(target.quaternion)))]
+
+
+def _reduced(reduce, values):
+    values = [value for value in values if value is not None]
+    return float(reduce(values)) if values else None
+
+
+def _crashed(log, body, flown):
+    """Fell to the ground, was stopped in flight, or left the numbers."""
+    for begin, end in flown.intervals:
+        position = body.position[body.window(begin, end)]
+        if not np.all(np.isfinite(position)) or np.any(position[:, 2] < GROUND_HEIGHT):
+            return True
+        if any(begin <= t <= end and state == 'emergency_stop'
+               for t, state in zip(log.state_t, log.states, strict=True)):
+            return True
+    return False
+
+
+def _effort(log, intervals, windows):
+    """Joint error |q* - q|, thrust, and how much the command moves while hovering."""
+    stamps, first = np.unique(log.command_t, return_index=True)
+    tilt, thrust = log.command_tilt[first], log.command_thrust[first]
+    joint = inside(log.joint_t, intervals)
+    joint &= log.joint_t >= (stamps[0] if len(stamps) else np.inf)
+    error = np.zeros((0, 4))
+    if np.any(joint):
+        error = np.abs(hold(stamps, tilt, log.joint_t[joint]) - log.joint_position[joint])
+    hovering = inside(log.joint_t[joint], windows)
+    used, still = inside(stamps, intervals), inside(stamps, windows)
+    return {'joint_error_mean_rad': _mean(error), 'joint_error_std_rad': _std(error),
+            'joint_error_hover_mean_rad': _mean(error[hovering]),
+            'thrust_mean_N': _mean(thrust[used]), 'thrust_std_N': _std(thrust[used]),
+            'thrust_hover_mean_N': _mean(thrust[still]),
+            'thrust_max_N': float(np.max(thrust[used])) if np.any(used) else None,
+            'hover_command_change_rms': {
+                'joint_rad': _change_rms(stamps, tilt, windows),
+                'thrust_N': _change_rms(stamps, thrust, windows)}}
+
+
+def _change_rms(stamps, values, windows):
+    """RMS change of a command in 10 ms over the windows; None without commands."""
+    changes = []
+    for begin, end in windows:
+        mask = inside(stamps, [(begin, end)])
+        times, inner = stamps[mask], values[mask]
+        if len(times) < 2:
+            continue
+        if not 0.8 <= np.median(np.diff(times)) / COMMAND_PERIOD <= 1.25:
+            inner = hold(times, inner, np.arange(times[0], times[-1], COMMAND_PERIOD))
+        changes.append(np.diff(inner, axis=0))
+    stacked = np.concatenate(changes) if changes else np.zeros((0, 4))
+    return float(np.sqrt(np.mean(stacked ** 2))) if len(stacked) else None
+
+
+def _stillness(body, windows):
+    mask = inside(body.t, windows)
+    speed = np.linalg.norm(body.velocity[mask], axis=1)
+    rate = np.linalg.norm(body.angular_velocity[mask], axis=1)
+    return {'hover_speed_mean_m_s': _mean(speed), 'hover_speed_std_m_s': _std(speed),
+            'hover_angular_speed_mean_rad_s': _mean(rate),
+            'hover_angular_speed_std_rad_s': _std(rate)}
+
+
+def _timing(log, intervals):
+    """From the stamp that a command answers to its recording, where these differ."""
+    mask = inside(log.command_t, intervals)
+    delay = 1e3 * (log.command_received[mask] - log.command_t[mask])
+    if not np.any(delay > 0):
+        return {}
+    return {'stamp_to_command_ms': {'median': float(np.median(delay)),
+                                    'p99': float(np.percentile(delay, 99)),
+                                    'max': float(np.max(delay))}}
+
+
+def _estimation(log, intervals):
+    """RMS error of the estimate where the truth is known."""
+    times = log.odom_t[inside(log.odom_t, intervals)]
+    if not len(times) or not len(log.truth_t):
+        return {}
+    odom, truth = motion(log, 'odom'), motion(log, 'truth')
+    mine = np.searchsorted(odom.t, times)
+    theirs = np.clip(np.searchsorted(truth.t, times - 2.5e-3), 0, len(truth.t) - 1)
+    close = np.abs(truth.t[theirs] - times) < 2.5e-3
+    if not np.any(close):
+        return {}
+    mine, theirs = mine[close], theirs[close]
+    distance = np.linalg.norm(odom.position[mine] - truth.position[theirs], axis=1)
+    angle = np.degrees(geodesic_angles(odom.quaternion[mine], truth.quaternion[theirs]))
+    return {'estimation': {'position_rms_m': float(np.sqrt(np.mean(distance ** 2))),
+                           'orientation_rms_deg': float(np.sqrt(np.mean(angle ** 2))),
+                           'position_max_m': float(np.max(distance)),
+                           'orientation_max_deg': float(np.max(angle))}}
+
+
+def _mean(values):
+    values = values[np.isfinite(values)]
+    return float(np.mean(values)) if values.size else None
+
+
+def _std(values):
+    values = values[np.isfinite(values)]
+    return float(np.std(values)) if values.size else None
