@@ -60,9 +60,9 @@ def node_parameters(given):
 
 def recorded_topics(namespace):
     """Absolute names of the topics of INTERFACES."""
-    from beetle_omni_ros.nodes.topics import TOPICS
+    from beetle_omni_ros.runs.topics import TOPICS
     prefix = f"/{namespace.strip('/')}/" if namespace.strip('/') else '/'
-    return [prefix + topic for topic in TOPICS]
+    return [prefix + topic for topic in (*TOPICS, 'reference/state')]
 
 
 def actions(context):

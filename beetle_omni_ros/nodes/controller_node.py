@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
@@ -72,9 +74,17 @@ class ControllerNode(FlightNode):
         self._command = command
 
     def _on_target(self, target):
-        # Targets may arrive out of order (latched and volatile copies): the newest stamp counts.
+        if target.stamp == 0.0:     # as quick tools send it: now
+            target = self._from_now(target)
+        # Latched and volatile copies may overtake each other: the newest stamp counts.
         if self._target is None or target.stamp >= self._target.stamp:
             self._target = target
+
+    def _from_now(self, target):
+        now = self.now()
+        if isinstance(target, PoseTarget):
+            return replace(target, stamp=now)
+        return replace(target, stamp=now, times=target.times + now)
 
     def _on_mode(self, message):
         if message.data in ('disarmed', 'emergency_stop') and self._mode != message.data:

@@ -96,11 +96,12 @@ class Operator:
         found = self.diagnostics.get(status)
         return {pair.key: pair.value for pair in found.values} if found else {}
 
-    def report(self, name: str, text: str, values: dict[str, float]) -> None:
+    def report(self, name: str, text: str, values: dict) -> None:
         """Put a status of the operator's own into ``diagnostics``, and so into the bag."""
         message = DiagnosticArray(status=[DiagnosticStatus(
             level=DiagnosticStatus.OK, name=name, message=text, hardware_id='beetle_omni',
-            values=[KeyValue(key=k, value=f'{v:.6g}') for k, v in values.items()])])
+            values=[KeyValue(key=k, value=f'{v:.6g}' if isinstance(v, float) else str(v))
+                    for k, v in values.items()])])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(message)
 

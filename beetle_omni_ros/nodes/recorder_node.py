@@ -1,0 +1,107 @@
+"""Records the flight into a bag, as ``ros2 bag record -s mcap`` does where that is installed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+import sys
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rosbags.interfaces import QosDurability
+
+from beetle_omni_ros.nodes import health, qos, runner
+from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.robot.schema import parameter, ParameterError
+from beetle_omni_ros.runs.bag import BagError, BagWriter
+from beetle_omni_ros.runs.topics import Topic, TOPICS
+from beetle_omni_ros.runs.topics import LATCHED as LATCHED_TOPIC
+
+FLUSH_PERIOD = 0.4      # s; a crash loses at most what came after the last flush
+OWN_TOPICS = {'reference/state': Topic('std_msgs/msg/String', LATCHED_TOPIC)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecorderNodeParameters:
+    """Parameters of recorder_node."""
+
+    bag: str = parameter(doc='folder to create for the bag', read_only=True)
+
+
+class RecorderNode(FlightNode):
+    """Writes every topic of the package as it comes from the wire."""
+
+    def __init__(self):
+        """Create the bag, then listen."""
+        super().__init__('recorder_node', RecorderNodeParameters)
+        try:
+            self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace())
+        except BagError as error:
+            raise ParameterError(f"key 'bag': {error}") from None
+        self._written = self._lost = 0
+        self._failure = None
+        prefix = self.get_namespace().rstrip('/') + '/'
+        for name, topic in {**TOPICS, **OWN_TOPICS}.items():
+            latched = topic.qos.durability == QosDurability.TRANSIENT_LOCAL
+            self.create_subscription(
+                _message_class(topic.type), name, self._writer(prefix + name, topic.type),
+                qos.LATCHED_LOG if latched else qos.LOG, raw=True,
+                event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
+        self.health.report('bag', self._bag_status)
+        self.create_timer(FLUSH_PERIOD, self._flush, clock=self.steady_clock)
+
+    def _writer(self, topic, message_type):
+        def write(data):
+            if self._failure:
+                return
+            try:
+                self._bag.write_raw(topic, message_type, data, self.now())
+                self._written += 1
+            except BagError as error:
+                self._give_up(error)
+        return write
+
+    def _on_lost(self, event):
+        self._lost += event.total_count_change
+        self.get_logger().warning(f'{event.total_count_change} messages lost on the way')
+
+    def _flush(self):
+        try:
+            if not self._failure:
+                self._bag.flush()
+        except BagError as error:
+            self._give_up(error)
+
+    def _give_up(self, error):
+        # A full disk ends the recording, never the flight that shares the process.
+        if self._failure is None:
+            self._failure = str(error)
+            self.get_logger().error(f'recording ended: {error}')
+
+    def _bag_status(self):
+        values = {'written': self._written, 'lost': self._lost}
+        if self._failure:
+            return health.ERROR, self._failure, values
+        return health.WARN if self._lost else health.OK, self.parameters.bag, values
+
+    def close(self):
+        """Finish the bag."""
+        bag = getattr(self, '_bag', None)
+        try:
+            if bag:
+                bag.close()
+        except BagError as error:
+            print(f'recorder_node: error: {error}', file=sys.stderr)
+
+
+def _message_class(name):
+    package, _, message = name.split('/')
+    return getattr(import_module(f'{package}.msg'), message)
+
+
+def main(args=None):
+    """Run the node."""
+    runner.main(RecorderNode, args)
+
+
+if __name__ == '__main__':
+    main()

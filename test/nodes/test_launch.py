@@ -1,0 +1,94 @@
+"""The launch file: arguments become processes (launch itself is replaced by recorders)."""
+
+from importlib.util import module_from_spec, spec_from_file_location
+import sys
+from types import ModuleType
+
+import pytest
+
+from beetle_omni_ros.nodes import composed
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.runs.topics import TOPICS
+
+
+class Recorded:
+    """Stands for any class of launch: keeps what it was made from."""
+
+    def __init__(self, *args, **kwargs):
+        self.args, self.kwargs = args, kwargs
+
+
+@pytest.fixture
+def bringup(monkeypatch):
+    """Load the launch file against stand-ins for the modules of launch."""
+    classes = {'launch': ['LaunchDescription'],
+               'launch.actions': ['DeclareLaunchArgument', 'ExecuteProcess', 'OpaqueFunction'],
+               'launch.substitutions': ['LaunchConfiguration'],
+               'launch_ros': [], 'launch_ros.actions': ['Node']}
+    for name, members in classes.items():
+        module = ModuleType(name)
+        for member in members:
+            setattr(module, member, type(member, (Recorded,), {}))
+        monkeypatch.setitem(sys.modules, name, module)
+    spec = spec_from_file_location('bringup', share_path('launch/bringup.launch.py'))
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    def start(**arguments):
+        declared = module.generate_launch_description().args[0][:-1]
+        given = {d.args[0]: d.kwargs['default_value'] for d in declared}
+        assert set(arguments) <= set(given)
+        given.update(arguments)
+        monkeypatch.setattr(module.LaunchConfiguration, 'perform',
+                            lambda self, context: given[self.args[0]], raising=False)
+        return module.actions(None)
+
+    module.start = start
+    return module
+
+
+def test_the_arguments_of_the_interface_are_declared(bringup):
+    declared = bringup.generate_launch_description().args[0][:-1]
+    names = {d.args[0] for d in declared}
+    assert {'backend', 'controller', 'record', 'namespace', 'composed'} <= names
+    assert all(d.kwargs['description'] for d in declared)
+
+
+def test_composed_is_one_process_with_every_node(bringup):
+    process, = bringup.start(seed='7', namespace='/robot1')
+    command = process.kwargs['cmd']
+    nodes = command[3:command.index('--ros-args')]
+    assert nodes == ['sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node']
+    assert set(nodes) <= set(composed.NODES)
+    assert 'sim_node:seed:=7' in command
+    assert command[-2:] == ['-r', '__ns:=/robot1']
+
+
+def test_separate_nodes_and_no_simulator_for_another_backend(bringup):
+    nodes = bringup.start(composed='false', backend='none', task='waypoints', viewer='true',
+                          namespace='robot1')
+    assert [n.kwargs['executable'] for n in nodes] == [
+        'ekf_node', 'nmpc_node', 'supervisor_node', 'reference_node', 'viewer_node']
+    assert all(n.kwargs['namespace'] == 'robot1' for n in nodes)
+
+
+def test_the_plant_may_differ_from_what_is_believed(bringup):
+    nodes = bringup.start(composed='false', robot_file='a.yaml', plant_file='b.yaml')
+    given = {n.kwargs['name']: n.kwargs['parameters'][0].get('robot_file') for n in nodes}
+    assert given == {'sim_node': 'b.yaml', 'ekf_node': 'a.yaml', 'nmpc_node': 'a.yaml',
+                     'supervisor_node': 'a.yaml'}
+
+
+@pytest.mark.parametrize('installed', [True, False])
+def test_ros2_bag_records_where_it_is_installed_else_the_recorder(bringup, monkeypatch, installed):
+    monkeypatch.setattr(bringup, 'has_ros2_bag', lambda: installed)
+    processes = bringup.start(composed='false', record='/data/run', namespace='robot1')
+    names = [p.kwargs.get('executable') for p in processes]
+    if installed:
+        command = processes[0].kwargs['cmd']
+        assert command[:7] == ['ros2', 'bag', 'record', '-s', 'mcap', '-o', '/data/run']
+        assert {f'/robot1/{topic}' for topic in TOPICS} <= set(command[7:])
+        assert 'recorder_node' not in names
+    else:
+        recorder = processes[names.index('recorder_node')]
+        assert recorder.kwargs['parameters'] == [{'bag': '/data/run'}]
