@@ -14,6 +14,10 @@ TINY_MASS = 1e-12               # [kg] MuJoCo refuses a moving body without mass
 TINY_INERTIA = 1e-13            # [kg m^2] ... or inertia
 MOTOR_HEIGHT = 0.02             # [m] half height of the disc in which a propeller can touch
 
+# The joint stops as hard as the step of 1 kHz bears; MuJoCo's solref and solimp.
+STOP_SOFTNESS = 0.002, 1.0
+STOP_IMPEDANCE = 0.99, 0.999, 0.001
+
 
 def build_model(robot: RobotParameters, plant: PlantParameters,
                 variation: Variation | None = None, scenery: str = '') -> mujoco.MjModel:
@@ -93,7 +97,8 @@ def _module(robot, plant, parts, k):
     inertia = np.maximum(module.inertia, TINY_INERTIA)
     return f'''
       <body name="module{k + 1}" pos="{_text(parts.joint_origins[k])}" quat="{_text(quaternion)}">
-        <joint name="gimbal{k + 1}" axis="1 0 0" limited="true"
+        <joint name="gimbal{k + 1}" axis="1 0 0" limited="true" solreflimit="{_text(*STOP_SOFTNESS)}"
+               solimplimit="{_text(*STOP_IMPEDANCE)}"
                range="{_text(-joints.position_limit, joints.position_limit)}"/>
         <inertial pos="{_text(module.centre_of_mass)}" mass="{max(module.mass, TINY_MASS)!r}"
                   diaginertia="{_text(inertia)}"/>
@@ -109,7 +114,7 @@ def _actuators(robot):
                                                       rotors.torque_to_thrust_ratio)
     scale = thrust_scale(robot)
     rotor = ''.join(
-        f'<general name="rotor{k + 1}" site="rotor{k + 1}" dyntype="filterexact" '
+        f'<general name="rotor{k + 1}" site="rotor{k + 1}" dyntype="filter" '
         f'dynprm="{rotors.time_constant!r}" gear="{_text(0, 0, scale[k], 0, 0)} '
         f'{_text(-rotors.spin[k] * ratio * scale[k])}"/>\n' for k in range(4))
     servo = ''.join(

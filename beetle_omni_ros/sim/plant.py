@@ -52,7 +52,7 @@ class Plant:
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
         self._ground_height: float | None = None
         self._wrench = np.zeros(6)
-        self._payload = 0.0
+        self._payload: float | None = None      # not yet set
         self.reset()
 
     def reset(self, position: np.ndarray | None = None,
@@ -73,6 +73,8 @@ class Plant:
 
     def _place(self, position, quaternion):
         mujoco.mj_resetData(self.model, self.data)
+        self.model.opt.disableflags = self._flags
+        self.model.opt.timestep = self._tick / self._substeps
         self.data.qpos[:3] = position
         self.data.qpos[3:7] = rotations.normalized(quaternion)[[3, 0, 1, 2]]
         self._update()
@@ -81,7 +83,6 @@ class Plant:
         """Where base_link comes to rest on its feet [m]; found once, by letting it settle."""
         if self._ground_height is None:
             self._place((0.0, 0.0, self._parameters.foot_depth), (0.0, 0.0, 0.0, 1.0))
-            self.model.opt.disableflags = self._flags
             settle = 100 * self._parameters.contact_time_constant
             mujoco.mj_step(self.model, self.data, int(np.ceil(settle / self.model.opt.timestep)))
             self._ground_height = float(self.data.qpos[2])

@@ -1,0 +1,54 @@
+"""Variants of the shipped robot, and small measurements on a plant, for the simulator's tests."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.plant import Plant
+
+ROBOT = RobotParameters.load()
+WORLD = SimulatorParameters.load()
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+HIGH = np.array([0.0, 0.0, 20.0])
+
+
+def massless_modules(**changes):
+    """The robot with modules that neither weigh nor resist: one rigid body."""
+    module = replace(ROBOT.multibody.module, mass=0.0, inertia=np.zeros(3),
+                     centre_of_mass=np.zeros(3))
+    return replace(ROBOT, multibody=replace(ROBOT.multibody, module=module), **changes)
+
+
+def immovable():
+    """The robot with so heavy a main body that its joints turn as on a bench, without gravity."""
+    return replace(ROBOT, mass=190.0, inertia=np.full(3, 90.0), gravity=0.0)
+
+
+def plant(robot=ROBOT, position=HIGH, quaternion=LEVEL, variation=None):
+    """A plant at rest."""
+    made = Plant(robot, WORLD.plant, variation)
+    made.reset(position, quaternion)
+    return made
+
+
+def momenta(made):
+    """Linear momentum, angular momentum about the world's origin and centre of mass, body by body."""
+    model, data = made.model, made.data
+    mujoco.mj_forward(model, data)
+    linear, angular, first = np.zeros(3), np.zeros(3), np.zeros(3)
+    twist = np.empty(6)
+    for body in range(1, model.nbody):
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, twist, 0)
+        spin = twist[:3]
+        centre = data.xipos[body]
+        velocity = twist[3:]            # of the body's centre of mass
+        axes = data.ximat[body].reshape(3, 3)
+        mass = model.body_mass[body]
+        linear += mass * velocity
+        first += mass * centre
+        angular += mass * np.cross(centre, velocity) \
+            + axes @ (model.body_inertia[body] * (axes.T @ spin))
+    return linear, angular, first / model.body_mass.sum()

@@ -1,0 +1,99 @@
+"""MuJoCo's plant, the CasADi model and Newton-Euler by hand describe the same rigid body."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from sim_robots import massless_modules, plant, ROBOT
+
+from beetle_omni_ros.robot.dynamics import body_acceleration
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim import effects as plant_effects
+
+EFFECTS = {
+    'none': {},
+    'mass': {'mass': {'mass': 3.3}},
+    'thrust_coefficient': {'thrust_coefficient': {'scale': 0.93}},
+    'rotor_thrust_coefficient': {'rotor_thrust_coefficient': {'scale': [1.0, 0.9, 1.05, 0.97]}},
+    'torque_coefficient': {'torque_coefficient': {'torque_to_thrust_ratio': 0.021}},
+    'wind': {'wind': {'force': [1.0, -2.0, 0.5]}},
+    'body_drag': {'body_drag': {'coefficient': 0.11}},
+    'rotor_drag': {'rotor_drag': {'coefficient': 0.4}},
+}
+EFFECTS['all'] = {name: values for each in EFFECTS.values() for name, values in each.items()}
+
+
+def random_states(count, seed):
+    """States anywhere in the flight envelope, away from the floor and the stops."""
+    generator = np.random.default_rng(seed)
+    for _ in range(count):
+        yield (generator.normal(size=3) + [0, 0, 10], Rotation.random(rng=generator).as_quat(),
+               generator.normal(size=3) * 3, generator.normal(size=3) * 3,
+               generator.uniform(-3.9, 3.9, 4), generator.uniform(-9, 9, 4),
+               generator.uniform(0.5, 20, 4))
+
+
+def difference(found, expected):
+    """Relative difference of two accelerations."""
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_plant_without_module_inertia_agrees_with_casadi(name):
+    robot = massless_modules(effects=EFFECTS[name])
+    made, model = plant(robot), body_acceleration(robot)
+    for p, q, v, w, tilt, tilt_rate, thrust in random_states(40, seed=1):
+        linear, angular = model(v, q, w, tilt, thrust)
+        found = made.acceleration(p, q, v, w, tilt, tilt_rate, thrust)
+        assert difference(found[:3], np.ravel(linear)) < 1e-6
+        assert difference(found[3:6], np.ravel(angular)) < 1e-6
+
+
+def test_plant_without_module_inertia_agrees_with_newton_euler():
+    """No effects; each rotor's thrust vector by scipy's rotations, frame by frame."""
+    robot = massless_modules()
+    made, rotors = plant(robot), robot.rotors
+    for p, q, v, w, tilt, tilt_rate, thrust in random_states(40, seed=2):
+        force, torque = np.zeros(3), np.zeros(3)
+        for i in range(4):
+            arm = Rotation.from_euler('z', rotors.arm_yaw[i])
+            up = (arm * Rotation.from_euler('x', tilt[i])).apply([0, 0, 1])
+            force += thrust[i] * up
+            torque += np.cross(rotors.positions[i], thrust[i] * up) \
+                - rotors.spin[i] * rotors.torque_to_thrust_ratio * thrust[i] * up
+        linear = Rotation.from_quat(q).apply(force) / robot.mass - [0, 0, robot.gravity]
+        angular = (torque - np.cross(w, robot.inertia * w)) / robot.inertia
+        found = made.acceleration(p, q, v, w, tilt, tilt_rate, thrust)
+        assert difference(found[:3], linear) < 1e-6
+        assert difference(found[3:6], angular) < 1e-6
+
+
+def test_true_modules_shift_the_centre_of_gravity():
+    """All modules at 90 deg: their centres of mass, beside the axes, pull as weight does."""
+    made, rigid = plant(), plant(massless_modules())
+    tilt = np.array([1, 1, -1, -1]) * np.pi / 2
+    state = ([0, 0, 10], [0, 0, 0, 1], np.zeros(3), np.zeros(3), tilt, np.zeros(4),
+             np.full(4, ROBOT.hover_thrust))
+    assert np.abs(made.acceleration(*state)[3:6] - rigid.acceleration(*state)[3:6]).max() > 0.1
+
+
+def test_step_is_the_integral_of_the_acceleration():
+    """Motion-dependent effects act inside the step as they do in a single state."""
+    robot = replace(ROBOT, effects={'body_drag': {'coefficient': 0.11},
+                                    'rotor_drag': {'coefficient': 0.4}})
+    made = plant(robot)
+    for p, q, v, w, tilt, _, thrust in random_states(5, seed=3):
+        before = made.acceleration(p, q, v, w, tilt, np.zeros(4), thrust)
+        velocity = made.state[1]
+        made.step()
+        after = made.data.qacc.copy()
+        change = (made.state[1] - velocity)[:6] / 0.005
+        scale = np.abs(after - before)[:6] + 1.0
+        assert np.all(np.abs(change - 0.5 * (before + after)[:6]) < 0.1 * scale)
+
+
+def test_effect_that_the_plant_lacks_is_refused_by_name(monkeypatch):
+    monkeypatch.setattr(plant_effects, 'FORCES', ('wind',))
+    with pytest.raises(ParameterError, match='effects.rotor_drag: the simulated plant does not'):
+        plant(replace(ROBOT, effects={'rotor_drag': {'coefficient': 0.4}}))

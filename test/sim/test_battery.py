@@ -1,0 +1,62 @@
+"""The pack: sag under load, voltage falling with charge, thrust limit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sim_robots import ROBOT, WORLD
+
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim.battery import Battery
+
+HOVER = np.full(4, ROBOT.hover_thrust)
+
+
+def test_ohm_and_power_hold():
+    battery = Battery(ROBOT, WORLD.battery)
+    rest = battery.rest_voltage
+    battery.step(HOVER, 1e-6)
+    power = WORLD.battery.idle_power + WORLD.battery.rotor_power * (HOVER ** 1.5).sum()
+    assert rest == pytest.approx(ROBOT.battery.full_voltage)
+    assert battery.voltage == pytest.approx(rest - ROBOT.battery.resistance * battery.current)
+    assert battery.voltage * battery.current == pytest.approx(power)
+
+
+def test_rest_voltage_falls_with_the_charge_drawn():
+    battery = Battery(ROBOT, WORLD.battery)
+    voltages, drawn = [battery.rest_voltage], 0.0
+    for _ in range(30):
+        battery.step(HOVER, 60.0)
+        drawn += battery.current * 60 / 3600
+        voltages.append(battery.rest_voltage)
+    assert np.all(np.diff(voltages) < 0)
+    assert battery.charge == pytest.approx(1 - drawn / WORLD.battery.capacity)
+
+
+def test_thrust_limit_is_the_maps_at_its_voltages_and_falls_below():
+    battery = Battery(ROBOT, WORLD.battery)
+    for row in ROBOT.rotors.map:
+        battery.voltage = row.voltage
+        assert battery.thrust_limit == pytest.approx(min(row.thrust_max, ROBOT.rotors.thrust_max))
+    battery.voltage = 20.0
+    below = battery.thrust_limit
+    battery.voltage = 21.40
+    assert 0 < below < battery.thrust_limit
+
+
+def test_overload_and_empty_pack_stay_finite():
+    battery = Battery(ROBOT, replace(WORLD.battery, capacity=0.02))
+    for _ in range(200):
+        battery.step(np.full(4, 60.0), 0.1)
+        assert np.isfinite([battery.voltage, battery.current, battery.thrust_limit]).all()
+        assert battery.voltage > 0 and battery.thrust_limit >= 0
+    assert battery.charge == 0
+
+
+@pytest.mark.parametrize('levels, voltages', [
+    ([0.0, 1.0], [0.8, 0.9, 1.0]), ([0.0, 0.5, 0.4, 1.0], [0.8, 0.9, 0.95, 1.0]),
+    ([0.0, 0.5, 1.0], [0.8, 0.7, 1.0]), ([0.1, 1.0], [0.8, 1.0])])
+def test_a_curve_that_is_none_is_refused(levels, voltages):
+    with pytest.raises(ParameterError, match='charge_levels'):
+        replace(WORLD.battery, charge_levels=np.array(levels),
+                relative_voltages=np.array(voltages))

@@ -1,0 +1,65 @@
+"""The parts add up to the totals of the robot file."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sim_robots import plant, ROBOT
+
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim.mass_properties import combined, mass_properties, Variation
+
+
+def whole(properties):
+    """All parts as one."""
+    return combined([properties.main_body, *properties.modules, properties.end_effector])
+
+
+def test_parts_add_up_to_the_totals():
+    total = whole(mass_properties(ROBOT))
+    assert total.mass == pytest.approx(ROBOT.mass, rel=1e-12)
+    np.testing.assert_allclose(total.centre, 0, atol=1e-15)
+    np.testing.assert_allclose(total.inertia, np.diag(ROBOT.inertia), atol=1e-15)
+
+
+def test_variation_moves_the_totals():
+    variation = Variation(1.04, np.array([0.96, 1.03, 1.05]), np.array([0.01, -0.007, 0.004]))
+    total = whole(mass_properties(ROBOT, variation))
+    assert total.mass == pytest.approx(1.04 * ROBOT.mass, rel=1e-12)
+    np.testing.assert_allclose(total.centre, variation.centre_of_mass, atol=1e-15)
+    np.testing.assert_allclose(total.inertia, np.diag(ROBOT.inertia * variation.inertia_scale),
+                               atol=1e-15)
+
+
+def test_parts_agree_with_the_published_description():
+    """Numbers that the residual does not use: main body's mass and centre, joint origins."""
+    properties, parts = mass_properties(ROBOT), ROBOT.multibody
+    assert properties.main_body.mass == pytest.approx(2.27739, abs=1e-5)
+    # The published rotor positions put the centre of gravity 0.2 mm beside the arms' middle.
+    np.testing.assert_allclose(properties.main_body.centre - properties.main_origin,
+                               parts.main_body.centre_of_mass, atol=3e-4)
+    assert -properties.main_origin[2] == pytest.approx(parts.centre_of_gravity_height, abs=1e-5)
+    np.testing.assert_allclose(np.abs(properties.joint_origins - properties.main_origin)[:, :2],
+                               parts.module.joint_offset, atol=1e-6)
+
+
+def test_mujoco_sees_the_same_totals():
+    made = plant()
+    model, data = made.model, made.data
+    inertia = np.zeros((3, 3))
+    for body in range(1, model.nbody):
+        axes = data.ximat[body].reshape(3, 3)
+        r = data.xipos[body] - data.xpos[1]
+        inertia += axes @ np.diag(model.body_inertia[body]) @ axes.T \
+            + model.body_mass[body] * (r @ r * np.eye(3) - np.outer(r, r))
+    assert model.body_mass.sum() == pytest.approx(ROBOT.mass, rel=1e-12)
+    np.testing.assert_allclose(data.subtree_com[1], data.xpos[1], atol=1e-12)
+    np.testing.assert_allclose(inertia, np.diag(ROBOT.inertia), atol=1e-9)
+
+
+@pytest.mark.parametrize('change, key', [
+    ({'mass': 0.5}, 'multibody'), ({'inertia': np.array([0.03, 0.0620796, 0.0948795])}, 'inertia')])
+def test_impossible_totals_are_refused_by_name(change, key):
+    with pytest.raises(ParameterError, match=f'^{key}: .*main body') as error:
+        mass_properties(replace(ROBOT, **change))
+    assert '\n' not in str(error.value)

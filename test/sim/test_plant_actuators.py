@@ -1,0 +1,84 @@
+"""Servos and rotors of the plant answer as their parameters say."""
+
+import numpy as np
+import pytest
+from sim_robots import immovable, plant, ROBOT
+
+JOINT = ROBOT.joints
+TICK = 0.005
+
+
+def second_order(time, step):
+    """Closed form of J q'' = Kp (step - q) - Kd q' from rest, underdamped."""
+    damping = JOINT.damping_ratio * JOINT.natural_frequency
+    ringing = JOINT.natural_frequency * np.sqrt(1 - JOINT.damping_ratio ** 2)
+    decay = np.exp(-damping * time)
+    position = step * (1 - decay * (np.cos(ringing * time)
+                                    + damping / ringing * np.sin(ringing * time)))
+    rate = step * decay * JOINT.natural_frequency ** 2 / ringing * np.sin(ringing * time)
+    return position, rate
+
+
+def test_unloaded_servo_answers_as_the_second_order_system():
+    made = plant(immovable())
+    made.set_targets(np.array([0.2, -0.2, 0.1, -0.05]), np.zeros(4))
+    for k in range(1, 41):
+        made.step()
+        position, rate = second_order(k * TICK, np.array([0.2, -0.2, 0.1, -0.05]))
+        np.testing.assert_allclose(made.state[0][7:], position, atol=2e-5)
+        np.testing.assert_allclose(made.state[1][6:], rate, atol=2e-3)
+
+
+def test_servo_sags_by_load_over_stiffness():
+    """Accelerated upward, a module at 90 deg hangs on its servo as it would in gravity."""
+    made = plant(immovable())
+    made.set_targets(np.full(4, np.pi / 2), np.zeros(4))
+    acceleration = 9.8
+    for _ in range(300):
+        made.set_wrench([0, 0, 190 * acceleration], np.zeros(3))
+        made.step()
+    module = ROBOT.multibody.module
+    tilt = made.state[0][7:]
+    load = -module.mass * acceleration * module.centre_of_mass[2] * np.sin(tilt)
+    np.testing.assert_allclose(JOINT.kp * (np.pi / 2 - tilt), load, rtol=2e-3)
+    assert np.all(np.pi / 2 - tilt > 0.05)
+
+
+def test_tilt_rate_stays_at_its_limit():
+    made = plant(immovable())
+    made.set_targets(np.array([3.0, -3.0, 2.0, 1.5]), np.zeros(4))
+    fastest, positions = 0.0, []
+    for _ in range(60):
+        made.step()
+        fastest = np.maximum(fastest, np.abs(made.state[1][6:]))
+        positions.append(made.state[0][7])
+    np.testing.assert_allclose(fastest, JOINT.velocity_limit, rtol=1e-3)
+    cruise = np.diff(positions[10:40]) / TICK
+    np.testing.assert_allclose(cruise, JOINT.velocity_limit, rtol=1e-3)
+    for _ in range(100):
+        made.step()
+    np.testing.assert_allclose(made.state[0][7:], [3.0, -3.0, 2.0, 1.5], atol=1e-3)
+
+
+def test_joint_stops_hold():
+    made = plant(immovable())
+    made.set_targets(np.full(4, 5.0), np.zeros(4))     # beyond what the command link lets pass
+    for _ in range(300):
+        made.step()
+    assert np.all(made.state[0][7:] > JOINT.position_limit - 0.01)
+    assert np.all(made.state[0][7:] < JOINT.position_limit + 0.001)
+
+
+def test_thrust_follows_first_order_lag_up_and_down():
+    made = plant()
+    made.set_targets(np.zeros(4), np.array([2.0, 5.0, 10.0, 20.0]))
+    for k in range(1, 60):
+        made.step()
+        expected = np.array([2, 5, 10, 20]) * -np.expm1(-k * TICK / ROBOT.rotors.time_constant)
+        np.testing.assert_allclose(made.thrust, expected, rtol=1e-6)
+    top = made.thrust
+    made.set_targets(np.zeros(4), np.zeros(4))
+    for _ in range(20):
+        made.step()
+    np.testing.assert_allclose(made.thrust, top * np.exp(-0.1 / ROBOT.rotors.time_constant),
+                               rtol=1e-6)

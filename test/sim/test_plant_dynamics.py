@@ -1,0 +1,124 @@
+"""The multibody plant obeys mechanics: free fall, momentum, energy, ground, payload."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from sim_robots import HIGH, LEVEL, momenta, plant, ROBOT, WORLD
+
+from beetle_omni_ros.robot import rotations
+
+WEIGHTLESS = replace(ROBOT, gravity=0.0)
+
+
+def spinning(made, velocity, angular_velocity):
+    """Set a plant in motion."""
+    made.data.qvel[:6] = np.concatenate([velocity, angular_velocity])
+
+
+def test_free_fall_follows_the_parabola():
+    made = plant(position=[0, 0, 30])
+    spinning(made, [1.0, -2.0, 3.0], np.zeros(3))
+    for _ in range(200):
+        made.step()
+    qpos, qvel = made.state
+    np.testing.assert_allclose(qpos[:3], [1, -2, 33 - ROBOT.gravity / 2], atol=1e-9)
+    np.testing.assert_allclose(qvel[:3], [1, -2, 3 - ROBOT.gravity], atol=1e-9)
+    np.testing.assert_allclose(made.specific_force, 0, atol=1e-9)
+
+
+def test_torque_free_spin_keeps_momenta_and_centre():
+    made = plant(WEIGHTLESS, quaternion=rotations.from_rpy(0.4, -0.2, 1.0))
+    spinning(made, [0.3, 0.1, -0.2], [3.0, -2.0, 4.0])
+    linear, angular, centre = momenta(made)
+    for _ in range(200):
+        made.step()
+    linear_after, angular_after, centre_after = momenta(made)
+    np.testing.assert_allclose(linear_after, linear, atol=1e-7)
+    np.testing.assert_allclose(angular_after, angular, atol=1e-6)
+    np.testing.assert_allclose(centre_after, centre + linear / ROBOT.mass, atol=1e-6)
+
+
+@pytest.mark.parametrize('target', [0.3, 3.0], ids=['servo linear', 'rate limited'])
+def test_tilting_modules_react_on_the_body_and_keep_momenta(target):
+    made = plant(WEIGHTLESS)
+    made.set_targets(np.array([target, -target, 0.5 * target, target]), np.zeros(4))
+    turned = 0.0
+    for _ in range(100):
+        made.step()
+        turned = max(turned, np.abs(made.state[1][3:6]).max())
+    linear, angular, centre = momenta(made)
+    np.testing.assert_allclose(linear, 0, atol=1e-7)
+    np.testing.assert_allclose(angular - np.cross(centre, linear), 0, atol=1e-7)
+    np.testing.assert_allclose(centre, HIGH, atol=1e-6)
+    assert turned > 1e-3
+
+
+def test_energy_is_what_the_wrench_put_in():
+    made = plant(WEIGHTLESS)
+    force = np.array([2.0, -1.0, 3.0])
+    made.set_wrench(force, np.zeros(3))
+    for _ in range(100):
+        made.step()
+    mujoco.mj_energyVel(made.model, made.data)
+    work = force @ (made.state[0][:3] - HIGH)
+    # The modules hang a little off the axis and swing against their servos' damping.
+    assert made.data.energy[1] == pytest.approx(work, rel=2e-3)
+
+
+def test_wrench_acts_in_its_frames():
+    made = plant(WEIGHTLESS, quaternion=rotations.from_rpy(0, 0, np.pi / 2))
+    made.set_wrench([3.0, 0, 0], [0, 0, 0.5])
+    for _ in range(20):
+        made.step()
+    linear, angular, centre = momenta(made)
+    np.testing.assert_allclose(linear, [0.3, 0, 0], atol=1e-4)
+    np.testing.assert_allclose(angular - np.cross(centre, linear), [0, 0, 0.05], atol=1e-4)
+
+
+def test_hover_thrust_carries_the_robot():
+    """Equal thrusts balance the weight; the 0.2 mm between arms and centre leaves a small moment."""
+    made = plant()
+    hover = np.full(4, ROBOT.hover_thrust)
+    acceleration = made.acceleration(HIGH, LEVEL, np.zeros(3), np.zeros(3), np.zeros(4),
+                                     np.zeros(4), hover)
+    np.testing.assert_allclose(acceleration[:3], 0, atol=2e-3)
+    moment = np.cross(ROBOT.rotors.positions, hover[:, None] * [0, 0, 1]).sum(axis=0)
+    np.testing.assert_allclose(ROBOT.inertia * acceleration[3:6], moment, atol=2e-4)
+
+
+def test_robot_rests_on_its_feet():
+    made = plant(position=None)
+    height = made.state[0][2]
+    assert WORLD.plant.foot_depth - 1e-3 < height < WORLD.plant.foot_depth
+    for _ in range(200):
+        made.step()
+    assert made.contact
+    np.testing.assert_allclose(made.state[0][:3], [0, 0, height], atol=1e-5)
+    np.testing.assert_allclose(made.specific_force, [0, 0, ROBOT.gravity], atol=1e-3)
+
+
+@pytest.mark.parametrize('rpy', [(0, 0, 0), (np.pi, 0, 0), (1.2, 0.3, 0), (0, -np.pi / 2, 0.4)])
+def test_dropped_robot_comes_to_rest_above_the_floor(rpy):
+    made = plant(position=[0, 0, 1.0], quaternion=rotations.from_rpy(*rpy))
+    for _ in range(1000):
+        made.step()
+    lowest = made.data.geom_xpos[1:, 2].min()
+    assert made.contact and lowest > 0
+    assert np.abs(made.state[1][:6]).max() < 0.05
+
+
+def test_payload_adds_its_weight_below_the_centre():
+    made = plant()
+    made.set_payload(0.75)
+    before = ROBOT.mass
+    assert made.model.body_mass.sum() == pytest.approx(before + 0.75)
+    mujoco.mj_forward(made.model, made.data)
+    depth = HIGH[2] - made.data.subtree_com[1][2]
+    assert depth == pytest.approx(0.75 * WORLD.plant.payload_depth / (before + 0.75), rel=1e-6)
+    lifted = made.acceleration(HIGH, LEVEL, np.zeros(3), np.zeros(3), np.zeros(4), np.zeros(4),
+                               np.full(4, (before + 0.75) * ROBOT.gravity / 4))
+    assert abs(lifted[2]) < 2e-3
+    made.set_payload(0.0)
+    assert made.model.body_mass.sum() == pytest.approx(before)

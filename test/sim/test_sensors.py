@@ -1,0 +1,160 @@
+"""Sensor readings: noise, resolution, latency and rate, measured on a robot at rest or in motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from sim_robots import HIGH, LEVEL, ROBOT, WORLD
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim.conditions import draw
+from beetle_omni_ros.sim.simulator import Simulator
+
+TICK = WORLD.plant.tick
+
+
+def at_rest(conditions='nominal', seconds=20, seed=0):
+    """Frames of a robot that stands on the floor."""
+    simulator = Simulator(ROBOT, WORLD, conditions, seed)
+    return simulator, [simulator.step() for _ in range(int(seconds / TICK))]
+
+
+def pose_errors(frames, truths):
+    """Position and rotation-vector errors of all MoCap frames against the truth at capture."""
+    poses = [frame.mocap for frame in frames if frame.mocap is not None]
+    position = np.array([pose.position - truths[pose.stamp].position for pose in poses])
+    rotation = (Rotation.from_quat([truths[pose.stamp].quaternion for pose in poses]).inv()
+                * Rotation.from_quat([pose.quaternion for pose in poses])).as_rotvec()
+    return position, rotation
+
+
+def agrees(samples, deviation, mean=0.0):
+    """Mean and standard deviation of columns within five standard errors."""
+    count = len(samples)
+    np.testing.assert_allclose(samples.mean(axis=0), mean, atol=5 * deviation / np.sqrt(count))
+    np.testing.assert_allclose(samples.std(axis=0), deviation, rtol=5 / np.sqrt(2 * count))
+
+
+def test_nominal_noise_is_as_stated():
+    _, frames = at_rest()
+    force = np.array([frame.imu.specific_force for frame in frames])
+    rate = np.array([frame.imu.angular_velocity for frame in frames])
+    agrees(force, 0.05, [0, 0, ROBOT.gravity])
+    agrees(rate, 0.005)
+    position, rotation = pose_errors(frames, {f.time: f.truth for f in frames} | {
+        0.0: frames[0].truth})
+    agrees(position, 0.001)
+    agrees(rotation, np.deg2rad(0.1))
+    white = np.corrcoef(force[1:, 0], force[:-1, 0])[0, 1]
+    assert abs(white) < 5 / np.sqrt(len(force))
+
+
+def test_rates_and_ages_are_exact_in_ticks():
+    _, frames = at_rest(seconds=1)
+    assert all(frame.imu.stamp == frame.time for frame in frames)
+    assert all(abs(frame.time - frame.joints.stamp - 0.010) < 1e-12 for frame in frames)
+    with_mocap = [frame for frame in frames if frame.mocap is not None]
+    assert len(with_mocap) == 100
+    assert all(abs(f.time - f.mocap.stamp - 0.010) < 1e-12 for f in with_mocap)
+    assert np.allclose(np.diff([f.mocap.stamp for f in with_mocap]), 0.010, atol=1e-12)
+    assert sum(frame.battery is not None for frame in frames) == 10
+
+
+def test_readings_are_the_truth_of_their_stamps():
+    """Falling and turning, noise off: old readings equal the old truth."""
+    quiet = replace(WORLD, imu=replace(WORLD.imu, specific_force_noise=0.0,
+                                       angular_velocity_noise=0.0),
+                    mocap=replace(WORLD.mocap, position_noise=0.0, orientation_noise=0.0))
+    simulator = Simulator(ROBOT, quiet)
+    simulator.reset(HIGH, Rotation.from_euler('ZYX', [0.3, 0.2, 0.1]).as_quat())
+    simulator.set_wrench([1, 2, 3], [0.1, 0.2, -0.1])
+    truths = {0.0: simulator.truth}
+    for _ in range(60):
+        simulator.command(Command(simulator.time, np.array([1.0, -1, 0.5, 0]), np.full(4, 6.0)))
+        frame = simulator.step()
+        truths[frame.time] = frame.truth
+        if frame.mocap:
+            np.testing.assert_allclose(frame.mocap.position, truths[frame.mocap.stamp].position)
+            np.testing.assert_allclose(frame.mocap.quaternion,
+                                       truths[frame.mocap.stamp].quaternion, atol=1e-12)
+        then = min(truths, key=lambda t: abs(t - frame.joints.stamp))
+        if frame.joints.stamp >= 0:
+            count = 2 * np.pi / WORLD.encoders.counts_per_turn
+            error = frame.joints.position - truths[then].tilt
+            assert np.abs(error).max() <= count / 2 + 1e-12
+            turns = frame.joints.position / count
+            np.testing.assert_allclose(turns, np.rint(turns), atol=1e-9)
+        np.testing.assert_allclose(frame.imu.angular_velocity, frame.truth.angular_velocity)
+
+
+def test_imu_measures_acceleration_less_gravity():
+    """Against central differences of the true velocity."""
+    quiet = replace(WORLD, imu=replace(WORLD.imu, specific_force_noise=0.0))
+    simulator = Simulator(ROBOT, quiet)
+    simulator.reset(HIGH, Rotation.from_euler('ZYX', [0.3, 0.2, 0.1]).as_quat())
+    frames = []
+    for _ in range(60):
+        simulator.command(Command(simulator.time, np.zeros(4), np.full(4, 9.0)))
+        frames.append(simulator.step())
+    for before, now, after in zip(frames[10:], frames[11:], frames[12:]):
+        acceleration = (after.truth.velocity - before.truth.velocity) / (2 * TICK)
+        expected = Rotation.from_quat(now.truth.quaternion).inv().apply(
+            acceleration + [0, 0, ROBOT.gravity])
+        np.testing.assert_allclose(now.imu.specific_force, expected, atol=5e-3)
+
+
+def test_published_biases_and_noise_come_from_the_table():
+    simulator, frames = at_rest('published', seed=5)
+    drawn, p = simulator.conditions, WORLD.published
+    position, rotation = pose_errors(frames, {f.time: f.truth for f in frames} | {
+        0.0: frames[0].truth})
+    agrees(position, np.hypot(0.001, 0.01 / np.sqrt(3)), drawn.position_bias)
+    agrees(rotation, np.hypot(np.deg2rad(0.1), 0.01 / np.sqrt(3)), drawn.orientation_bias)
+    rate = np.array([frame.imu.angular_velocity for frame in frames])
+    agrees(rate, np.hypot(0.005, 0.005 / np.sqrt(3)), drawn.imu_bias[3:])
+    tilt = np.array([frame.joints.position for frame in frames])
+    agrees(tilt, np.deg2rad(2) / np.sqrt(3), drawn.tilt_bias)
+    assert np.all(np.abs(tilt - drawn.tilt_bias) <= p.tilt_noise + 2 * np.pi / 4096)
+
+
+def test_published_draws_fill_their_ranges():
+    p, tick = WORLD.published, WORLD.published.latency_unit
+    drawn = [draw('published', WORLD, np.random.default_rng(seed)) for seed in range(400)]
+    for values, low, high in [
+            ([d.variation.mass_scale for d in drawn], 1 - p.mass_scale, 1 + p.mass_scale),
+            ([d.variation.inertia_scale for d in drawn], 0.95, 1.05),
+            ([d.variation.centre_of_mass for d in drawn], -0.01, 0.01),
+            ([d.position_bias for d in drawn], -0.01, 0.01),
+            ([d.tilt_bias for d in drawn], -np.deg2rad(3), np.deg2rad(3))]:
+        span = high - low
+        assert low <= np.min(values) < low + 0.05 * span
+        assert high - 0.05 * span < np.max(values) <= high + 1e-6
+    for name, expected in [('imu_latency', {3, 4, 5}), ('tilt_latency', {1, 2}),
+                           ('tilt_command_delay', {1, 2, 3}),
+                           ('thrust_command_delay', {1, 2, 3})]:
+        assert {round(getattr(d, name) / tick) for d in drawn} == expected
+
+
+def test_published_imu_hides_its_age():
+    quiet = replace(WORLD, imu=replace(WORLD.imu, angular_velocity_noise=0.0),
+                    published=replace(WORLD.published, angular_velocity_noise=0.0,
+                                      angular_velocity_bias=0.0))
+    simulator = Simulator(ROBOT, quiet, 'published', seed=2)
+    simulator.reset(HIGH, LEVEL)
+    simulator.set_wrench(np.zeros(3), [0, 0, 0.3])
+    frames = [simulator.step() for _ in range(40)]
+    late = round(simulator.conditions.imu_latency / TICK)
+    assert late >= 3
+    for now, then in zip(frames[late:], frames):
+        assert now.imu.stamp == now.time
+        np.testing.assert_allclose(now.imu.angular_velocity, then.truth.angular_velocity)
+
+
+@pytest.mark.parametrize('change, key', [
+    ({'mocap': replace(WORLD.mocap, latency=0.008)}, 'mocap.latency'),
+    ({'encoders': replace(WORLD.encoders, latency=0.0033)}, 'encoder latency')])
+def test_latency_between_ticks_is_refused(change, key):
+    with pytest.raises(ParameterError, match=f'{key}: .*multiple of the simulator tick'):
+        Simulator(ROBOT, replace(WORLD, **change))

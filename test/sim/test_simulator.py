@@ -1,0 +1,134 @@
+"""The simulator as the flight stack meets it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sim_robots import HIGH, ROBOT, WORLD
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim.simulator import Simulator
+
+HOVER = np.full(4, ROBOT.hover_thrust)
+
+
+def numbers(simulator, ticks=300):
+    """Every number of a short flight, as one array."""
+    values = []
+    for k in range(ticks):
+        if k % 2 == 0:
+            simulator.command(Command(simulator.time, 0.3 * np.sin(0.1 * k + np.arange(4)), HOVER))
+        frame = simulator.step()
+        values += [frame.imu.specific_force, frame.imu.angular_velocity, frame.truth.position,
+                   frame.joints.position, frame.truth.thrust]
+        if frame.mocap is not None:
+            values += [frame.mocap.position, frame.mocap.quaternion]
+        if frame.battery is not None:
+            values.append([frame.battery.voltage, frame.battery.current])
+    return np.concatenate(values)
+
+
+@pytest.mark.parametrize('conditions', ['nominal', 'published'])
+def test_same_seed_same_numbers_other_seed_others(conditions):
+    first = Simulator(ROBOT, WORLD, conditions, seed=7)
+    expected = numbers(first)
+    np.testing.assert_array_equal(numbers(Simulator(ROBOT, WORLD, conditions, seed=7)), expected)
+    first.set_wrench([1, 0, 0], [0, 0, 0])
+    first.set_payload(0.5)
+    first.reset()
+    np.testing.assert_array_equal(numbers(first), expected)
+    assert np.any(numbers(Simulator(ROBOT, WORLD, conditions, seed=8)) != expected)
+
+
+def test_command_moves_rotors_and_joints_two_ticks_after_its_stamp():
+    simulator = Simulator(ROBOT, WORLD)
+    simulator.reset(HIGH)
+    for _ in range(3):
+        simulator.step()
+    simulator.command(Command(simulator.time, np.full(4, 0.2), HOVER))
+    thrusts = [simulator.step().truth.thrust[0] for _ in range(4)]
+    lag = -np.expm1(-0.005 / ROBOT.rotors.time_constant)
+    np.testing.assert_allclose(thrusts[:3], [0, 0, lag * HOVER[0]], rtol=1e-6)
+    assert simulator.truth.tilt[0] > 0.01
+
+
+def test_rotors_stop_100_ms_after_the_last_command():
+    simulator = Simulator(ROBOT, WORLD)
+    simulator.reset(HIGH)
+    simulator.command(Command(0.0, np.zeros(4), HOVER))
+    thrusts = np.array([simulator.step().truth.thrust[0] for _ in range(40)])
+    assert np.argmax(thrusts) == 19         # rises through the tick that ends at 100 ms
+    assert np.all(np.diff(thrusts[19:]) < 0)
+
+
+def test_nan_command_is_refused_counted_and_harmless():
+    simulator = Simulator(ROBOT, WORLD)
+    simulator.reset(HIGH)
+    simulator.command(Command(0.0, np.zeros(4), HOVER))
+    assert not simulator.command(Command(0.005, np.full(4, np.nan), HOVER))
+    assert simulator.rejected['not finite'] == 1
+    for _ in range(10):
+        frame = simulator.step()
+    assert np.isfinite(frame.truth.position).all() and frame.truth.thrust[0] > 1
+
+
+def test_payload_needs_more_thrust_to_stay():
+    def fall(payload, thrust):
+        simulator = Simulator(ROBOT, WORLD)
+        simulator.reset(HIGH)
+        simulator.set_payload(payload)
+        for _ in range(200):
+            simulator.command(Command(simulator.time, np.zeros(4), np.full(4, thrust)))
+            frame = simulator.step()
+        return frame.truth.velocity[2]
+
+    weight = (ROBOT.mass + 0.5) * ROBOT.gravity / 4
+    # The same lag and delay, hence the same initial fall, when thrust over mass is the same.
+    assert fall(0.5, weight) == pytest.approx(fall(0.0, ROBOT.hover_thrust), abs=0.01)
+    assert fall(0.5, ROBOT.hover_thrust) < fall(0.0, ROBOT.hover_thrust) - 0.5
+
+
+def test_weak_battery_caps_the_thrust():
+    weak = replace(WORLD, battery=replace(WORLD.battery, initial_charge=0.05))
+    reached, voltages = [], []
+    for world in (WORLD, weak):
+        simulator = Simulator(ROBOT, world)
+        simulator.reset(HIGH)
+        for _ in range(100):
+            simulator.command(Command(simulator.time, np.zeros(4), np.full(4, 14.0)))
+            frame = simulator.step()
+            if frame.battery is not None:
+                voltage, current = frame.battery.voltage, frame.battery.current
+        reached.append(frame.truth.thrust[0])
+        voltages.append(voltage)
+    assert reached[0] == pytest.approx(14.0, rel=0.01)
+    assert reached[1] < 13.0
+    assert voltages[1] < voltages[0] - 2
+    assert current < 0
+
+
+def test_thrust_effect_scales_the_true_thrust():
+    simulator = Simulator(replace(ROBOT, effects={'thrust_coefficient': {'scale': 0.9}}), WORLD)
+    simulator.reset(HIGH)
+    for _ in range(200):
+        simulator.command(Command(simulator.time, np.zeros(4), HOVER))
+        frame = simulator.step()
+    np.testing.assert_allclose(frame.truth.thrust, 0.9 * HOVER, rtol=1e-4)
+
+
+@pytest.mark.parametrize('call, text', [
+    (lambda s: s.set_wrench([np.nan, 0, 0], [0, 0, 0]), 'wrench: expected three finite'),
+    (lambda s: s.set_wrench([0, 0], [0, 0, 0]), 'wrench: expected three finite'),
+    (lambda s: s.set_payload(-1.0), 'payload: expected a mass'),
+    (lambda s: s.set_payload(np.nan), 'payload: expected a mass')])
+def test_unusable_disturbance_is_refused(call, text):
+    with pytest.raises(ValueError, match=text):
+        call(Simulator(ROBOT, WORLD))
+
+
+def test_unknown_conditions_and_seeds_are_refused():
+    with pytest.raises(ParameterError, match="'publish' is unknown; expected one of nominal"):
+        Simulator(ROBOT, WORLD, 'publish')
+    with pytest.raises(ParameterError, match='seed: expected a whole number'):
+        Simulator(ROBOT, WORLD, seed=-1)
