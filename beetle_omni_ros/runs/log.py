@@ -79,8 +79,9 @@ class FlightLog:
         requests: controller -> what it asked for, before the supervisor.
         targets: pose and trajectory targets in the order of their stamps.
         state_t, states: (S,) times and names of the supervisor's states.
-        compute: controller -> median, p99, max [ms], deadline_misses, count (cumulative).
-        compute_history: controller -> list of (t, such a dict), one for each report.
+        compute: controller, or another node's name without '_node' -> median, p99, max [ms],
+            deadline_misses, count (cumulative).
+        compute_history: the same names -> list of (t, such a dict), one for each report.
         diagnostics: every status other than the above, in time order.
         meta: task, conditions, seed, robot, version, as far as known.
         warnings: what was wrong while reading, one line each.

@@ -19,7 +19,7 @@ TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 WORLD, BODY = 'world', 'base_link'
 COMMAND_NAMES = [*JOINT_NAMES, *ROTOR_NAMES]
 RUN_STATUS = 'run'  # diagnostic status '<node>: run' that carries a flight's meta data
-COMPUTE_STATUS = 'compute'  # diagnostic status '<controller>_node: compute'
+COMPUTE_STATUS = 'compute'  # diagnostic status '<name>_node: compute'
 
 _T = TYPESTORE.types
 Time = _T['builtin_interfaces/msg/Time']
@@ -260,12 +260,11 @@ def _read_diagnostics(recorder, message, received):
             if values.get('seed', '').isdigit():
                 values['seed'] = int(values['seed'])
             recorder.write_meta(values)
-        controller = node.rpartition('/')[2].removesuffix('_node')
-        if kind == COMPUTE_STATUS and controller in ('nmpc', 'rl', 'hover') \
-                and set(COMPUTE_KEYS) <= set(values):
-            recorder.write_compute(t, controller, **{
-                name: int(values[key]) if name in ('deadline_misses', 'count')
-                else float(values[key]) for key, name in COMPUTE_KEYS.items()})
+        name = node.rpartition('/')[2].removesuffix('_node')
+        if kind == COMPUTE_STATUS and set(COMPUTE_KEYS) <= set(values):
+            recorder.write_compute(t, name, **{
+                field: int(values[key]) if field in ('deadline_misses', 'count')
+                else float(values[key]) for key, field in COMPUTE_KEYS.items()})
         elif kind != RUN_STATUS:
             recorder.write_diagnostic(t, status.name, values, status.level, status.message)
 

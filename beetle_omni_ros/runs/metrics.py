@@ -104,9 +104,8 @@ def _split(log, task):
         lasted = end >= target.stamp + U_WINDOW[1] - 1e-3
         if isinstance(target, PoseTarget) and lasted:
             poses[name].append(k)
-        landing = _landing(log, target.stamp)
-        if landing > target.stamp:
-            intervals[name].append((target.stamp, min(end, log.end, landing)))
+        if shares:
+            intervals[name].append((target.stamp, min(end, log.end, _landing(log, target.stamp))))
     return [Flown(name, poses[name], intervals[name]) for name in poses
             if poses[name] or intervals[name]]
 
