@@ -1,0 +1,88 @@
+"""
+How far the true modules take the plant from the one-rigid-body model of the controller.
+
+``python benchmarks/multibody_difference.py``: at random states, the multibody plant (MuJoCo)
+against the CasADi model, as a force on the mass and a torque on the inertia. First with the
+joints held or turning evenly (only the shifted centre of mass and inertia remain), then with
+the servos braking them, which throws the modules' momentum into the body.
+"""
+
+import argparse
+
+import numpy as np
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.dynamics import body_acceleration
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.plant import Plant
+
+HEIGHT = np.array([0.0, 0.0, 10.0])     # [m] away from the floor
+CASES = (                               # name, tilts, body rates, joint rates, joints held
+    ('level hover', 0.0, 0.0, 0.0, True),
+    ('hover, tilts within +-pi', np.pi, 0.0, 0.0, True),
+    ('turning, |w| about 3 rad/s', np.pi, 2.0, 0.0, True),
+    ('joints moving, 5 rad/s', np.pi, 2.0, 5.0, True),
+    ('joints braked from 5 rad/s', np.pi, 2.0, 5.0, False))
+
+
+def held_target(plant, state, tilt):
+    """Tilt targets at which no joint accelerates: the response to a target is linear."""
+    rest = plant.acceleration(*state, tilt_target=tilt)[6:]
+    step = 0.01
+    response = np.stack([(plant.acceleration(*state, tilt_target=tilt + step * unit)[6:] - rest)
+                         / step for unit in np.eye(4)], axis=1)
+    return tilt - np.linalg.solve(response, rest)
+
+
+def differences(robot, count, tilt_span, rate, joint_rate, held, seed):
+    """Force [N] and torque [N m] differences (count,) at random states."""
+    plant, model = Plant(robot, SimulatorParameters.load().plant), body_acceleration(robot)
+    generator = np.random.default_rng(seed)
+    force, torque = np.empty(count), np.empty(count)
+    for k in range(count):
+        quaternion = rotations.normalized(generator.normal(size=4))
+        velocity, angular_velocity = generator.normal(size=3), rate * generator.normal(size=3)
+        tilt = tilt_span * generator.uniform(-1, 1, 4)
+        thrust = robot.hover_thrust * generator.uniform(0.7, 1.3, 4)
+        state = (HEIGHT, quaternion, velocity, angular_velocity, tilt,
+                 joint_rate * generator.choice([-1, 1], 4), thrust)
+        target = held_target(plant, state, tilt) if held else tilt
+        found = plant.acceleration(*state, tilt_target=target)
+        linear, angular = model(velocity, quaternion, angular_velocity, tilt, thrust)
+        force[k] = robot.mass * np.linalg.norm(found[:3] - np.ravel(linear))
+        torque[k] = np.linalg.norm(robot.inertia * (found[3:6] - np.ravel(angular)))
+    return force, torque
+
+
+def main():
+    """Print root mean square and largest difference of each case."""
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--states', type=int, default=500, help='random states of each case')
+    parser.add_argument('--robot', default=None, help='robot file')
+    given = parser.parse_args()
+    robot = RobotParameters.load(given.robot)
+    print(f"{'':<30}{'force N':>16}{'torque N m':>18}\n{'':<30}"
+          f"{'rms':>8}{'max':>8}{'rms':>10}{'max':>8}")
+    for name, *case in CASES:
+        force, torque = differences(robot, given.states, *case, seed=0)
+        print(f'{name:<30}{np.sqrt((force ** 2).mean()):>8.3f}{force.max():>8.3f}'
+              f'{np.sqrt((torque ** 2).mean()):>10.4f}{torque.max():>8.4f}')
+    plant = Plant(robot, SimulatorParameters.load().plant)
+    module = robot.multibody.module
+    aligned = np.pi / 2 * np.array([1, 1, -1, -1])
+    plant.acceleration(HEIGHT, [0, 0, 0, 1], np.zeros(3), np.zeros(3), aligned, np.zeros(4),
+                       np.zeros(4))
+    shift = plant.data.subtree_com[1] - HEIGHT
+    weight = robot.mass * robot.gravity
+    print(f'all modules at 90 deg to one side: centre of mass {1e3 * np.linalg.norm(shift[:2]):.2f} '
+          f'mm aside and {1e3 * shift[2]:.2f} mm up; as a moment of the weight '
+          f'{np.linalg.norm(shift[:2]) * weight:.4f} N m with the body level, up to '
+          f'{shift[2] * weight:.4f} N m with it on its side')
+    print(f'load of a module on its joint: up to '
+          f'{-module.mass * module.centre_of_mass[2] * robot.gravity:.4f} N m at 1 g')
+
+
+if __name__ == '__main__':
+    main()
