@@ -53,6 +53,15 @@ def geodesic_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return 2 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
 
 
+def roll_pitch_yaw(quaternions: np.ndarray) -> np.ndarray:
+    """(N, 3) roll, pitch, yaw [deg] of (N, 4) quaternions, R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    x, y, z, w = np.asarray(quaternions).T
+    return np.degrees(np.stack([
+        np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
+        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], axis=1))
+
+
 def errors(body: Motion, target: Target, window: slice = slice(None)):
     """
     Distance from the target and angle to it.

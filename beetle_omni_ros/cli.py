@@ -1,0 +1,205 @@
+"""
+The `beetle_omni` command.
+
+Every subcommand imports what it needs when it runs, so that `--help` is quick and an
+analysis needs no ROS. Unusable input ends with status 2 and one line on standard error.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+import sys
+from typing import Annotated, Optional
+
+import typer
+from typer.main import get_command
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.robot.schema import ParameterError
+
+UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130
+CONDITIONS = ('nominal', 'published')
+# Modules that come with ROS, or with the package's extra 'ros'.
+ROS_MODULES = ('rclpy', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs',
+               'geometry_msgs', 'nav_msgs', 'rcl_interfaces', 'sensor_msgs', 'std_msgs',
+               'std_srvs', 'trajectory_msgs')
+
+app = typer.Typer(no_args_is_help=True, add_completion=False,
+                  context_settings={'help_option_names': ['-h', '--help']},
+                  help='Fly, evaluate and report on the tiltable quadrotor.')
+
+TaskOption = Annotated[str, typer.Option(
+    '--task', help='CSV file of poses, or waypoints, random100, lemniscate, hover, force, torque '
+                   'or payload.', metavar='TASK')]
+ConditionsOption = Annotated[str, typer.Option(
+    '--conditions', metavar='nominal|published',
+    help="The simulator as measured, or with the publication's randomisation drawn from --seed.")]
+SeedOption = Annotated[int, typer.Option(
+    '--seed', min=0, max=2**31 - 1, help='Of random poses and of everything random in the '
+                                         'simulation.')]
+RobotOption = Annotated[Optional[Path], typer.Option(
+    '--robot', metavar='FILE', help='What estimator and controller believe. '
+                                    'Default: the shipped params/robot.yaml.')]
+PlantOption = Annotated[Optional[Path], typer.Option(
+    '--plant', metavar='FILE', help='What is true in the simulation. Default: as --robot.')]
+JsonOption = Annotated[Optional[Path], typer.Option(
+    '--json', metavar='FILE', help='Write the results there as JSON.')]
+
+
+def _version(wanted: bool):
+    if wanted:
+        typer.echo(f'beetle_omni {__version__}')
+        raise typer.Exit()
+
+
+@app.callback()
+def _common(version: Annotated[bool, typer.Option(
+        '--version', callback=_version, is_eager=True, help='Show the version.')] = False):
+    pass
+
+
+@app.command()
+def fly(bag: Annotated[Path, typer.Option(
+            '--bag', metavar='DIR', help='New folder for the recorded bag.')],
+        controller: Annotated[str, typer.Option(
+            '--controller', metavar='nmpc|rl', help='The active controller.')] = 'nmpc',
+        task: TaskOption = 'waypoints',
+        conditions: ConditionsOption = 'nominal',
+        seed: SeedOption = 0,
+        robot: RobotOption = None,
+        plant: PlantOption = None,
+        composed: Annotated[bool, typer.Option(
+            '--composed/--separate', help='All nodes in one process, or one process each.')] = True,
+        domain_id: Annotated[Optional[int], typer.Option(
+            '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
+        json_path: JsonOption = None):
+    """
+    Fly the whole ROS graph in real time against the simulated robot.
+
+    Takes off, flies the task, lands, records a bag and prints the result table.
+    Example: beetle_omni fly --controller nmpc --task waypoints --bag my_flight
+    """
+    _check(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
+           files=(robot, plant))
+    from beetle_omni_ros.nodes.fly import FlightError, run_fly
+    try:
+        code = run_fly(controller=controller, task=task, bag=bag, seed=seed,
+                       conditions=conditions, robot=robot, plant=plant, composed=composed,
+                       json_path=json_path, domain_id=domain_id)
+    except FlightError as error:
+        raise typer.Exit(_fail(error, FAILED)) from None
+    raise typer.Exit(code if isinstance(code, int) else 0)
+
+
+@app.command()
+def evaluate(controllers: Annotated[str, typer.Option(
+                 '--controllers', metavar='NAME,...',
+                 help='Controllers to fly one after the other, e.g. nmpc,nmpc_published.')]
+             = 'nmpc',
+             task: TaskOption = 'random100',
+             conditions: ConditionsOption = 'nominal',
+             seed: SeedOption = 0,
+             robot: RobotOption = None,
+             plant: PlantOption = None,
+             nmpc_file: Annotated[Optional[Path], typer.Option(
+                 '--nmpc', metavar='FILE', help='Other parameters for the NMPC.')] = None,
+             bag: Annotated[Optional[Path], typer.Option(
+                 '--bag', metavar='DIR', help='New folder for the bag; with several controllers '
+                                              'it holds one bag for each.')] = None,
+             json_path: JsonOption = None):
+    """
+    Fly a task in one process: deterministic and faster than real time.
+
+    Plant, sensors, estimator, controllers and actuators are those of the ROS graph.
+    Example: beetle_omni evaluate --controllers nmpc --task random100 --json result.json
+    """
+    names = [name.strip() for name in controllers.split(',') if name.strip()]
+    if not names or len(set(names)) != len(names):
+        raise ParameterError(f"--controllers '{controllers}': expected different names, "
+                             'separated by commas')
+    _check(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
+           files=(robot, plant, nmpc_file))
+    from beetle_omni_ros.evaluation.command import run_evaluate
+    from beetle_omni_ros.evaluation.loop import FlightError
+    try:
+        run_evaluate(controllers=names, task=task, conditions=conditions, robot=robot,
+                     plant=plant, seed=seed, bag=bag, json_path=json_path, nmpc_file=nmpc_file)
+    except FlightError as error:
+        raise typer.Exit(_fail(error, FAILED)) from None
+
+
+@app.command()
+def report(runs: Annotated[list[Path], typer.Argument(
+               metavar='RUN...', help='Recorded bags: rosbag2 folders, or one of their files.')],
+           output: Annotated[Path, typer.Option(
+               '--output', '-o', metavar='FILE', help='The page to write.')]
+           = Path('report.html'),
+           json_path: JsonOption = None):
+    """
+    Make one self-contained HTML page of metrics and plots, several runs side by side.
+
+    Example: beetle_omni report flight_a flight_b --output report.html
+    """
+    from beetle_omni_ros.runs.json_file import check_writable
+    check_writable(output, 'report')
+    if json_path:
+        check_writable(json_path)
+    from beetle_omni_ros.runs.report import run_report
+    run_report(runs, output, json_path=json_path)
+
+
+def _check(*, task, seed, conditions, bag, json_path, files):
+    """Refuse unusable input before anything long starts."""
+    from beetle_omni_ros.runs.json_file import check_writable
+    from beetle_omni_ros.runs.tasks import make_task
+    if conditions not in CONDITIONS:
+        raise ParameterError(f"--conditions '{conditions}': expected {' or '.join(CONDITIONS)}")
+    for file in files:
+        if file is not None and not file.is_file():
+            raise ParameterError(f'{file}: no such file')
+    make_task(task, seed)
+    if json_path:
+        check_writable(json_path)
+    if bag:
+        from beetle_omni_ros.runs.bag import check_new
+        check_new(bag)
+
+
+def _fail(error, status):
+    print(f"beetle_omni: error: {' '.join(str(error).split())}", file=sys.stderr)
+    return status
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command and return its exit status."""
+    try:
+        status = get_command(app).main(args=args, prog_name='beetle_omni', standalone_mode=False)
+        return status if isinstance(status, int) else 0
+    except ModuleNotFoundError as error:
+        top = (error.name or '').partition('.')[0]
+        if top == __package__:
+            raise
+        cure = "source a ROS 2 Jazzy environment or pip install 'beetle_omni_ros[ros]'" \
+            if top in ROS_MODULES else 'pip install beetle_omni_ros brings it'
+        return _fail(f"the module '{top}' is not installed; {cure}", UNUSABLE)
+    except ParameterError as error:
+        return _fail(error, UNUSABLE)
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail('interrupted', INTERRUPTED)
+    except Exception as error:
+        # usage errors of typer's parser, and bag errors, without importing either for --help
+        if hasattr(error, 'format_message'):
+            text = error.format_message()  # empty after the help of a bare `beetle_omni`
+            return _fail(f'{text} See beetle_omni --help.', UNUSABLE) if text else UNUSABLE
+        if type(error).__name__ == 'BagError':
+            return _fail(error, UNUSABLE)
+        raise
+
+
+def run() -> None:
+    """Entry point of the console script."""
+    sys.exit(main())
+
+
+if __name__ == '__main__':
+    run()

@@ -1,0 +1,58 @@
+"""Result files: refused early where they cannot be written, strict JSON where they can."""
+
+from __future__ import annotations
+
+import json
+from math import isfinite
+import os
+from pathlib import Path
+
+from beetle_omni_ros.robot.schema import ParameterError
+
+
+def check_writable(path: str | Path, what: str = 'result file') -> None:
+    """
+    Refuse a file that cannot be written, before the work that it is to hold.
+
+    Raises:
+        ParameterError: naming the file and the reason.
+
+    """
+    path = Path(path)
+    folder = path.absolute().parent
+    if path.is_dir():
+        reason = 'it is a folder'
+    elif not folder.is_dir():
+        reason = f'there is no folder {folder}'
+    elif not os.access(path if path.exists() else folder, os.W_OK):
+        reason = 'no permission'
+    else:
+        return
+    raise ParameterError(f'{path}: cannot write the {what} there ({reason})')
+
+
+def write_json(path: str | Path, results: dict) -> None:
+    """
+    Write results as strict JSON: a number that is not finite becomes null.
+
+    Raises:
+        ParameterError: the file cannot be written.
+
+    """
+    path = Path(path)
+    temporary = path.with_name(path.name + '.tmp')
+    try:
+        temporary.write_text(json.dumps(_strict(results), indent=1) + '\n')
+        temporary.replace(path)
+    except OSError as error:
+        raise ParameterError(f'{path}: cannot write the result file ({error.strerror})') from None
+
+
+def _strict(value):
+    if isinstance(value, dict):
+        return {str(key): _strict(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_strict(entry) for entry in value]
+    if isinstance(value, float) and not isfinite(value):
+        return None
+    return value
