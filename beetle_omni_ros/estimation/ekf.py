@@ -9,13 +9,16 @@ a motion that the poses contradict.
 """
 
 from collections import Counter, deque
+from math import sqrt
 
 import numpy as np
 
 from beetle_omni_ros.estimation.guard import InputGuard
 from beetle_omni_ros.estimation.model import ErrorStateModel
 from beetle_omni_ros.estimation.mounting import Mounting
+from beetle_omni_ros.estimation.noise import NoiseMonitor
 from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.estimation.propagation import TIME_OFFSET
 from beetle_omni_ros.estimation.samples import Estimate, ImuSample, PoseSample
 from beetle_omni_ros.estimation.track import interpolate, SAME_INSTANT, Track
 
@@ -36,12 +39,15 @@ class ErrorStateEkf:
         """
         self._parameters = parameters
         self._model = ErrorStateModel(parameters, gravity)
-        self._mounting = Mounting(parameters.imu)
+        self._mounting = Mounting(parameters.imu, gravity)
         self.reset()
 
     def reset(self) -> None:
         """Forget everything, as before the first sample."""
         self._guard = InputGuard(self._parameters)
+        self._noise = NoiseMonitor(self._parameters.mocap)
+        self._noise_scale = self._noise.scale
+        self._model.scale_noise(*self._noise_scale)
         self._readings: deque = deque()  # (stamp, force, rate) in base_link axes, newest last
         self._early: deque = deque()     # poses that wait for the IMU to reach their capture
         self._track: Track | None = None
@@ -116,14 +122,28 @@ class ErrorStateEkf:
         checked = self._guard.pose(sample, self._readings[0][0] if self._readings else 0.0)
         if checked is None:
             return False
-        if checked[0] > self._readings[-1][0] + SAME_INSTANT:
-            self._early.append(checked)
+        self._noise.add(*checked)
+        stamp = max(checked[0] + self._time_offset(), self._readings[0][0])
+        if stamp > self._readings[-1][0] + SAME_INSTANT:
+            self._early.append((stamp, *checked[1:]))
             return True
-        return self._apply(*checked)
+        return self._apply(stamp, *checked[1:])
+
+    def _time_offset(self) -> float:
+        """What brings a pose's stamp to the IMU's clock, as the leading track estimates it."""
+        leader = self._track if self._believed or self._candidate is None else self._candidate
+        return leader.newest.time_offset if leader is not None else 0.0
+
+    @property
+    def _believed(self) -> bool:
+        return self.status in ('tracking', 'dead_reckoning')
 
     def _apply(self, stamp, position, quaternion) -> bool:
         self._estimate = None
-        believed = self.status in ('tracking', 'dead_reckoning')
+        if self._noise.scale != self._noise_scale:
+            self._noise_scale = self._noise.scale
+            self._model.scale_noise(*self._noise_scale)
+        believed = self._believed
         if believed:
             if self._track.correct(stamp, position, quaternion):
                 self._candidate = None
@@ -151,17 +171,20 @@ class ErrorStateEkf:
                 if self._candidate.fixes >= needed:
                     self._track, self._candidate = self._candidate, None
                 return True
-        self._candidate = self._started(stamp, position, quaternion)
+        # What was known of the biases helps once; if it contradicts the poses, start without.
+        known = self._track.newest if agrees and self._track is not None else None
+        self._candidate = self._started(stamp, position, quaternion, known)
         return agrees
 
-    def _started(self, stamp, position, quaternion) -> Track:
-        """Start a track at a pose and bring it to the newest reading; known biases stay."""
+    def _started(self, stamp, position, quaternion, known) -> Track:
+        """Start a track at a pose, with the biases of ``known``, and bring it up to now."""
         later = [reading for reading in self._readings if reading[0] > stamp + SAME_INSTANT]
         before = self._readings[len(self._readings) - len(later) - 1]
         at_pose = interpolate(stamp, before, later[0]) if later else before[1:]
-        biases = self._track.newest if self._track is not None else None
-        first = self._model.start(stamp, *at_pose, position, quaternion, biases)
-        track = Track(self._model, first, self._parameters.mocap.delay_limit)
+        first = self._model.start(stamp, *at_pose, position, quaternion, known)
+        time_deviation = (self._parameters.initial.time_offset_std if known is None else
+                          sqrt(known.covariance[TIME_OFFSET, TIME_OFFSET]))
+        track = Track(self._model, first, self._parameters.mocap.delay_limit, time_deviation)
         for reading in later:
             track.predict(*reading)
         return track

@@ -11,9 +11,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.propagation import identity, Node, propagate, transition
+from beetle_omni_ros.estimation.propagation import (
+    identity, Node, propagate, STATES, TIME_OFFSET, transition)
 from beetle_omni_ros.estimation.samples import (
-    ACCELEROMETER_BIAS, ATTITUDE, ERROR_STATES, GYROSCOPE_BIAS, POSITION, VELOCITY)
+    ACCELEROMETER_BIAS, ATTITUDE, GYROSCOPE_BIAS, POSITION, VELOCITY)
 from beetle_omni_ros.robot import rotations
 
 MEASURED = 6  # position in world, rotation vector in base_link
@@ -34,8 +35,8 @@ class ErrorStateModel:
         imu, mocap = parameters.imu, parameters.mocap
         self.gravity = gravity
         self.parameters = parameters
-        self.filter = KalmanFilter(dim_x=ERROR_STATES, dim_z=MEASURED)
-        self._no_error = np.zeros(ERROR_STATES)
+        self.filter = KalmanFilter(dim_x=STATES, dim_z=MEASURED)
+        self._no_error = np.zeros(STATES)
         self._transition = identity()
         self._process = _process_noise(parameters)
         self._period = 1 / imu.rate
@@ -46,12 +47,18 @@ class ErrorStateModel:
         self._marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
         self.filter.H[0:3, POSITION] = np.eye(3)
         self.filter.H[3:6, ATTITUDE] = np.eye(3)
-        self.filter.R = np.diag([mocap.position_noise ** 2] * 3 + [mocap.orientation_noise ** 2] * 3)
+        self._claimed_noise = (mocap.position_noise ** 2, mocap.orientation_noise ** 2)
+        self.scale_noise(1.0, 1.0)
         self.gate = float(chi2.ppf(mocap.gate_probability, MEASURED))
+
+    def scale_noise(self, position: float, orientation: float) -> None:
+        """Take the MoCap's variances as these multiples of the parameters' ones."""
+        self.filter.R = np.diag([position * self._claimed_noise[0]] * 3
+                                + [orientation * self._claimed_noise[1]] * 3)
 
     def start(self, stamp, force, rate, position, quaternion, biases: Node | None) -> Node:
         """
-        Make the first node from one pose, at unknown velocity.
+        Make the first node from one pose, at unknown velocity and as if its time were exact.
 
         Args:
             stamp: capture time of the pose [s].
@@ -59,7 +66,7 @@ class ErrorStateModel:
             rate: (3,) angular rate then, base_link axes [rad/s].
             position: (3,) of the marker body in world [m].
             quaternion: (4,) marker body to world, unit.
-            biases: a node whose biases and their covariance are kept, or None.
+            biases: a node whose biases and time offset are kept with their covariance, or None.
 
         """
         first = self.parameters.initial
@@ -67,21 +74,41 @@ class ErrorStateModel:
         rotation = rotations.matrix(attitude)
         arm = rotation @ rotations.skew(self._lever)
         noise = self.filter.R
-        covariance = np.zeros((ERROR_STATES, ERROR_STATES))
+        covariance = np.zeros((STATES, STATES))
         covariance[POSITION, POSITION] = noise[:3, :3] + arm @ noise[3:, 3:] @ arm.T
         covariance[POSITION, ATTITUDE] = arm @ noise[3:, 3:]
         covariance[ATTITUDE, POSITION] = covariance[POSITION, ATTITUDE].T
         covariance[ATTITUDE, ATTITUDE] = noise[3:, 3:]
         covariance[VELOCITY, VELOCITY] = first.velocity_std ** 2 * np.eye(3)
         if biases is None:
-            accelerometer_bias, gyroscope_bias = np.zeros(3), np.zeros(3)
+            known = np.zeros(3), np.zeros(3), 0.0
             covariance[9:, 9:] = np.diag([first.accelerometer_bias_std ** 2] * 3
-                                         + [first.gyroscope_bias_std ** 2] * 3)
+                                         + [first.gyroscope_bias_std ** 2] * 3 + [0.0])
         else:
-            accelerometer_bias, gyroscope_bias = biases.accelerometer_bias, biases.gyroscope_bias
-            covariance[9:, 9:] = biases.covariance[9:, 9:]
+            known = biases.accelerometer_bias, biases.gyroscope_bias, biases.time_offset
+            covariance[9:15, 9:15] = biases.covariance[9:15, 9:15]
         return Node(stamp, force, rate, position - rotation @ self._lever, np.zeros(3), attitude,
-                    rotation, accelerometer_bias, gyroscope_bias, covariance)
+                    rotation, *known, covariance)
+
+    def doubt_time(self, node: Node, deviation: float) -> None:
+        """
+        Make the time offset uncertain, in a node that was found as if it were exact.
+
+        With another offset the same poses would have given the states of another moment: their
+        errors are the offset's error times how they change.
+
+        Args:
+            node: its velocity must be known; its covariance is replaced.
+            deviation: standard deviation of the offset [s].
+
+        """
+        acceleration = node.rotation @ (node.force - node.accelerometer_bias)
+        acceleration[2] -= self.gravity
+        change = np.zeros(STATES)
+        change[POSITION], change[VELOCITY] = -node.velocity, -acceleration
+        change[ATTITUDE] = node.gyroscope_bias - node.rate
+        change[TIME_OFFSET] = 1.0
+        node.covariance = node.covariance + deviation ** 2 * np.outer(change, change)
 
     def forget(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray) -> Node:
         """Move a state across an unknown lapse of time: only the biases are still worth much."""
@@ -92,7 +119,7 @@ class ErrorStateModel:
         covariance[VELOCITY, VELOCITY] = limits.initial.velocity_std ** 2 * np.eye(3)
         covariance[ATTITUDE, ATTITUDE] = np.pi ** 2 * np.eye(3)
         return Node(stamp, force, rate, node.position, np.zeros(3), node.quaternion, node.rotation,
-                    node.accelerometer_bias, node.gyroscope_bias, covariance)
+                    node.accelerometer_bias, node.gyroscope_bias, node.time_offset, covariance)
 
     def predict(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray) -> Node:
         """Carry ``node`` and its covariance to the next IMU reading."""
@@ -130,38 +157,57 @@ class ErrorStateModel:
         if self._has_lever:
             residual[:3] -= prior.rotation @ self._lever
             kalman.H[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
+        self._linearise_time(prior)
         kalman.x = self._no_error
         kalman.P = prior.covariance
         kalman.update(residual, H=kalman.H)
         # The innovation is filterpy's y with inverse covariance SI; not <= also catches NaN.
         if not float(kalman.y @ kalman.SI @ kalman.y) <= self.gate:
             return None
-        return _inject(prior, kalman.x, kalman.P)
+        return self._inject(prior, kalman.x, kalman.P)
 
+    def _linearise_time(self, prior) -> None:
+        """
+        Write the columns of the time offset: what moves is seen displaced by motion x offset.
 
-def _inject(prior: Node, error: np.ndarray, covariance: np.ndarray) -> Node:
-    """Move the estimated error into the state; the error that remains has mean zero."""
-    turn = error[ATTITUDE]
-    quaternion = rotations.normalized(
-        rotations.multiply(prior.quaternion, rotations.exp(turn.tolist())))
-    # The remaining attitude error counts from the corrected attitude: right Jacobian, first order.
-    shift = -0.5 * rotations.skew(turn.tolist())
-    covariance[ATTITUDE, :] += shift @ covariance[ATTITUDE, :]
-    covariance[:, ATTITUDE] += covariance[:, ATTITUDE] @ shift.T
-    return Node(prior.stamp, prior.force, prior.rate,
-                prior.position + error[POSITION], prior.velocity + error[VELOCITY],
-                quaternion, rotations.matrix(quaternion),
-                prior.accelerometer_bias + error[ACCELEROMETER_BIAS],
-                prior.gyroscope_bias + error[GYROSCOPE_BIAS],
-                0.5 * (covariance + covariance.T))
+        At rest they are zero: there, the estimated velocity and rate are mostly noise, which is
+        correlated with the residual and would pass for an offset.
+        """
+        least, jacobian = self.parameters.time_offset, self.filter.H
+        rate = prior.rate - prior.gyroscope_bias
+        velocity = prior.velocity
+        if self._has_lever:
+            velocity = velocity + prior.rotation @ np.cross(rate, self._lever)
+        jacobian[0:3, TIME_OFFSET] = velocity if velocity @ velocity > least.speed ** 2 else 0.0
+        jacobian[3:6, TIME_OFFSET] = rate if rate @ rate > least.rate ** 2 else 0.0
+
+    def _inject(self, prior: Node, error: np.ndarray, covariance: np.ndarray) -> Node:
+        """Move the estimated error into the state; the error that remains has mean zero."""
+        turn = error[ATTITUDE]
+        quaternion = rotations.normalized(
+            rotations.multiply(prior.quaternion, rotations.exp(turn.tolist())))
+        # The attitude error that remains counts from the corrected attitude: right Jacobian of
+        # SO(3), first order.
+        shift = -0.5 * rotations.skew(turn.tolist())
+        covariance[ATTITUDE, :] += shift @ covariance[ATTITUDE, :]
+        covariance[:, ATTITUDE] += covariance[:, ATTITUDE] @ shift.T
+        limit = self.parameters.time_offset.limit
+        return Node(prior.stamp, prior.force, prior.rate,
+                    prior.position + error[POSITION], prior.velocity + error[VELOCITY],
+                    quaternion, rotations.matrix(quaternion),
+                    prior.accelerometer_bias + error[ACCELEROMETER_BIAS],
+                    prior.gyroscope_bias + error[GYROSCOPE_BIAS],
+                    min(limit, max(-limit, prior.time_offset + float(error[TIME_OFFSET]))),
+                    0.5 * (covariance + covariance.T))
 
 
 def _process_noise(parameters: EkfParameters) -> np.ndarray:
-    """Spectral density (15, 15) of the process noise, per second."""
+    """Spectral density (16, 16) of the process noise, per second."""
     imu = parameters.imu
-    density = np.zeros(ERROR_STATES)
+    density = np.zeros(STATES)
     density[VELOCITY] = imu.accelerometer_noise ** 2 / imu.rate
     density[ATTITUDE] = imu.gyroscope_noise ** 2 / imu.rate
     density[ACCELEROMETER_BIAS] = imu.accelerometer_bias_walk ** 2
     density[GYROSCOPE_BIAS] = imu.gyroscope_bias_walk ** 2
+    density[TIME_OFFSET] = parameters.time_offset.walk ** 2
     return np.diag(density)

@@ -1,20 +1,31 @@
-"""Between the IMU, where the filter navigates, and base_link, which everybody else means."""
+"""
+From the filter's state to the estimate that everybody else means.
+
+The filter navigates the IMU's point at the IMU's stamps; others ask for base_link now.
+"""
+
+from dataclasses import replace
+from math import sqrt
 
 import numpy as np
 
 from beetle_omni_ros.estimation.parameters import ImuParameters
-from beetle_omni_ros.estimation.propagation import Node
+from beetle_omni_ros.estimation.propagation import Node, STATES, TIME_OFFSET
 from beetle_omni_ros.estimation.samples import (
-    ATTITUDE, ERROR_STATES, Estimate, GYROSCOPE_BIAS, POSITION, VELOCITY)
+    ACCELEROMETER_BIAS, ATTITUDE, ERROR_STATES, Estimate, GYROSCOPE_BIAS, POSITION, VELOCITY)
 from beetle_omni_ros.robot import rotations
+
+SIGNIFICANT = 4.0  # standard deviations by which a time offset must differ from chance
 
 
 class Mounting:
     """The IMU's rotation and lever arm in base_link."""
 
-    def __init__(self, imu: ImuParameters):
-        """Take rotation, position and noise from the IMU's parameters."""
-        self._axes = rotations.matrix(rotations.exp(imu.rotation)) if np.any(imu.rotation) else None
+    def __init__(self, imu: ImuParameters, gravity: float):
+        """Take rotation, position and noise from the IMU's parameters; gravity in m/s^2."""
+        self._gravity = np.array([0.0, 0.0, gravity])
+        turned = np.any(imu.rotation)
+        self._axes = rotations.matrix(rotations.exp(imu.rotation)) if turned else None
         self._arm = imu.position.copy() if np.any(imu.position) else None
         self._rate_noise = imu.gyroscope_noise ** 2
 
@@ -23,24 +34,58 @@ class Mounting:
         return vector if self._axes is None else self._axes @ vector
 
     def estimate(self, node: Node) -> Estimate:
+        """Express a node as base_link's state at its stamp, with its covariance."""
+        age = node.time_offset
+        if age > SIGNIFICANT * sqrt(node.covariance[TIME_OFFSET, TIME_OFFSET]):
+            node = self._aged(node, age)
+        rate = node.rate - node.gyroscope_bias
+        position, velocity = node.position, node.velocity
+        covariance = node.covariance[:ERROR_STATES, :ERROR_STATES]
+        if self._arm is not None:
+            position, velocity, covariance = self._at_base(node, rate, covariance)
+        return Estimate(node.stamp, position, velocity, node.quaternion, rate,
+                        node.accelerometer_bias, node.gyroscope_bias, covariance)
+
+    def _aged(self, node, age) -> Node:
         """
-        Move a state from the IMU to base_link's origin, with its covariance.
+        Carry a state over the latency that the IMU hides in its stamps.
+
+        A stamp can be late, because it was put on arrival, but not early: IMU stamps later than
+        the MoCap's mean that the reading is old, the reverse that the MoCap's stamps are late
+        and the reading is fresh. Acceleration and rate are held over the few milliseconds.
+        """
+        rate = node.rate - node.gyroscope_bias
+        acceleration = (node.rotation @ (node.force - node.accelerometer_bias) - self._gravity)
+        quaternion = rotations.multiply(node.quaternion, rotations.exp(age * rate))
+        turned = rotations.matrix(quaternion)
+        jacobian = np.eye(STATES)
+        jacobian[POSITION, VELOCITY] = age * np.eye(3)
+        jacobian[POSITION, TIME_OFFSET] = node.velocity
+        jacobian[VELOCITY, TIME_OFFSET] = acceleration
+        jacobian[VELOCITY, ATTITUDE] = -age * rotations.skew(acceleration) @ node.rotation
+        jacobian[VELOCITY, ACCELEROMETER_BIAS] = -age * node.rotation
+        jacobian[ATTITUDE, ATTITUDE] = turned.T @ node.rotation
+        jacobian[ATTITUDE, GYROSCOPE_BIAS] = -age * np.eye(3)
+        jacobian[ATTITUDE, TIME_OFFSET] = rate
+        return replace(
+            node, position=node.position + age * node.velocity + 0.5 * age ** 2 * acceleration,
+            velocity=node.velocity + age * acceleration, quaternion=quaternion, rotation=turned,
+            covariance=jacobian @ node.covariance @ jacobian.T)
+
+    def _at_base(self, node, rate, covariance):
+        """
+        Move a state from the IMU to base_link's origin.
 
         With arm r, rate w: p = p_imu - R r and v = v_imu - R (w x r). The noise of the rate
         sample itself enters the velocity through the arm.
         """
-        rate = node.rate - node.gyroscope_bias
-        position, velocity, covariance = node.position, node.velocity, node.covariance
-        if self._arm is not None:
-            swing = np.cross(rate, self._arm)
-            position = position - node.rotation @ self._arm
-            velocity = velocity - node.rotation @ swing
-            arm = node.rotation @ rotations.skew(self._arm)
-            jacobian = np.eye(ERROR_STATES)
-            jacobian[POSITION, ATTITUDE] = arm
-            jacobian[VELOCITY, ATTITUDE] = node.rotation @ rotations.skew(swing)
-            jacobian[VELOCITY, GYROSCOPE_BIAS] = -arm
-            covariance = jacobian @ covariance @ jacobian.T
-            covariance[VELOCITY, VELOCITY] += self._rate_noise * arm @ arm.T
-        return Estimate(node.stamp, position, velocity, node.quaternion, rate,
-                        node.accelerometer_bias, node.gyroscope_bias, covariance)
+        swing = np.cross(rate, self._arm)
+        arm = node.rotation @ rotations.skew(self._arm)
+        jacobian = np.eye(ERROR_STATES)
+        jacobian[POSITION, ATTITUDE] = arm
+        jacobian[VELOCITY, ATTITUDE] = node.rotation @ rotations.skew(swing)
+        jacobian[VELOCITY, GYROSCOPE_BIAS] = -arm
+        covariance = jacobian @ covariance @ jacobian.T
+        covariance[VELOCITY, VELOCITY] += self._rate_noise * arm @ arm.T
+        return (node.position - node.rotation @ self._arm, node.velocity - node.rotation @ swing,
+                covariance)

@@ -65,6 +65,9 @@ class MocapParameters:
     delay_limit: float = parameter(
         0.2, doc='oldest capture that is still used, behind the newest IMU sample', unit='s',
         low=0.005, high=2)
+    noise_scale_limit: float = parameter(
+        20.0, doc='largest factor on both noises when the poses are seen to be noisier; 1 keeps '
+        'them as given', low=1, high=1000)
     gate_probability: float = parameter(
         0.99999, doc='share of good poses that passes the chi-square gate', low=0.5,
         high=0.9999999999)
@@ -84,6 +87,23 @@ class InitialParameters:
         0.2, doc='standard deviation of the accelerometer bias', unit='m/s^2', low=1e-6, high=10)
     gyroscope_bias_std: float = parameter(
         0.05, doc='standard deviation of the gyroscope bias', unit='rad/s', low=1e-6, high=1)
+    time_offset_std: float = parameter(
+        0.01, doc='standard deviation of the offset between the clocks; 0 if there is none',
+        unit='s', low=0, high=0.1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeOffsetParameters:
+    """What remains between the clocks of IMU and MoCap, estimated in flight."""
+
+    limit: float = parameter(
+        0.05, doc='largest offset that is estimated', unit='s', low=0, high=0.2)
+    walk: float = parameter(
+        0.00001, doc='random walk', unit='s/sqrt(s)', low=0, high=1)
+    speed: float = parameter(
+        0.1, doc='slower motion says nothing about it', unit='m/s', low=0.001, high=10)
+    rate: float = parameter(
+        0.2, doc='slower rotation says nothing about it', unit='rad/s', low=0.001, high=10)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +131,7 @@ class EkfParameters:
     imu: ImuParameters = group(ImuParameters)
     mocap: MocapParameters = group(MocapParameters)
     initial: InitialParameters = group(InitialParameters)
+    time_offset: TimeOffsetParameters = group(TimeOffsetParameters)
     status: StatusParameters = group(StatusParameters)
 
     def __post_init__(self):

@@ -16,6 +16,10 @@ from beetle_omni_ros.estimation.samples import (
     ACCELEROMETER_BIAS, ATTITUDE, ERROR_STATES, GYROSCOPE_BIAS, POSITION, VELOCITY)
 from beetle_omni_ros.robot import rotations
 
+# Behind the 15 error states that leave the estimator, the offset between the sensors' clocks.
+TIME_OFFSET = ERROR_STATES
+STATES = ERROR_STATES + 1
+
 
 @dataclass(slots=True, eq=False)
 class Node:
@@ -32,7 +36,8 @@ class Node:
         rotation: (3, 3) the same.
         accelerometer_bias: (3,) base_link axes [m/s^2].
         gyroscope_bias: (3,) base_link axes [rad/s].
-        covariance: (15, 15) of the error state.
+        time_offset: by how much the stamps of the IMU are later than those of the MoCap [s].
+        covariance: (16, 16) of the error states and the time offset.
 
     """
 
@@ -45,6 +50,7 @@ class Node:
     rotation: np.ndarray
     accelerometer_bias: np.ndarray
     gyroscope_bias: np.ndarray
+    time_offset: float
     covariance: np.ndarray | None = None
 
 
@@ -83,7 +89,7 @@ def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
                 + (dt * dt / 6) * (acceleration0 + acceleration0 + acceleration1))
     position[2] -= 0.5 * gravity * dt * dt
     return Node(stamp, force, rate, position, velocity, np.array(unit), rotation,
-                node.accelerometer_bias, node.gyroscope_bias)
+                node.accelerometer_bias, node.gyroscope_bias, node.time_offset)
 
 
 def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
@@ -93,7 +99,7 @@ def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
     Args:
         before: where the step started.
         after: what :func:`propagate` made of it.
-        out: (15, 15) buffer; holds the identity wherever no block is written.
+        out: (16, 16) buffer; holds the identity wherever no block is written.
 
     """
     dt = after.stamp - before.stamp
@@ -123,4 +129,4 @@ def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
 
 def identity() -> np.ndarray:
     """Make a buffer for :func:`transition`."""
-    return np.eye(ERROR_STATES)
+    return np.eye(STATES)

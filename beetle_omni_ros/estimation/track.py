@@ -7,6 +7,7 @@ import numpy as np
 from beetle_omni_ros.estimation.model import ErrorStateModel
 from beetle_omni_ros.estimation.propagation import Node
 
+VELOCITY_KNOWN = 5  # poses after which the motion is known well enough to doubt its time
 SAME_INSTANT = 1e-6  # [s] well below a sample period, well above the resolution of a stamp
 
 
@@ -25,7 +26,8 @@ class Track:
     replayed, so that the result is the same as if it had arrived at once.
     """
 
-    def __init__(self, model: ErrorStateModel, first: Node, history: float):
+    def __init__(self, model: ErrorStateModel, first: Node, history: float,
+                 time_deviation: float = 0.0):
         """
         Begin with one state.
 
@@ -33,8 +35,10 @@ class Track:
             model: predicts and corrects.
             first: the state and its covariance.
             history: how far back a pose may lie [s].
+            time_deviation: standard deviation of the first state's time offset [s].
 
         """
+        self._time_deviation = time_deviation
         self._model = model
         self._history = history
         self.nodes = [first]
@@ -58,7 +62,7 @@ class Track:
         Apply a pose at its capture time and replay what came after.
 
         Args:
-            stamp: capture time, from the oldest to the newest node [s].
+            stamp: capture time, not after the newest node; before the oldest, that is used [s].
             position: (3,) of the marker body in world [m].
             quaternion: (4,) marker body to world.
 
@@ -67,6 +71,7 @@ class Track:
 
         """
         nodes = self.nodes
+        stamp = max(stamp, nodes[0].stamp)
         index = bisect_right(nodes, stamp + SAME_INSTANT, key=_stamp) - 1
         prior = nodes[index]
         if stamp - prior.stamp > SAME_INSTANT:
@@ -77,12 +82,14 @@ class Track:
         posterior = self._model.correct(prior, position, quaternion)
         if posterior is None:
             return False
+        self.fixes += 1
+        if self.fixes == VELOCITY_KNOWN:
+            self._model.doubt_time(posterior, self._time_deviation)
         replayed = [posterior]
         for node in nodes[index + 1:]:
             replayed.append(self._model.predict(replayed[-1], node.stamp, node.force, node.rate))
         self.nodes = replayed
         self.last_fix = stamp
-        self.fixes += 1
         return True
 
 

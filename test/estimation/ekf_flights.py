@@ -66,6 +66,8 @@ class Sensors:
     gyroscope_noise: float = 0.005
     accelerometer_bias: np.ndarray = field(default_factory=lambda: np.zeros(3))
     gyroscope_bias: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    accelerometer_bias_walk: float = 0.0
+    gyroscope_bias_walk: float = 0.0
     position_noise: float = 0.001
     orientation_noise: float = np.deg2rad(0.1)
     imu_position: tuple = (0.0, 0.0, 0.0)
@@ -74,20 +76,39 @@ class Sensors:
     mocap_rotation: tuple = (0.0, 0.0, 0.0)
 
     @classmethod
+    def believed(cls, parameters, seed):
+        """Sensors exactly as the filter's parameters believe them, with drawn biases."""
+        imu, mocap, first = parameters.imu, parameters.mocap, parameters.initial
+        rng = np.random.default_rng([seed, 2])
+        return cls(imu.accelerometer_noise, imu.gyroscope_noise,
+                   first.accelerometer_bias_std * rng.standard_normal(3),
+                   first.gyroscope_bias_std * rng.standard_normal(3),
+                   imu.accelerometer_bias_walk, imu.gyroscope_bias_walk,
+                   mocap.position_noise, mocap.orientation_noise, imu.position, imu.rotation,
+                   mocap.position, mocap.rotation)
+
+    @classmethod
     def perfect(cls, **changes):
         """Sensors without noise."""
         return cls(accelerometer_noise=0, gyroscope_noise=0, position_noise=0,
                    orientation_noise=0, **changes)
 
-    def imu(self, trajectory, times, rng):
+    def biases(self, times, rng):
+        """Biases (N, 6) at ``times``: accelerometer, gyroscope, base_link axes."""
+        walk = np.repeat([self.accelerometer_bias_walk, self.gyroscope_bias_walk], 3)
+        steps = np.sqrt(np.diff(times, prepend=times[0]))[:, None] * walk
+        start = np.concatenate([self.accelerometer_bias, self.gyroscope_bias])
+        return start + np.cumsum(steps * rng.standard_normal(steps.shape), axis=0)
+
+    def imu(self, trajectory, times, biases, rng):
         """IMU samples at ``times``, where and how the IMU is mounted."""
         truth = trajectory(times)
         rate, change, arm = truth['rate'], truth['rate_change'], np.array(self.imu_position)
         force = truth['rotation'].inv().apply(truth['acceleration'] + [0, 0, GRAVITY])
         force += np.cross(change, arm) + np.cross(rate, np.cross(rate, arm))
         axes = Rotation.from_rotvec(self.imu_rotation)
-        force = axes.inv().apply(force + self.accelerometer_bias)
-        rate = axes.inv().apply(rate + self.gyroscope_bias)
+        force = axes.inv().apply(force + biases[:, :3])
+        rate = axes.inv().apply(rate + biases[:, 3:])
         force = force + self.accelerometer_noise * rng.standard_normal(force.shape)
         rate = rate + self.gyroscope_noise * rng.standard_normal(rate.shape)
         return [ImuSample(*row) for row in zip(times.tolist(), force, rate)]
@@ -111,6 +132,7 @@ class Flight:
     trajectory: Trajectory
     imu: list
     poses: list
+    biases: np.ndarray
     delay: float = MOCAP_DELAY
 
     def arrivals(self):
@@ -129,8 +151,9 @@ def fly(seed, duration, sensors=None, agility=1.0, start=0.0, delay=MOCAP_DELAY,
     trajectory = Trajectory(seed, agility)
     imu_times = start + imu_period * np.arange(round(duration / imu_period) + 1)
     pose_times = start + MOCAP_PERIOD * np.arange(round(duration / MOCAP_PERIOD) + 1)
-    return Flight(trajectory, sensors.imu(trajectory, imu_times, rng),
-                  sensors.mocap(trajectory, pose_times, rng), delay)
+    biases = sensors.biases(imu_times, rng)
+    return Flight(trajectory, sensors.imu(trajectory, imu_times, biases, rng),
+                  sensors.mocap(trajectory, pose_times, rng), biases, delay)
 
 
 def feed(ekf, sample):
@@ -149,11 +172,12 @@ def run(ekf, flight, drop=lambda time: False, until=np.inf):
     return ekf
 
 
-def error_state(estimate, trajectory, sensors):
+def error_state(estimate, flight):
     """Error (15,) of an estimate in the filter's definition: truth minus estimate."""
-    truth = trajectory(np.array([estimate.stamp]))
+    truth = flight.trajectory(np.array([estimate.stamp]))
     turn = Rotation.from_quat(estimate.quaternion).inv() * truth['rotation'][0]
+    biases = flight.biases[np.searchsorted([s.stamp for s in flight.imu], estimate.stamp)]
     return np.concatenate([
         truth['position'][0] - estimate.position, truth['velocity'][0] - estimate.velocity,
-        turn.as_rotvec(), sensors.accelerometer_bias - estimate.accelerometer_bias,
-        sensors.gyroscope_bias - estimate.gyroscope_bias])
+        turn.as_rotvec(), biases[:3] - estimate.accelerometer_bias,
+        biases[3:] - estimate.gyroscope_bias])
