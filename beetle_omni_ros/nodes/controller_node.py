@@ -57,8 +57,8 @@ class ControllerNode(FlightNode):
         for profile in (qos.LATCHED, qos.EVENT):
             self.listen(PoseStamped, 'target_pose', convert.pose_target, self._on_target,
                         profile, stale_after=None)
-            self.listen(MultiDOFJointTrajectory, 'target_trajectory', convert.trajectory_target,
-                        self._on_target, profile, stale_after=None)
+        self.listen(MultiDOFJointTrajectory, 'target_trajectory', convert.trajectory_target,
+                    self._on_target, qos.EVENT, stale_after=None)
         self.create_subscription(String, 'supervisor/state', self._on_mode, qos.LATCHED)
         self.health.track_compute(self._controller.period)
         self.health.report('controller', self._controller_status)

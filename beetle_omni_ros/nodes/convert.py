@@ -9,6 +9,7 @@ for shape and finiteness here, once, and refused with :class:`MessageError`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseStamped, Quaternion, Transform, Twist, Vector3, WrenchStamped
@@ -40,6 +41,15 @@ class Joints:
     stamp: float
     position: np.ndarray
     velocity: np.ndarray
+
+
+@dataclass(frozen=True)
+class Battery:
+    """Pack voltage under load [V] and current [A, negative when discharging]."""
+
+    stamp: float
+    voltage: float
+    current: float
 
 
 @dataclass(frozen=True)
@@ -244,6 +254,13 @@ def battery_message(stamp: float, voltage: float, current: float, cells: int) ->
         cell_voltage=[nan] * cells)
     _header(message, stamp, '')
     return message
+
+
+def battery(message: BatteryState) -> Battery:
+    """Read the pack."""
+    if not isfinite(message.voltage):
+        raise MessageError('voltage is not finite')
+    return Battery(seconds(message.header.stamp), message.voltage, message.current)
 
 
 def wrench(message: WrenchStamped) -> Wrench:

@@ -83,6 +83,8 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
             graph = Graph(parameters, folder, number, composed)
             stack.enter_context(_terminable())
             status = _fly(graph, controller, flown, meta, console)
+            if not bag.exists():
+                return status or runner.FAILED
             return max(status, _report(bag, controller, flown, meta, json_path, console))
     except (ParameterError, BagError, OSError) as error:
         print(f'beetle_omni fly: error: {error}', file=sys.stderr)

@@ -21,7 +21,8 @@ class FlightNode(Node):
     """A node whose inputs are checked before its code sees them."""
 
     def __init__(self, name: str, parameter_class: type, file: str | None = None,
-                 file_key: str | None = None, on_change: Callable | None = None):
+                 file_key: str | None = None, on_change: Callable | None = None,
+                 changeable: tuple[str, ...] | None = None):
         """
         Claim the name, read the parameters, start diagnostics.
 
@@ -31,6 +32,7 @@ class FlightNode(Node):
             file: shipped parameter file.
             file_key: parameter that names another one.
             on_change: takes a changed instance.
+            changeable: names that may be set in flight.
 
         Raises:
             ParameterError, StartError: with one line for the operator.
@@ -40,7 +42,7 @@ class FlightNode(Node):
         self._claim = instance.claim(self)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.parameters = parameters.declare(self, parameter_class, file, file_key,
-                                             on_change)
+                                             on_change, changeable)
         self.health = Health(self)
         self._twin_checks = 0
         self._twin_timer = self.create_timer(1.0, self._look_for_twin, clock=self.steady_clock)

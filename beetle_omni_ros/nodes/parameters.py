@@ -28,7 +28,7 @@ UNBOUNDED = 1e300       # FloatingPointRange needs both ends
 
 
 def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,
-            on_change: Callable | None = None):
+            on_change: Callable | None = None, changeable: tuple[str, ...] | None = None):
     """
     Declare every leaf of the parameter dataclass ``cls`` on ``node``.
 
@@ -42,6 +42,7 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
         file_key: the parameter that names another file to start from.
         on_change: called with the new instance when parameters were set in flight; may
             raise ParameterError to refuse. Without it every parameter is read-only.
+        changeable: names that may be set in flight; None: all that are not read-only.
 
     Returns:
         The validated instance of ``cls``.
@@ -61,7 +62,8 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
     for name, entry, hint, value in schema.flatten(instance):
         if isinstance(value, (dict, tuple)):
             continue    # structured values live in files only
-        node.declare_parameter(name, _plain(value, hint), _descriptor(entry, hint, on_change),
+        fixed = on_change is None or changeable is not None and name not in changeable
+        node.declare_parameter(name, _plain(value, hint), _descriptor(entry, hint, fixed),
                                ignore_override=True)
     if on_change:
         _validate_changes(node, cls, instance, on_change)
@@ -112,12 +114,12 @@ def _kind(hint):
     return hint
 
 
-def _descriptor(entry, hint, on_change) -> ParameterDescriptor:
+def _descriptor(entry, hint, fixed) -> ParameterDescriptor:
     meta = entry.metadata
     unit = f" [{meta['unit']}]" if meta.get('unit') else ''
     descriptor = ParameterDescriptor(
         description=meta.get('doc', '') + unit,
-        read_only=bool(meta.get('read_only')) or on_change is None,
+        read_only=fixed or bool(meta.get('read_only')),
         additional_constraints=f"one of {', '.join(meta['choices'])}" if meta.get('choices')
         else '')
     low, high = meta.get('low'), meta.get('high')

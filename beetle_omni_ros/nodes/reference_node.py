@@ -22,7 +22,7 @@ PERIOD = 0.02           # s between looks at the task
 IMPULSE_PERIOD = 0.005  # s, the same for tasks with impulses of some 50 ms
 # A trajectory goes out in overlapping windows: one long message would take every reader
 # tenths of a second to unpack, and who joins late hears the next window soon.
-WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 4.0, 2.0, 0.05   # s
+WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 3.0, 1.5, 0.05   # s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class ReferenceNode(FlightNode):
         self._state = ''
         self._poses = self.create_publisher(PoseStamped, 'target_pose', qos.LATCHED)
         self._trajectories = self.create_publisher(MultiDOFJointTrajectory, 'target_trajectory',
-                                                   qos.EVENT)
+                                                   qos.LATCHED)
         self._wrenches = self.create_publisher(WrenchStamped, 'disturbance', qos.EVENT)
         self._states = self.create_publisher(String, 'reference/state', qos.LATCHED)
         self._payload = self.create_client(SetParameters, 'sim_node/set_parameters')

@@ -1,0 +1,150 @@
+"""Arming, selection, checks and fallback between the controllers and the actuators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import BatteryState, Imu, JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from beetle_omni_ros.control.base import State
+from beetle_omni_ros.control.hover import HoverController
+from beetle_omni_ros.nodes import convert, health, qos, runner
+from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import parameter, ParameterError
+from beetle_omni_ros.safety.events import ERROR, WARNING
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.supervisor import DISARMED, FALLBACK, FLYING, STOPPED, Supervisor
+
+CONTROLLERS = ('nmpc', 'rl')
+WATCH_PERIOD = 0.01     # s between looks at what is silent
+SENSOR_AGE = 0.2        # s, the descent without estimator uses nothing older
+LEVELS = {FALLBACK: health.WARN, STOPPED: health.ERROR}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SupervisorNodeParameters(SupervisorParameters):
+    """Parameters of supervisor_node: the supervisor's own and the robot."""
+
+    robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
+    supervisor_file: str = parameter(
+        '', doc='file to start from; empty: the shipped params/supervisor.yaml', read_only=True)
+
+
+class SupervisorNode(FlightNode):
+    """
+    Publishes command, the only topic that actuators obey, and supervisor/state (latched).
+
+    Services ~/arm, ~/disarm, ~/land and ~/emergency_stop; the parameter controller selects
+    the active controller, also in flight.
+    """
+
+    def __init__(self):
+        """Begin disarmed."""
+        super().__init__('supervisor_node', SupervisorNodeParameters, 'params/supervisor.yaml',
+                         'supervisor_file', self._changed, changeable=('controller',))
+        robot = RobotParameters.load(self.parameters.robot_file or None)
+        self._supervisor = Supervisor(self.parameters, robot, HoverController(robot), CONTROLLERS)
+        self._joints = None
+        self._sent = (None, '')     # stamp and source of the last command
+        self._state = ''
+        self._publisher = self.create_publisher(JointState, 'command', qos.COMMAND)
+        self._states = self.create_publisher(String, 'supervisor/state', qos.LATCHED)
+        self._listen()
+        for name in ('arm', 'disarm', 'land', 'emergency_stop'):
+            self.create_service(Trigger, f'~/{name}', self._request(name))
+        self.health.report('supervisor', self._supervisor_status)
+        self.create_timer(WATCH_PERIOD, self._update, clock=self.steady_clock)
+        self._update()
+
+    def _listen(self):
+        supervisor = self._supervisor
+        self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.ESTIMATE)
+        self.listen(JointState, 'joint_states', convert.joints, self._on_joints,
+                    max_age=SENSOR_AGE)
+        self.listen(Imu, 'imu/data_raw', convert.imu_sample, lambda s: supervisor.on_imu(
+            s.stamp, s.specific_force, s.angular_velocity), max_age=SENSOR_AGE)
+        self.listen(PoseStamped, 'mocap/pose', convert.pose_sample, lambda s: supervisor.on_mocap(
+            s.stamp, s.position, s.quaternion), max_age=SENSOR_AGE)
+        self.listen(BatteryState, 'battery_state', convert.battery,
+                    lambda b: supervisor.on_battery(b.voltage))
+        for name in CONTROLLERS:
+            self.listen(JointState, f'{name}/command', convert.command, self._on_command(name),
+                        qos.COMMAND, stale_after=None)
+
+    def _changed(self, new):
+        answer = self._supervisor.select(new.controller, self.now())
+        self._tell()
+        if not answer:
+            raise ParameterError(f"key 'controller': {answer.text}")
+
+    def _request(self, name):
+        def handle(_, response):
+            answer = getattr(self._supervisor, name)(self.now())
+            self._update()
+            response.success, response.message = bool(answer), answer.text
+            return response
+        return handle
+
+    def _on_joints(self, joints):
+        self._joints = joints
+        self._supervisor.on_joints(joints.stamp, joints.position, joints.velocity)
+
+    def _on_odom(self, odom):
+        joints = self._joints
+        if joints is None:
+            return
+        self._supervisor.on_state(State(
+            odom.stamp, odom.position, odom.velocity, odom.quaternion, odom.angular_velocity,
+            joints.position, joints.velocity, joints.stamp))
+        if self._supervisor.state not in (DISARMED, FLYING):
+            self._update()      # hover answers each estimate, as a controller does
+
+    def _on_command(self, name):
+        def handle(command):
+            supervisor = self._supervisor
+            accepted = supervisor.on_command(name, command, self.now())
+            if accepted and name == supervisor.active and supervisor.state == FLYING:
+                self._update()      # on with it at once, not at the next look
+        return handle
+
+    def _update(self):
+        supervisor = self._supervisor
+        command = supervisor.update(self.now())
+        # The same command is not repeated: its age tells the actuators that nothing new came.
+        if command is not None and (command.stamp, supervisor.source) != self._sent:
+            self._sent = (command.stamp, supervisor.source)
+            self._publisher.publish(convert.command_message(command))
+        self._tell()
+
+    def _tell(self):
+        supervisor = self._supervisor
+        state = f'{FLYING}:{supervisor.active}' if supervisor.state == FLYING \
+            else supervisor.state
+        if state != self._state:
+            self._state = state
+            self._states.publish(String(data=state))
+        if supervisor.events:
+            logger = self.get_logger()
+            for event in supervisor.events:
+                say = {ERROR: logger.error, WARNING: logger.warning}.get(event.severity,
+                                                                         logger.info)
+                say(event.text)
+            supervisor.events.clear()
+
+    def _supervisor_status(self):
+        return LEVELS.get(self._supervisor.state, health.OK), self._state, \
+            self._supervisor.diagnostics()
+
+
+def main(args=None):
+    """Run the node."""
+    runner.main(SupervisorNode, args)
+
+
+if __name__ == '__main__':
+    main()
