@@ -1,0 +1,45 @@
+# Every target that needs the environment makes it first; that returns at once when nothing
+# changed. Options: PYTHON=/path/to/python3, EXTRAS=..., ARGS='more arguments for the tool'.
+
+SHELL := /bin/sh
+TOOL := .venv/bin/beetle_omni
+RUN := $(shell date +%Y%m%d_%H%M%S)
+ARGS ?=
+
+# Marks of another virtual environment with ROS wheels (see .ci/setup).
+ifdef _ROS_WHEELS_BOOTSTRAP_COMPLETE
+unexport LD_LIBRARY_PATH
+endif
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONHOME VIRTUAL_ENV
+
+.PHONY: help setup fly test lint evaluate report clean
+
+help:  ## this list
+	@sed -n 's/^\([a-z]*\):.*## /\1|/p' Makefile | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+setup:  ## make .venv with everything (also: PYTHON=..., EXTRAS=...)
+	@PYTHON='$(PYTHON)' .ci/setup
+
+fly: setup  ## fly the waypoints in real time through ROS nodes; the bag lands in runs_out/
+	@mkdir -p runs_out
+	$(TOOL) fly --controller nmpc --task waypoints --bag runs_out/fly_$(RUN) $(ARGS)
+
+test: setup  ## the whole test suite
+	@.venv/bin/python -m pytest $(ARGS)
+
+lint: setup  ## style of every Python file
+	@.venv/bin/ruff check .
+
+evaluate: setup  ## 100 random poses, in one process and faster than real time
+	@mkdir -p runs_out
+	$(TOOL) evaluate --controllers nmpc --task random100 --json runs_out/evaluate_$(RUN).json $(ARGS)
+
+report: setup  ## one HTML page about the runs in runs_out/ (or RUNS='DIR...')
+	@runs='$(RUNS)'; for bag in runs_out/*/metadata.yaml; do \
+	    [ -n '$(RUNS)' ] || [ ! -f "$$bag" ] || runs="$$runs $${bag%/*}"; done; \
+	if [ -z "$$runs" ]; then echo 'no runs in runs_out/: make fly first, or RUNS=DIR' >&2; exit 2; fi; \
+	echo $(TOOL) report $$runs $(ARGS); $(TOOL) report $$runs $(ARGS)
+
+clean:  ## remove the environment and what builds and tools leave; keeps runs_out/
+	rm -rf .venv build install log dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

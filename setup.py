@@ -1,0 +1,116 @@
+"""
+Installation of beetle_omni_ros with colcon (ament_python) or pip.
+
+The one place for the package's metadata. It stays in ``setup.py`` because colcon runs this
+file, also with the setuptools 68 of Ubuntu 24.04; ``pyproject.toml`` names the build system
+and configures the tools.
+"""
+
+from pathlib import Path
+import re
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'beetle_omni_ros'
+NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node', 'reference_node',
+         'recorder_node', 'viewer_node')
+
+
+def version():
+    """Read the version from the package without importing it."""
+    text = Path(PACKAGE, '__init__.py').read_text(encoding='utf-8')
+    return re.search(r"^__version__ = '([^']+)'", text, re.MULTILINE).group(1)
+
+
+def shared(*folders):
+    """List the files below ``folders`` as data files under ``share/beetle_omni_ros``."""
+    files = [path for folder in folders for path in sorted(Path(folder).rglob('*'))
+             if path.is_file() and path.suffix != '.pyc' and not path.name.startswith('.')]
+    parents = sorted({path.parent for path in files})
+    return [(f'share/{PACKAGE}/{parent.as_posix()}',
+             [path.as_posix() for path in files if path.parent == parent])
+            for parent in parents]
+
+
+# Everything that simulates, flies in one process and reads bags; no ROS, no compiler.
+# Lower bounds admit what apt gives on Ubuntu 24.04; mujoco 4 has no wheels for Python 3.10.
+REQUIREMENTS = [
+    'casadi>=3.7,<4',
+    'filterpy>=1.4.5,<3',
+    'matplotlib>=3.6,<4',
+    'mcap>=1.2,<2',
+    'mcap-ros2-support>=0.5,<1',
+    'mujoco>=3.2,<5',
+    'numpy>=1.26,<3',
+    'onnxruntime>=1.18,<2',
+    'pyyaml>=6.0',
+    'rich>=13.7',
+    'rosbags>=0.11,<0.12',
+    'scipy>=1.11,<2',
+    'typer>=0.12',
+]
+
+# The plain name ros-rclpy on PyPI follows newer distributions; the names with jazzy stay.
+ROS = [
+    'ros-jazzy-rclpy[fastrtps]>=7.1.6,<8',
+    'ros-jazzy-common-interfaces>=5.3.6,<6',
+]
+
+HARDWARE = [
+    'dynamixel-sdk>=3.8,<5',
+    'pymavlink>=2.4.41,<3',
+    'pyserial>=3.5,<4',
+]
+
+TRAIN = [
+    'onnx>=1.16',
+    'onnxscript>=0.1',
+    'rsl-rl-lib>=3.0',
+    'tensorboard>=2.16',
+    'torch>=2.6',
+]
+
+# colcon looks for pytest under the name `test` before it runs pytest.
+TEST = [
+    'hypothesis>=6.100',
+    'pytest>=7.4',
+    'pytest-timeout>=2.2',
+]
+
+DEVELOPMENT = [
+    *TEST,
+    'colcon-common-extensions>=0.3',
+    'ruff>=0.9',
+]
+
+setup(
+    name=PACKAGE,
+    version=version(),
+    description='Flight stack and controller comparison for an overactuated tiltable quadrotor',
+    author='beetle_omni_ros contributors',
+    maintainer='beetle_omni_ros maintainers',
+    maintainer_email='maintainers@beetle-omni-ros.org',
+    license='BSD-3-Clause',
+    python_requires='>=3.10,<3.14',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        *shared('params', 'policies', 'launch', 'description'),
+    ],
+    zip_safe=False,
+    install_requires=REQUIREMENTS,
+    extras_require={
+        'ros': ROS,
+        'hardware': HARDWARE,
+        'train': TRAIN,
+        'test': TEST,
+        'dev': DEVELOPMENT,
+    },
+    entry_points={
+        'console_scripts': [
+            f'beetle_omni = {PACKAGE}.cli:main',
+            *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in NODES),
+        ],
+    },
+)
