@@ -123,10 +123,15 @@ class Plant:
                     self._limit_rates()
                 self._apply_forces()
                 mujoco.mj_step(model, data)
-            if not fast:
-                effort = self._robot.joints.effort_limit
-                model.actuator_forcerange[4:] = (-effort, effort)
-        self._update()
+        if fast:
+            self._update()
+        else:
+            # The sensors must see the capped torque too: at the rate limit the full one would
+            # accelerate a module by thousands of rad/s^2, and the accelerometer would report it.
+            self._limit_rates()
+            self._update()
+            effort = self._robot.joints.effort_limit
+            model.actuator_forcerange[4:] = (-effort, effort)
 
     def _may_touch(self):
         """Whether a contact or a joint stop is possible within the next tick."""
