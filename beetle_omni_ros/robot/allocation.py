@@ -53,6 +53,7 @@ class Allocator:
         matrix: (6, 8) from (f_i cos q_i, f_i sin q_i), interleaved, to (force, torque) in base_link.
         inverse: (8, 6) its pseudo-inverse.
         mass: the mass that the hover wrench carries [kg].
+        tilt_limit: travel of the joints to each side [rad].
 
     """
 
@@ -75,7 +76,7 @@ class Allocator:
         self.inverse = np.linalg.pinv(self.matrix, rcond=SINGULAR)
         self._negligible = NEGLIGIBLE * robot.hover_thrust
         self._thrust_min, self._thrust_max = rotors.thrust_min, rotors.thrust_max
-        self._tilt_limit = robot.joints.position_limit
+        self.tilt_limit = robot.joints.position_limit
 
     def wrench(self, tilt: np.ndarray, thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -146,15 +147,15 @@ class Allocator:
     def _nearest_turn(self, angle, present):
         """Angle + 2 pi k nearest ``present`` inside the travel; (angle, whether cut off)."""
         turned = angle + 2 * pi * round((present - angle) / (2 * pi))
-        if abs(turned) > self._tilt_limit:
+        if abs(turned) > self.tilt_limit:
             other = turned - copysign(2 * pi, turned)
-            if abs(other) <= self._tilt_limit:
+            if abs(other) <= self.tilt_limit:
                 return other, False
             return self._inside(min(turned, other, key=abs))
         return turned, False
 
     def _inside(self, angle):
-        limit = self._tilt_limit
+        limit = self.tilt_limit
         return (angle, False) if abs(angle) <= limit else (copysign(limit, angle), True)
 
 

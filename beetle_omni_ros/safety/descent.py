@@ -1,0 +1,211 @@
+"""
+The estimator of last resort: what is left when the EKF is gone.
+
+It starts from the last good estimate and is deliberately simpler than the EKF, so that the two do
+not fail for the same reason: gyroscope and accelerometer are integrated, and MoCap poses pull
+position, velocity and attitude by fixed gains, each compared with the own past at its capture
+time. While the EKF lives, the IMU biases are learnt from it. Without MoCap, position and velocity
+are dead reckoning, in which the velocity slowly forgets towards the one that is wished, so that a
+descent stays gentle; without IMU, rates come from MoCap alone.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from beetle_omni_ros.control.base import State
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.safety.parameters import BackupParameters
+
+KEPT_SAMPLES = 100     # IMU samples before the failure: 0.5 s at 200 Hz
+KEPT_POSES = 24        # own past for late MoCap frames: 0.12 s at 200 Hz
+LONGEST_STEP = 0.1     # [s] a gap in the samples is not integrated beyond this
+LARGEST_BIASES = (1.0, 0.2)   # [m/s^2], [rad/s] what learning may believe of an IMU
+
+
+class BackupEstimator:
+    """
+    Complementary filter on raw IMU and MoCap.
+
+    Args:
+        parameters: bandwidths.
+        gravity: [m/s^2].
+
+    Attributes:
+        running: whether :meth:`start` was called.
+        specific_force_up: latest specific force along world up [m/s^2], None without IMU.
+        imu_alive: set by the caller; without it rates come from MoCap.
+
+    """
+
+    def __init__(self, parameters: BackupParameters, gravity: float):
+        self._parameters = parameters
+        self._gravity = np.array([0.0, 0.0, -gravity])
+        self._samples: deque = deque(maxlen=KEPT_SAMPLES)
+        self._accelerometer_bias, self._gyroscope_bias = np.zeros(3), np.zeros(3)
+        self._learnt: State | None = None
+        self._mocap_stamp = -np.inf
+        self.imu_alive = True
+        self.stop()
+
+    def stop(self) -> None:
+        """Forget the flight; samples and biases stay."""
+        self.running = False
+        self._past: deque = deque(maxlen=KEPT_POSES)
+        self.specific_force_up = None
+
+    @property
+    def last_specific_force(self) -> np.ndarray | None:
+        """(3,) of the latest sample, in base_link [m/s^2]."""
+        return self._samples[-1][1] if self._samples else None
+
+    def on_imu(self, stamp: float, specific_force: np.ndarray,
+               angular_velocity: np.ndarray) -> bool:
+        """Take one raw sample; False when it is not finite or not newer than the last."""
+        force, rate = _vector(specific_force, 3), _vector(angular_velocity, 3)
+        if force is None or rate is None or not np.isfinite(stamp) \
+                or (self._samples and stamp <= self._samples[-1][0]):
+            return False
+        self._samples.append((stamp, force, rate))
+        if self.running:
+            self._use(stamp, force, rate)
+        return True
+
+    def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
+        """Take one pose, captured at ``stamp``; False when it is not usable."""
+        position, quaternion = _vector(position, 3), _vector(quaternion, 4)
+        if position is None or quaternion is None or not np.isfinite(stamp) \
+                or stamp <= self._mocap_stamp or abs(quaternion @ quaternion - 1) > 0.02:
+            return False
+        dt = min(stamp - self._mocap_stamp, LONGEST_STEP)
+        self._mocap_stamp = stamp
+        if self.running and self._past:
+            self._correct(stamp, position, rotations.normalized(quaternion), dt)
+        return True
+
+    def learn(self, state: State) -> None:
+        """Compare a good estimate with the IMU sample of its time; learn the biases."""
+        before, self._learnt = self._learnt, state
+        sample = next((s for s in reversed(self._samples) if s[0] <= state.stamp + 1e-6), None)
+        if before is None or sample is None:
+            return
+        dt = state.stamp - before.stamp
+        if not 0 < dt <= LONGEST_STEP or state.stamp - sample[0] > LONGEST_STEP:
+            return
+        acceleration = (state.velocity - before.velocity) / dt
+        expected = (acceleration - self._gravity) @ rotations.matrix(state.quaternion)
+        gain = min(1.0, dt / self._parameters.bias_time)
+        self._accelerometer_bias = _shortened(self._accelerometer_bias + gain * (
+            sample[1] - expected - self._accelerometer_bias), LARGEST_BIASES[0])
+        self._gyroscope_bias = _shortened(self._gyroscope_bias + gain * (
+            sample[2] - state.angular_velocity - self._gyroscope_bias), LARGEST_BIASES[1])
+
+    def start(self, state: State) -> None:
+        """Continue from the last good estimate, with the samples that came since."""
+        self.stop()
+        self.running = True
+        self._stamp = state.stamp
+        self._position, self._velocity = state.position.copy(), state.velocity.copy()
+        self._quaternion = rotations.normalized(state.quaternion)
+        self._rate = state.angular_velocity.copy()
+        self._remember()
+        for stamp, force, rate in self._samples:
+            if stamp > state.stamp:
+                self._use(stamp, force, rate)
+
+    def clock_went_back(self, by: float) -> None:
+        """Move everything known to the clock that was set back by ``by`` [s]."""
+        self._samples = deque(((t - by, *rest) for t, *rest in self._samples),
+                              maxlen=KEPT_SAMPLES)
+        self._past = deque(((t - by, *rest) for t, *rest in self._past), maxlen=KEPT_POSES)
+        self._mocap_stamp -= by
+        self._learnt = None
+        if self.running:
+            self._stamp -= by
+
+    def predict(self, now: float, wished_velocity: np.ndarray | None = None) -> None:
+        """
+        Advance to ``now`` without a sample.
+
+        Args:
+            now: [s].
+            wished_velocity: (3,) in world, given while MoCap is gone [m/s].
+
+        """
+        dt = now - self._stamp
+        if wished_velocity is not None and dt > 0:
+            self._velocity = self._velocity + min(1.0, dt / self._parameters.velocity_leak_time) \
+                * (wished_velocity - self._velocity)
+        if not self.imu_alive:
+            self.specific_force_up = None
+            self._advance(now, np.zeros(3))
+
+    def state(self, tilt: np.ndarray, tilt_velocity: np.ndarray, tilt_stamp: float,
+              now: float) -> State:
+        """The estimate at ``now``, extrapolated by at most the longest step."""
+        dt = float(np.clip(now - self._stamp, 0.0, LONGEST_STEP))
+        attitude = rotations.multiply(self._quaternion, rotations.exp(dt * self._rate))
+        return State(now, self._position + dt * self._velocity, self._velocity.copy(),
+                     rotations.normalized(attitude), self._rate.copy(), tilt, tilt_velocity,
+                     tilt_stamp)
+
+    def _use(self, stamp, force, rate):
+        if stamp <= self._stamp:
+            return
+        self._rate = rate - self._gyroscope_bias
+        in_world = rotations.matrix(self._quaternion) @ (force - self._accelerometer_bias)
+        self.specific_force_up = float(in_world[2])
+        self._advance(stamp, in_world + self._gravity)
+
+    def _advance(self, stamp, acceleration):
+        dt = min(stamp - self._stamp, LONGEST_STEP)
+        if dt <= 0:
+            return
+        self._position = self._position + dt * self._velocity + 0.5 * dt * dt * acceleration
+        self._velocity = self._velocity + dt * acceleration
+        self._quaternion = rotations.normalized(rotations.multiply(
+            self._quaternion, rotations.exp(dt * self._rate)))
+        self._stamp = stamp
+        self._remember()
+
+    def _remember(self):
+        self._past.append((self._stamp, self._position, self._quaternion))
+
+    def _correct(self, stamp, position, quaternion, dt):
+        p = self._parameters
+        _, then, attitude = min(self._past, key=lambda entry: abs(entry[0] - stamp))
+        error = _shortened(position - then, p.error_limit)
+        turn = _shortened(rotations.log(rotations.multiply(
+            rotations.conjugate(attitude), quaternion)), p.error_limit)
+        # Critically damped observer: position gain 2 w, velocity gain w^2.
+        w = p.position_bandwidth
+        self._position = self._position + min(1.0, 2 * w * dt) * error
+        self._velocity = self._velocity + w * w * dt * error
+        if self.imu_alive:
+            gain = p.attitude_bandwidth
+        else:
+            w = p.attitude_bandwidth_without_gyroscope
+            gain = 2 * w
+            self._rate = self._rate + w * w * dt * turn
+        self._quaternion = rotations.normalized(rotations.multiply(
+            self._quaternion, rotations.exp(min(1.0, gain * dt) * turn)))
+        # The corrected past is what the next late frame is compared with.
+        self._past = deque(((t, q + min(1.0, 2 * p.position_bandwidth * dt) * error,
+                             rotations.multiply(a, rotations.exp(min(1.0, gain * dt) * turn)))
+                            for t, q, a in self._past), maxlen=KEPT_POSES)
+
+
+def _vector(value, size):
+    """``value`` as finite floats (size,), or None."""
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        return None
+    return array if array.shape == (size,) and np.isfinite(array).all() else None
+
+
+def _shortened(vector, limit):
+    length = float(np.sqrt(vector @ vector))
+    return vector if length <= limit else vector * (limit / length)

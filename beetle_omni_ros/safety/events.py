@@ -1,0 +1,92 @@
+"""What the supervisor says: events, answers to requests, and the silence of a source."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+INFO, WARNING, ERROR = 'info', 'warning', 'error'
+KEPT = 1000   # events; a flight has tens
+
+
+@dataclass(frozen=True)
+class Event:
+    """
+    One thing that an operator must be able to read later.
+
+    Attributes:
+        stamp: when [s].
+        severity: 'info', 'warning' or 'error'.
+        text: one line that names the node at fault and the outcome.
+
+    """
+
+    stamp: float
+    severity: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer to a request: true when granted, with the reason as text."""
+
+    ok: bool
+    text: str
+
+    def __bool__(self):
+        """Whether the request was granted."""
+        return self.ok
+
+
+class EventLog(list):
+    """A list of events that drops the oldest ones and does not repeat itself."""
+
+    def __init__(self, quiet_time: float):
+        """``quiet_time``: a keyed event is said at most once in this time [s]."""
+        super().__init__()
+        self._quiet_time = quiet_time
+        self._said: dict[str, float] = {}
+
+    def say(self, stamp: float, severity: str, text: str, key: str | None = None) -> None:
+        """Add one event; with a ``key``, not again within the quiet time."""
+        if key is not None:
+            if abs(stamp - self._said.get(key, float('-inf'))) < self._quiet_time:
+                return
+            self._said[key] = stamp
+        self.append(Event(stamp, severity, text))
+        if len(self) > KEPT:
+            del self[0]
+
+
+class Silence:
+    """
+    How long a source has said nothing.
+
+    Time is counted in the supervisor's own ticks, each at most ``tick`` long: when the process
+    itself was held up, or the clock was set, the messages that wait in the queue get their chance
+    before anything is declared dead.
+    """
+
+    def __init__(self, limit: float):
+        """``limit``: longer silence is a fault [s]."""
+        self.limit = limit
+        self.elapsed = float('inf')   # nothing heard yet
+
+    def heard(self) -> None:
+        """The source spoke."""
+        self.elapsed = 0.0
+
+    def tick(self, dt: float) -> None:
+        """``dt`` seconds passed."""
+        self.elapsed += dt
+
+    @property
+    def silent(self) -> bool:
+        """Whether the silence is a fault; a rounding error short of the limit counts."""
+        return self.elapsed >= self.limit - 1e-9
+
+    @property
+    def text(self) -> str:
+        """For messages: 'silent for 52 ms', or 'never heard'."""
+        if self.elapsed == float('inf'):
+            return 'never heard'
+        return f'silent for {1000 * self.elapsed:.0f} ms'

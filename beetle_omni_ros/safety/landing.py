@@ -1,0 +1,118 @@
+"""Landing: level out, sink at a set rate, notice the ground, on whatever estimate is left."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf
+
+from beetle_omni_ros.control.base import Command, Controller, Reference
+from beetle_omni_ros.safety.events import ERROR, EventLog
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.ramp import inclination, levelled, Ramp
+from beetle_omni_ros.safety.support import SupportGauge
+from beetle_omni_ros.safety.vehicle import Vehicle
+
+
+class Landing:
+    """
+    One descent, stepped by the supervisor.
+
+    Args:
+        parameters: rates and thresholds.
+        hover: the controller that flies it.
+        gauge: what the rotors carry.
+        vehicle: estimate, joints and raw sensors.
+        events: where to say what is gone.
+
+    Attributes:
+        grounded: whether it stands.
+        blind: whether nothing measures the motion any more.
+
+    """
+
+    def __init__(self, parameters: SupervisorParameters, hover: Controller, gauge: SupportGauge,
+                 vehicle: Vehicle, events: EventLog):
+        self._parameters, self._blind_limit = parameters.landing, parameters.state.blind_limit
+        self._hover, self._gauge, self._vehicle, self._events = hover, gauge, vehicle, events
+        self.grounded, self.blind = False, False
+        self._standing_for, self._blind_for = 0.0, 0.0
+
+    def start(self, now: float, in_force: Command | None) -> None:
+        """Begin where the robot is, on the estimator or on the backup."""
+        self._hover.reset()
+        if self._vehicle.estimate.silent:
+            self._vehicle.backup.start(self._vehicle.state)
+        self.set_out(now, in_force)
+
+    def step(self, now: float, dt: float, in_force: Command | None) -> Command:
+        """The command of this instant."""
+        vehicle, backup = self._vehicle, self._vehicle.backup
+        if not backup.running and vehicle.estimate.silent:
+            self._events.say(now, ERROR, f'ekf_node {vehicle.estimate.text}: descent goes on with '
+                                         'raw sensors')
+            backup.start(vehicle.state)
+            self.set_out(now, in_force)
+        if not backup.running:
+            return self._follow(vehicle.seen(in_force), dt, None)
+        dead_reckoning = self._lean_on_what_is_left(now, dt)
+        state = vehicle.seen(in_force, vehicle.backup_state(now))
+        return self._follow(state, dt, backup.specific_force_up if dead_reckoning else None)
+
+    def _lean_on_what_is_left(self, now, dt):
+        """Advance the backup; whether it is without MoCap."""
+        vehicle = self._vehicle
+        no_mocap, no_imu = vehicle.mocap.silent, vehicle.imu.silent
+        for gone, name in ((no_mocap, 'MoCap'), (no_imu, 'IMU')):
+            if gone:
+                self._events.say(now, ERROR, f'{name} is gone too: descent without it',
+                                 f'no {name}')
+        self._blind_for = self._blind_for + dt if no_mocap and no_imu else 0.0
+        self.blind = self._blind_for > self._blind_limit
+        vehicle.backup.predict(now, self._ramp.at(now).velocity if no_mocap else None)
+        return no_mocap
+
+    def set_out(self, now: float, in_force: Command | None) -> None:
+        """Level out and sink from the present pose."""
+        vehicle = self._vehicle
+        state = vehicle.backup_state(now) if vehicle.backup.running else vehicle.seen(in_force)
+        p, angle = self._parameters, inclination(state.quaternion)
+        self._ramp = Ramp(state.stamp, state.position, state.quaternion,
+                          levelled(state.quaternion), p.level_rate,
+                          angle / p.level_rate if angle > p.level_first else 0.0,
+                          -inf, p.speed, p.acceleration)
+
+    def _follow(self, state, dt, specific_force_up):
+        """
+        Follow the ramp, whose target waits for the robot.
+
+        ``specific_force_up`` [m/s^2] is given only where motion is not measured: elsewhere an
+        upward wind would be taken for the ground.
+        """
+        reference = self._ramp.at(state.stamp)
+        lowest = state.position[2] - self._parameters.target_lead
+        if reference.position[2] < lowest:
+            position = reference.position.copy()
+            position[2] = lowest
+            reference = replace(reference, position=position)
+        self._feel_ground(state, dt, specific_force_up, reference)
+        return self._hover.step(state, _Now(reference))
+
+    def _feel_ground(self, state, dt, specific_force_up, reference):
+        """The rotors carry clearly less than the weight, yet it does not fall."""
+        p = self._parameters
+        still = abs(state.velocity[2]) < p.ground_speed
+        carried = self._gauge.support(specific_force_up) > p.ground_support
+        sinking = reference.velocity[2] < -0.5 * p.speed
+        stands = sinking and carried and (still or specific_force_up is not None)
+        self._standing_for = self._standing_for + dt if stands else 0.0
+        self.grounded = self._standing_for >= p.ground_time - 1e-9
+
+
+class _Now:
+    """A target that is one reference."""
+
+    def __init__(self, reference: Reference):
+        self._reference = reference
+
+    def at(self, time):
+        return self._reference

@@ -1,0 +1,154 @@
+"""The checks of every command, and the record of each controller's good and refused ones."""
+
+from __future__ import annotations
+
+from collections import Counter
+from math import isfinite
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Command, ROTORS
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.events import Silence
+from beetle_omni_ros.safety.parameters import CommandLimits
+
+NOT_A_COMMAND = 'not a command'
+SHAPE = 'wrong shape'
+NOT_FINITE = 'not finite'
+STALE = 'stale stamp'
+FUTURE = 'stamp in the future'
+REPEATED = 'repeated stamp'
+OLDER = 'older than the last'
+THRUST = 'thrust out of range'
+TILT = 'tilt out of range'
+JUMP = 'implausible jump'
+UNKNOWN = 'unknown controller'
+
+
+class CommandStream:
+    """
+    One controller's commands: what was accepted last, what was refused and why.
+
+    Args:
+        limits: thresholds.
+        robot: thrust and tilt ranges.
+
+    Attributes:
+        accepted: the last good command, or None.
+        refused: reason -> count.
+        last_refusal: reason of the last refusal, '' after a good command.
+        silence: since the last good command.
+        good_for: how long it has been good without a gap or refusal [s].
+
+    """
+
+    def __init__(self, limits: CommandLimits, robot: RobotParameters):
+        self._limits, self._rotors = limits, robot.rotors
+        self._tilt_limit = robot.joints.position_limit
+        self.accepted: Command | None = None
+        self.refused: Counter = Counter()
+        self.last_refusal = ''
+        self.silence = Silence(limits.timeout)
+        self.good_for = 0.0
+        self._offered: Command | None = None
+
+    @property
+    def good(self) -> bool:
+        """Whether it may be given control."""
+        return not self.silence.silent and self.good_for >= self._limits.return_after - 1e-9
+
+    @property
+    def complaint(self) -> str:
+        """Why it is not good, for messages."""
+        if self.silence.silent:
+            last = f'; last refused: {self.last_refusal}' if self.last_refusal else ''
+            return self.silence.text + last
+        return f'good for only {self.good_for:.2f} s of {self._limits.return_after:g} s'
+
+    def offer(self, command: Command, now: float) -> str:
+        """
+        Check one command; keep a clean copy when it is good.
+
+        Returns:
+            '' when accepted, else the reason.
+
+        """
+        reason, clean = self._check(command, now)
+        if reason:
+            self.refused[reason] += 1
+            self.last_refusal = reason
+            self.good_for = 0.0
+            return reason
+        self.accepted, self.last_refusal = clean, ''
+        self.silence.heard()
+        return ''
+
+    def tick(self, dt: float) -> None:
+        """``dt`` seconds passed."""
+        self.silence.tick(dt)
+        self.good_for = 0.0 if self.silence.silent else self.good_for + dt
+
+    def clock_went_back(self, now: float) -> None:
+        """Stamps from before a clock step must not block the stream."""
+        if self.accepted is not None and self.accepted.stamp > now:
+            self.accepted = self._offered = None
+            self.silence.elapsed = float('inf')
+
+    def _check(self, command, now):
+        """Reason and, without one, the copy with limits applied exactly."""
+        try:
+            stamp = float(command.stamp)
+            tilt = np.array(command.tilt, dtype=float)
+            thrust = np.array(command.thrust, dtype=float)
+        except (AttributeError, TypeError, ValueError):
+            return NOT_A_COMMAND, None
+        if tilt.shape != (ROTORS,) or thrust.shape != (ROTORS,):
+            return SHAPE, None
+        if not (isfinite(stamp) and np.isfinite(tilt).all() and np.isfinite(thrust).all()):
+            return NOT_FINITE, None
+        clean = Command(stamp, np.clip(tilt, -self._tilt_limit, self._tilt_limit),
+                        np.clip(thrust, self._rotors.thrust_min, self._rotors.thrust_max))
+        return self._check_stamp(stamp, now) or self._check_range(tilt, thrust, clean), clean
+
+    def _check_stamp(self, stamp, now):
+        if now - stamp > self._limits.stale_after:
+            return STALE
+        if stamp - now > self._limits.clock_tolerance:
+            return FUTURE
+        if self.accepted is not None and stamp <= self.accepted.stamp:
+            return REPEATED if stamp == self.accepted.stamp else OLDER
+        return ''
+
+    def _check_range(self, tilt, thrust, clean):
+        tolerance = self._limits.limit_tolerance
+        if np.abs(thrust - clean.thrust).max() > tolerance:
+            return THRUST
+        if np.abs(tilt - clean.tilt).max() > tolerance:
+            return TILT
+        before, self._offered = self._offered, clean
+        # Against the previous one offered, not accepted: a lone spike is refused, a real step
+        # costs one period.
+        if before is not None and clean.stamp - before.stamp <= self._limits.timeout and (
+                np.abs(clean.tilt - before.tilt).max() > self._limits.tilt_step
+                or np.abs(clean.thrust - before.thrust).max() > self._limits.thrust_step):
+            return JUMP
+        return ''
+
+
+def within_limits(command: Command, robot: RobotParameters, stopped: bool = False) -> \
+        Command | None:
+    """
+    The last look at what goes out: finite and cut to the limits, or None.
+
+    Args:
+        command: of whatever source.
+        robot: thrust and tilt ranges.
+        stopped: whether zero thrust is meant, below the smallest thrust of flight.
+
+    """
+    if not (np.isfinite(command.tilt).all() and np.isfinite(command.thrust).all()):
+        return None
+    limit = robot.joints.position_limit
+    low = 0.0 if stopped else robot.rotors.thrust_min
+    return Command(command.stamp, np.clip(command.tilt, -limit, limit),
+                   np.clip(command.thrust, low, robot.rotors.thrust_max))

@@ -1,0 +1,174 @@
+"""The supervisor's parameters; params/supervisor.yaml says why each has its value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import group, parameter
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandLimits:
+    """When a command is refused and when its controller counts as silent."""
+
+    timeout: float = parameter(0.05, doc='silence of the active controller: fallback', unit='s',
+                               low=0.01, high=1)
+    stale_after: float = parameter(0.05, doc='older stamps are refused on arrival', unit='s',
+                                   low=0.005, high=1)
+    age_limit: float = parameter(0.1, doc='no command is executed beyond this age', unit='s',
+                                 low=0.02, high=1)
+    clock_tolerance: float = parameter(0.02, doc='stamps farther ahead are refused', unit='s',
+                                       low=0, high=1)
+    return_after: float = parameter(0.5, doc='good time before a controller gets control',
+                                    unit='s', low=0.05, high=60)
+    limit_tolerance: float = parameter(0.001, doc='overstep of a limit that is cut off instead',
+                                       unit='rad or N', low=0, high=0.1)
+    tilt_step: float = parameter(2.0, doc='a lone larger jump of a tilt target is refused',
+                                 unit='rad', low=0.1, high=100)
+    thrust_step: float = parameter(15.0, doc='a lone larger jump of a thrust target is refused',
+                                   unit='N', low=0.1, high=200)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateLimits:
+    """When the state estimate, the joints and the raw sensors count as gone."""
+
+    timeout: float = parameter(0.05, doc='silence of the estimator: controlled descent', unit='s',
+                               low=0.01, high=1)
+    stale_after: float = parameter(0.05, doc='older estimates are refused', unit='s', low=0.005,
+                                   high=1)
+    joint_timeout: float = parameter(0.2, doc='silence of the joint feedback: landing', unit='s',
+                                     low=0.02, high=5)
+    imu_timeout: float = parameter(0.05, doc='silence of the raw IMU', unit='s', low=0.01, high=1)
+    mocap_timeout: float = parameter(0.2, doc='silence of the raw MoCap', unit='s', low=0.02,
+                                     high=5)
+    blind_limit: float = parameter(0.3, doc='time without any sensor before motors off', unit='s',
+                                   low=0.02, high=5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmingLimits:
+    """What must hold before the motors start."""
+
+    tilt: float = parameter(0.35, doc='largest inclination', unit='rad', low=0.01, high=3.15)
+    speed: float = parameter(0.3, doc='largest speed', unit='m/s', low=0.01, high=10)
+    rate: float = parameter(0.5, doc='largest angular rate', unit='rad/s', low=0.01, high=10)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TakeoffParameters:
+    """From the ground to the height where the selected controller takes over."""
+
+    height: float = parameter(1.0, doc='height of base_link in world', unit='m', low=0.1, high=20)
+    clearance: float = parameter(0.3, doc='least climb, from a raised platform', unit='m', low=0.05,
+                                 high=20)
+    speed: float = parameter(0.5, doc='climb speed', unit='m/s', low=0.05, high=5)
+    acceleration: float = parameter(0.5, doc='of the climb', unit='m/s^2', low=0.05, high=10)
+    align_rate: float = parameter(2.0, doc='joint rate before the rotors start', unit='rad/s',
+                                  low=0.1, high=10)
+    align_tolerance: float = parameter(0.1, doc='joint error allowed before start', unit='rad',
+                                       low=0.01, high=1)
+    align_patience: float = parameter(4.0, doc='time for the joints to get there', unit='s',
+                                      low=0.1, high=60)
+    position_tolerance: float = parameter(0.15, doc='hand over within this distance', unit='m',
+                                          low=0.01, high=2)
+    speed_tolerance: float = parameter(0.2, doc='hand over below this speed', unit='m/s', low=0.01,
+                                       high=5)
+    patience: float = parameter(4.0, doc='time after the climb before it counts as failed',
+                                unit='s', low=0.1, high=60)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LandingParameters:
+    """Levelling, descent and how the ground is noticed."""
+
+    speed: float = parameter(0.3, doc='descent speed', unit='m/s', low=0.05, high=3)
+    acceleration: float = parameter(0.5, doc='of the descent', unit='m/s^2', low=0.05, high=10)
+    level_rate: float = parameter(0.8, doc='angular rate of the levelling', unit='rad/s', low=0.05,
+                                  high=5)
+    level_first: float = parameter(0.3, doc='more inclination is levelled before the descent',
+                                   unit='rad', low=0, high=3.15)
+    target_lead: float = parameter(0.5, doc='the target sinks at most this far below the robot',
+                                   unit='m', low=0.05, high=5)
+    ground_speed: float = parameter(0.12, doc='vertical speed below which it may stand', unit='m/s',
+                                    low=0.01, high=1)
+    ground_support: float = parameter(0.2, doc='share of the weight that the rotors do not carry',
+                                      low=0.05, high=0.9)
+    ground_time: float = parameter(0.3, doc='for this long, then the robot stands', unit='s',
+                                   low=0.02, high=5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackupParameters:
+    """The estimator of last resort."""
+
+    position_bandwidth: float = parameter(8.0, doc='of MoCap corrections of position', unit='rad/s',
+                                          low=0.5, high=50)
+    attitude_bandwidth: float = parameter(5.0, doc='of MoCap corrections of attitude', unit='rad/s',
+                                          low=0.5, high=50)
+    attitude_bandwidth_without_gyroscope: float = parameter(
+        12.0, doc='the same when the IMU is gone too', unit='rad/s', low=0.5, high=50)
+    bias_time: float = parameter(2.0, doc='over which IMU biases are learnt from the estimator',
+                                 unit='s', low=0.1, high=100)
+    velocity_leak_time: float = parameter(
+        3.0, doc='without MoCap the velocity forgets towards the wished one', unit='s', low=0.2,
+        high=100)
+    error_limit: float = parameter(0.2, doc='larger MoCap corrections are shortened', unit='m or rad',
+                                   low=0.01, high=5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatteryLimits:
+    """Pack voltage for each cell, under load."""
+
+    arm: float = parameter(3.5, doc='arming needs at least this', unit='V', low=2.5, high=4.4)
+    warn: float = parameter(3.4, doc='warning below', unit='V', low=2.5, high=4.4)
+    land: float = parameter(3.2, doc='landing below', unit='V', low=2.0, high=4.4)
+    time: float = parameter(2.0, doc='for this long', unit='s', low=0.1, high=60)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Envelope:
+    """Where flight counts as lost; any attitude is legal, so attitude is not in it."""
+
+    half_width: float = parameter(20.0, doc='|x| and |y| in world', unit='m', low=0.5, high=1000)
+    height: float = parameter(20.0, doc='z in world', unit='m', low=0.5, high=1000)
+    fence_reaction: str = parameter('landing', doc='on leaving it',
+                                    choices=('none', 'landing', 'emergency_stop'))
+    rate: float = parameter(15.0, doc='tumbling above this angular rate', unit='rad/s', low=1,
+                            high=100)
+    fall_speed: float = parameter(6.0, doc='falling above this speed downwards', unit='m/s',
+                                  low=0.5, high=100)
+    lost_time: float = parameter(0.3, doc='for this long', unit='s', low=0.02, high=10)
+    lost_reaction: str = parameter('fallback', doc='on tumbling or falling', choices=(
+        'none', 'fallback', 'landing', 'emergency_stop'))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SupervisorParameters:
+    """Everything the supervisor can be told."""
+
+    controller: str = parameter('nmpc', doc='the active controller, also in flight',
+                                choices=('nmpc', 'rl'))
+    commands: CommandLimits = group(CommandLimits)
+    state: StateLimits = group(StateLimits)
+    arming: ArmingLimits = group(ArmingLimits)
+    takeoff: TakeoffParameters = group(TakeoffParameters)
+    landing: LandingParameters = group(LandingParameters)
+    backup: BackupParameters = group(BackupParameters)
+    battery: BatteryLimits = group(BatteryLimits)
+    envelope: Envelope = group(Envelope)
+    tick_limit: float = parameter(0.02, doc='longer pauses of the supervisor itself count as this',
+                                  unit='s', low=0.005, high=0.5)
+    stop_time: float = parameter(0.3, doc='zero thrust is commanded this long, then nothing',
+                                 unit='s', low=0, high=5)
+    quiet_time: float = parameter(1.0, doc='a repeated complaint is said once in this time',
+                                  unit='s', low=0, high=60)
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> SupervisorParameters:
+        """Read a supervisor file; without a path, the shipped one."""
+        return schema.load(cls, path if path else share_path('params/supervisor.yaml'))

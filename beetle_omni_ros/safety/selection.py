@@ -1,0 +1,73 @@
+"""Which controller is active, and the streams of all of them."""
+
+from __future__ import annotations
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.limits import CommandStream, UNKNOWN
+from beetle_omni_ros.safety.parameters import CommandLimits
+
+
+class Selection:
+    """
+    The controllers that may fly.
+
+    Args:
+        names: their names.
+        active: the one selected at first.
+        limits: thresholds of their commands.
+        robot: thrust and tilt ranges.
+
+    Attributes:
+        active: name of the selected controller.
+
+    """
+
+    def __init__(self, names: tuple[str, ...], active: str, limits: CommandLimits,
+                 robot: RobotParameters):
+        self._streams = {name: CommandStream(limits, robot) for name in names}
+        self._unknown = 0
+        self.active = active if active in self._streams else names[0]
+
+    @property
+    def stream(self) -> CommandStream:
+        """The active controller's commands."""
+        return self._streams[self.active]
+
+    def offer(self, controller: str, command: Command, now: float) -> str:
+        """Check one command; '' when it is good, else the reason (counted)."""
+        if controller not in self._streams:
+            self._unknown += 1
+            return UNKNOWN
+        return self._streams[controller].offer(command, now)
+
+    def why_not(self, controller: str, in_flight: bool) -> str:
+        """'' when ``controller`` may be selected, else the reason."""
+        if controller not in self._streams:
+            return f"unknown controller '{controller}'; known: {', '.join(self._streams)}"
+        stream = self._streams[controller]
+        if in_flight and not stream.good:
+            return f'{controller}_node {stream.complaint}; {self.active} stays selected'
+        return ''
+
+    def tick(self, dt: float) -> None:
+        """``dt`` seconds passed."""
+        for stream in self._streams.values():
+            stream.tick(dt)
+
+    def clock_went_back(self, now: float) -> None:
+        """Stamps from before a clock step must not block the streams."""
+        for stream in self._streams.values():
+            stream.clock_went_back(now)
+
+    def diagnostics(self) -> dict[str, float | int]:
+        """For each controller: good, silence [ms], refusals by reason."""
+        told: dict[str, float | int] = {}
+        for name, stream in self._streams.items():
+            told[f'{name}.good'] = int(stream.good)
+            told[f'{name}.silent_ms'] = 1000 * stream.silence.elapsed
+            told.update({f'{name}.refused.{reason}': count
+                         for reason, count in stream.refused.items()})
+        if self._unknown:
+            told[f'refused.{UNKNOWN}'] = self._unknown
+        return told

@@ -1,0 +1,287 @@
+"""
+The supervisor: which command the actuators execute, and what happens when something fails.
+
+A pure state machine: it reads no clock and no topic, every time is passed in, so the node and the
+in-process evaluation run the same code and get the same answer. See docs/safety.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Command, Controller, PoseTarget
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
+from beetle_omni_ros.safety.inputs import Inputs
+from beetle_omni_ros.safety.landing import Landing
+from beetle_omni_ros.safety.limits import within_limits
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.support import SupportGauge
+from beetle_omni_ros.safety.takeoff import Takeoff
+
+DISARMED, TAKEOFF, FLYING = 'disarmed', 'takeoff', 'flying'
+FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
+IN_FLIGHT = (TAKEOFF, FLYING, FALLBACK, LANDING)
+
+
+class Supervisor(Inputs):
+    """
+    Arms, selects, checks, falls back, lands.
+
+    Args:
+        parameters: thresholds.
+        robot: the robot as it is believed to be.
+        fallback: flies takeoff, fallback and landing; HoverController or alike.
+        controllers: names of the controllers that may be active.
+
+    Attributes:
+        state: 'disarmed', 'takeoff', 'flying', 'fallback', 'landing' or 'emergency_stop'.
+        source: whose command is executed: a controller's name, 'hover' or 'none'.
+        events, vehicle, active: see Inputs.
+
+    """
+
+    def __init__(self, parameters: SupervisorParameters, robot: RobotParameters,
+                 fallback: Controller, controllers: tuple[str, ...] = ('nmpc', 'rl')):
+        super().__init__(parameters, robot, controllers)
+        self._hover = fallback
+        self._allocator = Allocator(robot)
+        self._gauge = SupportGauge(self._allocator, robot.gravity, robot.rotors.time_constant)
+        self.state, self.source = DISARMED, 'none'
+        self._in_force: Command | None = None
+        self._takeoff: Takeoff | None = None
+        self._landing: Landing | None = None
+        self._target: PoseTarget | None = None
+        self._stop_left = 0.0
+
+    # Requests ---------------------------------------------------------------------------------
+
+    def arm(self, now: float) -> Answer:
+        """Start the motors and take off, or say why not."""
+        if self.state != DISARMED:
+            return self._refuse(now, f'arm refused: {self.state}, not disarmed')
+        reason = self.vehicle.why_not_arm()
+        if reason:
+            return self._refuse(now, f'arm refused: {reason}')
+        self._takeoff = Takeoff(self._parameters.takeoff, self._allocator, self._hover,
+                                self.vehicle.seen(None))
+        self._in_force = None
+        return self._enter(TAKEOFF, now, INFO, 'armed: takeoff')
+
+    def disarm(self, now: float) -> Answer:
+        """Motors off, on the ground or after an emergency stop; refused in the air."""
+        if self.state in IN_FLIGHT and not self._on_ground:
+            return self._refuse(now, f'disarm refused: {self.state}; land or emergency_stop')
+        if self.state == DISARMED:
+            return Answer(True, 'already disarmed')
+        return self._motors_off(DISARMED, now, INFO, 'disarmed')
+
+    def emergency_stop(self, now: float, reason: str = 'requested') -> Answer:
+        """Motors off at once, latched until disarmed."""
+        if self.state == STOPPED:
+            return Answer(True, 'already stopped')
+        return self._motors_off(STOPPED, now, ERROR, f'emergency stop: {reason}')
+
+    def land(self, now: float) -> Answer:
+        """Descend where it is, motors off at the ground."""
+        if self.state not in IN_FLIGHT:
+            return self._refuse(now, f'land refused: {self.state}, not in flight')
+        if self.state == LANDING:
+            return Answer(True, 'already landing')
+        return self._land(now, INFO, 'landing on request')
+
+    def select(self, controller: str, now: float | None = None) -> Answer:
+        """Make another controller the active one; in flight only one that is good."""
+        now = self._now if now is None else now
+        if controller == self.active:
+            return Answer(True, f'{controller} is active')
+        reason = self._selection.why_not(controller, self.state in IN_FLIGHT)
+        if reason:
+            return self._refuse(now, f'select refused: {reason}')
+        self._selection.active = controller
+        self._say(now, INFO, f'{controller} selected')
+        return Answer(True, f'{controller} selected')
+
+    # The cycle --------------------------------------------------------------------------------
+
+    def update(self, now: float) -> Command | None:
+        """
+        Decide what the actuators execute now; call it at least every 10 ms.
+
+        Returns:
+            a finite command within limits, or None: nothing is sent.
+
+        """
+        dt = self._tick(now)
+        now = self._now
+        if now is None:
+            return None
+        if self.state in IN_FLIGHT:
+            self._watch(now)
+        command = {TAKEOFF: self._take_off, FLYING: self._fly, FALLBACK: self._hold,
+                   LANDING: self._descend}.get(self.state, self._stand)(now, dt)
+        command = self._guarded(command, now)
+        if self.state in IN_FLIGHT:
+            self._gauge.update(command, self.vehicle.attitude(now), dt,
+                               self.vehicle.specific_force_up,
+                               learn=self.state in (FLYING, FALLBACK))
+        return command
+
+    def diagnostics(self) -> dict[str, float | int | str]:
+        """State, sources and refusals, flat, for operators and logs."""
+        told = {'state': self.state, 'controller': self.active, 'source': self.source,
+                'estimator': self.vehicle.status or 'never heard',
+                'on_backup_estimator': int(self.vehicle.backup.running)}
+        told.update(self._selection.diagnostics())
+        for reason, count in self.vehicle.refused.items():
+            told[f'refused.{reason}'] = count
+        if self.vehicle.voltage is not None:
+            told['battery_V'] = self.vehicle.voltage
+        return told
+
+    def _watch(self, now):
+        """Faults that end or change a flight, whoever flies it."""
+        vehicle, envelope = self.vehicle, self._parameters.envelope
+        if vehicle.battery_low(self._parameters.battery.warn):
+            self._say(now, WARNING, f'battery low: {vehicle.voltage:.1f} V', 'battery')
+        if self.state == LANDING:
+            return
+        if vehicle.estimate.silent:
+            why = f' (last refused: {vehicle.last_refusal})' if vehicle.last_refusal else ''
+            self._land(now, ERROR, f'ekf_node {vehicle.estimate.text}{why}: controlled descent '
+                                   'on raw sensors')
+        elif vehicle.joints.silent:
+            self._land(now, ERROR, f'joint_bridge_node {vehicle.joints.text}: landing with the '
+                                   'joints assumed where they were commanded')
+        elif vehicle.battery_empty:
+            self._land(now, ERROR, f'battery empty ({vehicle.voltage:.1f} V): landing')
+        elif vehicle.outside_fence and envelope.fence_reaction != 'none':
+            self._react(envelope.fence_reaction, now, 'left the fence')
+        elif vehicle.lost and envelope.lost_reaction != 'none':
+            self._react(envelope.lost_reaction, now, 'tumbling or falling')
+
+    def _react(self, reaction, now, why):
+        if reaction == 'emergency_stop':
+            self.emergency_stop(now, why)
+        elif reaction == 'landing':
+            self._land(now, ERROR, f'{why}: landing')
+        elif self.state == FLYING:
+            self._fall_back(now, ERROR, f'{why} under {self.active}_node: fallback to hover')
+
+    # One function for each state --------------------------------------------------------------
+
+    def _stand(self, now, dt):
+        """Motors off: zero thrust for a short while, then nothing."""
+        self.source = 'none'
+        if self._stop_left <= 0 or self._in_force is None:
+            return None
+        self._stop_left -= dt
+        return Command(now, self._in_force.tilt, np.zeros(4))
+
+    def _take_off(self, now, dt):
+        self.source = 'hover'
+        command = self._takeoff.step(self.vehicle.seen(self._in_force), self._in_force, dt)
+        if self._takeoff.failure:
+            self._motors_off(DISARMED, now, ERROR, f'takeoff failed: {self._takeoff.failure}')
+            return self._stand(now, dt)
+        if self._takeoff.done:
+            stream = self._selection.stream
+            if stream.good:
+                self._enter(FLYING, now, INFO, f'takeoff done: {self.active} flies')
+            else:
+                self._fall_back(now, WARNING, f'takeoff done, but {self.active}_node '
+                                f'{stream.complaint}: hover waits for it', self._takeoff.target)
+        return command
+
+    def _fly(self, now, dt):
+        stream = self._selection.stream
+        if stream.silence.silent:
+            estimate = self.vehicle.estimate
+            cause = f' (ekf_node {estimate.text} too)' if estimate.elapsed > 0.5 * estimate.limit \
+                else ''
+            self._fall_back(now, ERROR, f'{self.active}_node {stream.complaint}{cause}: '
+                                        'fallback to hover')
+            return self._hold(now, dt)
+        self.source = self.active
+        return stream.accepted
+
+    def _hold(self, now, dt):
+        if self._selection.stream.good and not self.vehicle.lost:
+            self._enter(FLYING, now, INFO, f'{self.active}_node good again: it flies')
+            return self._fly(now, dt)
+        self.source = 'hover'
+        return self._hover.step(self.vehicle.seen(self._in_force), self._target)
+
+    def _descend(self, now, dt):
+        self.source = 'hover'
+        command = self._landing.step(now, dt, self._in_force)
+        if self._landing.blind:
+            self.emergency_stop(now, 'no estimator, no MoCap, no IMU')
+            return self._stand(now, dt)
+        if self._landing.grounded:
+            self._motors_off(DISARMED, now, INFO, 'on the ground: motors off, disarmed')
+            return self._stand(now, dt)
+        return command
+
+    # Changes of state -------------------------------------------------------------------------
+
+    def _fall_back(self, now, severity, text, position=None):
+        """Hover at the present pose, or at ``position``."""
+        state = self.vehicle.state
+        self._target = PoseTarget(state.position if position is None else position,
+                                  state.quaternion, now)
+        if position is None:
+            self._hover.reset()
+        self._enter(FALLBACK, now, severity, text)
+
+    def _land(self, now, severity, text):
+        if self._on_ground:
+            return self._motors_off(DISARMED, now, severity, f'{text}; still on the ground: '
+                                                             'motors off')
+        self._landing = Landing(self._parameters, self._hover, self._gauge, self.vehicle,
+                                self.events)
+        answer = self._enter(LANDING, now, severity, text)
+        self._landing.start(now, self._in_force)
+        return answer
+
+    def _motors_off(self, state, now, severity, text):
+        self._stop_left = self._parameters.stop_time
+        self.vehicle.backup.stop()
+        return self._enter(state, now, severity, text)
+
+    def _enter(self, state, now, severity, text):
+        self.state = state
+        self._say(now, severity, text)
+        return Answer(True, text)
+
+    @property
+    def _on_ground(self):
+        return self.state == TAKEOFF and not self._takeoff.airborne
+
+    def _clock_went_back(self, now, by):
+        self._hover.reset()
+        if self.state == TAKEOFF:
+            self._takeoff.clock_went_back(by)
+        if self.state == LANDING:
+            self._landing.set_out(now, self._in_force)
+
+    # Small things -----------------------------------------------------------------------------
+
+    def _guarded(self, command, now):
+        """The last look at whatever goes out: finite, inside limits, not too old."""
+        if command is None:
+            return None
+        if now - command.stamp > self._parameters.commands.age_limit:
+            self._say(now, ERROR, f'the command of {self.source} is '
+                                  f'{1000 * (now - command.stamp):.0f} ms old: nothing sent',
+                      'old command')
+            return None
+        self._in_force = within_limits(command, self._robot, stopped=self.source == 'none')
+        if self._in_force is None:
+            self.emergency_stop(now, f'{self.source} gave a command that is not finite')
+        return self._in_force
+
+    def _refuse(self, now, text):
+        self._say(now, WARNING, text)
+        return Answer(False, text)

@@ -1,0 +1,191 @@
+"""What the supervisor knows of the vehicle: estimate, joints, raw sensors, battery; its checks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Command, State
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.descent import BackupEstimator
+from beetle_omni_ros.safety.events import Silence
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.ramp import inclination
+
+TRACKING = ('tracking', 'dead_reckoning')   # statuses whose estimate may be flown on
+UNIT_TOLERANCE = 0.02                       # of a quaternion's squared length
+
+
+class Vehicle:
+    """
+    The latest of everything, and how long each source has been silent.
+
+    Attributes:
+        state: the last good estimate, or None.
+        status: the estimator's status that came with it.
+        tilt, tilt_velocity, tilt_stamp: latest joint feedback.
+        voltage: of the pack [V], None before the first.
+        refused: 'estimate: stale stamp' and the like -> count.
+        last_refusal: reason of the last refused estimate, '' after a good one.
+
+    """
+
+    def __init__(self, parameters: SupervisorParameters, robot: RobotParameters):
+        self._parameters, self._cells = parameters, robot.battery.cells
+        limits = parameters.state
+        self.state: State | None = None
+        self.status = ''
+        self.tilt, self.tilt_velocity, self.tilt_stamp = np.zeros(4), np.zeros(4), -np.inf
+        self.voltage: float | None = None
+        self.estimate = Silence(limits.timeout)
+        self.joints = Silence(limits.joint_timeout)
+        self.imu, self.mocap = Silence(limits.imu_timeout), Silence(limits.mocap_timeout)
+        self.backup = BackupEstimator(parameters.backup, robot.gravity)
+        self.refused: Counter = Counter()
+        self.last_refusal = ''
+        self._low, self._lost = 0.0, 0.0
+
+    def tick(self, dt: float) -> None:
+        """``dt`` seconds passed."""
+        for source in (self.estimate, self.joints, self.imu, self.mocap):
+            source.tick(dt)
+        self.backup.imu_alive = not self.imu.silent
+        low = self.voltage is not None and self.voltage < self._cells * \
+            self._parameters.battery.land
+        self._low = self._low + dt if low else 0.0
+        self._lost = self._lost + dt if self.state is not None and self._tumbling() else 0.0
+
+    def clock_went_back(self, now: float, by: float) -> None:
+        """Stamps from before the clock was set back by ``by`` [s] must not block newer data."""
+        if self.state is not None and self.state.stamp > now:
+            self.state = replace(self.state, stamp=now)
+        self.tilt_stamp = min(self.tilt_stamp, now)
+        self.backup.clock_went_back(by)
+
+    def on_state(self, state: State, status: str, now: float | None) -> str:
+        """Take an estimate; '' when it is good, else the reason of the refusal."""
+        reason = self._check_state(state, status, now)
+        if reason:
+            self.refused[f'estimate: {reason}'] += 1
+            self.last_refusal = reason
+            return reason
+        self.state, self.status, self.last_refusal = state, status, ''
+        self.estimate.heard()
+        self.on_joints(state.tilt_stamp, state.tilt, state.tilt_velocity)
+        self.backup.learn(state)
+        return ''
+
+    def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
+        """Take joint feedback when it is newer and finite."""
+        if not (np.isfinite(stamp) and stamp > self.tilt_stamp and _finite(position, 4)):
+            return False
+        self.tilt, self.tilt_stamp = np.array(position, dtype=float), float(stamp)
+        self.tilt_velocity = np.array(velocity, dtype=float) if _finite(velocity, 4) \
+            else np.zeros(4)
+        self.joints.heard()
+        return True
+
+    def seen(self, in_force: Command | None, state: State | None = None) -> State:
+        """A state for the hover controller; with silent joints, tilts as commanded."""
+        state = self.state if state is None else state
+        if self.joints.silent and in_force is not None:
+            return replace(state, tilt=in_force.tilt, tilt_velocity=np.zeros(4),
+                           command=in_force)
+        return replace(state, tilt=self.tilt, tilt_velocity=self.tilt_velocity,
+                       tilt_stamp=self.tilt_stamp, command=in_force)
+
+    def backup_state(self, now: float) -> State:
+        """The estimate of last resort at ``now``."""
+        return self.backup.state(self.tilt, self.tilt_velocity, self.tilt_stamp, now)
+
+    def attitude(self, now: float) -> np.ndarray:
+        """(4,) best known attitude."""
+        return self.backup_state(now).quaternion if self.backup.running \
+            else self.state.quaternion
+
+    @property
+    def specific_force_up(self) -> float | None:
+        """Latest specific force along world up by the estimator's attitude [m/s^2]."""
+        force = self.backup.last_specific_force
+        if self.imu.silent or force is None or self.state is None:
+            return None
+        return float(rotations.matrix(self.state.quaternion)[2] @ force)
+
+    def why_not_arm(self) -> str:
+        """'' when the motors may start, else what is missing."""
+        limits, battery = self._parameters.arming, self._parameters.battery
+        if self.state is None or self.estimate.silent:
+            return f'no fresh state estimate (ekf_node {self.estimate.text})'
+        if self.status != 'tracking':
+            return f"the estimator reports '{self.status}', not 'tracking'"
+        if self.joints.silent:
+            return f'no fresh joint angles (joint_bridge_node {self.joints.text})'
+        angle, state = inclination(self.state.quaternion), self.state
+        if angle > limits.tilt:
+            return f'inclined by {np.degrees(angle):.0f} deg, at most ' \
+                   f'{np.degrees(limits.tilt):.0f} deg'
+        speed, rate = np.linalg.norm(state.velocity), np.linalg.norm(state.angular_velocity)
+        if speed > limits.speed:
+            return f'moving at {speed:.2f} m/s, at most {limits.speed:g} m/s'
+        if rate > limits.rate:
+            return f'turning at {rate:.2f} rad/s, at most {limits.rate:g} rad/s'
+        if self.outside_fence:
+            return 'outside the fence'
+        if self.voltage is not None and self.voltage < battery.arm * self._cells:
+            return f'battery at {self.voltage:.1f} V, at least {battery.arm * self._cells:.1f} V'
+        return ''
+
+    def battery_low(self, threshold: float) -> bool:
+        """Whether the last voltage is below ``threshold`` [V for each cell]."""
+        return self.voltage is not None and self.voltage < threshold * self._cells
+
+    @property
+    def battery_empty(self) -> bool:
+        """Whether the pack has been below its landing voltage for long enough."""
+        return self._low >= self._parameters.battery.time
+
+    @property
+    def lost(self) -> bool:
+        """Whether it has been tumbling or falling for long enough."""
+        return self._lost >= self._parameters.envelope.lost_time
+
+    @property
+    def outside_fence(self) -> bool:
+        """Whether the estimate lies outside the fence."""
+        fence = self._parameters.envelope
+        x, y, z = np.abs(self.state.position)
+        return bool(max(x, y) > fence.half_width or z > fence.height)
+
+    def _tumbling(self):
+        fence, state = self._parameters.envelope, self.state
+        return np.linalg.norm(state.angular_velocity) > fence.rate \
+            or state.velocity[2] < -fence.fall_speed
+
+    def _check_state(self, state, status, now):
+        limits = self._parameters.state
+        if not (_finite(state.position, 3) and _finite(state.velocity, 3)
+                and _finite(state.quaternion, 4) and _finite(state.angular_velocity, 3)
+                and np.isfinite(state.stamp)):
+            return 'not finite'
+        if abs(float(np.dot(state.quaternion, state.quaternion)) - 1) > UNIT_TOLERANCE:
+            return 'no unit quaternion'
+        if now is not None and now - state.stamp > limits.stale_after:
+            return 'stale stamp'
+        if now is not None and state.stamp - now > limits.timeout:
+            return 'stamp in the future'
+        if self.state is not None and state.stamp <= self.state.stamp:
+            return 'repeated or older stamp'
+        if status not in TRACKING:
+            return f"status '{status}'"
+        return ''
+
+
+def _finite(value, size):
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        return False
+    return array.shape == (size,) and bool(np.isfinite(array).all())
