@@ -69,7 +69,8 @@ def fly(bag: Annotated[Path, typer.Option(
         robot: RobotOption = None,
         plant: PlantOption = None,
         composed: Annotated[bool, typer.Option(
-            '--composed/--separate', help='All nodes in one process, or one process each.')] = True,
+            '--composed/--separate', help='All nodes in one process, or one process each.')]
+        = True,
         domain_id: Annotated[Optional[int], typer.Option(
             '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
         json_path: JsonOption = None):

@@ -239,11 +239,18 @@ class LogRecorder:
         """Record the supervisor's state, e.g. 'flying:nmpc', whenever it changes."""
         self._states.append((t, state))
 
-    def write_compute(self, t, controller: str, *, median: float, p99: float, max: float,
-                      deadline_misses: int, count: int) -> None:
-        """CPU time of one controller's steps since its start [ms]; the last report counts."""
-        report = {'median': float(median), 'p99': float(p99), 'max': float(max),
-                  'deadline_misses': int(deadline_misses), 'count': int(count)}
+    def write_compute(self, t, controller: str, **times) -> None:
+        """
+        CPU time of one controller's steps since its start; the last report counts.
+
+        Args:
+            t: time of the report [s].
+            controller: name.
+            times: median, p99, max [ms], deadline_misses, count.
+
+        """
+        report = {name: int(times[name]) if name in ('deadline_misses', 'count')
+                  else float(times[name]) for name in COMPUTE_KEYS.values()}
         self._log.compute[controller] = report
         self._log.compute_history.setdefault(controller, []).append((t, report))
 

@@ -15,8 +15,15 @@ import numpy as np
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs import task_metrics
-from beetle_omni_ros.runs.body import (errors, geodesic_angles, hold, inside, motion, Motion,
-                                       target_ends)
+from beetle_omni_ros.runs.body import (
+    errors,
+    geodesic_angles,
+    hold,
+    inside,
+    Motion,
+    motion,
+    target_ends,
+)
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.tasks import GROUND_HEIGHT, make_task, POSE_DURATION, Task, TaskError
 

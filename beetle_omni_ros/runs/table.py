@@ -7,11 +7,13 @@ from html import escape
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from beetle_omni_ros.runs import published
 
 MANY_POSES = 20  # above, only the summary is shown
 ABSENT = '–'
+PUBLISHED = ' class="published"'
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,7 @@ class Grid:
         header: of the columns.
         rows: their cells.
         faint: indices of rows that are not ours but published.
+        faint_columns: indices of such columns.
 
     """
 
@@ -31,6 +34,7 @@ class Grid:
     header: list[str]
     rows: list[list[str]]
     faint: frozenset[int] = frozenset()
+    faint_columns: frozenset[int] = frozenset()
 
 
 def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
@@ -44,7 +48,7 @@ def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
     """
     task = str(results.get('meta', {}).get('task', ''))
     judged = {name: result for name, result in results.items() if name != 'meta'}
-    made = [_summary(judged, task), _effort(judged, task)]
+    made = [_summary(judged, task)]
     if any('trajectory' in result for result in judged.values()):
         made.append(_tracking(judged, task))
     for kind, unit in (('force', 'N'), ('torque', 'N_m')):
@@ -61,52 +65,56 @@ def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
 
 
 def _summary(judged, task):
-    header = ['', 'U position [m]', 'U orientation [deg]', 'L position [m]',
-              'L orientation [deg]', 'reached', 'crashed']
-    rows = []
-    for name, result in judged.items():
-        reached = [pose['reached'] for pose in result['poses']]
-        rows.append([name, *_error_cells(result), f'{sum(reached)} of {len(reached)}',
-                     'yes' if result['crashed'] else 'no'])
-    ours = len(rows)
-    rows += [[f'published {name}', *_error_cells(result), ABSENT, ABSENT]
-             for name, result in published.pose_results(task).items()]
-    return Grid('Pose errors, mean (max): U hovering at 7.0 to 7.5 s, L on the way at 1.0 to 7.0 s',
-                header, rows, frozenset(range(ours, len(rows))))
+    """One column for each controller and each published result, one row for each metric."""
+    others = published.pose_results(task)
+    columns = [*judged.values(), *others.values()]
+    rows = [[text, *(_mean_and_max(column, key, digits) for column in columns)]
+            for text, key, digits in (
+                ('U position [m]: mean (max)', 'U_position_m', 4),
+                ('U orientation [deg]', 'U_orientation_deg', 2),
+                ('L position [m]', 'L_position_m', 3),
+                ('L orientation [deg]', 'L_orientation_deg', 2))]
+    rows += [['poses reached', *(_reached(column) for column in columns)],
+             ['crashed', *({True: 'yes', False: 'no'}.get(column.get('crashed'), ABSENT)
+                           for column in columns)]]
+    rows += [[text, *(_number(_at(column, path), digits) for column in columns)]
+             for text, path, digits in (
+                 ('|q* - q| [rad]', 'joint_error_mean_rad', 4),
+                 ('thrust [N]', 'thrust_mean_N', 2),
+                 ('hover |v| [m/s]', 'hover_speed_mean_m_s', 4),
+                 ('hover |w| [rad/s]', 'hover_angular_speed_mean_rad_s', 4),
+                 ('hover joint command change [rad]', 'hover_command_change_rms.joint_rad', 4),
+                 ('hover thrust command change [N]', 'hover_command_change_rms.thrust_N', 3))]
+    rows += [['CPU of a step [ms]: median', *(_number(_at(c, 'compute_ms.median'), 2)
+                                              for c in columns)]]
+    rows += [[f'{name}', *(_number(_at(c, f'compute_ms.{key}'), digits) for c in columns)]
+             for name, key, digits in (('CPU 99th percentile', 'p99', 2),
+                                       ('CPU largest', 'max', 2),
+                                       ('deadline misses', 'deadline_misses', 0))]
+    if any('stamp_to_command_ms' in column for column in columns):
+        rows.append(['stamp to command [ms]: 99 %', *(
+            _number(_at(column, 'stamp_to_command_ms.p99'), 2) for column in columns)])
+    first = len(judged) + 1
+    return Grid('U: hovering, 7.0 to 7.5 s after each target; L: on the way, 1 to 7 s',
+                ['', *judged, *(f'published {name}' for name in others)], rows,
+                faint_columns=frozenset(range(first, first + len(others))))
 
 
-def _error_cells(result):
-    cells = []
-    for key, digits in (('U_position_m', 4), ('U_orientation_deg', 2), ('L_position_m', 3),
-                        ('L_orientation_deg', 2)):
-        mean = _number(result['mean'].get(key), digits)
-        worst = _number(result['max'].get(key), digits)
-        cells.append(ABSENT if mean == ABSENT else f'{mean} ({worst})')
-    return cells
+def _at(result, path):
+    for key in path.split('.'):
+        result = (result or {}).get(key)
+    return result
 
 
-def _effort(judged, task):
-    header = ['', '|q* - q| [rad]', 'thrust [N]', 'hover |v| [m/s]', 'hover |w| [rad/s]',
-              'command change [rad], [N]', 'CPU median / p99 / max [ms]', 'deadline misses']
-    rows = []
-    for name, result in judged.items():
-        change = result['hover_command_change_rms']
-        compute = result['compute_ms']
-        times = ' / '.join(_number(compute[key], 2) for key in ('median', 'p99', 'max'))
-        misses = compute['deadline_misses']
-        rows.append([name, *_effort_cells(result),
-                     f"{_number(change['joint_rad'], 4)}, {_number(change['thrust_N'], 3)}",
-                     times, ABSENT if misses is None else str(misses)])
-    ours = len(rows)
-    rows += [[f'published {name}', *_effort_cells(result), ABSENT, ABSENT, ABSENT]
-             for name, result in published.pose_results(task).items() if 'thrust_mean_N' in result]
-    return Grid('Effort and timing', header, rows, frozenset(range(ours, len(rows))))
+def _mean_and_max(result, key, digits):
+    mean, worst = (_number(result[what].get(key), digits) for what in ('mean', 'max'))
+    return ABSENT if mean == ABSENT else f'{mean} ({worst})'
 
 
-def _effort_cells(result):
-    return [_number(result.get(key), 3) for key in
-            ('joint_error_mean_rad', 'thrust_mean_N', 'hover_speed_mean_m_s',
-             'hover_angular_speed_mean_rad_s')]
+def _reached(result):
+    if 'poses' not in result:
+        return ABSENT
+    return f"{sum(pose['reached'] for pose in result['poses'])} of {len(result['poses'])}"
 
 
 def _tracking(judged, task):
@@ -178,15 +186,15 @@ def _hover(judged):
 
 
 def _poses(judged):
-    header = ['', 'x, y, z [m]', 'roll, pitch, yaw [deg]'] + [
-        f'{name}: {what}' for name in judged for what in ('U [m]', 'U [deg]')]
+    header = ['', 'x, y, z [m], roll, pitch, yaw [deg]'] + [
+        f'{name}: {what}' for name in judged for what in ('U [m]', '[deg]')]
     rows = []
     for k in range(max(len(result['poses']) for result in judged.values())):
         poses = [result['poses'][k] if k < len(result['poses']) else None
                  for result in judged.values()]
         target = next(pose['target'] for pose in poses if pose)
-        row = [str(k + 1), ', '.join(f'{v:.2f}' for v in target[:3]),
-               ', '.join(f'{v:.0f}' for v in target[3:])]
+        row = [str(k + 1), ' '.join([*(f'{v:.2f}' for v in target[:3]),
+                                     *(f'{v:.0f}' for v in target[3:])])]
         for pose in poses:
             mark = '' if not pose or pose['reached'] else ' ✗'
             row += [_number(pose['U_position_m'], 4) + mark,
@@ -215,9 +223,11 @@ def _rich(grid):
     table = Table(title=grid.title, title_justify='left', title_style='', box=None,
                   header_style='dim', padding=(0, 2, 0, 0))
     for k, name in enumerate(grid.header):
-        table.add_column(name, justify='left' if k == 0 else 'right', overflow='fold')
+        table.add_column(Text(name), justify='left' if k == 0 else 'right', overflow='fold',
+                         style='dim' if k in grid.faint_columns else None)
     for k, row in enumerate(grid.rows):
-        table.add_row(*row, style='dim' if k in grid.faint else None)
+        table.add_row(*(Text(cell, no_wrap=True) for cell in row),
+                      style='dim' if k in grid.faint else None)
     return table
 
 
@@ -225,24 +235,27 @@ def markdown(results: dict) -> str:
     """Tables of a result as GitHub Markdown."""
     parts = []
     for grid in grids(results):
-        lines = [f'**{grid.title}**', '', '| ' + ' | '.join(_escape(c) for c in grid.header) + ' |',
+        lines = [f'**{grid.title}**', '', _markdown_row(grid.header),
                  '| --- |' + ' ---: |' * (len(grid.header) - 1)]
-        lines += ['| ' + ' | '.join(_escape(c) for c in row) + ' |' for row in grid.rows]
+        lines += [_markdown_row(row) for row in grid.rows]
         parts.append('\n'.join(lines))
     return '\n\n'.join(parts) + '\n'
 
 
-def _escape(cell):
-    return cell.replace('|', '\\|')
+def _markdown_row(cells):
+    return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |'
 
 
 def html(grid: Grid) -> str:
     """One table as HTML."""
-    head = ''.join(f'<th>{escape(cell)}</th>' for cell in grid.header)
-    body = ''
-    for k, row in enumerate(grid.rows):
-        kind = ' class="published"' if k in grid.faint else ''
-        body += f'<tr{kind}>' + ''.join(f'<td>{escape(cell)}</td>' for cell in row) + '</tr>\n'
+    def cell(tag, text, row, column):
+        faint = row in grid.faint or column in grid.faint_columns
+        return f'<{tag}{PUBLISHED if faint else ""}>{escape(text)}</{tag}>'
+
+    head = ''.join(cell('th', text, None, k) for k, text in enumerate(grid.header))
+    body = ''.join(
+        '<tr>' + ''.join(cell('td', text, row, k) for k, text in enumerate(cells)) + '</tr>\n'
+        for row, cells in enumerate(grid.rows))
     return (f'<figure class="table"><figcaption>{escape(grid.title)}</figcaption>'
             f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'
             f'<tbody>{body}</tbody></table></div></figure>\n')

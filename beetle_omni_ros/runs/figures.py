@@ -1,0 +1,121 @@
+"""How figures look, and how they become part of a page."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from io import BytesIO
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+
+from beetle_omni_ros.runs.body import Motion, motion
+from beetle_omni_ros.runs.log import FlightLog
+from beetle_omni_ros.runs.tasks import Task
+
+COLOURS = ('#1f5fa8', '#d1432f', '#2f8f5b', '#d98a1c', '#7a52a3', '#5b6770')  # one for each run
+PARTS = ('#1f5fa8', '#d98a1c', '#2f8f5b', '#b0447a')  # one for each joint, rotor or axis
+INK, FAINT = '#22272e', '#8a939d'
+WIDTH = 9.6  # [in] of a page-wide figure
+POINTS = 1600  # of a drawn line; more would not be seen
+
+STYLE = {
+    'font.family': 'sans-serif', 'font.size': 9, 'axes.titlesize': 9.5, 'axes.titleweight': 'bold',
+    'axes.titlelocation': 'left', 'axes.edgecolor': FAINT, 'axes.labelcolor': INK,
+    'axes.spines.top': False, 'axes.spines.right': False, 'axes.linewidth': 0.7,
+    'axes.grid': True, 'grid.color': '#e6e9ed', 'grid.linewidth': 0.6, 'axes.axisbelow': True,
+    'xtick.color': INK, 'ytick.color': INK, 'xtick.major.size': 2.5, 'ytick.major.size': 2.5,
+    'text.color': INK, 'legend.frameon': False, 'legend.fontsize': 8.5, 'lines.linewidth': 1.2,
+    'svg.hashsalt': 'beetle_omni', 'svg.fonttype': 'path', 'figure.dpi': 100}
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    One flight of a report.
+
+    Attributes:
+        label: what it is called on the page.
+        colour: of its lines.
+        log: the flight.
+        task: what was flown, where the log says.
+        results: label -> metrics, one entry for each controller that flew.
+
+    """
+
+    label: str
+    colour: str
+    log: FlightLog
+    task: Task | None
+    results: dict[str, dict]
+
+    @property
+    def start(self) -> float:
+        """Time of the first target, from which the plots count [s]."""
+        return self.log.targets[0].stamp if self.log.targets else self.log.start
+
+    @property
+    def body(self) -> Motion:
+        """The motion that the metrics judge."""
+        return motion(self.log)
+
+
+def panels(rows: int, columns: int = 1, height: float = 1.5, **options):
+    """
+    Make a figure of panels.
+
+    Returns:
+        The figure and a (rows, columns) array of its axes.
+
+    """
+    figure = Figure(figsize=(WIDTH, height * rows + 0.5), layout='constrained')
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    return figure, axes
+
+
+def line(axes: Axes, t: np.ndarray, values: np.ndarray, **style) -> None:
+    """Draw a long series with few points, keeping its extremes."""
+    axes.plot(*thinned(t, values), **style)
+
+
+def thinned(t: np.ndarray, values: np.ndarray, points: int = POINTS):
+    """At most ``points`` samples of a series: the lowest and the highest of each stretch."""
+    if len(t) <= points:
+        return t, values
+    bins = points // 2
+    length = len(t) // bins
+    count = bins * length
+    table = values[:count].reshape(bins, length)
+    safe = np.where(np.isfinite(table), table, 0.0)
+    base = np.arange(bins)[:, None] * length
+    index = np.sort(np.concatenate(
+        [base + safe.argmin(axis=1)[:, None], base + safe.argmax(axis=1)[:, None],
+         np.where(np.isfinite(table), -1, base + np.arange(length)).max(axis=1)[:, None]],
+        axis=1), axis=1).ravel()
+    index = np.unique(np.concatenate([index[index >= 0], np.arange(count, len(t))]))
+    return t[index], values[index]
+
+
+def without_jumps(angles: np.ndarray) -> np.ndarray:
+    """Angles [deg] with a gap wherever they wrap round, so that no line crosses the plot."""
+    angles = np.array(angles, dtype=float)
+    angles[1:][np.abs(np.diff(angles)) > 180] = np.nan
+    return angles
+
+
+def legend(figure: Figure, axes: Axes) -> None:
+    """One legend above the whole figure."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc='outside upper right', ncols=min(6, len(labels)))
+
+
+def svg(figure: Figure, alternative: str) -> str:
+    """Figure as an <img> that holds its SVG, so that figures cannot disturb each other."""
+    buffer = BytesIO()
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(buffer, format='svg', metadata={'Date': None, 'Creator': None})
+    data = base64.b64encode(buffer.getvalue()).decode()
+    return f'<img alt="{alternative}" src="data:image/svg+xml;base64,{data}">'
