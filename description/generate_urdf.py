@@ -1,4 +1,4 @@
-"""Write the URDF of a robot file: ``python description/generate_urdf.py [--robot FILE] [--output FILE]``."""
+"""Write the URDF of a robot file: ``python description/generate_urdf.py [--robot FILE]``."""
 
 import argparse
 from math import atan2, hypot
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES, RobotParameters
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
 from beetle_omni_ros.sim.mass_properties import mass_properties
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
@@ -89,7 +89,8 @@ def module(robot, plant, parts, k) -> str:
              rod([0, 0, 0], [module.rotor_offset, 0, 0], ARM_RADIUS)),
         f'  <joint name="{JOINT_NAMES[k]}" type="revolute">\n    <parent link="base_link"/>'
         f'<child link="module{k + 1}"/>\n    '
-        f'{origin(parts.joint_origins[k], (0, 0, robot.rotors.arm_yaw[k]))}\n    <axis xyz="1 0 0"/>\n'
+        f'{origin(parts.joint_origins[k], (0, 0, robot.rotors.arm_yaw[k]))}\n    '
+        '<axis xyz="1 0 0"/>\n'
         f'    <limit lower="{text(-joints.position_limit)}" upper="{text(joints.position_limit)}" '
         f'effort="{text(joints.effort_limit)}" velocity="{text(joints.velocity_limit)}"/>\n'
         '  </joint>',

@@ -32,7 +32,10 @@ class Conditions:
         imu_uniform_noise: (6,) half-widths.
         mocap_uniform_noise: (6,) half-widths, position [m] and rotation vector [rad].
         tilt_uniform_noise: half-width [rad].
-        imu_latency, tilt_latency, tilt_command_delay, thrust_command_delay: [s].
+        imu_latency: age that the IMU's stamps hide [s].
+        tilt_latency: age of joint feedback [s].
+        tilt_command_delay: from a command's stamp until it acts [s].
+        thrust_command_delay: the same for thrusts [s].
 
     """
 
@@ -64,7 +67,8 @@ def draw(name: str, parameters: SimulatorParameters,
         return Conditions(tilt_latency=parameters.encoders.latency, tilt_command_delay=delay,
                           thrust_command_delay=delay)
     if name != 'published':
-        raise ParameterError(f"conditions: '{name}' is unknown; expected one of {', '.join(NAMES)}")
+        raise ParameterError(f"conditions: '{name}' is unknown; expected one of "
+                             f"{', '.join(NAMES)}")
     p = parameters.published
 
     def uniform(half_width, size=None):

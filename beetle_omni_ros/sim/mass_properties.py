@@ -35,7 +35,7 @@ class Variation:
 
 @dataclass(frozen=True)
 class RigidPart:
-    """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) there [kg m^2], in base_link's axes."""
+    """Mass [kg], centre of mass (3,) [m], inertia (3, 3) there [kg m^2], in base_link's axes."""
 
     mass: float
     centre: np.ndarray

@@ -42,7 +42,7 @@ def build_model(robot: RobotParameters, plant: PlantParameters,
 
 def base_part(robot: RobotParameters, plant: PlantParameters, variation: Variation | None,
               payload: float) -> RigidPart:
-    """Everything that is rigid with base_link: main body, end-effector, payload of ``payload`` kg."""
+    """Everything rigid with base_link: main body, end-effector, ``payload`` [kg]."""
     parts = mass_properties(robot, variation)
     rigid = [parts.main_body, parts.end_effector]
     if payload:
@@ -95,17 +95,17 @@ def _module(robot, plant, parts, k):
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, parts.module_rotations[k].ravel())
     inertia = np.maximum(module.inertia, TINY_INERTIA)
-    return f'''
+    return f"""
       <body name="module{k + 1}" pos="{_text(parts.joint_origins[k])}" quat="{_text(quaternion)}">
-        <joint name="gimbal{k + 1}" axis="1 0 0" limited="true" solreflimit="{_text(*STOP_SOFTNESS)}"
-               solimplimit="{_text(*STOP_IMPEDANCE)}"
+        <joint name="gimbal{k + 1}" axis="1 0 0" limited="true"
+               solreflimit="{_text(*STOP_SOFTNESS)}" solimplimit="{_text(*STOP_IMPEDANCE)}"
                range="{_text(-joints.position_limit, joints.position_limit)}"/>
         <inertial pos="{_text(module.centre_of_mass)}" mass="{max(module.mass, TINY_MASS)!r}"
                   diaginertia="{_text(inertia)}"/>
         <site name="rotor{k + 1}" pos="{_text(module.rotor_offset, 0, 0)}"/>
         <geom name="propeller{k + 1}" type="cylinder" pos="{_text(module.rotor_offset, 0, 0)}"
               size="{_text(plant.propeller_radius, MOTOR_HEIGHT)}"/>
-      </body>'''
+      </body>"""
 
 
 def _actuators(robot):
@@ -140,15 +140,16 @@ def _mjcf(robot, plant, variation, scenery):
                    for k, (x, y) in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)]))
     modules = ''.join(_module(robot, plant, parts, k) for k in range(4))
     ball = parts.main_origin + [0, 0, robot.multibody.end_effector.height]
-    return f'''
+    return f"""
 <mujoco model="{robot.name}">
   <compiler angle="radian" autolimits="true" inertiafromgeom="false"/>
   <option timestep="{plant.tick / plant.substeps!r}" integrator="RK4"
           gravity="{_text(0, 0, -robot.gravity)}">
-    <flag midphase="disable" island="disable" sensor="disable"/>
+    <flag midphase="disable" island="disable" sensor="disable" autoreset="disable"/>
   </option>
   <default>
-    <geom contype="1" conaffinity="0" condim="3" friction="{_text(plant.floor_friction, 0.005, 1e-4)}"
+    <geom contype="1" conaffinity="0" condim="3"
+          friction="{_text(plant.floor_friction, 0.005, 1e-4)}"
           solref="{_text(plant.contact_time_constant, plant.contact_damping_ratio)}"
           rgba="0.3 0.3 0.32 1"/>
   </default>
@@ -167,4 +168,4 @@ def _mjcf(robot, plant, variation, scenery):
   <actuator>
     {_actuators(robot)}
   </actuator>
-</mujoco>'''
+</mujoco>"""

@@ -40,7 +40,7 @@ class PlantParameters:
 class ActuatorTimingParameters:
     """How commands reach the actuators."""
 
-    command_delay: float = parameter(doc='from a command\'s stamp until it acts', unit='s', low=0,
+    command_delay: float = parameter(doc="from a command's stamp until it acts", unit='s', low=0,
                                      high=0.5)
     command_timeout: float = parameter(doc='silence after which the rotors stop', unit='s',
                                        low=0.01, high=10)
@@ -69,8 +69,8 @@ class PackParameters:
         """Refuse a discharge curve that is no curve."""
         levels, voltages = self.charge_levels, self.relative_voltages
         if len(levels) != len(voltages) or len(levels) < 2:
-            raise ParameterError(f'charge_levels and relative_voltages must be equally long, two or '
-                                 f'more; found {len(levels)} and {len(voltages)}')
+            raise ParameterError('charge_levels and relative_voltages must be equally long, two '
+                                 f'or more; found {len(levels)} and {len(voltages)}')
         if np.any(np.diff(levels) <= 0) or np.any(np.diff(voltages) < 0) \
                 or levels[0] != 0 or levels[-1] != 1 or voltages[-1] != 1:
             raise ParameterError('charge_levels must rise from 0 to 1 and relative_voltages must '
@@ -129,7 +129,7 @@ class PublishedParameters:
                                               low=0, high=1)
     tilt_bias: float = parameter(doc='each encoder', unit='rad', low=0, high=1)
     tilt_noise: float = parameter(doc='each encoder and reading', unit='rad', low=0, high=1)
-    latency_unit: float = parameter(doc='the table\'s dt', unit='s', low=0.001, high=0.1)
+    latency_unit: float = parameter(doc="the table's dt", unit='s', low=0.001, high=0.1)
     imu_latency: np.ndarray = parameter(doc='from, to, in latency_unit', shape=(2,), low=0,
                                         high=100)
     tilt_latency: np.ndarray = parameter(doc='from, to, in latency_unit', shape=(2,), low=0,

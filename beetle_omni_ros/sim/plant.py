@@ -9,12 +9,16 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.effects import check_supported, MotionForces
 from beetle_omni_ros.sim.mass_properties import Variation
-from beetle_omni_ros.sim.mjcf import base_part, BASE, build_model, set_base_part, thrust_scale
+from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, set_base_part, thrust_scale
 from beetle_omni_ros.sim.parameters import PlantParameters
+
+# MuJoCo would write its warnings into a file in the working directory; the plant checks its state.
+mujoco.set_mju_user_warning(lambda text: None)
 
 NO_CONSTRAINT = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
 WXYZ = np.array([6, 3, 4, 5])       # where (w, x, y, z) stand in position + quaternion xyzw
 XYZW = np.array([4, 5, 6, 3])       # where (x, y, z, w) stand in qpos
+DIVERGED = 1e9                      # sum of accelerations that only a broken state has
 
 
 class Plant:
@@ -106,7 +110,13 @@ class Plant:
                                                 mass))
 
     def step(self) -> None:
-        """Advance one tick with the present targets."""
+        """
+        Advance one tick with the present targets.
+
+        Raises:
+            RuntimeError: forces beyond all reason have broken the state.
+
+        """
         model, data = self.model, self.data
         touching = self._may_touch()
         model.opt.disableflags = self._flags if touching else self._flags | NO_CONSTRAINT
@@ -132,6 +142,9 @@ class Plant:
             self._update()
             effort = self._robot.joints.effort_limit
             model.actuator_forcerange[4:] = (-effort, effort)
+        if not abs(float(data.qacc.sum())) < DIVERGED:
+            raise RuntimeError(f'the simulated plant diverged: position {self._qpos[:3]} m, '
+                               f'velocity {self._qvel[:3]} m/s, tilts {self._tilt} rad')
 
     def _may_touch(self):
         """Whether a contact or a joint stop is possible within the next tick."""

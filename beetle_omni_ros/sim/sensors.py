@@ -12,7 +12,13 @@ from beetle_omni_ros.sim.battery import Battery
 from beetle_omni_ros.sim.conditions import Conditions
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant
-from beetle_omni_ros.sim.readings import BatteryReading, ImuReading, JointReading, PoseReading, Truth
+from beetle_omni_ros.sim.readings import (
+    BatteryReading,
+    ImuReading,
+    JointReading,
+    PoseReading,
+    Truth,
+)
 
 BLOCK = 1024            # noise is drawn this many readings at a time, because one by one is slow
 

@@ -67,7 +67,16 @@ class Simulator:
             position: (3,) of base_link in world [m]; by default standing on the floor.
             quaternion: (4,) base_link to world, xyzw; by default level.
 
+        Raises:
+            ValueError: not finite numbers of these shapes, or a quaternion of length zero.
+
         """
+        if position is not None:
+            position = _vector('position', position, 3)
+        if quaternion is not None:
+            quaternion = _vector('quaternion', quaternion, 4)
+            if not quaternion.any():
+                raise ValueError('quaternion: expected a rotation, found zeros')
         self._ticks = 0
         self.time = 0.0
         self._plant.reset(position, quaternion)
@@ -106,12 +115,8 @@ class Simulator:
             ValueError: not three finite numbers each.
 
         """
-        force, torque = (np.asarray(v, dtype=float) for v in (force_world, torque_body))
-        if force.shape != (3,) or torque.shape != (3,) \
-                or not (np.isfinite(force).all() and np.isfinite(torque).all()):
-            raise ValueError(f'wrench: expected three finite numbers each, found force '
-                             f'{force_world!r} N and torque {torque_body!r} N m')
-        self._plant.set_wrench(force, torque)
+        self._plant.set_wrench(_vector('wrench force', force_world, 3),
+                               _vector('wrench torque', torque_body, 3))
 
     def set_payload(self, mass: float) -> None:
         """
@@ -142,3 +147,13 @@ class Simulator:
         qpos, qvel = self._plant.state
         return Truth(self.time, qpos[:3], qvel[:3], qpos[XYZW], qvel[3:6], qpos[7:], qvel[6:],
                      self._plant.thrust, self._plant.contact)
+
+
+def _vector(name, value, length):
+    try:
+        vector = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        vector = np.empty(0)
+    if vector.shape != (length,) or not np.isfinite(vector).all():
+        raise ValueError(f'{name}: expected {length} finite numbers, found {value!r}')
+    return vector

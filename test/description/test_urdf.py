@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES, RobotParameters
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 

@@ -35,7 +35,7 @@ def plant(robot=ROBOT, position=HIGH, quaternion=LEVEL, variation=None):
 
 
 def momenta(made):
-    """Linear momentum, angular momentum about the world's origin and centre of mass, body by body."""
+    """Linear momentum, angular momentum about the world's origin, centre of mass: by bodies."""
     model, data = made.model, made.data
     mujoco.mj_forward(model, data)
     linear, angular, first = np.zeros(3), np.zeros(3), np.zeros(3)

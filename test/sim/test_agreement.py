@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from sim_robots import massless_modules, plant, ROBOT
 
 from beetle_omni_ros.robot.dynamics import body_acceleration
+from beetle_omni_ros.robot.rotations import normalized
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim import effects as plant_effects
 
@@ -28,7 +29,7 @@ def random_states(count, seed):
     """States anywhere in the flight envelope, away from the floor and the stops."""
     generator = np.random.default_rng(seed)
     for _ in range(count):
-        yield (generator.normal(size=3) + [0, 0, 10], Rotation.random(rng=generator).as_quat(),
+        yield (generator.normal(size=3) + [0, 0, 10], normalized(generator.normal(size=4)),
                generator.normal(size=3) * 3, generator.normal(size=3) * 3,
                generator.uniform(-3.9, 3.9, 4), generator.uniform(-9, 9, 4),
                generator.uniform(0.5, 20, 4))

@@ -58,7 +58,8 @@ def test_mujoco_sees_the_same_totals():
 
 
 @pytest.mark.parametrize('change, key', [
-    ({'mass': 0.5}, 'multibody'), ({'inertia': np.array([0.03, 0.0620796, 0.0948795])}, 'inertia')])
+    ({'mass': 0.5}, 'multibody'),
+    ({'inertia': np.array([0.03, 0.0620796, 0.0948795])}, 'inertia')])
 def test_impossible_totals_are_refused_by_name(change, key):
     with pytest.raises(ParameterError, match=f'^{key}: .*main body') as error:
         mass_properties(replace(ROBOT, **change))

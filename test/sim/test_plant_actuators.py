@@ -1,7 +1,6 @@
 """Servos and rotors of the plant answer as their parameters say."""
 
 import numpy as np
-import pytest
 from sim_robots import immovable, plant, ROBOT
 
 JOINT = ROBOT.joints

@@ -78,7 +78,7 @@ def test_wrench_acts_in_its_frames():
 
 
 def test_hover_thrust_carries_the_robot():
-    """Equal thrusts balance the weight; the 0.2 mm between arms and centre leaves a small moment."""
+    """Equal thrusts balance the weight; 0.2 mm between arms and centre leaves a moment."""
     made = plant()
     hover = np.full(4, ROBOT.hover_thrust)
     acceleration = made.acceleration(HIGH, LEVEL, np.zeros(3), np.zeros(3), np.zeros(4),

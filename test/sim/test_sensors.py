@@ -1,4 +1,4 @@
-"""Sensor readings: noise, resolution, latency and rate, measured on a robot at rest or in motion."""
+"""Sensor readings: noise, resolution, latency and rate, measured at rest and in motion."""
 
 from dataclasses import replace
 
@@ -103,6 +103,26 @@ def test_imu_measures_acceleration_less_gravity():
         expected = Rotation.from_quat(now.truth.quaternion).inv().apply(
             acceleration + [0, 0, ROBOT.gravity])
         np.testing.assert_allclose(now.imu.specific_force, expected, atol=5e-3)
+
+
+def test_imu_sees_the_torque_that_the_rate_limit_leaves():
+    """Joints at their rate limit turn evenly: no burst of module inertia in the reading."""
+    quiet = replace(WORLD, imu=replace(WORLD.imu, specific_force_noise=0.0))
+    simulator = Simulator(ROBOT, quiet)
+    simulator.reset(HIGH)
+    slewing = 0
+    for _ in range(60):
+        simulator.command(Command(simulator.time, np.array([3.5, 0, 0, 0]), np.zeros(4)))
+        before = simulator.truth.velocity
+        frame = simulator.step()
+        if frame.truth.tilt_velocity[0] > 0.99 * ROBOT.joints.velocity_limit:
+            slewing += 1
+            acceleration = (frame.truth.velocity - before) / TICK
+            expected = Rotation.from_quat(frame.truth.quaternion).inv().apply(
+                acceleration + [0, 0, ROBOT.gravity])
+            if slewing > 1:
+                np.testing.assert_allclose(frame.imu.specific_force, expected, atol=0.1)
+    assert slewing > 40
 
 
 def test_published_biases_and_noise_come_from_the_table():

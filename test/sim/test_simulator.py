@@ -118,11 +118,13 @@ def test_thrust_effect_scales_the_true_thrust():
 
 
 @pytest.mark.parametrize('call, text', [
-    (lambda s: s.set_wrench([np.nan, 0, 0], [0, 0, 0]), 'wrench: expected three finite'),
-    (lambda s: s.set_wrench([0, 0], [0, 0, 0]), 'wrench: expected three finite'),
+    (lambda s: s.set_wrench([np.nan, 0, 0], [0, 0, 0]), 'wrench force: expected 3 finite'),
+    (lambda s: s.set_wrench([0, 0, 0], [0, 0]), 'wrench torque: expected 3 finite'),
+    (lambda s: s.reset([0, 0, np.inf]), 'position: expected 3 finite'),
+    (lambda s: s.reset([0, 0, 1], [0, 0, 0, 0]), 'quaternion: expected a rotation'),
     (lambda s: s.set_payload(-1.0), 'payload: expected a mass'),
     (lambda s: s.set_payload(np.nan), 'payload: expected a mass')])
-def test_unusable_disturbance_is_refused(call, text):
+def test_unusable_disturbance_or_start_is_refused(call, text):
     with pytest.raises(ValueError, match=text):
         call(Simulator(ROBOT, WORLD))
 
@@ -132,3 +134,14 @@ def test_unknown_conditions_and_seeds_are_refused():
         Simulator(ROBOT, WORLD, 'publish')
     with pytest.raises(ParameterError, match='seed: expected a whole number'):
         Simulator(ROBOT, WORLD, seed=-1)
+
+
+def test_broken_state_is_an_error_and_not_a_silent_restart():
+    simulator = Simulator(ROBOT, WORLD)
+    simulator.reset(HIGH)
+    simulator.set_wrench([1e200, 0, 0], [0, 1e200, 0])
+    with pytest.raises(RuntimeError, match='the simulated plant diverged'):
+        for _ in range(5):
+            simulator.step()
+    simulator.reset(HIGH)
+    assert np.isfinite(simulator.step().truth.position).all()
