@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from math import inf
 
+import numpy as np
+
 from beetle_omni_ros.control.base import Command, Controller, Reference
 from beetle_omni_ros.safety.events import ERROR, EventLog
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -26,7 +28,7 @@ class Landing:
 
     Attributes:
         grounded: whether it stands.
-        blind: whether nothing measures the motion any more.
+        given_up: '' or why a descent under control is no longer possible.
 
     """
 
@@ -34,7 +36,7 @@ class Landing:
                  vehicle: Vehicle, events: EventLog):
         self._parameters, self._blind_limit = parameters.landing, parameters.state.blind_limit
         self._hover, self._gauge, self._vehicle, self._events = hover, gauge, vehicle, events
-        self.grounded, self.blind = False, False
+        self.grounded, self.given_up = False, ''
         self._standing_for, self._blind_for = 0.0, 0.0
 
     def start(self, now: float, in_force: Command | None) -> None:
@@ -67,7 +69,8 @@ class Landing:
                 self._events.say(now, ERROR, f'{name} is gone too: descent without it',
                                  f'no {name}')
         self._blind_for = self._blind_for + dt if no_mocap and no_imu else 0.0
-        self.blind = self._blind_for > self._blind_limit
+        if self._blind_for > self._blind_limit:
+            self.given_up = 'no estimator, no MoCap, no IMU'
         vehicle.backup.predict(now, self._ramp.at(now).velocity if no_mocap else None)
         return no_mocap
 
@@ -80,6 +83,7 @@ class Landing:
                           levelled(state.quaternion), p.level_rate,
                           angle / p.level_rate if angle > p.level_first else 0.0,
                           -inf, p.speed, p.acceleration)
+        self._due = now + self._ramp.wait + max(0.0, state.position[2]) / p.speed
 
     def _follow(self, state, dt, specific_force_up):
         """
@@ -89,11 +93,19 @@ class Landing:
         upward wind would be taken for the ground.
         """
         reference = self._ramp.at(state.stamp)
+        sink, velocity = 0.0, reference.velocity
+        if specific_force_up is not None:
+            # Dead reckoning may believe in a descent that is none: what is overdue sinks faster.
+            growth = self._parameters.overdue_acceleration
+            late = max(0.0, state.stamp - self._due)
+            sink = 0.5 * growth * late ** 2
+            velocity = velocity - [0.0, 0.0, growth * late]
+            if late > self._parameters.overdue_limit:
+                self.given_up = f'no MoCap, and no ground felt {late:.0f} s after it was due'
         lowest = state.position[2] - self._parameters.target_lead
-        if reference.position[2] < lowest:
-            position = reference.position.copy()
-            position[2] = lowest
-            reference = replace(reference, position=position)
+        height = max(reference.position[2] - sink, lowest)
+        reference = replace(reference, velocity=velocity, position=np.array(
+            [*reference.position[:2], height]))
         self._feel_ground(state, dt, specific_force_up, reference)
         return self._hover.step(state, _Now(reference))
 

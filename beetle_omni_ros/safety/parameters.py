@@ -91,6 +91,11 @@ class LandingParameters:
                                   high=5)
     level_first: float = parameter(0.3, doc='more inclination is levelled before the descent',
                                    unit='rad', low=0, high=3.15)
+    overdue_acceleration: float = parameter(
+        0.6, doc='without MoCap, growth of the descent speed once the ground is overdue',
+        unit='m/s^2', low=0, high=2)
+    overdue_limit: float = parameter(6.0, doc='without MoCap, motors off this long after the '
+                                     'ground was due', unit='s', low=0.1, high=60)
     target_lead: float = parameter(0.5, doc='the target sinks at most this far below the robot',
                                    unit='m', low=0.05, high=5)
     ground_speed: float = parameter(0.12, doc='vertical speed below which it may stand', unit='m/s',

@@ -216,8 +216,8 @@ class Supervisor(Inputs):
     def _descend(self, now, dt):
         self.source = 'hover'
         command = self._landing.step(now, dt, self._in_force)
-        if self._landing.blind:
-            self.emergency_stop(now, 'no estimator, no MoCap, no IMU')
+        if self._landing.given_up:
+            self.emergency_stop(now, self._landing.given_up)
             return self._stand(now, dt)
         if self._landing.grounded:
             self._motors_off(DISARMED, now, INFO, 'on the ground: motors off, disarmed')
