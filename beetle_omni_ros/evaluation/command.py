@@ -1,0 +1,140 @@
+"""`beetle_omni evaluate`: tasks flown in process, for one or several controllers."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.control.base import Controller
+from beetle_omni_ros.control.hover import HoverController
+from beetle_omni_ros.control.nmpc import NmpcController
+from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.estimation.ekf import ErrorStateEkf
+from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.evaluation.loop import FlightLoop
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs import metrics as metrics_of_runs
+from beetle_omni_ros.runs import table
+from beetle_omni_ros.runs.bag import BagWriter
+from beetle_omni_ros.runs.json_file import write_json
+from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Tee
+from beetle_omni_ros.runs.tasks import make_task, Task
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.supervisor import Supervisor
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.simulator import Simulator
+
+CONTROLLERS = ('nmpc', 'nmpc_published', 'hover')
+
+
+def make_controller(name: str, robot: RobotParameters, nmpc_file: Path | None = None) -> Controller:
+    """
+    Build a controller by name.
+
+    Args:
+        name: 'nmpc', 'nmpc_published' (the publication's settings) or 'hover'.
+        robot: what it believes about the robot.
+        nmpc_file: parameter file for 'nmpc' in place of the shipped one.
+
+    Raises:
+        ParameterError: unknown name, or an unusable file.
+
+    """
+    if name == 'nmpc':
+        return NmpcController(robot, NmpcParameters.load(nmpc_file))
+    if name == 'nmpc_published':
+        return NmpcController(robot, NmpcParameters.load(share_path('params/nmpc_published.yaml')))
+    if name == 'hover':
+        return HoverController(robot)
+    raise ParameterError(f"controller '{name}': expected one of {', '.join(CONTROLLERS)}")
+
+
+def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,
+        conditions: str = 'nominal', seed: int = 0, nmpc_file: Path | None = None,
+        bag: Path | None = None, meta: dict | None = None,
+        progress=lambda part: None) -> FlightLog:
+    """
+    Fly one task with one controller; see :func:`run_evaluate` for the arguments.
+
+    Returns:
+        the flight, also when the robot crashed (``meta['crashed']``).
+
+    """
+    meta = dict(meta or {}, controller=controller)
+    memory = LogRecorder(meta)
+    with ExitStack() as stack:
+        recorder = memory
+        if bag is not None:
+            writer = stack.enter_context(BagWriter(bag, meta=meta))
+            recorder = Tee(memory, writer)
+        estimator = EkfParameters.load()
+        supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
+                                CONTROLLERS)
+        loop = FlightLoop(
+            Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed),
+            ErrorStateEkf(estimator, robot.gravity),
+            {controller: make_controller(controller, robot, nmpc_file)}, supervisor, recorder,
+            estimator.imu.gyroscope_noise)
+        supervisor.select(controller)
+        stayed = loop.fly(task, progress)
+        recorder.write_meta({'crashed': not stayed})
+    return memory.log()
+
+
+def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nominal',
+                 robot: Path | None = None, plant: Path | None = None, seed: int = 0,
+                 bag: Path | None = None, json_path: Path | None = None,
+                 nmpc_file: Path | None = None, console: Console | None = None) -> dict:
+    """
+    Fly a task with each controller and report.
+
+    Args:
+        controllers: names, see :func:`make_controller`.
+        task: name or pose file.
+        conditions: 'nominal' or 'published'.
+        robot: file that estimator and controllers believe; default the shipped one.
+        plant: file that is true in the simulation; default ``robot``.
+        seed: of the task's poses and of everything random in the simulation.
+        bag: folder for a bag; with several controllers, one bag for each inside it.
+        json_path: file for the results.
+        nmpc_file: parameter file for 'nmpc' in place of the shipped one.
+        console: where to print.
+
+    Returns:
+        the results as in INTERFACES: ``meta`` and a key for each controller.
+
+    Raises:
+        ParameterError, TaskError, BagError: unusable input, in one line.
+
+    """
+    console = console or Console()
+    believed = RobotParameters.load(robot)
+    true = RobotParameters.load(plant) if plant else believed
+    flown = make_task(task, seed)
+    for name in controllers:
+        if name not in CONTROLLERS:
+            make_controller(name, believed)
+    meta = {'task': task, 'conditions': conditions, 'seed': seed,
+            'robot': str(robot) if robot else 'params/robot.yaml',
+            'plant': str(plant) if plant else None, 'version': __version__}
+    results: dict = {'meta': meta}
+    columns = (TextColumn('{task.description}'), BarColumn(),
+               TextColumn('{task.percentage:>3.0f} %'), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bars:
+        for name in controllers:
+            bar = bars.add_task(f'{name}: {task}, {conditions}', total=1.0)
+            folder = bag / name if bag and len(controllers) > 1 else bag
+            log = fly(name, flown, robot=believed, plant=true, conditions=conditions, seed=seed,
+                      nmpc_file=nmpc_file if name == 'nmpc' else None, bag=folder, meta=meta,
+                      progress=lambda part, bar=bar: bars.update(bar, completed=part))
+            results[name] = metrics_of_runs.metrics(log, flown)
+    table.print_results(results, console)
+    if json_path:
+        write_json(json_path, results)
+    return results

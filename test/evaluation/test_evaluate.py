@@ -1,0 +1,107 @@
+"""The in-process flight: deterministic, complete, honest about what went wrong."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+import yaml
+
+from beetle_omni_ros.evaluation import command, loop
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.bag_reader import read_bag
+from beetle_omni_ros.runs.metrics import metrics
+from beetle_omni_ros.runs.tasks import make_task
+
+ROBOT = RobotParameters.load()
+
+
+def evaluate(task, controllers=('nmpc',), **options):
+    return command.run_evaluate(controllers=list(controllers), task=str(task),
+                                console=Console(file=io.StringIO()), **options)
+
+
+@pytest.fixture
+def poses(tmp_path):
+    """A pose file of one near pose, so that a flight is short."""
+    path = tmp_path / 'poses.csv'
+    path.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0.3,0.2,1.1,30,-20,40\n')
+    return path
+
+
+def without_times(results):
+    return {name: {key: value for key, value in result.items() if key != 'compute_ms'}
+            for name, result in results.items()}
+
+
+def test_a_seed_gives_the_same_numbers_and_another_seed_others(poses):
+    first, again, other = (evaluate(poses, seed=seed) for seed in (3, 3, 4))
+    assert json.dumps(without_times(first)) == json.dumps(without_times(again))
+    assert first['nmpc']['mean'] != other['nmpc']['mean']
+
+
+def test_the_json_holds_what_interfaces_promises(poses, tmp_path):
+    path = tmp_path / 'result.json'
+    evaluate(poses, json_path=path)
+    result = json.loads(path.read_text())
+    assert {'task', 'conditions', 'seed', 'robot', 'version'} <= set(result['meta'])
+    flown = result['nmpc']
+    assert {'poses', 'mean', 'median', 'max', 'success_rate', 'crashed', 'compute_ms',
+            'joint_error_mean_rad', 'thrust_mean_N', 'hover_command_change_rms'} <= set(flown)
+    assert {'target', 'U_position_m', 'U_orientation_deg', 'L_position_m', 'L_orientation_deg',
+            'reached'} <= set(flown['poses'][0])
+    assert {'median', 'p99', 'max', 'deadline_misses'} <= set(flown['compute_ms'])
+    assert {'joint_rad', 'thrust_N'} <= set(flown['hover_command_change_rms'])
+    assert flown['poses'][0]['reached']
+
+
+def test_the_bag_gives_the_same_numbers_as_the_flight(poses, tmp_path):
+    results = evaluate(poses, bag=tmp_path / 'bag')
+    again = metrics(read_bag(tmp_path / 'bag'), make_task(str(poses)))
+    for key in ('mean', 'hover_command_change_rms'):
+        for name, value in results['nmpc'][key].items():
+            assert again[key][name] == pytest.approx(value, rel=1e-5, abs=1e-6)
+    assert again['success_rate'] == results['nmpc']['success_rate'] == 1.0
+
+
+def test_an_unknown_weakness_of_the_plant_leaves_no_steady_error(poses, tmp_path):
+    content = yaml.safe_load(share_path('params/robot.yaml').read_text())
+    content['mass'] *= 1.05
+    content['effects'] = {'thrust_coefficient': {'scale': 0.93}}
+    plant = tmp_path / 'plant.yaml'
+    plant.write_text(yaml.safe_dump(content))
+    result = evaluate(poses, plant=plant)['nmpc']
+    assert result['mean']['U_position_m'] < 0.005
+
+
+def test_several_controllers_fly_one_after_the_other_with_a_bag_each(poses, tmp_path):
+    results = evaluate(poses, ('nmpc', 'hover'), bag=tmp_path / 'bags')
+    assert set(results) == {'meta', 'nmpc', 'hover'}
+    for name in ('nmpc', 'hover'):
+        assert read_bag(tmp_path / 'bags' / name).controllers() == [name]
+
+
+def test_an_unknown_controller_is_refused_before_anything_flies(poses):
+    with pytest.raises(ParameterError, match="controller 'npmc': expected one of nmpc"):
+        evaluate(poses, ('nmpc', 'npmc'))
+
+
+def test_a_robot_that_cannot_lift_off_says_so(poses, tmp_path):
+    content = yaml.safe_load(share_path('params/robot.yaml').read_text())
+    content['effects'] = {'thrust_coefficient': {'scale': 0.2}}
+    plant = tmp_path / 'plant.yaml'
+    plant.write_text(yaml.safe_dump(content))
+    with pytest.raises(loop.FlightError, match='(?i)take-?off'):
+        evaluate(poses, plant=plant)
+
+
+def test_a_force_task_ends_with_the_level_that_was_too_much():
+    task = make_task('force')
+    log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)
+    lost = metrics(log, task)
+    levels = [segment.level for segment in task.segments if segment.level]
+    assert np.isfinite(log.truth_position).all()
+    assert any(str(level) in json.dumps(lost) for level in levels)
