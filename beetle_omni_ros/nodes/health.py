@@ -90,9 +90,9 @@ class Health:
         entry.seen = time.monotonic()
 
     def rejected(self, topic: str, reason: str) -> None:
-        """Count a refused message; the first of a kind is logged at once."""
+        """Count a refused message; the first of a kind is logged, save backlog at the start."""
         entry = self._inputs[topic]
-        if reason not in entry.rejected:
+        if reason not in entry.rejected and (entry.received or 'stamp' not in reason):
             self._node.get_logger().warning(f'{topic}: message refused, {reason}')
         entry.rejected[reason] += 1
 

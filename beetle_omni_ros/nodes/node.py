@@ -102,4 +102,12 @@ class FlightNode(Node):
             self._twin_timer.cancel()
 
     def close(self) -> None:
-        """Release what destroy_node does not."""
+        """Release what only this node holds; each node says what."""
+
+    def destroy_node(self) -> None:
+        """Close, leave the graph, let go of the name."""
+        self.close()
+        super().destroy_node()
+        if self._claim:
+            self._claim.close()
+            self._claim = None

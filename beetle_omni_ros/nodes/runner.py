@@ -8,10 +8,13 @@ import gc
 import os
 import re
 import signal
+import socket
 import sys
+import threading
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
@@ -53,9 +56,11 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
 
     """
     nodes, status = [], OK
+    signal.signal(signal.SIGTERM, signal.default_int_handler)   # while starting, as Ctrl-C
     _end_with_parent()
     try:
-        rclpy.init(args=list(argv))
+        # Not rclpy's handlers: they end the context under a callback that still publishes.
+        rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
         executor = make_executor()
         for node_class in node_classes:
             name = executable(node_class)
@@ -66,7 +71,7 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
         # that no pause of some 10 ms lands in a control cycle.
         gc.collect()
         gc.freeze()
-        executor.spin_until_future_complete(Future(), FOREVER)
+        executor.spin_until_future_complete(_stop_on_signal(), FOREVER)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ParameterError as error:
@@ -78,9 +83,6 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         for node in reversed(nodes):
-            close = getattr(node, 'close', None)
-            if close:
-                close()
             node.destroy_node()
         rclpy.try_shutdown()
     return status
@@ -111,6 +113,28 @@ def make_executor(context=None):
         from rclpy.executors import SingleThreadedExecutor
         return SingleThreadedExecutor(context=context)
     return EventsExecutor(context=context)
+
+
+def _stop_on_signal() -> Future:
+    """
+    Make a future that SIGINT or SIGTERM completes, between two callbacks.
+
+    Python runs a signal handler only when the main thread is in Python, which in an idle
+    node may take a second; the wake-up descriptor is written at once.
+    """
+    stop = Future()
+    waiting, written = socket.socketpair()
+    written.setblocking(False)
+
+    def wait():
+        waiting.recv(1)
+        stop.set_result(written)     # keeps the descriptor open until then
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)
+    signal.set_wakeup_fd(written.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=wait, daemon=True).start()
+    return stop
 
 
 def _end_with_parent():

@@ -128,13 +128,19 @@ class SupervisorNode(FlightNode):
         if state != self._state:
             self._state = state
             self._states.publish(String(data=state))
-        if supervisor.events:
-            logger = self.get_logger()
-            for event in supervisor.events:
-                say = {ERROR: logger.error, WARNING: logger.warning}.get(event.severity,
-                                                                         logger.info)
-                say(event.text)
-            supervisor.events.clear()
+        for event in supervisor.events:
+            self._log(event)
+        supervisor.events.clear()
+
+    def _log(self, event):
+        # One call for each severity: rclpy ties a severity to the line of the call.
+        logger = self.get_logger()
+        if event.severity == ERROR:
+            logger.error(event.text)
+        elif event.severity == WARNING:
+            logger.warning(event.text)
+        else:
+            logger.info(event.text)
 
     def _supervisor_status(self):
         return LEVELS.get(self._supervisor.state, health.OK), self._state, \

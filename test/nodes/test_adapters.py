@@ -1,0 +1,245 @@
+"""What the nodes add to the pure code: pacing, triggering, holding, selecting, refusing."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.parameter import Parameter
+
+from beetle_omni_ros.control.base import Command, PoseTarget
+from beetle_omni_ros.nodes import convert, sim_node
+from beetle_omni_ros.nodes.controller_node import ControllerNode
+from beetle_omni_ros.nodes.ekf_node import EkfNode
+from beetle_omni_ros.nodes.ekf_node import EkfNodeParameters
+from beetle_omni_ros.nodes.reference_node import ReferenceNode
+from beetle_omni_ros.nodes.sim_node import SimNode
+from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
+
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@pytest.fixture
+def make(ros_domain):
+    """Make one node of this process, with parameters."""
+    nodes = []
+
+    def build(node_class, *overrides):
+        arguments = [a for override in overrides for a in ('-p', override)]
+        rclpy.init(args=['--ros-args', *arguments], domain_id=ros_domain)
+        nodes.append(node_class())
+        return nodes[0]
+
+    yield build
+    for node in nodes:
+        node.destroy_node()
+    rclpy.try_shutdown()
+
+
+class Sent(list):
+    """A publisher that keeps what it is given."""
+
+    publish = list.append
+
+
+class Follower:
+    """A controller that remembers what it was asked."""
+
+    name, period = 'follower', 0.01
+
+    def __init__(self):
+        self.asked, self.resets = [], 0
+
+    def reset(self):
+        self.resets += 1
+
+    def step(self, state, target):
+        self.asked.append((state, target))
+        return Command(state.stamp, np.zeros(4), np.full(4, 7.5))
+
+    def diagnostics(self):
+        return {'steps': len(self.asked)}
+
+
+class FollowerNode(ControllerNode):
+    """The controller node with a controller that needs no solver."""
+
+    def __init__(self):
+        super().__init__('nmpc', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')
+        self._publisher = Sent()
+
+    def make_controller(self, parameters):
+        self.follower = Follower()
+        return self.follower
+
+
+def odom_at(stamp, height=1.0):
+    return convert.Odom(stamp, np.array([0, 0, height]), np.zeros(3), LEVEL, np.zeros(3))
+
+
+def fly(node, stamps, height=1.0):
+    for stamp in stamps:
+        node._on_odom(odom_at(stamp, height))
+
+
+def test_the_controller_steps_once_a_period_and_stamps_with_the_state(make):
+    node = make(FollowerNode)
+    fly(node, 100 + 0.005 * np.arange(20))
+    assert not node._publisher          # no joint angles yet
+    node._on_joints(convert.Joints(100.0, np.zeros(4), np.zeros(4)))
+    stamps = 101 + 0.005 * np.arange(200)
+    fly(node, stamps)
+    sent = [convert.seconds(m.header.stamp) for m in node._publisher]
+    assert len(sent) == 100
+    assert np.allclose(sent, stamps[::2])
+    fly(node, [95.0, 95.005, 95.01])    # the clock was set back: on with it
+    assert len(node._publisher) == 102
+
+
+def test_without_a_target_it_holds_the_pose_of_the_hand_over(make):
+    node = make(FollowerNode)
+    node._on_joints(convert.Joints(100.0, np.zeros(4), np.zeros(4)))
+    node._on_mode(SimpleNamespace(data='takeoff'))
+    fly(node, [100.0], height=0.2)
+    node._on_mode(SimpleNamespace(data='flying:nmpc'))
+    fly(node, [100.01], height=1.3)
+    heights = [target.position[2] for _, target in node.follower.asked]
+    assert heights == [0.2, 0.2]
+    node._on_mode(SimpleNamespace(data='disarmed'))
+    assert node.follower.resets == 1
+    fly(node, [101.0], height=0.4)
+    assert node.follower.asked[-1][1].position[2] == 0.4
+
+
+def test_the_newest_target_counts_and_an_unset_stamp_means_now(make):
+    node = make(FollowerNode)
+    node._on_joints(convert.Joints(100.0, np.zeros(4), np.zeros(4)))
+    for stamp, x in ((50.0, 1.0), (60.0, 2.0), (50.0, 3.0)):
+        node._on_target(PoseTarget(np.array([x, 0, 0]), LEVEL, stamp))
+    fly(node, [100.0])
+    assert node.follower.asked[-1][1].position[0] == 2.0
+    node._on_target(PoseTarget(np.array([4.0, 0, 0]), LEVEL, 0.0))
+    fly(node, [101.0])
+    assert node.follower.asked[-1][1].position[0] == 4.0
+    assert node.follower.asked[-1][1].stamp == pytest.approx(node.now(), abs=5)
+
+
+def test_a_stalled_computer_costs_ticks_but_never_a_spiral(make, monkeypatch):
+    node = make(SimNode)
+    clock = SimpleNamespace(now=1000.0)
+    monkeypatch.setattr(sim_node.time, 'monotonic', lambda: clock.now)
+    monkeypatch.setattr(node, 'now', lambda: 5e8 + clock.now)
+    for _ in range(100):
+        node._on_timer()
+        clock.now += 0.005
+    assert node._ticks == 100
+    clock.now += 3.0                        # everything stood still
+    node._on_timer()
+    assert node._ticks == 100 + sim_node.CATCH_UP_TICKS
+    for _ in range(100):
+        clock.now += 0.005
+        node._on_timer()
+    assert node._ticks == 200 + sim_node.CATCH_UP_TICKS
+    assert node._lost_ticks == pytest.approx(3.0 / 0.005 - sim_node.CATCH_UP_TICKS, abs=2)
+    # Stamps stayed with ROS time.
+    assert node._epoch + node._simulator.time == pytest.approx(node.now(), abs=0.01)
+
+
+def test_the_stamps_follow_a_clock_that_was_set(make, monkeypatch):
+    node = make(SimNode)
+    offset = SimpleNamespace(value=0.0)
+    monkeypatch.setattr(node, 'now', lambda: 5e8 + sim_node.time.monotonic() + offset.value)
+    node._on_timer()
+    offset.value = 60.0
+    node._on_timer()
+    assert node._epoch + node._simulator.time == pytest.approx(node.now(), abs=0.02)
+    assert node._clock_steps == 1
+
+
+def test_the_payload_changes_in_flight_within_its_range(make):
+    node = make(SimNode, 'payload:=0.25')
+    assert node.set_parameters([Parameter('payload', value=1.0)])[0].successful
+    assert not node.set_parameters([Parameter('payload', value=-1.0)])[0].successful
+    assert not node.set_parameters([Parameter('seed', value=3)])[0].successful
+
+
+def test_the_supervisor_takes_another_controller_but_no_unknown_one(make):
+    node = make(SupervisorNode)
+
+    def select(name):
+        return node.set_parameters([Parameter('controller', value=name)])[0]
+
+    assert select('rl').successful and node._supervisor.active == 'rl'
+    refused = select('pid')
+    assert not refused.successful and 'nmpc, rl' in refused.reason
+    assert node._supervisor.active == 'rl'
+    assert not node.set_parameters([Parameter('takeoff.height', value=2.0)])[0].successful
+
+
+def test_the_supervisor_refuses_to_arm_without_an_estimate_and_says_why(make):
+    node = make(SupervisorNode)
+    answer = node._request('arm')(None, SimpleNamespace())
+    assert not answer.success and 'ekf_node' in answer.message
+    assert node._state == 'disarmed'
+
+
+def test_the_reference_waits_for_flight_then_plays_the_task(make, monkeypatch):
+    node = make(ReferenceNode, 'task:=waypoints')
+    clock = SimpleNamespace(now=2000.0)
+    monkeypatch.setattr(node, 'now', lambda: clock.now)
+    node._poses, node._states = Sent(), Sent()
+    node._on_timer()
+    assert not node._poses
+    node._on_supervisor(SimpleNamespace(data='flying:nmpc'))
+    while clock.now < 2000 + 15 * 8 + 1:
+        node._on_timer()
+        clock.now += 0.02
+    stamps = [convert.seconds(m.header.stamp) for m in node._poses]
+    assert np.allclose(stamps, 2000 + 8 * np.arange(15))
+    assert node._states[0].data == 'flying 1/15' and node._states[-1].data == 'done'
+
+
+def test_a_landing_in_the_middle_aborts_the_task(make):
+    node = make(ReferenceNode, 'task:=hover')
+    node._on_supervisor(SimpleNamespace(data='flying:nmpc'))
+    node._on_timer()
+    node._on_supervisor(SimpleNamespace(data='landing'))
+    assert node._state == 'aborted'
+
+
+def test_trajectory_windows_join_without_a_gap_and_keep_to_the_path(make, monkeypatch):
+    node = make(ReferenceNode, 'task:=lemniscate')
+    clock = SimpleNamespace(now=2000.0)
+    monkeypatch.setattr(node, 'now', lambda: clock.now)
+    node._trajectories = Sent()
+    node._on_supervisor(SimpleNamespace(data='flying:nmpc'))
+    path = node._task.segments[-1].target(2008.0)
+    while node._state != 'done':
+        node._on_timer()
+        clock.now += 0.02
+        assert clock.now < 2200
+        if node._trajectories and clock.now < path.times[-1] - 0.1:
+            window = convert.trajectory_target(node._trajectories[-1])
+            assert window.times[0] <= clock.now and clock.now + 1.0 < max(
+                window.times[-1], path.times[-1] - 0.1 + 1.2)
+            assert np.linalg.norm(window.at(clock.now).position
+                                  - path.at(clock.now).position) < 1e-3
+    assert convert.trajectory_target(node._trajectories[0]).times[0] == pytest.approx(2008.0)
+
+
+def test_the_estimator_publishes_only_what_it_believes(make):
+    node = make(EkfNode)
+    node._publisher = Sent()
+    at_rest = np.array([0, 0, 9.80665])
+    for k in range(400):
+        stamp = 100 + 0.005 * k
+        if k % 2:
+            node._on_pose(convert.PoseSample(stamp - 0.01, np.array([0, 0, 0.3]), LEVEL))
+        node._on_imu(convert.ImuSample(stamp, at_rest, np.zeros(3)))
+        if k == 3:
+            assert not node._publisher      # too few poses to believe
+    message = node._publisher[-1]
+    covariance = np.reshape(message.pose.covariance, (6, 6))
+    assert message.pose.pose.position.z == pytest.approx(0.3, abs=0.01)
+    assert np.allclose(covariance, covariance.T) and np.all(np.linalg.eigvalsh(covariance) > 0)
+    assert np.linalg.eigvalsh(np.reshape(message.twist.covariance, (6, 6))).min() > 0
