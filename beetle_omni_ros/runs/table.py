@@ -15,6 +15,27 @@ MANY_POSES = 20  # above, only the summary is shown
 ABSENT = '–'
 PUBLISHED = ' class="published"'
 
+ERROR_ROWS = (  # text, path in the metrics, digits
+    ('U position, mean [m]', 'mean.U_position_m', 4),
+    ('U position, max [m]', 'max.U_position_m', 4),
+    ('U orientation, mean [deg]', 'mean.U_orientation_deg', 2),
+    ('U orientation, max [deg]', 'max.U_orientation_deg', 2),
+    ('L position, mean [m]', 'mean.L_position_m', 3),
+    ('L position, max [m]', 'max.L_position_m', 3),
+    ('L orientation, mean [deg]', 'mean.L_orientation_deg', 2),
+    ('L orientation, max [deg]', 'max.L_orientation_deg', 2))
+EFFORT_ROWS = (
+    ('|q* - q| [rad]', 'joint_error_mean_rad', 4),
+    ('thrust [N]', 'thrust_mean_N', 2),
+    ('hover speed [m/s]', 'hover_speed_mean_m_s', 4),
+    ('hover rate [rad/s]', 'hover_angular_speed_mean_rad_s', 4),
+    ('hover tilt change [rad/10 ms]', 'hover_command_change_rms.joint_rad', 4),
+    ('hover thrust change [N/10 ms]', 'hover_command_change_rms.thrust_N', 3),
+    ('CPU of a step, median [ms]', 'compute_ms.median', 2),
+    ('CPU of a step, 99 % [ms]', 'compute_ms.p99', 2),
+    ('CPU of a step, max [ms]', 'compute_ms.max', 2),
+    ('deadline misses', 'compute_ms.deadline_misses', 0))
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -53,46 +74,40 @@ def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
         made.append(_tracking(judged, task))
     for kind, unit in (('force', 'N'), ('torque', 'N_m')):
         if any(kind in result for result in judged.values()):
-            made.append(_levels(judged, kind, unit))
+            made.append(_levels(_with(judged, kind), kind, unit))
     if any('payload' in result for result in judged.values()):
-        made.append(_payloads(judged))
+        made.append(_payloads(_with(judged, 'payload')))
     if any('hover' in result for result in judged.values()):
         made.append(_hover(judged))
-    most = max((len(result['poses']) for result in judged.values()), default=0)
-    if with_poses or (with_poses is None and 1 < most <= MANY_POSES):
-        made.append(_poses(judged))
+    for group in _same_poses(judged):
+        count = len(next(iter(group.values()))['poses'])
+        if with_poses or (with_poses is None and 1 < count <= MANY_POSES):
+            made.append(_poses(group))
     return made
+
+
+def _same_poses(judged):
+    """Results in groups that flew the same targets, which alone can stand side by side."""
+    groups: dict[tuple, dict] = {}
+    for name, result in judged.items():
+        key = tuple(round(v, 6) for pose in result['poses'] for v in pose['target'])
+        groups.setdefault(key, {})[name] = result
+    return [group for key, group in groups.items() if key]
 
 
 def _summary(judged, task):
     """One column for each controller and each published result, one row for each metric."""
     others = published.pose_results(task)
     columns = [*judged.values(), *others.values()]
-    rows = [[text, *(_mean_and_max(column, key, digits) for column in columns)]
-            for text, key, digits in (
-                ('U position [m]: mean (max)', 'U_position_m', 4),
-                ('U orientation [deg]', 'U_orientation_deg', 2),
-                ('L position [m]', 'L_position_m', 3),
-                ('L orientation [deg]', 'L_orientation_deg', 2))]
+    rows = [[text, *(_number(_at(column, path), digits) for column in columns)]
+            for text, path, digits in ERROR_ROWS]
     rows += [['poses reached', *(_reached(column) for column in columns)],
              ['crashed', *({True: 'yes', False: 'no'}.get(column.get('crashed'), ABSENT)
                            for column in columns)]]
     rows += [[text, *(_number(_at(column, path), digits) for column in columns)]
-             for text, path, digits in (
-                 ('|q* - q| [rad]', 'joint_error_mean_rad', 4),
-                 ('thrust [N]', 'thrust_mean_N', 2),
-                 ('hover |v| [m/s]', 'hover_speed_mean_m_s', 4),
-                 ('hover |w| [rad/s]', 'hover_angular_speed_mean_rad_s', 4),
-                 ('hover joint command change [rad]', 'hover_command_change_rms.joint_rad', 4),
-                 ('hover thrust command change [N]', 'hover_command_change_rms.thrust_N', 3))]
-    rows += [['CPU of a step [ms]: median', *(_number(_at(c, 'compute_ms.median'), 2)
-                                              for c in columns)]]
-    rows += [[f'{name}', *(_number(_at(c, f'compute_ms.{key}'), digits) for c in columns)]
-             for name, key, digits in (('CPU 99th percentile', 'p99', 2),
-                                       ('CPU largest', 'max', 2),
-                                       ('deadline misses', 'deadline_misses', 0))]
+             for text, path, digits in EFFORT_ROWS]
     if any('stamp_to_command_ms' in column for column in columns):
-        rows.append(['stamp to command [ms]: 99 %', *(
+        rows.append(['stamp to command, 99 % [ms]', *(
             _number(_at(column, 'stamp_to_command_ms.p99'), 2) for column in columns)])
     first = len(judged) + 1
     return Grid('U: hovering, 7.0 to 7.5 s after each target; L: on the way, 1 to 7 s',
@@ -106,15 +121,14 @@ def _at(result, path):
     return result
 
 
-def _mean_and_max(result, key, digits):
-    mean, worst = (_number(result[what].get(key), digits) for what in ('mean', 'max'))
-    return ABSENT if mean == ABSENT else f'{mean} ({worst})'
-
-
 def _reached(result):
     if 'poses' not in result:
         return ABSENT
     return f"{sum(pose['reached'] for pose in result['poses'])} of {len(result['poses'])}"
+
+
+def _with(judged, key):
+    return {name: result for name, result in judged.items() if key in result}
 
 
 def _tracking(judged, task):
@@ -186,19 +200,16 @@ def _hover(judged):
 
 
 def _poses(judged):
-    header = ['', 'x, y, z [m], roll, pitch, yaw [deg]'] + [
+    header = ['', 'x y z [m] roll pitch yaw [deg]'] + [
         f'{name}: {what}' for name in judged for what in ('U [m]', '[deg]')]
     rows = []
-    for k in range(max(len(result['poses']) for result in judged.values())):
-        poses = [result['poses'][k] if k < len(result['poses']) else None
-                 for result in judged.values()]
-        target = next(pose['target'] for pose in poses if pose)
+    for k, poses in enumerate(zip(*(r['poses'] for r in judged.values()), strict=True)):
+        target = poses[0]['target']
         row = [str(k + 1), ' '.join([*(f'{v:.2f}' for v in target[:3]),
                                      *(f'{v:.0f}' for v in target[3:])])]
         for pose in poses:
-            mark = '' if not pose or pose['reached'] else ' ✗'
-            row += [_number(pose['U_position_m'], 4) + mark,
-                    _number(pose['U_orientation_deg'], 2)] if pose else [ABSENT, ABSENT]
+            row += [_number(pose['U_position_m'], 4) + ('' if pose['reached'] else ' ✗'),
+                    _number(pose['U_orientation_deg'], 2)]
         rows.append(row)
     return Grid('Poses', header, rows)
 
@@ -224,9 +235,9 @@ def _rich(grid):
                   header_style='dim', padding=(0, 2, 0, 0))
     for k, name in enumerate(grid.header):
         table.add_column(Text(name), justify='left' if k == 0 else 'right', overflow='fold',
-                         style='dim' if k in grid.faint_columns else None)
+                         no_wrap=k == 0, style='dim' if k in grid.faint_columns else None)
     for k, row in enumerate(grid.rows):
-        table.add_row(*(Text(cell, no_wrap=True) for cell in row),
+        table.add_row(*(Text(cell) for cell in row),
                       style='dim' if k in grid.faint else None)
     return table
 
