@@ -38,12 +38,10 @@ class InputGuard:
         stamp = float(sample.stamp)
         force = np.array(sample.specific_force, dtype=float)
         rate = np.array(sample.angular_velocity, dtype=float)
-        squared_force, squared_rate = float(force @ force), float(rate @ rate)
-        if not isfinite(stamp + squared_force + squared_rate):
-            finite = np.all(np.isfinite(force)) and np.all(np.isfinite(rate)) and isfinite(stamp)
-            return self._refuse('out_of_range' if finite else 'not_finite')
-        if (squared_force > self._imu.specific_force_limit ** 2
-                or squared_rate > self._imu.angular_velocity_limit ** 2):
+        if not _finite(stamp, force, rate):
+            return self._refuse('not_finite')
+        if (_squared_norm(force) > self._imu.specific_force_limit ** 2
+                or _squared_norm(rate) > self._imu.angular_velocity_limit ** 2):
             return self._refuse('out_of_range')
         self.clock_jumped = False
         if self._last_reading is not None:
@@ -81,13 +79,11 @@ class InputGuard:
         stamp = float(sample.stamp) + self._mocap.time_offset
         position = np.array(sample.position, dtype=float)
         quaternion = np.array(sample.quaternion, dtype=float)
-        if not (isfinite(stamp) and np.all(np.isfinite(position))
-                and np.all(np.isfinite(quaternion))):
+        if not _finite(stamp, position, quaternion):
             return self._refuse('not_finite')
-        if np.max(np.abs(position)) > self._mocap.position_limit:
+        if max(map(abs, position.tolist())) > self._mocap.position_limit:
             return self._refuse('out_of_range')
-        with np.errstate(over='ignore'):
-            norm = sqrt(float(quaternion @ quaternion))
+        norm = sqrt(_squared_norm(quaternion))
         if not abs(norm - 1) <= self._mocap.quaternion_tolerance:
             return self._refuse('quaternion_norm')
         if self._last_reading is None:
@@ -103,3 +99,14 @@ class InputGuard:
 
     def _refuse(self, reason) -> None:
         self.rejected[reason] += 1
+
+
+def _finite(stamp, *vectors) -> bool:
+    """Whether stamp and all elements are finite."""
+    return isfinite(stamp) and all(
+        isfinite(number) for vector in vectors for number in vector.tolist())
+
+
+def _squared_norm(vector) -> float:
+    """Sum of squares in plain floats: huge values become infinite without a warning."""
+    return sum(number * number for number in vector.tolist())

@@ -1,0 +1,106 @@
+"""Poses count at their capture time, whenever they arrive."""
+
+from dataclasses import replace
+
+from ekf_flights import error_state, fly, GRAVITY, run, Sensors
+import numpy as np
+import pytest
+
+from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, PoseSample
+
+
+def estimate_of(flight, parameters=None):
+    """Fly through; the last estimate."""
+    return run(ErrorStateEkf(parameters or EkfParameters.load(), GRAVITY), flight).estimate
+
+
+@pytest.mark.parametrize('delay', [0.003, 0.01, 0.037, 0.15])
+@pytest.mark.parametrize('capture', [0.0, 0.0017])
+def test_replay_equals_processing_in_order(delay, capture):
+    """However late poses come and wherever they fall between IMU samples."""
+    flight = fly(1, 1.5)
+    poses = flight.trajectory(np.array([s.stamp + capture for s in flight.poses]))
+    flight.poses = [PoseSample(s.stamp + capture, p, q) for s, p, q in
+                    zip(flight.poses, poses['position'], poses['rotation'].as_quat())
+                    if s.stamp + capture + delay < 1.49]
+    flight.delay = delay
+    late = estimate_of(flight)
+    flight.delay = 0.0
+    prompt = estimate_of(flight)
+    np.testing.assert_allclose(late.position, prompt.position, atol=1e-9)
+    np.testing.assert_allclose(late.velocity, prompt.velocity, atol=1e-9)
+    np.testing.assert_allclose(late.quaternion, prompt.quaternion, atol=1e-9)
+    np.testing.assert_allclose(late.covariance, prompt.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_a_pose_ahead_of_the_imu_waits_for_it():
+    flight = fly(2, 1.0)
+    flight.poses = flight.poses[1:]
+    flight.delay = -0.004  # the IMU's samples are delivered later than the MoCap's
+    early = estimate_of(flight)
+    flight.delay = 0.0
+    np.testing.assert_allclose(early.position, estimate_of(flight).position, atol=1e-9)
+
+
+def test_capture_time_beats_time_of_arrival():
+    """The same late poses, once at their capture time and once taken for current."""
+    parameters = EkfParameters.load()
+    parameters = replace(parameters, initial=replace(parameters.initial, time_offset_std=0.0),
+                         mocap=replace(parameters.mocap, gate_probability=0.9999999999))
+    flight, delay = fly(3, 4.0, agility=0.5), 0.03
+    flight.delay = delay
+    right = error_state(estimate_of(flight, parameters), flight)
+    flight.delay = 0.0
+    flight.poses = [replace(s, stamp=s.stamp + delay) for s in flight.poses
+                    if s.stamp + delay <= 4.0]
+    wrong = error_state(estimate_of(flight, parameters), flight)
+    assert np.linalg.norm(wrong[:3]) > 5 * np.linalg.norm(right[:3])
+    assert np.linalg.norm(wrong[6:9]) > 5 * np.linalg.norm(right[6:9])
+
+
+@pytest.mark.parametrize('age', [0.015, 0.025])
+def test_latency_hidden_in_the_stamps_of_the_imu_is_found_and_bridged(age):
+    flight = fly(4, 6.0, agility=0.5)
+    flight.imu = [replace(s, stamp=s.stamp + age) for s in flight.imu]
+    parameters = EkfParameters.load()
+    ekf = run(ErrorStateEkf(parameters, GRAVITY), flight)
+    assert ekf.status == 'tracking'
+    error = error_state(replace(ekf.estimate, stamp=ekf.estimate.stamp - age), flight)
+    truth = flight.trajectory(np.array([ekf.estimate.stamp, ekf.estimate.stamp - age]))
+    assert np.linalg.norm(ekf.estimate.position - truth['position'][0]) < 0.004
+    assert np.linalg.norm(error[:3]) > 0.5 * age * np.linalg.norm(truth['velocity'][0])
+
+    trusting = replace(parameters, initial=replace(parameters.initial, time_offset_std=0.0))
+    blind = run(ErrorStateEkf(trusting, GRAVITY), flight)
+    assert (np.linalg.norm(blind.estimate.position - truth['position'][0])
+            > 3 * np.linalg.norm(ekf.estimate.position - truth['position'][0]))
+
+
+def test_late_stamps_of_the_mocap_do_not_shift_the_estimate_in_time():
+    """Poses stamped on arrival look later than they are; the IMU's clock is then the right one."""
+    flight = fly(5, 6.0, agility=0.5)
+    flight.poses = [replace(s, stamp=s.stamp + 0.012) for s in flight.poses]
+    flight.delay = 0.0
+    ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
+    assert ekf.status == 'tracking'
+    error = error_state(ekf.estimate, flight)
+    assert np.linalg.norm(error[:3]) < 0.004 and np.linalg.norm(error[6:9]) < np.deg2rad(0.3)
+
+
+def test_a_hovering_robot_does_not_invent_an_offset():
+    """At rest nothing is known of the offset, and noise must not pass for it."""
+    flight = fly(6, 10.0, Sensors(), agility=0.0)
+    ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
+    error = error_state(ekf.estimate, flight)
+    assert np.linalg.norm(error[:3]) < 0.002 and np.linalg.norm(error[3:6]) < 0.01
+
+
+def test_constant_offset_given_as_parameter_is_applied():
+    parameters = EkfParameters.load()
+    parameters = replace(parameters, initial=replace(parameters.initial, time_offset_std=0.0))
+    flight = fly(7, 2.0)
+    plain = estimate_of(flight, parameters)
+    flight.poses = [replace(s, stamp=s.stamp - 0.3) for s in flight.poses]
+    flight.delay = 0.31
+    shifted = replace(parameters, mocap=replace(parameters.mocap, time_offset=0.3))
+    np.testing.assert_allclose(estimate_of(flight, shifted).position, plain.position, atol=1e-6)

@@ -1,0 +1,148 @@
+"""Dropouts, outliers, jumps: what the status says and how the filter comes back."""
+
+from dataclasses import replace
+
+from ekf_flights import error_state, feed, fly, GRAVITY, ImuSample, run, Sensors
+import numpy as np
+import pytest
+
+from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
+from beetle_omni_ros.robot import rotations
+
+
+def new_ekf():
+    """With the shipped parameters."""
+    return ErrorStateEkf(EkfParameters.load(), GRAVITY)
+
+
+def history(ekf, flight, drop=lambda time: False):
+    """Feed a flight; list (time, status, position variance) after each IMU sample."""
+    rows = []
+    for time, sample in flight.arrivals():
+        if isinstance(sample, ImuSample):
+            feed(ekf, sample)
+            variance = ekf.estimate.covariance[0, 0] if ekf.estimate else np.inf
+            rows.append((time, ekf.status, variance))
+        elif not drop(sample.stamp):
+            feed(ekf, sample)
+    return rows
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_half_a_second_without_mocap_costs_less_than_5_cm_and_1_deg(seed):
+    sensors = Sensors.believed(EkfParameters.load(), seed)
+    flight = fly(seed, 4.5, sensors)
+    ekf = run(new_ekf(), flight, drop=lambda time: time > 4.0)
+    error = error_state(ekf.estimate, flight)
+    assert ekf.status == 'dead_reckoning'
+    assert ekf.estimate.stamp == pytest.approx(4.5)
+    assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[6:9]) < np.deg2rad(1)
+
+
+def test_status_and_covariance_tell_a_dropout():
+    ekf, limits = new_ekf(), EkfParameters.load().status
+    rows = history(ekf, fly(1, 6.0), drop=lambda time: 2.0 < time < 4.8)
+    by_time = {round(time, 3): (status, variance) for time, status, variance in rows}
+    assert by_time[0.1][0] == 'uninitialised'
+    assert by_time[1.9][0] == 'tracking'
+    assert by_time[2.0 + limits.dead_reckoning_after + 0.02][0] == 'dead_reckoning'
+    assert by_time[2.0 + limits.lost_after + 0.02][0] == 'lost'
+    assert by_time[5.9][0] == 'tracking'
+    growing = [variance for time, _, variance in rows if 2.02 < time < 4.8]
+    assert np.all(np.diff(growing) > 0)
+    assert by_time[5.9][1] < 4 * by_time[1.9][1]
+
+
+def test_a_lost_filter_comes_back_where_the_robot_is():
+    ekf, flight = new_ekf(), fly(2, 9.0)
+    run(ekf, flight, drop=lambda time: 2.0 < time < 7.0)
+    error = error_state(ekf.estimate, flight)
+    assert ekf.status == 'tracking'
+    assert np.linalg.norm(error[:3]) < 0.005 and np.linalg.norm(error[6:9]) < np.deg2rad(0.5)
+
+
+def test_short_dropouts_need_no_new_start():
+    ekf, flight = new_ekf(), fly(3, 3.0)
+    rows = history(ekf, flight, drop=lambda time: 1.5 < time < 2.0)
+    assert {status for time, status, _ in rows if time > 2.02} == {'tracking'}
+    assert not ekf.rejected
+
+
+@pytest.mark.parametrize('shift, turn', [(0.05, 0.0), (3.0, 0.0), (0.0, 0.2), (1.0, 3.1)])
+def test_single_outliers_are_refused_and_leave_no_trace(shift, turn):
+    flight = fly(4, 3.0)
+    clean = fly(4, 3.0)
+    outliers = range(100, 300, 10)
+    for k in outliers:
+        pose = flight.poses[k]
+        flight.poses[k] = replace(
+            pose, position=pose.position + shift,
+            quaternion=rotations.multiply(pose.quaternion, rotations.exp((turn, 0, 0))))
+    clean.poses = [pose for k, pose in enumerate(clean.poses) if k not in outliers]
+    ekf, reference = new_ekf(), new_ekf()
+    results = [(feed(ekf, sample), sample) for _, sample in flight.arrivals()]
+    run(reference, clean)
+    refused = [sample.stamp for accepted, sample in results if not accepted]
+    assert refused == [flight.poses[k].stamp for k in outliers]
+    assert ekf.rejected == {'outlier': len(outliers)}
+    # only the noise seen around the outliers may weigh the good poses differently
+    np.testing.assert_allclose(ekf.estimate.position, reference.estimate.position, atol=5e-4)
+    assert ekf.status == 'tracking'
+
+
+def test_a_persistent_jump_is_believed_after_a_while_and_not_at_once():
+    flight, shift = fly(5, 5.0), np.array([0.5, -0.3, 0.2])
+    flight.poses = [replace(pose, position=pose.position + shift) if pose.stamp > 2.0 else pose
+                    for pose in flight.poses]
+    ekf, limits = new_ekf(), EkfParameters.load().status
+    rows = history(ekf, flight)
+    back = 2.0 + 0.01 * (limits.jump_poses + 5)
+    assert {s for time, s, _ in rows if 2.2 < time < back - 0.1} == {'dead_reckoning'}
+    assert {s for time, s, _ in rows if time > back} == {'tracking'}
+    truth = flight.trajectory(np.array([ekf.estimate.stamp]))
+    np.testing.assert_allclose(ekf.estimate.position, truth['position'][0] + shift, atol=0.005)
+
+
+def test_a_burst_of_outliers_shorter_than_a_jump_is_bridged():
+    flight = fly(6, 3.0)
+    flight.poses = [replace(pose, position=pose.position + 0.5) if 2.0 < pose.stamp < 2.6
+                    else pose for pose in flight.poses]
+    ekf = run(new_ekf(), flight)
+    assert ekf.status == 'tracking'
+    assert np.linalg.norm(error_state(ekf.estimate, flight)[:3]) < 0.005
+
+
+def test_random_poses_never_start_the_filter():
+    flight, rng = fly(7, 2.0), np.random.default_rng(0)
+    flight.poses = [replace(pose, position=rng.uniform(-1, 1, 3)) for pose in flight.poses]
+    ekf = run(new_ekf(), flight)
+    assert ekf.status == 'uninitialised' and ekf.estimate is None
+    assert ekf.rejected['inconsistent_start'] > 50
+
+
+@pytest.mark.parametrize('fault', [lambda force: -force, lambda force: force / 9.80665,
+                                   lambda force: force[:, [1, 2, 0]], lambda force: 0 * force])
+def test_an_imu_that_contradicts_gravity_never_starts_the_filter(fault):
+    """Upside down, in units of g, with swapped axes, with gravity removed."""
+    flight = fly(8, 2.0, agility=0.3)
+    forces = fault(np.array([sample.specific_force for sample in flight.imu]))
+    flight.imu = [replace(sample, specific_force=f) for sample, f in zip(flight.imu, forces)]
+    ekf = run(new_ekf(), flight)
+    assert ekf.status != 'tracking'
+    assert ekf.rejected['inconsistent_start'] + ekf.rejected['outlier'] > 0
+
+
+def test_noisier_mocap_than_claimed_is_noticed_and_weighed_down():
+    """Six times the claimed noise, as in the published randomisation."""
+    sensors = Sensors(position_noise=0.006, orientation_noise=0.006)
+    flight = fly(9, 5.0, sensors)
+    ekf = new_ekf()
+    rows = history(ekf, flight)
+    assert {status for time, status, _ in rows if time > 1.0} == {'tracking'}
+    error = error_state(ekf.estimate, flight)
+    assert error @ np.linalg.solve(ekf.estimate.covariance, error) < 40
+    assert np.linalg.norm(error[:3]) < 0.006
+
+    parameters = EkfParameters.load()
+    stubborn = replace(parameters, mocap=replace(parameters.mocap, noise_scale_limit=1.0))
+    assert run(ErrorStateEkf(stubborn, GRAVITY), flight).status != 'tracking'

@@ -1,0 +1,171 @@
+"""Bad input is refused, counted by its reason, and the state stays as it was."""
+
+from dataclasses import replace
+import warnings
+
+from ekf_flights import feed, fly, GRAVITY, ImuSample, PoseSample, run
+import numpy as np
+import pytest
+
+from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
+
+NAN, INF, HUGE = np.nan, np.inf, 1e200
+
+
+@pytest.fixture
+def flying():
+    """Give a filter in the middle of a flight, and the flight."""
+    flight = fly(1, 4.0)
+    ekf = ErrorStateEkf(EkfParameters.load(), GRAVITY)
+    run(ekf, flight, until=1.5)
+    assert ekf.status == 'tracking' and not ekf.rejected
+    return ekf, flight
+
+
+def vector(value, size=3):
+    """One bad element."""
+    return np.array([0.1] * (size - 1) + [value])
+
+
+BAD_IMU = {
+    'not_finite': [{'stamp': NAN}, {'stamp': INF}, {'specific_force': vector(NAN)},
+                   {'specific_force': vector(INF)}, {'angular_velocity': vector(NAN)}],
+    'out_of_range': [{'specific_force': vector(500.0)}, {'specific_force': vector(HUGE)},
+                     {'angular_velocity': vector(100.0)}, {'angular_velocity': vector(-HUGE)}],
+    'duplicate': [{'ahead': 0.0}],
+    'backwards': [{'ahead': -0.001}, {'ahead': -1000.0}],
+    'forward_gap': [{'ahead': 0.5}, {'ahead': 1e9}],
+}
+BAD_POSE = {
+    'not_finite': [{'stamp': NAN}, {'stamp': -INF}, {'position': vector(NAN)},
+                   {'quaternion': vector(NAN, 4)}, {'quaternion': vector(INF, 4)}],
+    'out_of_range': [{'position': vector(1e6)}, {'position': vector(-HUGE)}],
+    'quaternion_norm': [{'quaternion': np.zeros(4)}, {'quaternion': np.array([0, 0, 0, 1.1])},
+                        {'quaternion': np.full(4, HUGE)}],
+    'duplicate': [{'ahead': 0.0}],
+    'backwards': [{'ahead': -0.02}],
+    'future': [{'ahead': 5.0}, {'ahead': 1e9}],
+}
+
+
+def cases(table):
+    """Flatten (reason, changes)."""
+    return [(reason, change) for reason, changes in table.items() for change in changes]
+
+
+def refused(ekf, sample, reason):
+    """Give ``sample``; it must be refused for ``reason`` and change nothing."""
+    before, status = ekf.estimate, ekf.status
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        assert feed(ekf, sample) is False
+    assert ekf.rejected == {reason: 1}
+    after = ekf.estimate
+    assert ekf.status == status and after.stamp == before.stamp
+    for name in ('position', 'velocity', 'quaternion', 'covariance'):
+        assert np.array_equal(getattr(after, name), getattr(before, name))
+
+
+def continued(ekf, flight, after):
+    """Finish the flight; the filter must track as if nothing had happened."""
+    undisturbed = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
+    for time, sample in flight.arrivals():
+        if time > after:
+            feed(ekf, sample)
+    assert ekf.status == 'tracking'
+    np.testing.assert_allclose(ekf.estimate.position, undisturbed.estimate.position, atol=1e-4)
+
+
+@pytest.mark.parametrize('reason, change', cases(BAD_IMU))
+def test_bad_imu_sample_is_refused_and_forgotten(flying, reason, change):
+    ekf, flight = flying
+    change = dict(change)
+    last = max(s.stamp for s in flight.imu if s.stamp <= 1.5)
+    stamp = last + change.pop('ahead', 0.005)
+    good = ImuSample(stamp, np.array([0.0, 0.0, GRAVITY]), np.zeros(3))
+    refused(ekf, replace(good, **change), reason)
+    continued(ekf, flight, 1.5)
+
+
+@pytest.mark.parametrize('reason, change', cases(BAD_POSE))
+def test_bad_pose_is_refused_and_forgotten(flying, reason, change):
+    ekf, flight = flying
+    change = dict(change)
+    last = max((s for s in flight.poses if s.stamp + flight.delay <= 1.5 + 1e-9),
+               key=lambda s: s.stamp)
+    ahead = change.pop('ahead', 0.005)
+    refused(ekf, replace(last, stamp=last.stamp + ahead, **{}) if not change else
+            replace(replace(last, stamp=last.stamp + ahead), **change), reason)
+    continued(ekf, flight, 1.5)
+
+
+def test_a_pose_older_than_the_history_is_refused():
+    flight = fly(2, 1.0)
+    ekf = ErrorStateEkf(EkfParameters.load(), GRAVITY)
+    run(ekf, flight, drop=lambda time: time > 0.3)
+    stale = next(s for s in flight.poses if s.stamp > 0.5)
+    refused(ekf, stale, 'too_old')
+
+
+def test_a_pose_without_any_imu_is_refused():
+    ekf = ErrorStateEkf(EkfParameters.load(), GRAVITY)
+    assert ekf.pose(PoseSample(0.0, np.zeros(3), np.array([0, 0, 0, 1.0]))) is False
+    assert ekf.rejected == {'no_imu': 1}
+
+
+def test_sign_of_the_quaternion_is_free():
+    flight, flipped = fly(3, 2.0), fly(3, 2.0)
+    flipped.poses = [replace(s, quaternion=s.quaternion * (-1) ** k)
+                     for k, s in enumerate(flipped.poses)]
+    a, b = (run(ErrorStateEkf(EkfParameters.load(), GRAVITY), f) for f in (flight, flipped))
+    assert not b.rejected
+    np.testing.assert_allclose(a.estimate.position, b.estimate.position, atol=1e-12)
+    assert abs(abs(a.estimate.quaternion @ b.estimate.quaternion) - 1) < 1e-12
+
+
+def test_slightly_unnormalised_quaternions_are_normalised():
+    flight = fly(4, 1.0)
+    flight.poses = [replace(s, quaternion=1.002 * s.quaternion) for s in flight.poses]
+    ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
+    assert ekf.status == 'tracking' and not ekf.rejected
+
+
+def test_the_caller_may_reuse_its_buffers():
+    flight, ekf = fly(5, 1.0), ErrorStateEkf(EkfParameters.load(), GRAVITY)
+    reference = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight).estimate
+    buffers = [np.zeros(3), np.zeros(3), np.zeros(4)]
+    for _, sample in flight.arrivals():
+        if isinstance(sample, ImuSample):
+            buffers[0][:], buffers[1][:] = sample.specific_force, sample.angular_velocity
+            ekf.imu(ImuSample(sample.stamp, buffers[0], buffers[1]))
+        else:
+            buffers[1][:], buffers[2][:] = sample.position, sample.quaternion
+            ekf.pose(PoseSample(sample.stamp, buffers[1], buffers[2]))
+    assert np.array_equal(ekf.estimate.covariance, reference.covariance)
+    assert np.array_equal(ekf.estimate.position, reference.position)
+
+
+def test_missing_imu_samples_within_the_gap_limit_are_bridged():
+    flight = fly(6, 3.0)
+    flight.imu = [s for s in flight.imu if not 1.5 < s.stamp < 1.56]
+    ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)
+    assert ekf.status == 'tracking' and not ekf.rejected['forward_gap']
+
+
+@pytest.mark.parametrize('jump', [-1000.0, 7.0])
+def test_a_clock_that_jumps_for_good_costs_the_state_and_is_followed(jump):
+    """Simulated time starts anew, or the IMU was silent for long."""
+    flight = fly(7, 4.0)
+    flight.imu = [replace(s, stamp=s.stamp + jump) if s.stamp > 2.0 else s for s in flight.imu]
+    flight.poses = [replace(s, stamp=s.stamp + jump) if s.stamp > 2.0 else s
+                    for s in flight.poses]
+    ekf, statuses = ErrorStateEkf(EkfParameters.load(), GRAVITY), []
+    events = [(s.stamp - (jump if s in flight.imu[401:] else 0), 0, s) for s in flight.imu]
+    events = [(0.005 * k, 0, s) for k, s in enumerate(flight.imu)]
+    events += [(0.01 * k + flight.delay, 1, s) for k, s in enumerate(flight.poses)]
+    for _, _, sample in sorted(events, key=lambda event: (round(event[0], 7), event[1])):
+        feed(ekf, sample)
+        statuses.append(ekf.status)
+    assert 'lost' in statuses and statuses[-1] == 'tracking'
+    truth = flight.trajectory(np.array([ekf.estimate.stamp - jump]))
+    np.testing.assert_allclose(ekf.estimate.position, truth['position'][0], atol=0.005)

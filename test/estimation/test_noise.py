@@ -1,0 +1,43 @@
+"""The noise of the MoCap, seen from its poses."""
+
+from ekf_flights import fly, Sensors
+import numpy as np
+import pytest
+
+from beetle_omni_ros.estimation.noise import NoiseMonitor
+from beetle_omni_ros.estimation.parameters import MocapParameters
+
+
+def scale_after(poses):
+    """Feed poses to a monitor with the default claim."""
+    monitor = NoiseMonitor(MocapParameters())
+    for pose in poses:
+        monitor.add(pose.stamp, pose.position, pose.quaternion)
+    return np.array(monitor.scale)
+
+
+@pytest.mark.parametrize('agility', [0.0, 1.0])
+def test_claimed_noise_is_left_alone(agility):
+    assert np.array_equal(scale_after(fly(1, 5.0, agility=agility).poses), [1.0, 1.0])
+
+
+def test_noise_below_the_claim_is_left_alone():
+    assert np.array_equal(scale_after(fly(1, 5.0, Sensors.perfect()).poses), [1.0, 1.0])
+
+
+@pytest.mark.parametrize('position, orientation', [(5.0, 1.0), (1.0, 4.0), (6.0, 3.0)])
+def test_excess_is_measured_for_each_kind(position, orientation):
+    claim = MocapParameters()
+    sensors = Sensors(position_noise=position * claim.position_noise,
+                      orientation_noise=orientation * claim.orientation_noise)
+    scale = np.sqrt(scale_after(fly(2, 8.0, sensors).poses))
+    np.testing.assert_allclose(scale, [position, orientation], rtol=0.25)
+
+
+def test_uneven_captures_and_jumps_are_not_noise():
+    poses = fly(3, 6.0).poses
+    uneven = [pose for k, pose in enumerate(poses) if k % 5]
+    assert np.array_equal(scale_after(uneven), [1.0, 1.0])
+    for pose in poses[300:]:
+        pose.position[:] += 1.0
+    assert np.array_equal(scale_after(poses[:500]), [1.0, 1.0])
