@@ -77,9 +77,9 @@ def main():
     shift = plant.data.subtree_com[1] - HEIGHT
     weight = robot.mass * robot.gravity
     aside, up = np.linalg.norm(shift[:2]), shift[2]
-    print(f'all modules at 90 deg to one side: centre of mass {1e3 * aside:.2f} mm aside and '
-          f'{1e3 * up:.2f} mm up; as a moment of the weight {aside * weight:.4f} N m with the body '
-          f'level, up to {up * weight:.4f} N m with it on its side')
+    print(f'all modules at 90 deg to one side: centre of mass {1e3 * aside:.2f} mm aside, '
+          f'{1e3 * up:.2f} mm up; as a moment of the weight {aside * weight:.4f} N m with the '
+          f'body level, up to {up * weight:.4f} N m with it on its side')
     print(f'load of a module on its joint: up to '
           f'{-module.mass * module.centre_of_mass[2] * robot.gravity:.4f} N m at 1 g')
 

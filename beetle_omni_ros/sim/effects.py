@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -41,7 +42,8 @@ class MotionForces:
         self.rotor_drag = effects.get('rotor_drag', {}).get('coefficient', 0.0)
         self.depends_on_motion = bool(self.body_drag or self.rotor_drag)
         self._hover_thrust = robot.hover_thrust
-        self._positions = robot.rotors.positions
+        # r x f for each rotor as a matrix, stacked (12, 3): np.cross is slow on small arrays.
+        self._levers = np.concatenate([rotations.skew(r) for r in robot.rotors.positions])
         axes = robot.tilt_axes
         self._level = np.array([0.0, 0.0, 1.0])
         self._sideways = np.cross(axes, self._level)   # where a rotor at +90 deg points
@@ -67,11 +69,11 @@ class MotionForces:
         if self.body_drag:
             force -= self.body_drag * np.sqrt(velocity @ velocity) * velocity
         if self.rotor_drag:
-            normal = np.outer(np.cos(tilt), self._level) + np.sin(tilt)[:, None] * self._sideways
-            hub = rotation.T @ velocity + np.cross(angular_velocity, self._positions)
-            in_plane = hub - np.sum(hub * normal, axis=1)[:, None] * normal
+            normal = np.cos(tilt)[:, None] * self._level + np.sin(tilt)[:, None] * self._sideways
+            hub = rotation.T @ velocity - (self._levers @ angular_velocity).reshape(4, 3)
+            in_plane = hub - (hub * normal).sum(axis=1)[:, None] * normal
             speed_ratio = np.sqrt(np.maximum(thrust, 0.0) / self._hover_thrust)
             drag = -0.25 * self.rotor_drag * speed_ratio[:, None] * in_plane
             force += rotation @ drag.sum(axis=0)
-            torque += np.cross(self._positions, drag).sum(axis=0)
+            torque -= drag.ravel() @ self._levers      # sum of r x f: each lever is skew
         return force, torque

@@ -123,15 +123,12 @@ class Plant:
         fast = not self._may_reach_rate_limit()
         substeps = self._floor_substeps if fast and data.ncon else self._substeps
         model.opt.timestep = self._tick / substeps
-        if fast and not self._forces.depends_on_motion:
-            data.qfrc_applied[:6] = self._wrench
-            data.qfrc_applied[:3] += self._forces.wind
+        self._apply_forces(0.5 * self._tick)
+        if fast:
             mujoco.mj_step(model, data, substeps)
         else:
             for _ in range(substeps):
-                if not fast:
-                    self._limit_rates()
-                self._apply_forces()
+                self._limit_rates()
                 mujoco.mj_step(model, data)
         if fast:
             self._update()
@@ -171,17 +168,32 @@ class Plant:
         limits[4:, 0] = np.clip(gain * (-rate_limit - rate), -effort, effort)
         limits[4:, 1] = np.clip(gain * (rate_limit - rate), -effort, effort)
 
-    def _apply_forces(self):
+    def _apply_forces(self, ahead=0.0):
+        """
+        External wrench and the effects' forces, as they will be ``ahead`` [s] from now.
+
+        Taken in the middle of a tick and held through it, forces that depend on the motion are
+        second-order accurate, for one evaluation.
+        """
         data = self.data
-        force, torque = self._forces(rotations.matrix(data.qpos[XYZW]), data.qvel[:3],
-                                     data.qvel[3:6], data.qpos[7:], self.thrust)
-        data.qfrc_applied[:3] = self._wrench[:3] + force
-        data.qfrc_applied[3:6] = self._wrench[3:] + torque
+        applied = data.qfrc_applied
+        if not self._forces.depends_on_motion:
+            applied[:6] = self._wrench
+            applied[:3] += self._forces.wind
+            return
+        change = data.ctrl[:4] - data.act
+        thrust = data.act - np.expm1(-ahead / self._robot.rotors.time_constant) * change
+        turn = rotations.exp(ahead * self._qvel[3:6])
+        force, torque = self._forces(
+            rotations.matrix(rotations.multiply(self._qpos[XYZW], turn)),
+            self._qvel[:3] + ahead * data.qacc[:3], self._qvel[3:6] + ahead * data.qacc[3:6],
+            self._tilt + ahead * self._rate, self._scale * thrust)
+        applied[:3] = self._wrench[:3] + force
+        applied[3:6] = self._wrench[3:] + torque
 
     def _update(self):
         """Accelerations and contacts of the state just reached."""
-        if self._forces.depends_on_motion:
-            self._apply_forces()
+        self._apply_forces()
         mujoco.mj_forward(self.model, self.data)
 
     @property
@@ -238,7 +250,6 @@ class Plant:
         data.act[:] = thrust
         self.set_targets(tilt if tilt_target is None else tilt_target, thrust)
         self.model.opt.disableflags = self._flags | NO_CONSTRAINT
-        self._apply_forces()
         self._update()
         return data.qacc.copy()
 

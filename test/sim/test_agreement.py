@@ -79,19 +79,30 @@ def test_true_modules_shift_the_centre_of_gravity():
     assert np.abs(made.acceleration(*state)[3:6] - rigid.acceleration(*state)[3:6]).max() > 0.1
 
 
-def test_step_is_the_integral_of_the_acceleration():
-    """Motion-dependent effects act inside the step as they do in a single state."""
-    robot = replace(ROBOT, effects={'body_drag': {'coefficient': 0.11},
-                                    'rotor_drag': {'coefficient': 0.4}})
-    made = plant(robot)
+@pytest.mark.parametrize('effects', [
+    {'wind': {'force': [3.0, -4.0, 2.0]}},
+    {'wind': {'force': [3.0, -4.0, 2.0]}, 'body_drag': {'coefficient': 0.3},
+     'rotor_drag': {'coefficient': 0.8}}], ids=['wind', 'wind and drag'])
+def test_step_is_the_integral_of_the_acceleration(effects):
+    """Effects act inside the step as they do in a single state."""
+    made = plant(replace(ROBOT, effects=effects))
     for p, q, v, w, tilt, _, thrust in random_states(5, seed=3):
         before = made.acceleration(p, q, v, w, tilt, np.zeros(4), thrust)
         velocity = made.state[1]
         made.step()
         after = made.data.qacc.copy()
         change = (made.state[1] - velocity)[:6] / 0.005
-        scale = np.abs(after - before)[:6] + 1.0
+        scale = np.abs(after - before)[:6] + 0.5
         assert np.all(np.abs(change - 0.5 * (before + after)[:6]) < 0.1 * scale)
+
+
+def test_terminal_speed_is_where_drag_carries_the_weight():
+    robot = replace(ROBOT, effects={'body_drag': {'coefficient': 2.0}})
+    made = plant(robot, position=[0, 0, 200])
+    for _ in range(1200):
+        made.step()
+    speed = np.sqrt(ROBOT.mass * ROBOT.gravity / 2.0)
+    assert made.state[1][2] == pytest.approx(-speed, rel=1e-5)
 
 
 def test_effect_that_the_plant_lacks_is_refused_by_name(monkeypatch):
