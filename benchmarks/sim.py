@@ -1,12 +1,16 @@
-"""Speed of the simulator on one core: ``python benchmarks/sim.py [--seconds N]``."""
+"""Speed of the simulator on one core, and its step's error: ``python benchmarks/sim.py``."""
 
 import argparse
+from dataclasses import replace
 import time
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.simulator import Simulator
 
 FLIGHT = 2.0            # [s] of open-loop flight before a reset, so that it stays in the air
@@ -30,19 +34,42 @@ def fly(simulator: Simulator, robot: RobotParameters, seconds: float, airborne: 
     return time.process_time() - began
 
 
+def end_state(robot: RobotParameters, refinement: int) -> tuple[np.ndarray, np.ndarray]:
+    """Position and quaternion after an open-loop flight with ``refinement`` times the substeps."""
+    parameters = SimulatorParameters.load().plant
+    plant = Plant(robot, replace(parameters, substeps=refinement * parameters.substeps))
+    plant.reset((0.0, 0.0, 4 * HEIGHT))
+    generator = np.random.default_rng(0)
+    for k in range(int(FLIGHT / parameters.tick)):
+        if k % COMMAND_TICKS == 0:
+            noise = generator.normal(size=(2, 4))
+            plant.set_targets(2 * SWING * np.sin(0.02 * k + np.arange(4)) + 0.05 * noise[0],
+                              robot.hover_thrust * (1 + 0.1 * noise[1]))
+        plant.step()
+    qpos, _ = plant.state
+    return qpos[:3], qpos[XYZW]
+
+
 def main():
-    """Print the real-time factor in the air and on the floor, for each kind of conditions."""
+    """Print the real-time factor of each case, and the error of the integration step."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seconds', type=float, default=20.0, help='simulated time of each case')
     seconds = parser.parse_args().seconds
     robot = RobotParameters.load()
-    print(f"{'conditions':<12}{'where':<8}{'us/tick':>9}{'x real time':>13}")
-    for conditions in ('nominal', 'published'):
-        simulator = Simulator(robot, conditions=conditions)
-        for where in ('air', 'floor'):
-            cpu = min(fly(simulator, robot, seconds / 2, where == 'air') for _ in range(2))
-            print(f'{conditions:<12}{where:<8}{1e6 * cpu * 2 * simulator.tick / seconds:>9.1f}'
-                  f'{seconds / 2 / cpu:>13.0f}')
+    dragged = replace(robot, effects={'rotor_drag': {'coefficient': 0.4},
+                                      'body_drag': {'coefficient': 0.1}})
+    print(f"{'conditions':<12}{'where':<16}{'us/tick':>9}{'x real time':>13}")
+    for conditions, where, plant in [
+            ('nominal', 'air', robot), ('nominal', 'floor', robot), ('published', 'air', robot),
+            ('nominal', 'air, with drag', dragged)]:
+        simulator = Simulator(plant, conditions=conditions)
+        cpu = min(fly(simulator, plant, seconds / 2, where != 'floor') for _ in range(2))
+        print(f'{conditions:<12}{where:<16}{2e6 * cpu * simulator.tick / seconds:>9.1f}'
+              f'{seconds / 2 / cpu:>13.0f}')
+    (p, q), (p_fine, q_fine) = end_state(robot, 1), end_state(robot, 4)
+    print(f'error of the integration step after {FLIGHT:g} s of open-loop tumbling: '
+          f'{1e3 * np.linalg.norm(p - p_fine):.3f} mm, '
+          f'{np.rad2deg(rotations.geodesic_angle(q, q_fine)):.4f} deg (against a quarter of it)')
 
 
 if __name__ == '__main__':
