@@ -24,7 +24,8 @@ def share_path(relative: str) -> Path:
         if prefix:
             roots.append(Path(prefix) / 'share' / PACKAGE)
     roots.append(Path(sys.prefix) / 'share' / PACKAGE)
-    roots.append(Path(__file__).resolve().parents[4] / 'share' / PACKAGE)
+    # prefix/lib/pythonX.Y/site-packages/beetle_omni_ros/robot/resources.py
+    roots += [prefix / 'share' / PACKAGE for prefix in Path(__file__).resolve().parents[5:6]]
     for root in roots:
         if (root / 'package.xml').is_file() and (root / relative).exists():
             return root / relative

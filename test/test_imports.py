@@ -1,0 +1,87 @@
+"""Imports point one way, and heavy or special libraries stay in their room."""
+
+import ast
+from pathlib import Path
+import sys
+
+import pytest
+
+from beetle_omni_ros.robot.resources import PACKAGE
+
+SOURCE = Path(sys.modules[PACKAGE].__file__).parent
+
+# Room -> what it may import of the package beside itself. A new room needs a line here.
+ALLOWED = {
+    'robot': (),
+    'control': ('robot',),
+    'estimation': ('robot',),
+    'sim': ('robot',),
+    'safety': ('robot', 'control.base'),
+    'runs': ('robot', 'control.base'),
+    'evaluation': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs'),
+    'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs'),
+    'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'nodes'),
+}
+
+# Library -> the only room that imports it.
+KEPT_IN = {'mujoco': 'sim', 'rclpy': 'nodes', 'launch': 'nodes', 'torch': 'train',
+           'dynamixel_sdk': 'drivers', 'pymavlink': 'drivers', 'serial': 'drivers'}
+
+
+def imports(path):
+    """Dotted names that a file imports, those inside functions too, with their line."""
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'), str(path))):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f'{path}:{node.lineno}: relative import'
+            # `from package import room` names the room only in the alias.
+            yield from ((f'{node.module}.{alias.name}', node.lineno) for alias in node.names)
+
+
+def room_of(path):
+    """Return the room that a file of the package belongs to."""
+    parts = path.relative_to(SOURCE).with_suffix('').parts
+    return parts[0]
+
+
+def is_below(name, place):
+    """Tell whether dotted ``name`` is ``place`` or lies in it."""
+    return name == place or name.startswith(place + '.')
+
+
+FILES = sorted(path for path in SOURCE.rglob('*.py') if path.parent != SOURCE
+               or path.stem != '__init__')
+
+
+def wrong_rooms(room, names):
+    """List the package's own names that ``room`` must not import."""
+    own = [name.removeprefix(PACKAGE + '.') for name in names if name.startswith(PACKAGE + '.')]
+    legal = (room, *ALLOWED[room])
+    return [name for name in own if name != '__version__'
+            and not any(is_below(name, place) for place in legal)]
+
+
+@pytest.mark.parametrize('path', FILES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_a_room_imports_only_rooms_below_it(path):
+    room = room_of(path)
+    assert room in ALLOWED, f'{path}: room {room} has no line in ALLOWED'
+    wrong = wrong_rooms(room, [name for name, _ in imports(path)])
+    assert not wrong, f'{path}: {room} must not import {wrong}'
+
+
+@pytest.mark.parametrize('path', FILES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_special_libraries_stay_in_their_room(path):
+    room = room_of(path)
+    for name, line in imports(path):
+        top = name.split('.')[0]
+        home = 'nodes' if top.endswith(('_msgs', '_srvs')) else KEPT_IN.get(top, room)
+        assert room == home, f'{path}:{line}: {top} is imported only in {home}/'
+
+
+def test_the_rule_catches_what_it_forbids():
+    assert wrong_rooms('control', [f'{PACKAGE}.sim.plant.Plant']) == ['sim.plant.Plant']
+    assert wrong_rooms('safety', [f'{PACKAGE}.control.nmpc.NmpcController'])
+    assert wrong_rooms('runs', [f'{PACKAGE}.estimation'])
+    assert not wrong_rooms('safety', [f'{PACKAGE}.control.base.Command', 'numpy'])
+    assert not wrong_rooms('nodes', [f'{PACKAGE}.sim.simulator.Simulator'])

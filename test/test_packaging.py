@@ -1,0 +1,172 @@
+"""What colcon, pip, ros2 and rosdep read about the package is complete and agrees."""
+
+import ast
+from importlib import import_module
+import importlib.util
+from pathlib import Path
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+import beetle_omni_ros
+from beetle_omni_ros.control.hover import HoverParameters
+from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import PACKAGE, share_path
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+
+ROOT = Path(__file__).resolve().parents[1]
+MANIFEST = ElementTree.parse(ROOT / 'package.xml').getroot()
+HAS_ROS = importlib.util.find_spec('rclpy') is not None
+
+# Import name -> distribution on PyPI, where they differ; import name -> rosdep key.
+DISTRIBUTION = {'yaml': 'pyyaml', 'mcap_ros2': 'mcap-ros2-support', 'serial': 'pyserial',
+                'dynamixel_sdk': 'dynamixel-sdk'}
+KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-ros2-support',
+       'casadi': 'casadi-pip', 'serial': 'python3-serial'}
+PARAMETER_CLASSES = {
+    'ekf.yaml': EkfParameters, 'hover.yaml': HoverParameters, 'nmpc.yaml': NmpcParameters,
+    'nmpc_published.yaml': NmpcParameters, 'robot.yaml': RobotParameters,
+    'simulator.yaml': SimulatorParameters, 'supervisor.yaml': SupervisorParameters}
+
+
+@pytest.fixture(scope='module')
+def setup_arguments():
+    """Keyword arguments that setup.py gives to setuptools."""
+    code = ('import json, runpy, setuptools; setuptools.setup = '
+            'lambda **given: print(json.dumps(given)); runpy.run_path("setup.py")')
+    pytest.importorskip('setuptools')
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=True, timeout=60,
+                          capture_output=True, text=True)
+    import json
+    return json.loads(done.stdout)
+
+
+def third_party_imports():
+    """Top-level modules that the package imports, without its own and Python's."""
+    found = set()
+    for path in (ROOT / PACKAGE).rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.split('.')[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                found.add(node.module.split('.')[0])
+    return sorted(found - set(sys.stdlib_module_names) - {PACKAGE})
+
+
+def is_ros(module):
+    """Tell whether a module comes with ROS."""
+    return module in ('rclpy', 'launch', 'launch_ros', 'ament_index_python',
+                      'builtin_interfaces') or module.endswith(('_msgs', '_srvs', '_interfaces'))
+
+
+def dependencies(*tags):
+    """Names under ``tags`` in package.xml."""
+    return {entry.text for tag in tags for entry in MANIFEST.findall(tag)}
+
+
+def test_manifest_is_format_3_for_ament_python():
+    assert MANIFEST.get('format') == '3'
+    assert MANIFEST.find('export/build_type').text == 'ament_python'
+
+
+def test_maintainer_has_an_address_that_colcon_accepts(setup_arguments):
+    # With one that it refuses, colcon silently builds a plain Python package.
+    address = MANIFEST.find('maintainer').get('email')
+    assert re.fullmatch(r'[-\w.+]+@[-\w]+(\.[-\w]+)*\.[a-zA-Z]{2,}', address)
+    assert setup_arguments['maintainer_email'] == address
+
+
+def test_name_version_and_licence_agree_everywhere(setup_arguments):
+    assert MANIFEST.find('name').text == setup_arguments['name'] == PACKAGE
+    assert MANIFEST.find('version').text == beetle_omni_ros.__version__
+    assert setup_arguments['version'] == beetle_omni_ros.__version__
+    assert MANIFEST.find('license').text == setup_arguments['license'] == 'BSD-3-Clause'
+    assert (ROOT / MANIFEST.find('license').get('file')).is_file()
+
+
+def test_every_executable_has_its_function(setup_arguments):
+    scripts = setup_arguments['entry_points']['console_scripts']
+    assert scripts
+    for script in scripts:
+        _, target = (part.strip() for part in script.split('='))
+        module, function = target.split(':')
+        if module.startswith(f'{PACKAGE}.nodes') and not HAS_ROS:
+            assert importlib.util.find_spec(module), f'{script}: no such module'
+            continue
+        assert callable(getattr(import_module(module), function)), script
+
+
+def test_every_node_file_is_an_executable(setup_arguments):
+    scripts = [script.split(' ')[0] for script in setup_arguments['entry_points'][
+        'console_scripts']]
+    for path in (ROOT / PACKAGE / 'nodes').glob('*_node.py'):
+        if re.search(r'^def main\(', path.read_text(encoding='utf-8'), re.MULTILINE):
+            assert path.stem in scripts, f'{path.name}: not in setup.py'
+
+
+def test_every_folder_of_code_is_installed(setup_arguments):
+    folders = {path.parent.relative_to(ROOT).as_posix().replace('/', '.')
+               for path in (ROOT / PACKAGE).rglob('*.py')}
+    assert folders == set(setup_arguments['packages'])
+
+
+def test_every_file_beside_the_code_is_installed(setup_arguments):
+    patterns = setup_arguments['package_data']['']
+    for path in (ROOT / PACKAGE).rglob('*'):
+        if path.is_file() and path.suffix not in ('.py', '.pyc'):
+            assert any(path.match(pattern) for pattern in patterns), f'{path}: add to setup.py'
+
+
+def test_data_files_are_where_ros_looks(setup_arguments):
+    installed = {f'{folder}/{Path(file).name}': ROOT / file
+                 for folder, files in setup_arguments['data_files'] for file in files}
+    assert all(path.is_file() for path in installed.values())
+    assert f'share/ament_index/resource_index/packages/{PACKAGE}' in installed
+    expected = [ROOT / 'package.xml', *(ROOT / 'params').glob('*.yaml'),
+                *(ROOT / 'launch').glob('*.launch.py'), *(ROOT / 'description').glob('*.urdf')]
+    assert len(expected) > 3
+    for path in expected:
+        target = f'share/{PACKAGE}/{path.relative_to(ROOT).as_posix()}'
+        assert installed.get(target) == path, f'{target}: not installed'
+
+
+def test_every_import_is_a_declared_requirement(setup_arguments):
+    extras = setup_arguments['extras_require']
+    lines = setup_arguments['install_requires'] + extras['hardware'] + extras['train']
+    declared = {re.split(r'[\[<>=~;! ]', line)[0] for line in lines}
+    keys = dependencies('exec_depend', 'depend')
+    for module in third_party_imports():
+        if is_ros(module):
+            assert module in keys, f'{module}: not in package.xml'
+            continue
+        assert DISTRIBUTION.get(module, module) in declared, f'{module}: not in setup.py'
+        if module not in ('torch', 'onnx', 'onnxscript', 'rsl_rl', 'tensorboard'):
+            candidates = {KEY.get(module), f'python3-{module}', f'python3-{module}-pip', module}
+            assert keys & candidates, f'{module}: no rosdep key in package.xml'
+
+
+def test_each_parameter_file_is_read_by_its_class():
+    shipped = sorted(path.name for path in (ROOT / 'params').glob('*.yaml'))
+    assert shipped == sorted(PARAMETER_CLASSES)
+    for name, kind in PARAMETER_CLASSES.items():
+        assert isinstance(schema.load(kind, share_path(f'params/{name}')), kind)
+
+
+def test_checkout_wins_over_an_installation(tmp_path, monkeypatch):
+    other = tmp_path / 'share' / PACKAGE
+    (other / 'params').mkdir(parents=True)
+    (other / 'package.xml').touch()
+    (other / 'params' / 'robot.yaml').touch()
+    (other / 'params' / 'elsewhere.yaml').touch()
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    assert share_path('params/robot.yaml') == ROOT / 'params' / 'robot.yaml'
+    assert share_path('params/elsewhere.yaml') == other / 'params' / 'elsewhere.yaml'
+    with pytest.raises(FileNotFoundError, match='nowhere.yaml'):
+        share_path('params/nowhere.yaml')

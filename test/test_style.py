@@ -1,0 +1,25 @@
+"""Every Python file keeps the style of pyproject.toml."""
+
+import importlib.util
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_ruff_has_nothing_to_say():
+    if importlib.util.find_spec('ruff'):
+        ruff = [sys.executable, '-m', 'ruff']
+    elif shutil.which('ruff'):
+        ruff = ['ruff']
+    else:
+        pytest.skip('ruff is not installed')
+    done = subprocess.run([*ruff, 'check', '--no-cache', '--output-format', 'concise', str(ROOT)],
+                          cwd=ROOT, capture_output=True, text=True, check=False, timeout=60,
+                          env={**os.environ, 'NO_COLOR': '1'})
+    assert done.returncode == 0, f'{done.stdout}\n{done.stderr}'
