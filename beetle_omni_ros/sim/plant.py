@@ -193,7 +193,8 @@ class Plant:
 
     def _update(self):
         """Accelerations and contacts of the state just reached."""
-        self._apply_forces()
+        if self._forces.depends_on_motion:
+            self._apply_forces()
         mujoco.mj_forward(self.model, self.data)
 
     @property
@@ -250,6 +251,7 @@ class Plant:
         data.act[:] = thrust
         self.set_targets(tilt if tilt_target is None else tilt_target, thrust)
         self.model.opt.disableflags = self._flags | NO_CONSTRAINT
+        self._apply_forces()
         self._update()
         return data.qacc.copy()
 
