@@ -22,6 +22,7 @@ from beetle_omni_ros.safety.parameters import BackupParameters
 KEPT_SAMPLES = 100     # IMU samples before the failure: 0.5 s at 200 Hz
 KEPT_POSES = 24        # own past for late MoCap frames: 0.12 s at 200 Hz
 LONGEST_STEP = 0.1     # [s] a gap in the samples is not integrated beyond this
+ABSURD = 1e4           # [m, m/s^2, rad/s] no sensor of this robot says that
 LARGEST_BIASES = (1.0, 0.2)   # [m/s^2], [rad/s] what learning may believe of an IMU
 
 
@@ -198,12 +199,12 @@ class BackupEstimator:
 
 
 def _vector(value, size):
-    """``value`` as finite floats (size,), or None."""
+    """``value`` as finite, not absurd floats (size,), or None."""
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):
         return None
-    return array if array.shape == (size,) and np.isfinite(array).all() else None
+    return array if array.shape == (size,) and np.all(np.abs(array) < ABSURD) else None
 
 
 def _shortened(vector, limit):

@@ -70,14 +70,18 @@ class Silence:
         """``limit``: longer silence is a fault [s]."""
         self.limit = limit
         self.elapsed = float('inf')   # nothing heard yet
+        self._just_heard = False
 
     def heard(self) -> None:
-        """The source spoke."""
+        """The source spoke, some time within the present tick."""
         self.elapsed = 0.0
+        self._just_heard = True
 
     def tick(self, dt: float) -> None:
-        """``dt`` seconds passed."""
-        self.elapsed += dt
+        """``dt`` seconds passed; those of the tick in which it spoke do not count."""
+        if not self._just_heard:
+            self.elapsed += dt
+        self._just_heard = False
 
     @property
     def silent(self) -> bool:

@@ -17,6 +17,7 @@ from beetle_omni_ros.safety.ramp import inclination
 
 TRACKING = ('tracking', 'dead_reckoning')   # statuses whose estimate may be flown on
 UNIT_TOLERANCE = 0.02                       # of a quaternion's squared length
+ABSURD = 1e4                                # [m, m/s, rad/s] no robot is there, no sum overflows
 
 
 class Vehicle:
@@ -80,7 +81,8 @@ class Vehicle:
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
         """Take joint feedback when it is newer and finite."""
-        if not (np.isfinite(stamp) and stamp > self.tilt_stamp and _finite(position, 4)):
+        if not (np.isfinite(stamp) and stamp > self.tilt_stamp and _finite(position, 4)
+                and np.abs(position).max() < ABSURD):
             return False
         self.tilt, self.tilt_stamp = np.array(position, dtype=float), float(stamp)
         self.tilt_velocity = np.array(velocity, dtype=float) if _finite(velocity, 4) \
@@ -170,6 +172,9 @@ class Vehicle:
                 and _finite(state.quaternion, 4) and _finite(state.angular_velocity, 3)
                 and np.isfinite(state.stamp)):
             return 'not finite'
+        if max(np.abs(v).max() for v in (state.position, state.velocity,
+                                         state.angular_velocity)) > ABSURD:
+            return 'absurdly large'
         if abs(float(np.dot(state.quaternion, state.quaternion)) - 1) > UNIT_TOLERANCE:
             return 'no unit quaternion'
         if now is not None and now - state.stamp > limits.stale_after:

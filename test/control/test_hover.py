@@ -1,8 +1,6 @@
 """The hover controller in closed loop with lagging, delayed actuators, and its properties."""
 
 from dataclasses import replace
-from pathlib import Path
-import sys
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.hover import HoverController, HoverParameters
@@ -10,10 +8,8 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 import numpy as np
+from plant import fly, Plant
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from plant import fly, Plant  # noqa: E402, I100
 
 ROBOT = RobotParameters.load()
 PARAMETERS = HoverParameters.load()

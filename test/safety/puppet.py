@@ -1,0 +1,83 @@
+"""A vehicle on strings for tests of the state machine: it goes where the test puts it."""
+
+from beetle_omni_ros.control.base import Command, State
+from beetle_omni_ros.control.hover import HoverController
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.supervisor import Supervisor
+import numpy as np
+
+ROBOT = RobotParameters.load()
+PARAMETERS = SupervisorParameters.load()
+ALLOCATOR = Allocator(ROBOT)
+TICK = 0.01
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+ALL = ('estimate', 'joints', 'imu', 'mocap', 'nmpc', 'rl')
+
+
+def hover_command(stamp, quaternion=LEVEL):
+    """A command that any controller might give."""
+    hover = ALLOCATOR.hover(quaternion, np.zeros(4))
+    return Command(stamp, hover.tilt, hover.thrust)
+
+
+class Puppet:
+    """Supervisor plus everything that talks to it; ``alive`` holds the sources that do."""
+
+    def __init__(self, parameters=PARAMETERS, start=100.0):
+        self.supervisor = Supervisor(parameters, ROBOT, HoverController(ROBOT))
+        self.now = start
+        self.alive = set(ALL)
+        self.position, self.velocity = np.array([0.3, -0.2, 0.16]), np.zeros(3)
+        self.quaternion, self.rate = LEVEL, np.zeros(3)
+        self.status, self.voltage = 'tracking', 24.0
+        self.lifts = True           # whether takeoff moves it
+        self.command = None
+        self.sent = []
+
+    def run(self, duration):
+        """Let time pass; returns the commands that were sent meanwhile."""
+        sent = []
+        for _ in range(round(duration / TICK)):
+            self.now += TICK
+            self._talk()
+            self.command = self.supervisor.update(self.now)
+            sent.append(self.command)
+            if self.supervisor.state == 'takeoff' and self.lifts \
+                    and self.command is not None and self.command.thrust.sum() > 10:
+                self.position = np.array([0.3, -0.2, min(1.0, self.position[2] + 0.01)])
+        return sent
+
+    def fly(self):
+        """Arm and get to 'flying'."""
+        self.run(0.6)
+        answer = self.supervisor.arm(self.now)
+        assert answer, answer.text
+        for _ in range(100):
+            self.run(0.1)
+            if self.supervisor.state == 'flying':
+                return self
+        raise AssertionError(f'never flew: {self.supervisor.events}')
+
+    def texts(self, severity=None):
+        """All event texts, of one severity."""
+        return [e.text for e in self.supervisor.events if severity in (None, e.severity)]
+
+    def _talk(self):
+        supervisor, alive = self.supervisor, self.alive
+        tilt = self.command.tilt if self.command is not None else np.zeros(4)
+        if 'imu' in alive:
+            supervisor.on_imu(self.now, np.array([0, 0, ROBOT.gravity]), self.rate)
+        if 'mocap' in alive:
+            supervisor.on_mocap(self.now - 0.01, self.position, self.quaternion)
+        joints = (self.now - 0.01, tilt) if 'joints' in alive else (np.nan, np.full(4, np.nan))
+        if 'joints' in alive:
+            supervisor.on_joints(joints[0], tilt, np.zeros(4))
+        if 'estimate' in alive:
+            supervisor.on_state(State(self.now, self.position, self.velocity, self.quaternion,
+                                      self.rate, joints[1], np.zeros(4), joints[0]), self.status)
+        supervisor.on_battery(self.voltage)
+        for name in ('nmpc', 'rl'):
+            if name in alive:
+                supervisor.on_command(name, hover_command(self.now, self.quaternion), self.now)

@@ -1,0 +1,95 @@
+"""Whatever comes in, in whatever order: nothing unsafe goes out."""
+
+from beetle_omni_ros.control.base import Command, State
+from hypothesis import given, settings, strategies as st
+import numpy as np
+from puppet import LEVEL, PARAMETERS, Puppet, ROBOT
+
+RUBBISH = [np.nan, np.inf, -np.inf, 1e300, -1e9, 0.0, 1.0, 3.9, -4.1, 25.0, -0.5]
+numbers = st.one_of(st.sampled_from(RUBBISH), st.floats(-30, 30))
+vectors = st.one_of(st.lists(numbers, min_size=4, max_size=4), st.lists(numbers, max_size=5))
+offsets = st.one_of(st.sampled_from([0.0, -0.02, -0.06, -5.0, 0.01, 0.5, np.nan, np.inf]),
+                    st.floats(-0.2, 0.1))
+actions = st.lists(st.one_of(
+    st.tuples(st.just('wait'), st.sampled_from([0.01, 0.03, 0.2, 0.7, 3.0])),
+    st.tuples(st.just('jump'), st.sampled_from([0.04, 1.0, -2.0, np.nan])),
+    st.tuples(st.just('command'), st.sampled_from(['nmpc', 'rl', 'x']), offsets, vectors, vectors),
+    st.tuples(st.just('spoil'), st.sampled_from(RUBBISH), st.integers(0, 7)),
+    st.tuples(st.just('state'), offsets, vectors, vectors, vectors),
+    st.tuples(st.just('raw'), offsets, vectors, vectors),
+    st.tuples(st.just('battery'), numbers),
+    st.tuples(st.just('toggle'), st.sampled_from(
+        ['estimate', 'joints', 'imu', 'mocap', 'nmpc', 'rl'])),
+    st.tuples(st.just('ask'), st.sampled_from(
+        ['arm', 'disarm', 'land', 'emergency_stop', 'nmpc', 'rl', 'x']))), max_size=12)
+
+
+def perform(puppet, action):
+    """Do one thing to the supervisor."""
+    supervisor, (kind, *rest) = puppet.supervisor, action
+    if kind == 'jump':
+        # Held up: the clock runs on before the messages that wait are read.
+        puppet.now += rest[0] if np.isfinite(rest[0]) else 0.0
+        supervisor.update(puppet.now if np.isfinite(rest[0]) else rest[0])
+    elif kind == 'command':
+        supervisor.on_command(rest[0], Command(puppet.now + rest[1], np.array(rest[2]),
+                                               np.array(rest[3])), puppet.now)
+    elif kind == 'spoil':
+        # One wrong number in a command that is otherwise good, and newer than any other.
+        values = np.concatenate([np.zeros(4), np.full(4, ROBOT.hover_thrust)])
+        values[rest[1]] = rest[0]
+        supervisor.on_command(supervisor.active, Command(puppet.now + 0.01, values[:4],
+                                                         values[4:]), puppet.now)
+    elif kind == 'state':
+        supervisor.on_state(State(puppet.now + rest[0], np.array(rest[1][:3]),
+                                  np.array(rest[2][:3]), LEVEL, np.array(rest[3][:3]),
+                                  np.array(rest[3]), np.array(rest[2]), puppet.now + rest[0]))
+    elif kind == 'raw':
+        supervisor.on_imu(puppet.now + rest[0], rest[1][:3], rest[2][:3])
+        supervisor.on_mocap(puppet.now + rest[0], rest[1][:3], rest[2])
+        supervisor.on_joints(puppet.now + rest[0], rest[1], rest[2])
+    elif kind == 'battery':
+        supervisor.on_battery(rest[0])
+    elif kind == 'toggle':
+        puppet.alive ^= {rest[0]}
+    elif rest[0] in ('nmpc', 'rl', 'x'):
+        supervisor.select(rest[0])
+    else:
+        getattr(supervisor, rest[0])(puppet.now)
+
+
+def watch(puppet, command):
+    """What must hold of everything that goes out."""
+    supervisor = puppet.supervisor
+    if command is None:
+        return
+    assert np.isfinite(command.tilt).all() and np.isfinite(command.thrust).all()
+    assert command.tilt.shape == command.thrust.shape == (4,)
+    assert np.abs(command.tilt).max() <= ROBOT.joints.position_limit
+    assert command.thrust.min() >= 0 and command.thrust.max() <= ROBOT.rotors.thrust_max
+    assert supervisor._now - command.stamp <= PARAMETERS.commands.age_limit + 1e-9
+    if supervisor.state in ('disarmed', 'emergency_stop'):
+        assert not command.thrust.any()
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(airborne=st.booleans(), sequence=actions)
+def test_nothing_unsafe_ever_goes_out(airborne, sequence):
+    puppet = Puppet()
+    if airborne:
+        puppet.fly()
+    inner = puppet.supervisor.update
+
+    def watched(now):
+        command = inner(now)
+        watch(puppet, command)
+        return command
+
+    puppet.supervisor.update = watched
+    for action in sequence:
+        if action[0] == 'wait':
+            puppet.run(action[1])
+        else:
+            perform(puppet, action)
+            puppet.run(0.02)
+    assert puppet.supervisor.diagnostics()['state'] == puppet.supervisor.state

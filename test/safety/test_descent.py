@@ -1,0 +1,142 @@
+"""The estimator of last resort against motions that are known in closed form."""
+
+from beetle_omni_ros.control.base import State
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.safety.descent import BackupEstimator
+from beetle_omni_ros.safety.parameters import BackupParameters
+import numpy as np
+import pytest
+
+GRAVITY = 9.80665
+RATE = np.array([0.3, -0.2, 0.5])
+
+
+def truth(t):
+    """A swinging, turning body: position, velocity, acceleration, attitude."""
+    phase = np.array([0.9, 1.1, 0.7]) * t
+    amplitude = np.array([0.5, -0.4, 0.3])
+    w = np.array([0.9, 1.1, 0.7])
+    return (amplitude * np.sin(phase), amplitude * w * np.cos(phase),
+            -amplitude * w ** 2 * np.sin(phase), rotations.exp(RATE * t))
+
+
+def state(t):
+    position, velocity, _, attitude = truth(t)
+    return State(t, position, velocity, attitude, RATE, np.zeros(4), np.zeros(4), t)
+
+
+def sample(t, force_bias=0.0, rate_bias=0.0):
+    _, _, acceleration, attitude = truth(t)
+    force = (acceleration + [0, 0, GRAVITY]) @ rotations.matrix(attitude)
+    return t, force + force_bias, RATE + rate_bias
+
+
+def follow(estimator, begin, end, imu=True, mocap=True, force_bias=0.0, rate_bias=0.0, learn=False,
+           noise=None):
+    """Feed 200 Hz of IMU and 100 Hz of MoCap, 10 ms late."""
+    for k in range(round(begin * 200) + 1, round(end * 200) + 1):
+        t = k / 200
+        if imu:
+            estimator.on_imu(*sample(t, force_bias, rate_bias))
+        if mocap and k % 2 == 0:
+            position, _, _, attitude = truth(t - 0.01)
+            if noise is not None:
+                position = position + 0.001 * noise.normal(size=3)
+                attitude = rotations.multiply(attitude, rotations.exp(
+                    0.002 * noise.normal(size=3)))
+            estimator.on_mocap(t - 0.01, position, attitude)
+        if learn:
+            estimator.learn(state(t))
+        elif not imu:
+            estimator.predict(t)
+
+
+def errors(estimator, t):
+    got = estimator.state(np.zeros(4), np.zeros(4), t, t)
+    position, velocity, _, attitude = truth(t)
+    return (np.linalg.norm(got.position - position), np.linalg.norm(got.velocity - velocity),
+            rotations.geodesic_angle(got.quaternion, attitude))
+
+
+def test_follows_a_motion_with_late_noisy_mocap_and_a_biased_imu():
+    estimator = BackupEstimator(BackupParameters(), GRAVITY)
+    estimator.start(state(0.0))
+    follow(estimator, 0.0, 6.0, force_bias=0.1, rate_bias=0.01, noise=np.random.default_rng(0))
+    position, velocity, attitude = errors(estimator, 6.0)
+    assert position < 0.01 and velocity < 0.06 and attitude < 0.01
+
+
+def test_catches_up_the_samples_between_the_last_estimate_and_the_failure():
+    estimator = BackupEstimator(BackupParameters(), GRAVITY)
+    follow(estimator, 0.0, 2.0, mocap=False)
+    estimator.start(state(1.7))
+    position, velocity, attitude = errors(estimator, 2.0)
+    assert position < 0.01 and velocity < 0.02 and attitude < 0.01
+
+
+def test_learnt_biases_carry_dead_reckoning():
+    results = []
+    for learn in (True, False):
+        estimator = BackupEstimator(BackupParameters(), GRAVITY)
+        follow(estimator, 0.0, 8.0, force_bias=0.2, rate_bias=0.03, learn=learn)
+        estimator.start(state(8.0))
+        follow(estimator, 8.0, 10.0, mocap=False, force_bias=0.2, rate_bias=0.03)
+        results.append(errors(estimator, 10.0))
+    learnt, ignorant = results
+    assert learnt[0] < 0.1 and learnt[2] < 0.02
+    assert ignorant[0] > 3 * learnt[0] and ignorant[2] > 3 * learnt[2]
+
+
+def test_follows_mocap_alone_when_the_imu_is_gone():
+    estimator = BackupEstimator(BackupParameters(), GRAVITY)
+    estimator.start(state(0.0))
+    estimator.imu_alive = False
+    follow(estimator, 0.0, 5.0, imu=False)
+    position, velocity, attitude = errors(estimator, 5.0)
+    assert position < 0.03 and velocity < 0.15 and attitude < 0.02
+
+
+def test_one_wild_mocap_frame_moves_it_little():
+    estimator = BackupEstimator(BackupParameters(), GRAVITY)
+    estimator.start(state(0.0))
+    follow(estimator, 0.0, 1.0)
+    estimator.on_mocap(1.0, np.array([90.0, 0, 0]), rotations.from_rpy(3, 0, 0))
+    assert errors(estimator, 1.0)[0] < 0.05
+
+
+@pytest.mark.parametrize('bad', [np.full(3, np.nan), np.zeros(2), None, [1, 2, 'x']])
+def test_unusable_readings_are_refused_and_change_nothing(bad):
+    estimator = BackupEstimator(BackupParameters(), GRAVITY)
+    estimator.start(state(0.0))
+    follow(estimator, 0.0, 1.0)
+    before = errors(estimator, 1.0)
+    assert not estimator.on_imu(1.005, bad, RATE)
+    assert not estimator.on_imu(1.005, np.zeros(3), bad)
+    assert not estimator.on_imu(1.0, *sample(1.0)[1:])            # not newer
+    assert not estimator.on_mocap(1.005, bad, np.array([0, 0, 0, 1.0]))
+    assert not estimator.on_mocap(1.005, np.zeros(3), np.array([0, 0, 0, 1.5]))
+    assert not estimator.on_mocap(np.nan, np.zeros(3), np.array([0, 0, 0, 1.0]))
+    assert errors(estimator, 1.0) == before
+
+
+def test_without_mocap_the_velocity_forgets_towards_the_wished_one():
+    estimator = BackupEstimator(BackupParameters(), GRAVITY)
+    still = State(0.0, np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 0, 0, 1.0]), np.zeros(3),
+                  np.zeros(4), np.zeros(4), 0.0)
+    estimator.start(still)
+    wished = np.array([0.0, 0, -0.3])
+    for k in range(1, 2001):
+        estimator.predict(k / 200, wished)
+        estimator.on_imu(k / 200, np.array([0, 0, GRAVITY]), np.zeros(3))
+    velocity = estimator.state(np.zeros(4), np.zeros(4), 10.0, 10.0).velocity
+    np.testing.assert_allclose(velocity, wished, atol=0.05)
+
+
+def test_clock_set_back_is_followed():
+    estimator = BackupEstimator(BackupParameters(), GRAVITY)
+    estimator.start(state(5.0))
+    follow(estimator, 5.0, 6.0)
+    estimator.clock_went_back(5.0)
+    assert estimator.on_imu(1.005, *sample(6.005)[1:])
+    got = estimator.state(np.zeros(4), np.zeros(4), 1.005, 1.005)
+    assert np.linalg.norm(got.position - truth(6.005)[0]) < 0.01

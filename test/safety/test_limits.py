@@ -1,0 +1,131 @@
+"""Every reason for which a command is refused, and what is not refused."""
+
+from types import SimpleNamespace
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety import limits
+from beetle_omni_ros.safety.limits import CommandStream, within_limits
+from beetle_omni_ros.safety.parameters import CommandLimits, SupervisorParameters
+import numpy as np
+import pytest
+
+ROBOT = RobotParameters.load()
+LIMITS = CommandLimits()
+NOW = 50.0
+
+
+def command(stamp=NOW, tilt=(0.1, 0.2, 0.3, 0.4), thrust=(7.0, 7.5, 8.0, 8.5)):
+    return Command(stamp, np.array(tilt), np.array(thrust))
+
+
+def stream():
+    return CommandStream(LIMITS, ROBOT)
+
+
+@pytest.mark.parametrize('bad, reason', [
+    (None, limits.NOT_A_COMMAND),
+    (SimpleNamespace(stamp='x', tilt=np.zeros(4), thrust=np.zeros(4)), limits.NOT_A_COMMAND),
+    (command(tilt=['a', 'b', 'c', 'd']), limits.NOT_A_COMMAND),
+    (command(tilt=[0, 0, 0]), limits.SHAPE),
+    (command(thrust=[[7, 7, 7, 7]]), limits.SHAPE),
+    (command(tilt=[0, np.nan, 0, 0]), limits.NOT_FINITE),
+    (command(thrust=[7, 7, np.inf, 7]), limits.NOT_FINITE),
+    (command(stamp=np.nan), limits.NOT_FINITE),
+    (command(stamp=NOW - LIMITS.stale_after - 0.001), limits.STALE),
+    (command(stamp=NOW + LIMITS.clock_tolerance + 0.001), limits.FUTURE),
+    (command(thrust=[7, 7, 7, ROBOT.rotors.thrust_max + 0.1]), limits.THRUST),
+    (command(thrust=[7, -0.1, 7, 7]), limits.THRUST),
+    (command(tilt=[0, ROBOT.joints.position_limit + 0.01, 0, 0]), limits.TILT),
+    (command(tilt=[0, -ROBOT.joints.position_limit - 0.01, 0, 0]), limits.TILT)])
+def test_bad_command_is_refused_with_its_reason_and_counted(bad, reason):
+    checked = stream()
+    assert checked.offer(bad, NOW) == reason
+    assert checked.refused == {reason: 1}
+    assert checked.accepted is None and checked.last_refusal == reason
+
+
+def test_repeated_and_older_stamps_are_refused():
+    checked = stream()
+    assert checked.offer(command(), NOW) == ''
+    assert checked.offer(command(), NOW) == limits.REPEATED
+    assert checked.offer(command(stamp=NOW - 0.01), NOW) == limits.OLDER
+    assert checked.offer(command(stamp=NOW + 0.01), NOW + 0.01) == ''
+
+
+def test_rounding_beyond_a_limit_is_cut_off_not_refused():
+    checked, over = stream(), LIMITS.limit_tolerance / 2
+    top, travel = ROBOT.rotors.thrust_max, ROBOT.joints.position_limit
+    assert checked.offer(command(tilt=[travel + over, 0, 0, 0], thrust=[-over, 7, 7, top + over]),
+                         NOW) == ''
+    assert checked.accepted.tilt[0] == travel
+    assert checked.accepted.thrust[0] == 0.0 and checked.accepted.thrust[3] == top
+
+
+def test_lone_spike_is_refused_but_a_real_step_costs_one_command():
+    checked, far = stream(), (0.1 + LIMITS.tilt_step + 0.1, 0.2, 0.3, 0.4)
+    checked.offer(command(), NOW)
+    assert checked.offer(command(NOW + 0.01, far), NOW + 0.01) == limits.JUMP
+    assert checked.offer(command(NOW + 0.02, far), NOW + 0.02) == ''
+    assert checked.offer(command(NOW + 0.03, far, (0, 0, 0, 0)), NOW + 0.03) == ''
+    assert checked.offer(command(NOW + 0.04, far, (16, 16, 16, 16)), NOW + 0.04) == limits.JUMP
+
+
+def test_accepted_command_does_not_change_with_the_callers_arrays():
+    checked, given = stream(), command()
+    checked.offer(given, NOW)
+    given.tilt[:] = np.nan
+    assert np.isfinite(checked.accepted.tilt).all()
+
+
+def test_good_means_half_a_second_without_gap_or_refusal():
+    checked = stream()
+    assert not checked.good and 'never heard' in checked.complaint
+
+    def run(duration, spoil=False):
+        nonlocal now
+        for _ in range(round(duration / 0.01)):
+            now += 0.01
+            checked.tick(0.01)
+            checked.offer(command(now, thrust=(np.nan,) * 4) if spoil else command(now), now)
+
+    now = NOW
+    run(0.4)
+    assert not checked.good and 'good for only' in checked.complaint
+    run(0.2)
+    assert checked.good
+    run(0.01, spoil=True)
+    assert not checked.good
+    run(0.6)
+    assert checked.good
+    checked.tick(0.01)
+    checked.tick(LIMITS.timeout)
+    assert not checked.good and 'silent for' in checked.complaint
+
+
+def test_clock_set_back_does_not_block_a_stream():
+    checked = stream()
+    checked.offer(command(), NOW)
+    checked.clock_went_back(NOW - 5)
+    assert checked.offer(command(NOW - 5), NOW - 5) == ''
+
+
+def test_last_look_cuts_to_limits_and_refuses_what_is_not_finite():
+    out = within_limits(command(tilt=[9, -9, 0, 0], thrust=[-1, 99, 1, 1]), ROBOT)
+    assert np.abs(out.tilt).max() == ROBOT.joints.position_limit
+    assert out.thrust.min() == 0 and out.thrust.max() == ROBOT.rotors.thrust_max
+    assert within_limits(command(tilt=[np.nan, 0, 0, 0]), ROBOT) is None
+
+
+def test_shipped_file_holds_every_parameter_at_its_default():
+    from beetle_omni_ros.robot import schema
+    from beetle_omni_ros.robot.resources import share_path
+    leaves = {name for name, *_ in schema.flatten(SupervisorParameters())}
+
+    def names(mapping, prefix=''):
+        for key, value in mapping.items():
+            yield from names(value, f'{prefix}{key}.') if isinstance(value, dict) \
+                else (f'{prefix}{key}',)
+
+    assert set(names(schema.load_yaml(share_path('params/supervisor.yaml')))) == leaves
+    assert SupervisorParameters.load() == SupervisorParameters()

@@ -1,0 +1,332 @@
+"""Each transition of the state machine, with a vehicle on strings."""
+
+from dataclasses import replace
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+import numpy as np
+from puppet import hover_command, PARAMETERS, Puppet, ROBOT, TICK
+import pytest
+
+TIMEOUT = PARAMETERS.commands.timeout
+
+
+def test_nothing_is_sent_before_arming():
+    puppet = Puppet()
+    assert set(puppet.run(1.0)) == {None}
+    assert puppet.supervisor.state == 'disarmed' and puppet.supervisor.source == 'none'
+
+
+def test_takes_off_by_hover_and_hands_over():
+    puppet = Puppet()
+    puppet.run(0.6)
+    assert puppet.supervisor.arm(puppet.now)
+    puppet.run(0.1)
+    assert puppet.supervisor.state == 'takeoff' and puppet.supervisor.source == 'hover'
+    puppet.run(4.0)
+    assert puppet.supervisor.state == 'flying' and puppet.supervisor.source == 'nmpc'
+    np.testing.assert_allclose(puppet.command.thrust, hover_command(0.0).thrust)
+
+
+@pytest.mark.parametrize('spoil, text', [
+    (lambda p: p.alive.discard('estimate'), 'ekf_node never heard'),
+    (lambda p: setattr(p, 'status', 'dead_reckoning'), "'dead_reckoning', not 'tracking'"),
+    (lambda p: setattr(p, 'status', 'lost'), 'no fresh state estimate'),
+    (lambda p: p.alive.discard('joints'), 'joint_bridge_node never heard'),
+    (lambda p: setattr(p, 'quaternion', rotations.from_rpy(1.0, 0, 0)), 'inclined by 57 deg'),
+    (lambda p: setattr(p, 'velocity', np.array([0.5, 0, 0])), 'moving at 0.50 m/s'),
+    (lambda p: setattr(p, 'rate', np.array([0, 0, 1.0])), 'turning at 1.00 rad/s'),
+    (lambda p: setattr(p, 'position', np.array([30.0, 0, 0])), 'outside the fence'),
+    (lambda p: setattr(p, 'voltage', 20.0), 'battery at 20.0 V')])
+def test_arming_is_refused_with_the_reason(spoil, text):
+    puppet = Puppet()
+    spoil(puppet)
+    puppet.run(0.3)
+    answer = puppet.supervisor.arm(puppet.now)
+    assert not answer and text in answer.text
+    assert puppet.supervisor.state == 'disarmed' and set(puppet.run(0.1)) == {None}
+    assert any(text in said for said in puppet.texts('warning'))
+
+
+def test_silent_controller_falls_back_to_hover_without_a_jump_and_gets_control_back():
+    puppet = Puppet().fly()
+    before = puppet.command
+    puppet.alive.discard('nmpc')
+    puppet.run(TIMEOUT - TICK)
+    assert puppet.supervisor.state == 'flying'
+    puppet.run(TICK)
+    assert puppet.supervisor.state == 'fallback' and puppet.supervisor.source == 'hover'
+    assert any(text.startswith('nmpc_node silent for 50 ms') and 'fallback' in text
+               for text in puppet.texts('error'))
+    assert np.abs(puppet.command.tilt - before.tilt).max() < 0.2
+    assert np.abs(puppet.command.thrust - before.thrust).max() < 7
+    puppet.alive.add('nmpc')
+    puppet.run(PARAMETERS.commands.return_after - 2 * TICK)
+    assert puppet.supervisor.state == 'fallback'
+    puppet.run(4 * TICK)
+    assert puppet.supervisor.state == 'flying' and puppet.supervisor.source == 'nmpc'
+
+
+def test_fallback_holds_the_pose_at_which_it_began():
+    puppet = Puppet().fly()
+    puppet.quaternion = rotations.from_rpy(1.2, 0.4, -2.0)
+    puppet.run(0.2)
+    puppet.alive.discard('nmpc')
+    puppet.run(0.2)
+    goal = puppet.supervisor._target.at(puppet.now)
+    np.testing.assert_array_equal(goal.position, puppet.position)
+    np.testing.assert_array_equal(goal.quaternion, puppet.quaternion)
+
+
+def test_controller_that_sends_only_rubbish_counts_as_silent_and_the_reason_is_named():
+    puppet = Puppet().fly()
+    puppet.alive.discard('nmpc')
+    for _ in range(20):
+        puppet.supervisor.on_command('nmpc', Command(puppet.now, np.full(4, np.nan), np.ones(4)),
+                                     puppet.now)
+        puppet.run(TICK)
+    assert puppet.supervisor.state == 'fallback'
+    assert any('last refused: not finite' in text for text in puppet.texts('error'))
+    assert puppet.supervisor.diagnostics()['nmpc.refused.not finite'] == 20
+
+
+def test_controller_that_is_not_there_at_hand_over_is_waited_for_in_hover():
+    puppet = Puppet()
+    puppet.alive.discard('nmpc')
+    puppet.run(0.6)
+    puppet.supervisor.arm(puppet.now)
+    puppet.run(5.0)
+    assert puppet.supervisor.state == 'fallback'
+    puppet.alive.add('nmpc')
+    puppet.run(0.6)
+    assert puppet.supervisor.state == 'flying'
+
+
+def test_selecting_in_flight_needs_a_good_controller():
+    puppet = Puppet()
+    puppet.alive.discard('rl')
+    puppet.fly()
+    answer = puppet.supervisor.select('rl')
+    assert not answer and 'rl_node never heard; nmpc stays selected' in answer.text
+    assert puppet.supervisor.active == 'nmpc'
+    puppet.alive.add('rl')
+    puppet.run(0.2)
+    assert 'good for only' in puppet.supervisor.select('rl').text
+    puppet.run(0.4)
+    assert puppet.supervisor.select('rl')
+    puppet.run(TICK)
+    assert puppet.supervisor.source == 'rl' and puppet.supervisor.state == 'flying'
+    unknown = puppet.supervisor.select('pid')
+    assert not unknown and "unknown controller 'pid'" in unknown.text
+
+
+def test_selecting_on_the_ground_is_free():
+    puppet = Puppet()
+    puppet.alive -= {'rl', 'nmpc'}
+    puppet.run(0.1)
+    assert puppet.supervisor.select('rl') and puppet.supervisor.active == 'rl'
+
+
+def test_emergency_stop_is_latched_until_disarmed():
+    puppet = Puppet().fly()
+    assert puppet.supervisor.emergency_stop(puppet.now)
+    sent = puppet.run(1.0)
+    stop_ticks = round(PARAMETERS.stop_time / TICK)
+    assert all(not command.thrust.any() for command in sent[:stop_ticks])
+    assert set(sent[stop_ticks + 1:]) == {None}
+    assert not puppet.supervisor.arm(puppet.now) and not puppet.supervisor.land(puppet.now)
+    assert puppet.supervisor.state == 'emergency_stop'
+    assert puppet.supervisor.disarm(puppet.now) and puppet.supervisor.state == 'disarmed'
+    puppet.position = np.array([0, 0, 0.16])
+    assert puppet.supervisor.arm(puppet.now)
+
+
+def test_disarming_is_refused_in_the_air_and_granted_on_the_ground():
+    puppet = Puppet()
+    puppet.lifts = False
+    puppet.run(0.6)
+    puppet.supervisor.arm(puppet.now)
+    puppet.run(0.2)
+    assert puppet.supervisor.disarm(puppet.now)
+    flying = Puppet().fly()
+    answer = flying.supervisor.disarm(flying.now)
+    assert not answer and 'land or emergency_stop' in answer.text
+    assert flying.supervisor.state == 'flying'
+
+
+def test_takeoff_that_never_leaves_the_ground_is_given_up():
+    puppet = Puppet()
+    puppet.lifts = False
+    puppet.run(0.6)
+    puppet.supervisor.arm(puppet.now)
+    puppet.run(10.0)
+    assert puppet.supervisor.state == 'disarmed'
+    assert any('still on the ground' in text for text in puppet.texts('error'))
+
+
+def test_joint_that_does_not_follow_stops_the_takeoff_before_the_rotors_start():
+    puppet = Puppet()
+    stuck = np.array([0.0, 0.0, 1.5, 0.0])
+    talk = puppet._talk
+
+    def with_stuck_joint():
+        talk()
+        puppet.supervisor.vehicle.tilt = stuck
+
+    puppet._talk = with_stuck_joint
+    puppet.run(0.6)
+    assert puppet.supervisor.arm(puppet.now)
+    sent = puppet.run(5.0)
+    assert all(command is None or not command.thrust.any() for command in sent)
+    assert any('gimbal3 is 1.50 rad from its place' in text for text in puppet.texts('error'))
+
+
+@pytest.mark.parametrize('source, name, delay', [
+    ('estimate', 'ekf_node', PARAMETERS.state.timeout),
+    ('joints', 'joint_bridge_node', PARAMETERS.state.joint_timeout)])
+def test_silent_estimator_or_joints_lead_to_a_landing_that_names_the_node(source, name, delay):
+    puppet = Puppet().fly()
+    puppet.alive.discard(source)
+    puppet.run(delay + 2 * TICK)
+    assert puppet.supervisor.state == 'landing' and puppet.supervisor.source == 'hover'
+    assert any(text.startswith(f'{name} silent for') for text in puppet.texts('error'))
+    assert puppet.supervisor.vehicle.backup.running == (source == 'estimate')
+
+
+def test_estimator_that_reports_lost_counts_as_silent():
+    puppet = Puppet().fly()
+    puppet.status = 'dead_reckoning'
+    puppet.run(0.5)
+    assert puppet.supervisor.state == 'flying'
+    puppet.status = 'lost'
+    puppet.run(0.1)
+    assert puppet.supervisor.state == 'landing'
+    assert any("last refused: status 'lost'" in text for text in puppet.texts('error'))
+
+
+def test_nothing_left_to_measure_with_stops_the_motors():
+    puppet = Puppet().fly()
+    puppet.alive -= {'estimate', 'imu', 'mocap'}
+    puppet.run(1.0)
+    assert puppet.supervisor.state == 'emergency_stop'
+    assert any('no estimator, no MoCap, no IMU' in text for text in puppet.texts('error'))
+
+
+def test_fault_before_lift_off_just_stops_the_motors():
+    puppet = Puppet()
+    puppet.lifts = False
+    puppet.run(0.6)
+    puppet.supervisor.arm(puppet.now)
+    puppet.run(0.1)
+    puppet.alive.discard('estimate')
+    puppet.run(0.1)
+    assert puppet.supervisor.state == 'disarmed'
+    assert any('still on the ground: motors off' in text for text in puppet.texts('error'))
+
+
+def test_low_battery_warns_then_lands():
+    puppet = Puppet().fly()
+    puppet.voltage = (PARAMETERS.battery.warn - 0.05) * ROBOT.battery.cells
+    puppet.run(3.0)
+    assert puppet.supervisor.state == 'flying' and any('battery low' in t for t in puppet.texts())
+    puppet.voltage = (PARAMETERS.battery.land - 0.05) * ROBOT.battery.cells
+    puppet.run(PARAMETERS.battery.time - 0.1)
+    assert puppet.supervisor.state == 'flying'
+    puppet.run(0.2)
+    assert puppet.supervisor.state == 'landing'
+
+
+@pytest.mark.parametrize('reaction, state', [
+    ('none', 'flying'), ('landing', 'landing'), ('emergency_stop', 'emergency_stop')])
+def test_fence_reaction_is_a_parameter(reaction, state):
+    puppet = Puppet(replace(PARAMETERS, envelope=replace(PARAMETERS.envelope,
+                                                         fence_reaction=reaction))).fly()
+    puppet.position = np.array([0.0, 25.0, 1.0])
+    puppet.run(0.1)
+    assert puppet.supervisor.state == state
+
+
+@pytest.mark.parametrize('reaction, state', [
+    ('none', 'flying'), ('fallback', 'fallback'), ('landing', 'landing'),
+    ('emergency_stop', 'emergency_stop')])
+@pytest.mark.parametrize('motion', ['tumbling', 'falling'])
+def test_lost_control_reaction_is_a_parameter(motion, reaction, state):
+    puppet = Puppet(replace(PARAMETERS, envelope=replace(PARAMETERS.envelope,
+                                                         lost_reaction=reaction))).fly()
+    if motion == 'tumbling':
+        puppet.rate = np.array([20.0, 0, 0])
+    else:
+        puppet.velocity = np.array([0, 0, -8.0])
+    puppet.run(PARAMETERS.envelope.lost_time - 0.02)
+    assert puppet.supervisor.state == 'flying'
+    puppet.run(0.6)
+    assert puppet.supervisor.state == state
+
+
+def test_any_attitude_is_legal():
+    puppet = Puppet().fly()
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        puppet.quaternion = rotations.normalized(rng.normal(size=4))
+        puppet.run(0.05)
+    assert puppet.supervisor.state == 'flying'
+
+
+def test_supervisor_that_was_held_up_declares_nobody_dead_and_sends_nothing_old():
+    puppet = Puppet().fly()
+    puppet.now += 3.0
+    assert puppet.supervisor.update(puppet.now) is None
+    puppet.run(0.1)
+    assert puppet.supervisor.state == 'flying' and puppet.command is not None
+
+
+def test_clock_set_back_in_flight_is_survived():
+    puppet = Puppet().fly()
+    puppet.now -= 30.0
+    puppet.run(1.0)
+    assert puppet.supervisor.state == 'flying'
+    assert any('the clock went back by' in text for text in puppet.texts('warning'))
+    puppet.alive.discard('estimate')
+    puppet.run(0.2)
+    puppet.now -= 30.0
+    sent = puppet.run(0.5)
+    assert puppet.supervisor.state == 'landing'
+    assert all(command is not None for command in sent[2:])
+
+
+@pytest.mark.parametrize('change, reason', [
+    (dict(position=np.full(3, np.nan)), 'not finite'),
+    (dict(velocity=np.full(3, 1e300)), 'absurdly large'),
+    (dict(quaternion=np.array([0, 0, 0, 2.0])), 'no unit quaternion'),
+    (dict(stamp=90.0), 'stale stamp'), (dict(stamp=200.0), 'stamp in the future'),
+    (dict(stamp=0.0, _repeat=True), 'repeated or older stamp')])
+def test_bad_estimates_are_refused_and_counted(change, reason):
+    puppet = Puppet()
+    puppet.run(0.1)
+    repeat = change.pop('_repeat', False)
+    good = puppet.supervisor.vehicle.state
+    bad = good if repeat else replace(good, **{'stamp': puppet.now + TICK, **change})
+    assert not puppet.supervisor.on_state(bad)
+    assert puppet.supervisor.diagnostics()[f'refused.estimate: {reason}'] == 1
+    assert puppet.supervisor.vehicle.state is good
+
+
+def test_command_of_an_unknown_controller_is_counted_and_not_executed():
+    puppet = Puppet().fly()
+    assert not puppet.supervisor.on_command('pid', hover_command(puppet.now), puppet.now)
+    assert puppet.supervisor.diagnostics()['refused.unknown controller'] == 1
+
+
+def test_requests_out_of_place_say_why():
+    puppet = Puppet()
+    puppet.run(0.1)
+    assert 'not in flight' in puppet.supervisor.land(puppet.now).text
+    puppet.fly()
+    assert 'flying, not disarmed' in puppet.supervisor.arm(puppet.now).text
+
+
+def test_parameters_of_the_wrong_kind_are_named():
+    from beetle_omni_ros.robot import schema
+    with pytest.raises(schema.ParameterError, match='commands.timout.*timeout'):
+        schema.bind(SupervisorParameters, {'commands': {'timout': 0.1}})
