@@ -126,7 +126,8 @@ class NmpcController:
         unsolved = steps - self._statuses.get(0, 0)
         d = self._estimator.disturbance
         return {'solver': 'compiled' if self.compiled else 'interpreted', 'steps': steps,
-                'unsolved': unsolved, 'rejected_states': self._rejected, 'iterations': self._iterations,
+                'unsolved': unsolved, 'rejected_states': self._rejected,
+                'iterations': self._iterations,
                 'force_estimate_N': float(np.linalg.norm(d[model.FORCE])),
                 'torque_estimate_Nm': float(np.linalg.norm(d[model.TORQUE])),
                 'servo_offset_rad': float(np.max(np.abs(d[model.TILT_OFFSET])))}

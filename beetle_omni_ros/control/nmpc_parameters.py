@@ -27,8 +27,8 @@ class HorizonParameters:
 class ModelParameters:
     """What the prediction model holds."""
 
-    servo_lag: float = parameter(0.03, doc='time constant of the first-order servo model', unit='s',
-                                 low=0.002, high=0.5, read_only=True)
+    servo_lag: float = parameter(0.03, doc='time constant of the first-order servo model',
+                                 unit='s', low=0.002, high=0.5, read_only=True)
     rotor_lag: bool = parameter(True, doc='thrust as a state with the rotor time constant '
                                 '(21 states) instead of a direct input (17)', read_only=True)
     command_delay: float = parameter(0.01, doc='from the state stamp to the actuators; predicted '
@@ -46,8 +46,8 @@ class LimitParameters:
     tilt: float = parameter(3.96, doc='of the tilt targets', unit='rad', low=0.1, high=20)
     thrust_max: float = parameter(20.0, doc='upper bound inside the optimisation', unit='N',
                                   low=0.1, high=200)
-    soft: bool = parameter(True, doc='velocity and rate limits give way at a cost, which keeps the '
-                           'QP feasible', read_only=True)
+    soft: bool = parameter(True, doc='velocity and rate limits give way at a cost, which keeps '
+                           'the QP feasible', read_only=True)
     slack_linear: float = parameter(10.0, doc='cost of exceeding a soft limit', unit='', low=0,
                                     high=1e6, read_only=True)
     slack_quadratic: float = parameter(100.0, doc='cost of exceeding a soft limit, squared', low=0,

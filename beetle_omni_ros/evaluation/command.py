@@ -33,7 +33,8 @@ from beetle_omni_ros.sim.simulator import Simulator
 CONTROLLERS = ('nmpc', 'nmpc_published', 'hover')
 
 
-def make_controller(name: str, robot: RobotParameters, nmpc_file: Path | None = None) -> Controller:
+def make_controller(name: str, robot: RobotParameters,
+                    nmpc_file: Path | None = None) -> Controller:
     """
     Build a controller by name.
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from beetle_omni_ros.control.base import Controller, PoseTarget, State, Target
-from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
+from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import ComputeTimer
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.supervisor import Supervisor

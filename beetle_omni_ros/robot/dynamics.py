@@ -15,8 +15,8 @@ import numpy as np
 from beetle_omni_ros.robot.effects import CATALOGUE, Terms
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-# Slices of the full state (25): world position [m] and velocity [m/s], attitude (x, y, z, w) body to
-# world, body rates [rad/s], tilt angles [rad] and rates [rad/s], thrusts [N].
+# Slices of the full state (25): world position [m] and velocity [m/s], attitude (x, y, z, w) body
+# to world, body rates [rad/s], tilt angles [rad] and rates [rad/s], thrusts [N].
 POSITION, VELOCITY, QUATERNION, RATE = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
 TILT, TILT_RATE, THRUST = slice(13, 17), slice(17, 21), slice(21, 25)
 STATE_SIZE, INPUT_SIZE = 25, 8
@@ -124,7 +124,7 @@ def derivative(robot: RobotParameters, x, u, d):
 
 
 def full_model(robot: RobotParameters) -> ca.Function:
-    """f(x (25), u (8), d (10)) -> x' (25): state, input, disturbance as in this module's slices."""
+    """State derivative f(x (25), u (8), d (10)) -> (25,), in this module's slices."""
     x, u, d = ca.SX.sym('x', STATE_SIZE), ca.SX.sym('u', INPUT_SIZE), \
         ca.SX.sym('d', DISTURBANCE_SIZE)
     return ca.Function('dynamics', [x, u, d], [derivative(robot, x, u, d)],

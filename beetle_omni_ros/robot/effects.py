@@ -118,7 +118,7 @@ def _rotor_drag(terms, coefficient):
 
 CATALOGUE: dict[str, Effect] = {
     'mass': Effect('body', {'mass': EffectParameter('kg', float('nan'), 0.05, 200)}, _mass,
-                   'm v\' = F'),
+                   "m v' = F"),
     'thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0)}, _thrust_coefficient,
         'f = scale f*'),
@@ -134,7 +134,7 @@ CATALOGUE: dict[str, Effect] = {
                         _body_drag, 'F = -c |v| v'),
     'rotor_drag': Effect('body', {'coefficient': EffectParameter('N s/m', 0.0, 0.0, 5.0)},
                          _rotor_drag,
-                         'H-force of Faessler et al. 2018, scaled with rotor speed sqrt(f / f_hover)'),
+                         'H-force of Faessler et al. 2018, growing with rotor speed sqrt(f / f_h)'),
 }
 
 
@@ -157,8 +157,8 @@ def validated(effects: dict | None) -> dict[str, dict]:
             raise ParameterError(f'effects.{name}: unknown effect{hint}')
         entry = CATALOGUE[name]
         if not isinstance(given, dict) or set(given) != set(entry.parameters):
-            raise ParameterError(f"effects.{name}: expected the keys {', '.join(entry.parameters)}, "
-                                 f'found {given!r}')
+            expected = ', '.join(entry.parameters)
+            raise ParameterError(f'effects.{name}: expected the keys {expected}, found {given!r}')
         checked[name] = {key: _value(f'effects.{name}.{key}', spec, given[key])
                          for key, spec in entry.parameters.items()}
     return checked

@@ -12,7 +12,7 @@ import yaml
 from beetle_omni_ros.robot import effects as catalogue
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+from beetle_omni_ros.robot.schema import parameter, ParameterError
 
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
 ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
@@ -164,8 +164,8 @@ class RobotParameters:
         object.__setattr__(self, 'effects', catalogue.validated(self.effects))
         hover = self.mass * self.gravity / 4
         if hover > self.rotors.thrust_max:
-            raise ParameterError(f'mass {self.mass:g} kg needs {hover:.1f} N a rotor to hover, above '
-                                 f'rotors.thrust_max {self.rotors.thrust_max:g} N')
+            raise ParameterError(f'mass {self.mass:g} kg needs {hover:.1f} N a rotor to hover, '
+                                 f'above rotors.thrust_max {self.rotors.thrust_max:g} N')
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> RobotParameters:
@@ -191,7 +191,8 @@ class RobotParameters:
 
     def hash(self) -> str:
         """Short digest of all physical values, for caches and policy contracts."""
-        return hashlib.sha256(yaml.safe_dump(self.as_dict(), sort_keys=True).encode()).hexdigest()[:16]
+        text = yaml.safe_dump(self.as_dict(), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def as_dict(self) -> dict:
         """All physical values as plain nested data (without name and provenance)."""

@@ -62,7 +62,7 @@ def normalized(quaternion: np.ndarray) -> np.ndarray:
 
 
 def skew(vector: np.ndarray) -> np.ndarray:
-    """Matrix (3, 3) of the cross product: skew(a) @ b = a x b."""
+    """Cross-product matrix (3, 3) of a vector."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 

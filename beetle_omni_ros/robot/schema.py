@@ -5,7 +5,7 @@ A parameter file is YAML, either plain or in the ROS 2 form
 ``--params-file`` and the tools that run without ROS.
 """
 
-from dataclasses import MISSING, field, fields, is_dataclass
+from dataclasses import field, fields, is_dataclass, MISSING
 from difflib import get_close_matches
 from pathlib import Path
 import types
@@ -184,7 +184,7 @@ def _check_range(meta, value, at):
     if not np.isfinite(value):
         raise ParameterError(f'{at}: {value} is not finite')
     if (low is not None and value < low) or (high is not None and value > high):
-        span = f"{'-inf' if low is None else f'{low:g}'} to {'inf' if high is None else f'{high:g}'}"
+        span = f'{-np.inf if low is None else low:g} to {np.inf if high is None else high:g}'
         raise ParameterError(f'{at}: {value:g} is outside {span}' + (f' {unit}' if unit else ''))
 
 
@@ -198,7 +198,8 @@ def _join(prefix, key):
 
 
 def _at(where, key):
-    return ': '.join(part for part in (where, f"key '{key}'" if key else '') if part) or 'parameters'
+    parts = (where, f"key '{key}'" if key else '')
+    return ': '.join(part for part in parts if part) or 'parameters'
 
 
 def flatten(instance, prefix: str = ''):

@@ -65,7 +65,8 @@ def qp_by_casadi(problem, x, u, x0, references, disturbance, bounds):
                                      'g': ca.vertcat(*equal, *inequality)},
                       {'print_iter': False, 'print_header': False, 'error_on_fail': True})
     zeros = np.zeros(sum(e.numel() for e in equal))
-    solution = solver(lbg=np.r_[zeros, np.concatenate(low)], ubg=np.r_[zeros, np.concatenate(high)])
+    solution = solver(lbg=np.r_[zeros, np.concatenate(low)],
+                      ubg=np.r_[zeros, np.concatenate(high)])
     values = np.array(solution['x']).ravel()
     return values[size * (n + 1):size * (n + 1) + nu].reshape(nu) + u[0]
 
