@@ -116,7 +116,8 @@ class HoverController:
         gap = state.stamp - self._stamp if self._stamp is not None else self.period
         dt = min(gap, 5 * self.period)   # after a pause, not one long blind leap
         in_force = state.command
-        own = in_force is not None and _same(in_force, self._command)   # integrate only what this controller flies
+        # Integrate only while this controller flies.
+        own = in_force is not None and _same(in_force, self._command)
         self._follow_thrust(in_force, dt)
         force, torque = self._wrench(state, target, dt if own and not self._saturated else 0.0)
         present = in_force.tilt if in_force is not None else state.tilt

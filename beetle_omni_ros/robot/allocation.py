@@ -50,7 +50,7 @@ class Allocator:
         robot: the robot.
 
     Attributes:
-        matrix: (6, 8) from (f_i cos q_i, f_i sin q_i), interleaved, to (force, torque) in base_link.
+        matrix: (6, 8) from the interleaved components u to (force, torque) in base_link.
         inverse: (8, 6) its pseudo-inverse.
         mass: the mass that the hover wrench carries [kg].
         tilt_limit: travel of the joints to each side [rad].

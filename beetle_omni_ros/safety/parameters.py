@@ -63,8 +63,8 @@ class TakeoffParameters:
     """From the ground to the height where the selected controller takes over."""
 
     height: float = parameter(1.0, doc='height of base_link in world', unit='m', low=0.1, high=20)
-    clearance: float = parameter(0.3, doc='least climb, from a raised platform', unit='m', low=0.05,
-                                 high=20)
+    clearance: float = parameter(0.3, doc='least climb, from a raised platform', unit='m',
+                                 low=0.05, high=20)
     speed: float = parameter(0.5, doc='climb speed', unit='m/s', low=0.05, high=5)
     acceleration: float = parameter(0.5, doc='of the climb', unit='m/s^2', low=0.05, high=10)
     align_rate: float = parameter(2.0, doc='joint rate before the rotors start', unit='rad/s',
@@ -98,8 +98,8 @@ class LandingParameters:
                                      'ground was due', unit='s', low=0.1, high=60)
     target_lead: float = parameter(0.5, doc='the target sinks at most this far below the robot',
                                    unit='m', low=0.05, high=5)
-    ground_speed: float = parameter(0.12, doc='vertical speed below which it may stand', unit='m/s',
-                                    low=0.01, high=1)
+    ground_speed: float = parameter(0.12, doc='vertical speed below which it may stand',
+                                    unit='m/s', low=0.01, high=1)
     ground_support: float = parameter(0.2, doc='share of the weight that the rotors do not carry',
                                       low=0.05, high=0.9)
     ground_time: float = parameter(0.3, doc='for this long, then the robot stands', unit='s',
@@ -110,10 +110,10 @@ class LandingParameters:
 class BackupParameters:
     """The estimator of last resort."""
 
-    position_bandwidth: float = parameter(8.0, doc='of MoCap corrections of position', unit='rad/s',
-                                          low=0.5, high=50)
-    attitude_bandwidth: float = parameter(5.0, doc='of MoCap corrections of attitude', unit='rad/s',
-                                          low=0.5, high=50)
+    position_bandwidth: float = parameter(8.0, doc='of MoCap corrections of position',
+                                          unit='rad/s', low=0.5, high=50)
+    attitude_bandwidth: float = parameter(5.0, doc='of MoCap corrections of attitude',
+                                          unit='rad/s', low=0.5, high=50)
     attitude_bandwidth_without_gyroscope: float = parameter(
         12.0, doc='the same when the IMU is gone too', unit='rad/s', low=0.5, high=50)
     bias_time: float = parameter(2.0, doc='over which IMU biases are learnt from the estimator',
@@ -121,8 +121,8 @@ class BackupParameters:
     velocity_leak_time: float = parameter(
         3.0, doc='without MoCap the velocity forgets towards the wished one', unit='s', low=0.2,
         high=100)
-    error_limit: float = parameter(0.2, doc='larger MoCap corrections are shortened', unit='m or rad',
-                                   low=0.01, high=5)
+    error_limit: float = parameter(0.2, doc='larger MoCap corrections are shortened',
+                                   unit='m or rad', low=0.01, high=5)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,10 +2,11 @@
 
 from collections import deque
 
+import numpy as np
+
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
-import numpy as np
 
 STEP = 0.001
 DELAY = 0.010

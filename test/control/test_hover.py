@@ -2,14 +2,15 @@
 
 from dataclasses import replace
 
+import numpy as np
+from plant import fly, Plant
+import pytest
+
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.hover import HoverController, HoverParameters
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
-import numpy as np
-from plant import fly, Plant
-import pytest
 
 ROBOT = RobotParameters.load()
 PARAMETERS = HoverParameters.load()

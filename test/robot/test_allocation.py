@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import allocate, Allocator, hover_allocation
-from beetle_omni_ros.robot.parameters import RobotParameters
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.allocation import allocate, Allocator, hover_allocation
+from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
 ALLOCATOR = Allocator(ROBOT)

@@ -1,12 +1,13 @@
 """A vehicle on strings for tests of the state machine: it goes where the test puts it."""
 
+import numpy as np
+
 from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
-import numpy as np
 
 ROBOT = RobotParameters.load()
 PARAMETERS = SupervisorParameters.load()

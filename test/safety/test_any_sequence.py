@@ -1,9 +1,11 @@
 """Whatever comes in, in whatever order: nothing unsafe goes out."""
 
-from beetle_omni_ros.control.base import Command, State
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 from puppet import LEVEL, PARAMETERS, Puppet, ROBOT
+
+from beetle_omni_ros.control.base import Command, State
 
 RUBBISH = [np.nan, np.inf, -np.inf, 1e300, -1e9, 0.0, 1.0, 3.9, -4.1, 25.0, -0.5]
 numbers = st.one_of(st.sampled_from(RUBBISH), st.floats(-30, 30))

@@ -1,13 +1,14 @@
 """Takeoff, fallback and descents on the simulated robot with its sensors, delays and ground."""
 
+import numpy as np
+import pytest
+
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
-import numpy as np
-import pytest
 
 simulator = pytest.importorskip('beetle_omni_ros.sim.simulator')
 ROBOT = RobotParameters.load()
@@ -21,7 +22,8 @@ class Flight:
     def __init__(self, attitude=LEVEL, conditions='nominal', seed=0):
         self.sim = simulator.Simulator(ROBOT, conditions=conditions, seed=seed)
         self.supervisor = Supervisor(SupervisorParameters.load(), ROBOT, HoverController(ROBOT))
-        self.nmpc, self.target = HoverController(ROBOT), PoseTarget(np.array([0, 0, 1.0]), attitude)
+        self.nmpc = HoverController(ROBOT)
+        self.target = PoseTarget(np.array([0, 0, 1.0]), attitude)
         self.alive = {'ekf', 'nmpc', 'imu', 'mocap', 'joints'}
         self.in_force, self.joints = None, None
         self.height, self.touchdown_speed, self.armed = [], None, False

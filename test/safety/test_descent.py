@@ -1,11 +1,12 @@
 """The estimator of last resort against motions that are known in closed form."""
 
+import numpy as np
+import pytest
+
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.safety.descent import BackupEstimator
 from beetle_omni_ros.safety.parameters import BackupParameters
-import numpy as np
-import pytest
 
 GRAVITY = 9.80665
 RATE = np.array([0.3, -0.2, 0.5])

@@ -2,13 +2,14 @@
 
 from types import SimpleNamespace
 
+import numpy as np
+import pytest
+
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety import limits
 from beetle_omni_ros.safety.limits import CommandStream, within_limits
 from beetle_omni_ros.safety.parameters import CommandLimits, SupervisorParameters
-import numpy as np
-import pytest
 
 ROBOT = RobotParameters.load()
 LIMITS = CommandLimits()

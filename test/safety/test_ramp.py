@@ -1,9 +1,10 @@
 """The moving target: its velocity is the derivative of its pose, and it ends where it should."""
 
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.safety.ramp import inclination, levelled, Ramp
 import numpy as np
 import pytest
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.safety.ramp import inclination, levelled, Ramp
 
 
 def ramp(climb=-0.8, wait=0.5):

@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 
-from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.safety.parameters import SupervisorParameters
 import numpy as np
 from puppet import hover_command, PARAMETERS, Puppet, ROBOT, TICK
 import pytest
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.safety.parameters import SupervisorParameters
 
 TIMEOUT = PARAMETERS.commands.timeout
 
@@ -296,11 +297,11 @@ def test_clock_set_back_in_flight_is_survived():
 
 
 @pytest.mark.parametrize('change, reason', [
-    (dict(position=np.full(3, np.nan)), 'not finite'),
-    (dict(velocity=np.full(3, 1e300)), 'absurdly large'),
-    (dict(quaternion=np.array([0, 0, 0, 2.0])), 'no unit quaternion'),
-    (dict(stamp=90.0), 'stale stamp'), (dict(stamp=200.0), 'stamp in the future'),
-    (dict(stamp=0.0, _repeat=True), 'repeated or older stamp')])
+    ({'position': np.full(3, np.nan)}, 'not finite'),
+    ({'velocity': np.full(3, 1e300)}, 'absurdly large'),
+    ({'quaternion': np.array([0, 0, 0, 2.0])}, 'no unit quaternion'),
+    ({'stamp': 90.0}, 'stale stamp'), ({'stamp': 200.0}, 'stamp in the future'),
+    ({'stamp': 0.0, '_repeat': True}, 'repeated or older stamp')])
 def test_bad_estimates_are_refused_and_counted(change, reason):
     puppet = Puppet()
     puppet.run(0.1)
