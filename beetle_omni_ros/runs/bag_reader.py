@@ -99,7 +99,7 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
                 reader = NonSeekingReader(_WholeReads(stream), validate_crcs=True)
                 for schema, channel, message in reader.iter_messages(log_time_order=False):
                     yield RawMessage(channel.topic, schema.name if schema else '', message.data,
-                                     message.log_time * 1e-9)
+                                     messages.seconds(message.log_time))
         except OSError as error:
             raise BagError(f'{file}: {error.strerror}') from None
         except InvalidMagic:

@@ -7,6 +7,8 @@ in each direction. Types come from rosbags' Jazzy type store.
 
 from __future__ import annotations
 
+from math import floor
+
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
@@ -57,14 +59,20 @@ class LayoutError(ValueError):
 
 
 def nanoseconds(t: float) -> int:
-    """Seconds to integer nanoseconds."""
-    return round(float(t) * 1e9)
+    """Seconds to integer nanoseconds, whole seconds apart: an epoch time keeps every bit."""
+    whole = floor(t)
+    return whole * 1_000_000_000 + round((t - whole) * 1e9)
+
+
+def seconds(time: int) -> float:
+    """Integer nanoseconds to seconds, the inverse of :func:`nanoseconds`."""
+    whole, rest = divmod(time, 1_000_000_000)
+    return whole + rest * 1e-9
 
 
 def header(t: float, frame: str = '') -> Header:
     """Header with stamp ``t`` [s]."""
-    seconds, rest = divmod(max(0, nanoseconds(t)), 1_000_000_000)
-    return Header(Time(seconds, rest), frame)
+    return Header(Time(*divmod(max(0, nanoseconds(t)), 1_000_000_000)), frame)
 
 
 def stamp(message, received: float) -> float:

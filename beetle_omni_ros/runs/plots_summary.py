@@ -45,9 +45,9 @@ def use(runs: list[Run], robot: RobotParameters) -> Figure:
     """Histograms of what joints and rotors were asked for and gave, with their limits."""
     figure, axes = panels(2, 2, height=2.1)
     joints, rotors = robot.joints, robot.rotors
-    for run in runs:
-        for panel, values in zip(axes.ravel(), _used(run), strict=True):
-            _histogram(panel, values, run)
+    used = [_used(run) for run in runs]
+    for panel, column in zip(axes.ravel(), zip(*used, strict=True), strict=True):
+        _histograms(panel, runs, column)
     limits = ((-joints.position_limit, joints.position_limit),
               (-joints.velocity_limit, joints.velocity_limit),
               (rotors.thrust_min, rotors.thrust_max), ())
@@ -70,18 +70,21 @@ def _used(run):
     if np.any(joint) and len(log.command_t):
         error = np.abs(hold(log.command_t, log.command_tilt, log.joint_t[joint])
                        - log.joint_position[joint])
-    return (log.joint_position[joint], log.joint_velocity[joint], log.command_thrust[command],
-            error)
+    return (log.joint_position[joint].ravel(), log.joint_velocity[joint].ravel(),
+            log.command_thrust[command].ravel(), error.ravel())
 
 
-def _histogram(panel, values, run):
-    values = values[np.isfinite(values)]
-    if not values.size:
+def _histograms(panel, runs, columns):
+    """All runs in the same bins, so that their shares compare."""
+    columns = [values[np.isfinite(values)] for values in columns]
+    every = np.concatenate(columns)
+    if not every.size:
         return
-    share, edges = np.histogram(values, bins=60)
-    share = share / values.size
-    panel.stairs(share, edges, color=run.colour, lw=1.3, label=run.label)
-    panel.stairs(share, edges, color=run.colour, alpha=0.12, fill=True)
+    edges = np.histogram_bin_edges(every, bins=60)
+    for run, values in zip(runs, columns, strict=True):
+        share = np.histogram(values, bins=edges)[0] / max(1, values.size)
+        panel.stairs(share, edges, color=run.colour, lw=1.3, label=run.label)
+        panel.stairs(share, edges, color=run.colour, alpha=0.12, fill=True)
 
 
 def path(runs: list[Run]) -> Figure | None:

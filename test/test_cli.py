@@ -1,0 +1,131 @@
+"""The command line: exit statuses, one-line errors, results where they were asked for."""
+
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+from synthetic_flights import fly
+
+from beetle_omni_ros import __version__, cli
+from beetle_omni_ros.runs.bag import BagWriter
+from beetle_omni_ros.runs.tasks import make_task
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """A short recorded flight."""
+    folder = tmp_path_factory.mktemp('cli') / 'flight'
+    with BagWriter(folder, {'task': 'waypoints', 'seed': 0, 'conditions': 'nominal'}) as writer:
+        fly(writer, make_task('waypoints'), duration=24.5)
+    return folder
+
+
+def refused(capsys, *arguments):
+    """Run the command, expect status 2 and one line on standard error; return the line."""
+    assert cli.main([str(a) for a in arguments]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+@pytest.mark.parametrize('command', [[], ['fly'], ['evaluate'], ['report']])
+def test_every_command_has_help(capsys, command):
+    assert cli.main([*command, '--help']) == 0
+    assert 'Usage' in capsys.readouterr().out
+
+
+def test_help_needs_neither_ros_nor_any_heavy_module():
+    program = ('import sys\nfrom beetle_omni_ros import cli\ncli.main(["--help"])\n'
+               'heavy = {"rclpy", "mujoco", "casadi", "matplotlib", "rosbags", "scipy"}\n'
+               'sys.exit(str(heavy & set(sys.modules)) if heavy & set(sys.modules) else 0)')
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
+                          env={**os.environ, 'PYTHONPATH': str(ROOT)}, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_version(capsys):
+    assert cli.main(['--version']) == 0
+    assert capsys.readouterr().out.strip() == f'beetle_omni {__version__}'
+
+
+def test_usage_errors_are_one_line(capsys):
+    assert '--bag' in refused(capsys, 'fly')
+    assert 'frobnicate' in refused(capsys, 'frobnicate')
+    assert '--seed' in refused(capsys, 'evaluate', '--seed', 'x')
+    assert '--seed' in refused(capsys, 'evaluate', '--seed', '-1')
+    assert '--nonsense' in refused(capsys, 'report', '--nonsense')
+
+
+@pytest.mark.parametrize('command', ['evaluate', 'fly'])
+def test_unusable_input_is_refused_before_the_flight(capsys, tmp_path, command):
+    base = [command, '--bag', tmp_path / 'new']
+    poses = tmp_path / 'poses.csv'
+    poses.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,oops\n')
+    for arguments, named in (
+            (['--task', 'wayponts'], 'wayponts'),
+            (['--task', poses], 'row 2, column yaw_deg'),
+            (['--conditions', 'windy'], 'windy'),
+            (['--robot', tmp_path / 'none.yaml'], 'none.yaml'),
+            (['--plant', tmp_path / 'none.yaml'], 'none.yaml'),
+            (['--json', tmp_path / 'no' / 'folder.json'], 'folder.json'),
+            (['--json', tmp_path], str(tmp_path)),
+            (['--bag', tmp_path], 'exists already')):
+        assert named in refused(capsys, *base, *arguments)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['poses.csv']
+
+
+def test_controllers_must_be_different_names(capsys):
+    for value in ('', 'nmpc,nmpc', ' , '):
+        assert '--controllers' in refused(capsys, 'evaluate', '--controllers', value)
+
+
+def test_report_writes_one_page_that_needs_no_network(capsys, bag, tmp_path):
+    page, result = tmp_path / 'page.html', tmp_path / 'result.json'
+    status = cli.main(['report', str(bag), str(bag / 'flight.mcap'), '-o', str(page),
+                       '--json', str(result)])
+    assert status == 0
+    text = page.read_text()
+    for part in ('http://', 'https://', '<script', '<link', 'url('):
+        assert part not in text
+    for part in ('flight (1)', 'flight (2)', 'Steady errors', 'Joint and thrust use',
+                 'one MoCap pose was no unit quaternion', 'Compute time', 'Estimate'):
+        assert part in text
+    judged = json.loads(result.read_text())
+    assert judged['meta']['task'] == 'waypoints'
+    assert judged['flight (1)'] == judged['flight (2)']
+    assert sum(pose['reached'] for pose in judged['flight (1)']['poses']) == 3
+    assert '3 of 15' in capsys.readouterr().out
+
+
+def test_report_shows_a_bag_that_a_crash_cut_off(capsys, bag, tmp_path):
+    data = (bag / 'flight.mcap').read_bytes()
+    (tmp_path / 'cut').mkdir()
+    (tmp_path / 'cut' / 'cut.mcap').write_bytes(data[:len(data) * 2 // 3])
+    assert cli.main(['report', str(tmp_path / 'cut'), '-o', str(tmp_path / 'page.html')]) == 0
+    assert 'cut off' in capsys.readouterr().err
+    assert 'cut off' in (tmp_path / 'page.html').read_text()
+
+
+def test_report_refuses_what_is_no_flight(capsys, bag, tmp_path):
+    out = ['-o', tmp_path / 'page.html']
+    assert 'no such bag' in refused(capsys, 'report', tmp_path / 'none', *out)
+    with BagWriter(tmp_path / 'imu_only') as writer:
+        writer.write_imu(1.0, (0, 0, 9.8), (0, 0, 0))
+    assert 'ground_truth/odom' in refused(capsys, 'report', tmp_path / 'imu_only', *out)
+    assert 'at most' in refused(capsys, 'report', *[bag] * 7, *out)
+    assert 'page.html' in refused(capsys, 'report', bag, '-o', tmp_path / 'no' / 'page.html')
+    assert not (tmp_path / 'page.html').exists()
+
+
+def test_a_missing_ros_is_named_with_its_extra(capsys, monkeypatch, tmp_path):
+    for name in [name for name in sys.modules if name.startswith('beetle_omni_ros.nodes')]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, 'rclpy', None)
+    line = refused(capsys, 'fly', '--bag', tmp_path / 'bag')
+    assert 'rclpy' in line
+    assert 'beetle_omni_ros[ros]' in line
