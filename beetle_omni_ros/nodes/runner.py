@@ -24,6 +24,7 @@ from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 OK, FAILED, UNUSABLE = 0, 1, 2
 # The events executor of Jazzy dispatches nothing in the calls that take no timeout.
 FOREVER = 1e8
+FLIGHT_PRIORITY = -10   # nice value
 PR_SET_PDEATHSIG = 1    # of linux/prctl.h
 
 
@@ -58,6 +59,7 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
     nodes, status = [], OK
     signal.signal(signal.SIGTERM, signal.default_int_handler)   # while starting, as Ctrl-C
     _end_with_parent()
+    _raise_priority()
     try:
         # Not rclpy's handlers: they end the context under a callback that still publishes.
         rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
@@ -135,6 +137,14 @@ def _stop_on_signal() -> Future:
     signal.set_wakeup_fd(written.fileno(), warn_on_full_buffer=False)
     threading.Thread(target=wait, daemon=True).start()
     return stop
+
+
+def _raise_priority():
+    """Run before what is not in flight, where the system allows it."""
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, FLIGHT_PRIORITY)
+    except OSError:
+        pass
 
 
 def _end_with_parent():

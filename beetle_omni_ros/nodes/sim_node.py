@@ -19,7 +19,8 @@ from beetle_omni_ros.sim.simulator import Simulator
 # After a stall of the computer the plant catches up by so much and forgets the rest:
 # a node that tried to make good every lost tick would never be on time again.
 CATCH_UP_TICKS = 8
-CLOCK_STEP = 0.05       # s between stamps and ROS time: the clock was set, the stamps follow
+CLOCK_STEP = 0.005      # s of change between ROS and steady time: the clock was set
+CLOCK_READING = 0.001   # s in which both clocks must have been read to be compared
 COMMAND_AGE = 0.1       # s, older commands are not executed
 
 
@@ -56,6 +57,7 @@ class SimNode(FlightNode):
         self._tick = self._simulator.tick
         self._started = None        # steady time of the first tick
         self._epoch = None          # ROS time at which simulated time is 0
+        self._clock_offset = self.now() - time.monotonic()
         self._ticks = self._lost_ticks = self._clock_steps = 0
         self._latency = health.Distribution()
         self._publish_to = {
@@ -82,20 +84,27 @@ class SimNode(FlightNode):
         if self._started is None:
             # Half a tick early, so that the timer's jitter makes no empty and double ticks.
             self._started = now - 0.5 * tick
-            self._epoch = self.now() - self._simulator.time - tick
+        self._follow_clock()
         due = int((now - self._started) / tick) + 1 - self._ticks
         lost = max(0, due - CATCH_UP_TICKS)
-        if lost:
-            self._lost_ticks += lost
-            self._started += lost * tick
-            self._epoch += lost * tick
+        self._lost_ticks += lost
+        self._started += lost * tick
+        self._epoch = self._clock_offset + self._started - 0.5 * tick
         for _ in range(due - lost):
             self._ticks += 1
             self._publish(self.timed(self._simulator.step))
-        offset = self.now() - (self._epoch + self._simulator.time)
-        if abs(offset) > CLOCK_STEP:
-            self._epoch += offset
-            self._clock_steps += 1
+
+    def _follow_clock(self):
+        """Keep ROS time minus steady time, unless the clock was set."""
+        before = time.monotonic()
+        ros = self.now()
+        after = time.monotonic()
+        if after - before > CLOCK_READING:
+            return      # held up between the readings, they do not belong together
+        offset = ros - 0.5 * (before + after)
+        if abs(offset - self._clock_offset) > CLOCK_STEP:
+            self._clock_steps += self._epoch is not None
+            self._clock_offset = offset
 
     def _publish(self, frame):
         epoch, publish_to = self._epoch, self._publish_to
