@@ -48,7 +48,7 @@ class ErrorStateEkf:
         self._noise = NoiseMonitor(self._parameters.mocap)
         self._noise_scale = self._noise.scale
         self._model.scale_noise(*self._noise_scale)
-        self._readings: deque = deque()  # (stamp, force, rate) in base_link axes, newest last
+        self._readings: deque = deque()  # (stamp, force, rate, shaken), base_link axes
         self._early: deque = deque()     # poses that wait for the IMU to reach their capture
         self._track: Track | None = None
         self._candidate: Track | None = None
@@ -93,7 +93,8 @@ class ErrorStateEkf:
         if checked is None:
             return False
         stamp = checked[0]
-        reading = (stamp, self._mounting.aligned(checked[1]), self._mounting.aligned(checked[2]))
+        reading = (stamp, self._mounting.aligned(checked[1]), self._mounting.aligned(checked[2]),
+                   self._guard.shaken)
         self._estimate = None
         if self._guard.clock_jumped:
             self._restart(reading)
@@ -180,7 +181,7 @@ class ErrorStateEkf:
         """Start a track at a pose, with the biases of ``known``, and bring it up to now."""
         later = [reading for reading in self._readings if reading[0] > stamp + SAME_INSTANT]
         before = self._readings[len(self._readings) - len(later) - 1]
-        at_pose = interpolate(stamp, before, later[0]) if later else before[1:]
+        at_pose = interpolate(stamp, before, later[0]) if later else before[1:3]
         first = self._model.start(stamp, *at_pose, position, quaternion, known)
         time_deviation = (self._parameters.initial.time_offset_std if known is None else
                           sqrt(known.covariance[TIME_OFFSET, TIME_OFFSET]))
@@ -196,6 +197,6 @@ class ErrorStateEkf:
         self._early.clear()
         self._candidate = None
         if self._track is not None:
-            first = self._model.forget(self._track.newest, *reading)
+            first = self._model.forget(self._track.newest, *reading[:3])
             self._track = Track(self._model, first, self._parameters.mocap.delay_limit)
             self._track.last_fix = -np.inf

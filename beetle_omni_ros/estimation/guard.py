@@ -15,6 +15,7 @@ class InputGuard:
     Attributes:
         rejected: reason -> count.
         clock_jumped: whether the reading just accepted begins a new time line.
+        shaken: whether readings just before it were beyond the sensor's range, as in an impact.
 
     """
 
@@ -23,6 +24,8 @@ class InputGuard:
         self._imu, self._mocap = parameters.imu, parameters.mocap
         self.rejected: Counter = Counter()
         self.clock_jumped = False
+        self.shaken = False
+        self._out_of_range = False
         self._last_reading: float | None = None
         self._last_pose = -inf
         self._refused: list[float] = []  # stamps refused in a row, each shortly after the last
@@ -42,6 +45,7 @@ class InputGuard:
             return self._refuse('not_finite')
         if (_squared_norm(force) > self._imu.specific_force_limit ** 2
                 or _squared_norm(rate) > self._imu.angular_velocity_limit ** 2):
+            self._out_of_range = True
             return self._refuse('out_of_range')
         self.clock_jumped = False
         if self._last_reading is not None:
@@ -54,6 +58,7 @@ class InputGuard:
                 self._last_pose = -inf
         self._last_reading = stamp
         self._refused.clear()
+        self.shaken, self._out_of_range = self._out_of_range, False
         return stamp, force, rate
 
     def _new_time_line(self, stamp) -> bool:

@@ -12,9 +12,20 @@ from scipy.stats import chi2
 
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.propagation import (
-    identity, Node, propagate, STATES, TIME_OFFSET, transition)
+    identity,
+    Node,
+    propagate,
+    STATES,
+    TIME_OFFSET,
+    transition,
+)
 from beetle_omni_ros.estimation.samples import (
-    ACCELEROMETER_BIAS, ATTITUDE, GYROSCOPE_BIAS, POSITION, VELOCITY)
+    ACCELEROMETER_BIAS,
+    ATTITUDE,
+    GYROSCOPE_BIAS,
+    POSITION,
+    VELOCITY,
+)
 from beetle_omni_ros.robot import rotations
 
 MEASURED = 6  # position in world, rotation vector in base_link
@@ -40,6 +51,11 @@ class ErrorStateModel:
         self._transition = identity()
         self._process = _process_noise(parameters)
         self._period = 1 / imu.rate
+        # an unseen reading was at the limit of the sensor's range or beyond, in any direction
+        self._shock = np.zeros(STATES)
+        self._shock[VELOCITY] = imu.specific_force_limit ** 2
+        self._shock[ATTITUDE] = imu.angular_velocity_limit ** 2
+        self._impact = imu.impact_change ** 2
 
         # the marker body, as seen from the navigated point (the IMU), in base_link axes
         self._lever = mocap.position - imu.position
@@ -88,7 +104,7 @@ class ErrorStateModel:
             known = biases.accelerometer_bias, biases.gyroscope_bias, biases.time_offset
             covariance[9:15, 9:15] = biases.covariance[9:15, 9:15]
         return Node(stamp, force, rate, position - rotation @ self._lever, np.zeros(3), attitude,
-                    rotation, *known, covariance)
+                    rotation, *known, covariance=covariance)
 
     def doubt_time(self, node: Node, deviation: float) -> None:
         """
@@ -119,9 +135,11 @@ class ErrorStateModel:
         covariance[VELOCITY, VELOCITY] = limits.initial.velocity_std ** 2 * np.eye(3)
         covariance[ATTITUDE, ATTITUDE] = np.pi ** 2 * np.eye(3)
         return Node(stamp, force, rate, node.position, np.zeros(3), node.quaternion, node.rotation,
-                    node.accelerometer_bias, node.gyroscope_bias, node.time_offset, covariance)
+                    node.accelerometer_bias, node.gyroscope_bias, node.time_offset,
+                    covariance=covariance)
 
-    def predict(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray) -> Node:
+    def predict(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
+                shaken: bool = False) -> Node:
         """Carry ``node`` and its covariance to the next IMU reading."""
         after = propagate(node, stamp, force, rate, self.gravity)
         dt = stamp - node.stamp
@@ -133,7 +151,18 @@ class ErrorStateModel:
         kalman.predict(F=transition(node, after, self._transition),
                        Q=self._process * (dt * missing ** 3))
         after.covariance = kalman.P
+        change = force - node.force
+        jolt = float(change @ change)
+        if shaken or jolt > self._impact:
+            self._doubt_impulse(after, dt, jolt, shaken)
         return after
+
+    def _doubt_impulse(self, node, dt, jolt, shaken) -> None:
+        """Take the velocity, and after unseen readings the attitude, as shaken over a step."""
+        node.shaken = shaken
+        density = self._shock.copy() if shaken else np.zeros(STATES)
+        density[VELOCITY] += jolt
+        node.covariance = node.covariance + np.diag(density * dt ** 2)
 
     def correct(self, prior: Node, position: np.ndarray, quaternion: np.ndarray) -> Node | None:
         """
@@ -198,7 +227,7 @@ class ErrorStateModel:
                     prior.accelerometer_bias + error[ACCELEROMETER_BIAS],
                     prior.gyroscope_bias + error[GYROSCOPE_BIAS],
                     min(limit, max(-limit, prior.time_offset + float(error[TIME_OFFSET]))),
-                    0.5 * (covariance + covariance.T))
+                    prior.shaken, 0.5 * (covariance + covariance.T))
 
 
 def _process_noise(parameters: EkfParameters) -> np.ndarray:

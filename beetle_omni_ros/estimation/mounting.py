@@ -12,7 +12,14 @@ import numpy as np
 from beetle_omni_ros.estimation.parameters import ImuParameters
 from beetle_omni_ros.estimation.propagation import Node, STATES, TIME_OFFSET
 from beetle_omni_ros.estimation.samples import (
-    ACCELEROMETER_BIAS, ATTITUDE, ERROR_STATES, Estimate, GYROSCOPE_BIAS, POSITION, VELOCITY)
+    ACCELEROMETER_BIAS,
+    ATTITUDE,
+    ERROR_STATES,
+    Estimate,
+    GYROSCOPE_BIAS,
+    POSITION,
+    VELOCITY,
+)
 from beetle_omni_ros.robot import rotations
 
 SIGNIFICANT = 4.0  # standard deviations by which a time offset must differ from chance

@@ -8,7 +8,13 @@ ROS wants a pose's rotation error about the fixed (world) axes and a twist in th
 import numpy as np
 
 from beetle_omni_ros.estimation.samples import (
-    ATTITUDE, ERROR_STATES, Estimate, GYROSCOPE_BIAS, POSITION, VELOCITY)
+    ATTITUDE,
+    ERROR_STATES,
+    Estimate,
+    GYROSCOPE_BIAS,
+    POSITION,
+    VELOCITY,
+)
 from beetle_omni_ros.robot import rotations
 
 

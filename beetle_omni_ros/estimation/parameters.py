@@ -37,6 +37,9 @@ class ImuParameters:
         160.0, doc='larger readings are refused', unit='m/s^2', low=10, high=2000)
     angular_velocity_limit: float = parameter(
         40.0, doc='larger readings are refused', unit='rad/s', low=1, high=200)
+    impact_change: float = parameter(
+        30.0, doc='a larger change of the specific force from one sample to the next is an impact, '
+        'whose impulse is unknown', unit='m/s^2', low=1, high=2000)
     gap_limit: float = parameter(
         0.1, doc='longest time between two samples that is bridged', unit='s', low=0.001, high=1)
     resync_samples: int = parameter(

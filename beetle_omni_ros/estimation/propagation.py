@@ -13,7 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.estimation.samples import (
-    ACCELEROMETER_BIAS, ATTITUDE, ERROR_STATES, GYROSCOPE_BIAS, POSITION, VELOCITY)
+    ACCELEROMETER_BIAS,
+    ATTITUDE,
+    ERROR_STATES,
+    GYROSCOPE_BIAS,
+    POSITION,
+    VELOCITY,
+)
 from beetle_omni_ros.robot import rotations
 
 # Behind the 15 error states that leave the estimator, the offset between the sensors' clocks.
@@ -37,6 +43,7 @@ class Node:
         accelerometer_bias: (3,) base_link axes [m/s^2].
         gyroscope_bias: (3,) base_link axes [rad/s].
         time_offset: by how much the stamps of the IMU are later than those of the MoCap [s].
+        shaken: whether readings just before were beyond the sensor's range.
         covariance: (16, 16) of the error states and the time offset.
 
     """
@@ -51,6 +58,7 @@ class Node:
     accelerometer_bias: np.ndarray
     gyroscope_bias: np.ndarray
     time_offset: float
+    shaken: bool = False
     covariance: np.ndarray | None = None
 
 

@@ -50,10 +50,10 @@ class Track:
         """The state at the newest reading."""
         return self.nodes[-1]
 
-    def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray) -> None:
+    def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray, shaken: bool) -> None:
         """Append the state at the next reading."""
         nodes = self.nodes
-        nodes.append(self._model.predict(nodes[-1], stamp, force, rate))
+        nodes.append(self._model.predict(nodes[-1], stamp, force, rate, shaken))
         while nodes[1].stamp < stamp - self._history:
             del nodes[0]
 
@@ -78,7 +78,7 @@ class Track:
             after = nodes[index + 1]
             prior = self._model.predict(prior, stamp, *interpolate(
                 stamp, (prior.stamp, prior.force, prior.rate),
-                (after.stamp, after.force, after.rate)))
+                (after.stamp, after.force, after.rate)), after.shaken)
         posterior = self._model.correct(prior, position, quaternion)
         if posterior is None:
             return False
@@ -87,7 +87,8 @@ class Track:
             self._model.doubt_time(posterior, self._time_deviation)
         replayed = [posterior]
         for node in nodes[index + 1:]:
-            replayed.append(self._model.predict(replayed[-1], node.stamp, node.force, node.rate))
+            replayed.append(self._model.predict(replayed[-1], node.stamp, node.force, node.rate,
+                                                node.shaken))
         self.nodes = replayed
         self.last_fix = stamp
         return True

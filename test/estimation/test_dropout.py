@@ -146,3 +146,32 @@ def test_noisier_mocap_than_claimed_is_noticed_and_weighed_down():
     parameters = EkfParameters.load()
     stubborn = replace(parameters, mocap=replace(parameters.mocap, noise_scale_limit=1.0))
     assert run(ErrorStateEkf(stubborn, GRAVITY), flight).status != 'tracking'
+
+
+def struck(flight, time, impulse, samples):
+    """Let the robot be struck: ``samples`` readings from ``time`` on show the blow."""
+    period, trajectory = 0.005, flight.trajectory
+    start = next(k for k, s in enumerate(flight.imu) if s.stamp >= time - 1e-9)
+    blow = np.array(impulse) / (len(samples) * period)
+    for k, seen in enumerate(samples, start):
+        sample = flight.imu[k]
+        attitude = trajectory(np.array([sample.stamp]))['rotation'][0]
+        flight.imu[k] = replace(sample, specific_force=sample.specific_force
+                                + seen * attitude.inv().apply(blow))
+    end = time + (len(samples) - 0.5) * period
+    flight.poses = [replace(pose, position=pose.position + max(0.0, pose.stamp - end)
+                            * np.array(impulse)) for pose in flight.poses]
+    return flight
+
+
+@pytest.mark.parametrize('seen', [0.3, 1.0, 3.0])
+def test_a_blow_that_the_imu_measures_badly_does_not_lose_the_track(seen):
+    """A hard landing: readings aliased, or beyond the range and refused."""
+    flight = struck(fly(10, 3.0, agility=0.3), 2.0, (0.0, 0.5, 1.2), [seen] * 2)
+    ekf = new_ekf()
+    rows = history(ekf, flight)
+    assert {status for time, status, _ in rows if time > 2.0} == {'tracking'}
+    truth = flight.trajectory(np.array([3.0]))
+    velocity = truth['velocity'][0] + [0.0, 0.5, 1.2]
+    np.testing.assert_allclose(ekf.estimate.velocity, velocity, atol=0.03)
+    assert ekf.rejected.get('out_of_range', 0) == (2 if seen == 3.0 else 0)

@@ -1,0 +1,77 @@
+"""The estimator on the multibody simulator, from the drop at the start to large turns."""
+
+from ekf_flights import feed
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from beetle_omni_ros.control.base import PoseTarget, State
+from beetle_omni_ros.control.hover import HoverController, HoverParameters
+from beetle_omni_ros.estimation.ekf import (
+    EkfParameters, ErrorStateEkf, ImuSample, PoseSample)
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.sim.simulator import Simulator
+
+DURATION, HEIGHT, POSE_TIME = 8.0, 2.0, 2.0
+
+
+def fly(conditions, seed, drop=lambda time: False):
+    """Fly random poses on the true state; the estimator listens. Yield it with the truth."""
+    robot = RobotParameters.load()
+    simulator = Simulator(robot, conditions=conditions, seed=seed)
+    hover = HoverController(robot, HoverParameters.load())
+    hover.reset()
+    simulator.reset(np.array([0.0, 0.0, HEIGHT + 1]))
+    ekf, rng = ErrorStateEkf(EkfParameters.load(), robot.gravity), np.random.default_rng(seed)
+    target, command = PoseTarget(np.array([0, 0, HEIGHT]), np.array([0, 0, 0, 1.0])), None
+    for k in range(round(DURATION / simulator.tick)):
+        frame = simulator.step()
+        truth = frame.truth
+        if k % round(POSE_TIME / simulator.tick) == 0 and k:
+            quaternion = Rotation.random(random_state=int(rng.integers(2 ** 31))).as_quat()
+            target = PoseTarget(np.append(rng.uniform(-1, 1, 2), HEIGHT), quaternion)
+        if frame.mocap is not None and not drop(frame.mocap.stamp):
+            feed(ekf, PoseSample(frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion))
+        feed(ekf, ImuSample(frame.imu.stamp, frame.imu.specific_force, frame.imu.angular_velocity))
+        if k % 2 == 0:
+            command = hover.step(
+                State(truth.stamp, truth.position, truth.velocity, truth.quaternion,
+                      truth.angular_velocity, truth.tilt, truth.tilt_velocity, truth.stamp,
+                      command), target)
+            simulator.command(command)
+        yield ekf, truth
+
+
+def errors(ekf, truth):
+    """Position [m], velocity [m/s] and attitude [rad] errors."""
+    estimate = ekf.estimate
+    return (np.linalg.norm(estimate.position - truth.position),
+            np.linalg.norm(estimate.velocity - truth.velocity),
+            rotations.geodesic_angle(estimate.quaternion, truth.quaternion))
+
+
+@pytest.mark.parametrize('conditions, position, velocity, angle', [
+    ('nominal', 0.002, 0.015, np.deg2rad(0.15)),
+    # bias of the MoCap itself, which no filter can see: 0.01 m and 0.01 rad an axis
+    ('published', 0.025, 0.1, np.deg2rad(1.5)),
+])
+def test_flight_is_tracked_all_the_way(conditions, position, velocity, angle):
+    rows = []
+    for ekf, truth in fly(conditions, seed=0):
+        if truth.stamp > 1.0:
+            assert ekf.status == 'tracking'
+        if truth.stamp > 3.0:
+            rows.append(errors(ekf, truth))
+    rms = np.sqrt(np.mean(np.square(rows), axis=0))
+    assert rms[0] < position and rms[1] < velocity and rms[2] < angle
+
+
+def test_half_a_second_without_mocap_in_simulated_flight():
+    worst = np.zeros(3)
+    for ekf, truth in fly('nominal', seed=1, drop=lambda time: 5.0 < time < 5.5):
+        if 5.2 < truth.stamp < 5.5:
+            assert ekf.status == 'dead_reckoning'
+            worst = np.maximum(worst, errors(ekf, truth))
+    assert 0 < worst[0] < 0.05 and 0 < worst[2] < np.deg2rad(1)
+    assert ekf.status == 'tracking'
