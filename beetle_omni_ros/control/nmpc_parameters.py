@@ -39,7 +39,7 @@ class ModelParameters:
 class LimitParameters:
     """Constraints of the optimisation."""
 
-    velocity: float = parameter(2.0, doc='of each component of the world velocity', unit='m/s',
+    velocity: float = parameter(3.0, doc='of each component of the world velocity', unit='m/s',
                                 low=0.05, high=20)
     rate: float = parameter(6.0, doc='of each component of the body rate', unit='rad/s', low=0.1,
                             high=50)
