@@ -38,7 +38,7 @@ class ImuParameters:
     angular_velocity_limit: float = parameter(
         40.0, doc='larger readings are refused', unit='rad/s', low=1, high=200)
     impact_change: float = parameter(
-        30.0, doc='a larger change of the specific force from one sample to the next is an impact, '
+        30.0, doc='a larger change of the specific force between two samples is an impact, '
         'whose impulse is unknown', unit='m/s^2', low=1, high=2000)
     gap_limit: float = parameter(
         0.1, doc='longest time between two samples that is bridged', unit='s', low=0.001, high=1)

@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.hover import HoverController, HoverParameters
-from beetle_omni_ros.estimation.ekf import (
-    EkfParameters, ErrorStateEkf, ImuSample, PoseSample)
+from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, ImuSample, PoseSample
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.simulator import Simulator
