@@ -11,8 +11,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test' / 'estimation')]
 
 from ekf_flights import fly, GRAVITY  # noqa: E402
 
-from beetle_omni_ros.estimation.ekf import (  # noqa: E402
-    EkfParameters, ErrorStateEkf, ImuSample)
+from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, ImuSample  # noqa: E402
 
 FLIGHT = 800.0  # [s] a run of 100 poses
 
