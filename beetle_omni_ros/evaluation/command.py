@@ -23,7 +23,8 @@ from beetle_omni_ros.runs import metrics as metrics_of_runs
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import BagWriter
 from beetle_omni_ros.runs.json_file import write_json
-from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Tee
+from beetle_omni_ros.runs.log import FlightLog
+from beetle_omni_ros.runs.recorder import LogRecorder, Tee
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor

@@ -13,7 +13,8 @@ from mcap.reader import NonSeekingReader
 import yaml
 
 from beetle_omni_ros.runs import messages
-from beetle_omni_ros.runs.log import FlightLog, LogRecorder
+from beetle_omni_ros.runs.log import FlightLog
+from beetle_omni_ros.runs.recorder import LogRecorder
 from beetle_omni_ros.runs.topics import split_topic, TOPICS
 
 META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml

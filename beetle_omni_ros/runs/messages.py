@@ -173,7 +173,7 @@ def record(recorder, topic: str, message, received: float) -> None:
     Pass one decoded message on to a recorder.
 
     Args:
-        recorder: takes ``write_*`` calls, see :class:`~beetle_omni_ros.runs.log.LogRecorder`.
+        recorder: takes ``write_*`` calls, see :class:`~beetle_omni_ros.runs.recorder.LogRecorder`.
         topic: name in ``TOPICS``.
         message: decoded by ``TYPESTORE``.
         received: time of recording [s].

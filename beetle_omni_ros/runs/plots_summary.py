@@ -123,7 +123,9 @@ def disturbance(runs: list[Run]) -> Figure | None:
                                        for kind in kinds):
         for run in runs:
             for label, result in run.results.items():
-                levels = result.get(kind, {}).get('levels', [])
+                levels = result.get(kind, {}).get('levels')
+                if not levels:
+                    continue
                 for panel, key in zip(axes[row], ('peak_position_m', 'peak_orientation_deg'),
                                       strict=True):
                     x = [entry[f'level_{unit}'] for entry in levels]

@@ -25,7 +25,8 @@ from beetle_omni_ros.runs.bag import (
     read_bag,
     read_messages,
 )
-from beetle_omni_ros.runs.log import FlightLog, LogRecorder, Tee
+from beetle_omni_ros.runs.log import FlightLog
+from beetle_omni_ros.runs.recorder import LogRecorder, Tee
 from beetle_omni_ros.runs.tasks import make_task
 from beetle_omni_ros.runs.topics import TOPICS
 
