@@ -12,7 +12,7 @@ from mcap.exceptions import InvalidMagic
 from mcap.reader import NonSeekingReader
 import yaml
 
-from beetle_omni_ros.runs import messages
+from beetle_omni_ros.runs import decode, messages
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.recorder import LogRecorder
 from beetle_omni_ros.runs.topics import split_topic, TOPICS
@@ -160,9 +160,9 @@ class _Reading:
             return
         try:
             if message.type != TOPICS[name].type:
-                raise messages.LayoutError(f'type is {message.type}, not {TOPICS[name].type}')
+                raise decode.LayoutError(f'type is {message.type}, not {TOPICS[name].type}')
             decoded = messages.TYPESTORE.deserialize_cdr(message.data, message.type)
-            messages.record(self.recorder, name, decoded, message.received)
+            decode.record(self.recorder, name, decoded, message.received)
             self._counts[name] += 1
         except Exception as error:  # one message that cannot be used must not lose the others
             self._bad[name] += 1
