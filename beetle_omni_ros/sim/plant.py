@@ -133,8 +133,8 @@ class Plant:
         if fast:
             self._update()
         else:
-            # The sensors must see the capped torque too: at the rate limit the full one would
-            # accelerate a module by thousands of rad/s^2, and the accelerometer would report it.
+            # The capped torque counts here too: at the rate limit the full one would accelerate
+            # a module by thousands of rad/s^2.
             self._limit_rates()
             self._update()
             effort = self._robot.joints.effort_limit
@@ -216,6 +216,11 @@ class Plant:
     def contact(self) -> bool:
         """Whether any part touches the floor."""
         return self.data.ncon > 0
+
+    @property
+    def gravity(self) -> float:
+        """Along world -z [m/s^2]."""
+        return self._robot.gravity
 
     @property
     def specific_force(self) -> np.ndarray:

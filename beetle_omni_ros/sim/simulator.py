@@ -86,7 +86,7 @@ class Simulator:
         seeds = np.random.SeedSequence(self._seed).spawn(5)[1:]
         self._sensors = Sensors(self._parameters, self.conditions, seeds, self.truth,
                                 self._plant.effort)
-        self._sensors.start_imu(self._plant.specific_force, self.truth.angular_velocity)
+        self._sensors.start_imu(self.truth, self._plant.specific_force)
 
     def command(self, command) -> bool:
         """
