@@ -28,6 +28,8 @@ class ControllerNode(FlightNode):
     charge it follows along, so that it can take over without a jump.
     """
 
+    real_time = True
+
     def __init__(self, controller_name: str, parameter_class: type, file: str, file_key: str):
         """
         Subscribe the controller's inputs.

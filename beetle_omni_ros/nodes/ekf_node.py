@@ -34,6 +34,8 @@ class EkfNodeParameters(EkfParameters):
 class EkfNode(FlightNode):
     """Publishes odom for every IMU sample, corrected by MoCap poses at their capture time."""
 
+    real_time = True
+
     def __init__(self):
         """Wait for the first poses."""
         super().__init__('ekf_node', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')

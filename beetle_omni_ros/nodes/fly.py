@@ -29,6 +29,8 @@ from beetle_omni_ros.runs.tasks import make_task, Task
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
 ARM_TIMEOUT = 10.0      # s
 TAKEOFF_TIMEOUT = 30.0  # s
+TAKEOFF_ATTEMPTS = 3
+SETTLE_TIME = 1.0       # s before arming, in which all processes come to rest
 LANDING_TIMEOUT = 30.0  # s
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
 LOOK_PERIOD = 0.1       # s between looks at processes and progress
@@ -167,13 +169,7 @@ class Flight:
         operator = self._operator
         self._await('starting (the first time compiles the controller)',
                     lambda: operator.ready and operator.progress, READY_TIMEOUT)
-        self._say('arming')
-        deadline = time.monotonic() + ARM_TIMEOUT
-        while not (answer := operator.call('arm'))[0]:
-            if time.monotonic() > deadline:
-                raise FlightError(f'supervisor_node refuses to arm: {answer[1]}')
-            self._look()
-        self._await('taking off', lambda: operator.state.startswith('flying'), TAKEOFF_TIMEOUT)
+        self._take_off()
         cpu, start = self._graph.cpu_seconds(), time.monotonic()
         while not operator.progress.startswith('done'):
             self._look()
@@ -190,6 +186,24 @@ class Flight:
             value = operator.values('sim_node: latency').get(name)
             if value is not None:
                 self.measured[key] = float(value)
+
+    def _take_off(self):
+        """Arm and climb; a start that the busy computer spoilt on the ground is tried again."""
+        operator = self._operator
+        for _ in range(TAKEOFF_ATTEMPTS):
+            self._say('arming')
+            deadline = time.monotonic() + ARM_TIMEOUT
+            self._look(SETTLE_TIME)
+            while not (answer := operator.call('arm'))[0]:
+                if time.monotonic() > deadline:
+                    raise FlightError(f'supervisor_node refuses to arm: {answer[1]}')
+                self._look()
+            operator.states.clear()
+            self._await('taking off', lambda: operator.state.startswith('flying')
+                        or 'disarmed' in operator.states, TAKEOFF_TIMEOUT)
+            if operator.state.startswith('flying'):
+                return
+        raise FlightError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
 
     def land(self) -> None:
         """Land, if there is a supervisor that can; wait for the motors to stop."""
@@ -214,9 +228,9 @@ class Flight:
                 raise FlightError(f'{text}: nothing after {timeout:g} s, supervisor in '
                                   f"'{self._operator.state}'")
 
-    def _look(self):
+    def _look(self, seconds=LOOK_PERIOD):
         """Take in messages; a dead process ends the flight."""
-        self._operator.spin(LOOK_PERIOD)
+        self._operator.spin(seconds)
         dead = {name: how for name, how in self._graph.dead().items()
                 if name not in self._reported}
         self._reported |= set(dead)

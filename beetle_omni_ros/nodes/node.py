@@ -18,7 +18,15 @@ TWIN_CHECKS = 3
 
 
 class FlightNode(Node):
-    """A node whose inputs are checked before its code sees them."""
+    """
+    A node whose inputs are checked before its code sees them.
+
+    Attributes:
+        real_time: whether it is part of the control loop and runs before ordinary processes.
+
+    """
+
+    real_time = False
 
     def __init__(self, name: str, parameter_class: type, file: str | None = None,
                  file_key: str | None = None, on_change: Callable | None = None,
@@ -44,6 +52,7 @@ class FlightNode(Node):
         self.parameters = parameters.declare(self, parameter_class, file, file_key,
                                              on_change, changeable)
         self.health = Health(self)
+        self.get_logger().debug('started')      # the first call is slow: not in flight
         self._twin_checks = 0
         self._twin_timer = self.create_timer(1.0, self._look_for_twin, clock=self.steady_clock)
 

@@ -19,6 +19,9 @@ from beetle_omni_ros.sim.simulator import Simulator
 # After a stall of the computer the plant catches up by so much and forgets the rest:
 # a node that tried to make good every lost tick would never be on time again.
 CATCH_UP_TICKS = 8
+EARLY = 0.3             # part of a tick that the timer may come before the tick
+PHASE_WINDOW = 50       # calls of the timer that tell its phase
+SLEW = 0.01             # most that a tick's stamp may be stretched for it
 CLOCK_STEP = 0.005      # s of change between ROS and steady time: the clock was set
 CLOCK_READING = 0.001   # s in which both clocks must have been read to be compared
 COMMAND_AGE = 0.1       # s, older commands are not executed
@@ -45,6 +48,8 @@ class SimNodeParameters:
 class SimNode(FlightNode):
     """Steps the simulator on the steady clock, stamps its readings in ROS time."""
 
+    real_time = True
+
     def __init__(self):
         """Build the plant at rest on the ground."""
         super().__init__('sim_node', SimNodeParameters, on_change=self._changed)
@@ -59,6 +64,7 @@ class SimNode(FlightNode):
         self._epoch = None          # ROS time at which simulated time is 0
         self._clock_offset = self.now() - time.monotonic()
         self._ticks = self._lost_ticks = self._clock_steps = 0
+        self._lateness, self._slew = [], 0.0
         self._latency = health.Distribution()
         self._publish_to = {
             'mocap': self.create_publisher(PoseStamped, 'mocap/pose', qos.SENSOR),
@@ -82,17 +88,34 @@ class SimNode(FlightNode):
     def _on_timer(self):
         now, tick = time.monotonic(), self._tick
         if self._started is None:
-            # Half a tick early, so that the timer's jitter makes no empty and double ticks.
-            self._started = now - 0.5 * tick
+            self._started = now - tick
         self._follow_clock()
-        due = int((now - self._started) / tick) + 1 - self._ticks
+        due = int((now - self._started) / tick + EARLY) - self._ticks
         lost = max(0, due - CATCH_UP_TICKS)
         self._lost_ticks += lost
         self._started += lost * tick
-        self._epoch = self._clock_offset + self._started - 0.5 * tick
+        self._follow_timer(now, due - lost)
+        self._epoch = self._clock_offset + self._started
         for _ in range(due - lost):
             self._ticks += 1
             self._publish(self.timed(self._simulator.step))
+
+    def _follow_timer(self, now, due):
+        """
+        Let the times of the ticks glide to those at which the timer fires.
+
+        Its phase is unknown at first; a tick that is always due some milliseconds before
+        the timer would make every stamp that much too old.
+        """
+        tick = self._tick
+        if due > 0:
+            self._lateness.append(now - self._started - (self._ticks + due) * tick)
+        if len(self._lateness) == PHASE_WINDOW:
+            self._slew = min(self._lateness)
+            self._lateness.clear()
+        step = min(max(self._slew, -SLEW * tick), SLEW * tick)
+        self._slew -= step
+        self._started += step
 
     def _follow_clock(self):
         """Keep ROS time minus steady time, unless the clock was set."""

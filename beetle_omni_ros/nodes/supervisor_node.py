@@ -43,6 +43,8 @@ class SupervisorNode(FlightNode):
     the active controller, also in flight.
     """
 
+    real_time = True
+
     def __init__(self):
         """Begin disarmed."""
         super().__init__('supervisor_node', SupervisorNodeParameters, 'params/supervisor.yaml',
