@@ -49,14 +49,26 @@ def _summary(body, target, begin, end):
 
 def _tracking(log, body, task, start):
     """Tracking errors over all rounds and in each; a round that was cut short is None."""
-    target = next((t for t in log.targets if isinstance(t, TrajectoryTarget)), None)
-    if target is None:
+    windows = [t for t in log.targets if isinstance(t, TrajectoryTarget)]
+    if not windows:
         return {**dict.fromkeys(_summary_keys()), 'rounds': []}
+    target = _joined(windows)
     rounds = [_summary(body, target, start + begin, start + end)
               if body.covers(start + begin, start + end) else dict.fromkeys(_summary_keys())
               for begin, end in task.rounds]
     whole = _summary(body, target, start + task.rounds[0][0], start + task.rounds[-1][1])
     return {**whole, 'rounds': rounds}
+
+
+def _joined(windows):
+    """One path of overlapping windows, as the reference node publishes; the newer one counts."""
+    ends = [window.times[0] for window in windows[1:]] + [np.inf]
+    kept = [window.times < end for window, end in zip(windows, ends, strict=True)]
+    return TrajectoryTarget(*(
+        np.concatenate([getattr(window, name)[mask]
+                        for window, mask in zip(windows, kept, strict=True)])
+        for name in ('times', 'positions', 'quaternions', 'velocities', 'angular_velocities')),
+        stamp=windows[0].stamp)
 
 
 def _summary_keys():

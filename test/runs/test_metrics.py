@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic_flights import fly
 
+from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs.bag import BagWriter, read_bag
 from beetle_omni_ros.runs.body import geodesic_angles, roll_pitch_yaw
@@ -229,6 +230,21 @@ def test_tracking_reports_every_round():
     cut = metrics(flown(make_task('lemniscate'), duration=30.0), make_task('lemniscate'))
     assert [part['position_mean_m'] is None for part in cut['trajectory']['rounds']] \
         == [False, True, True, True, True]
+
+
+def test_a_trajectory_that_came_in_windows_is_judged_as_one():
+    task = make_task('lemniscate')
+    log = flown(task)
+    expected = metrics(log, task)['trajectory']
+    whole = log.targets.pop()
+    for start in range(0, len(whole.times) - 1, 75):
+        part = slice(start, start + 150)        # half of each window repeats in the next
+        log.targets.append(TrajectoryTarget(
+            whole.times[part], whole.positions[part], whole.quaternions[part],
+            whole.velocities[part], whole.angular_velocities[part], whole.times[start]))
+    result = metrics(log, task)['trajectory']
+    assert result.pop('rounds') == expected.pop('rounds')
+    assert result == pytest.approx(expected)
 
 
 def test_the_level_at_which_control_was_lost_is_reported():
