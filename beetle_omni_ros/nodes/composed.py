@@ -16,7 +16,8 @@ def main(args=None):
     """Run the named nodes on one events executor, as one process."""
     argv = list(sys.argv if args is None else args)
     names = runner.own_arguments(argv, 'composed')
-    usage = f"usage: composed NODE... [--ros-args -p NODE:KEY:=VALUE ...]; NODE: {', '.join(NODES)}"
+    usage = ('usage: composed NODE... [--ros-args -p NODE:KEY:=VALUE ...]; '
+             f"NODE: {', '.join(NODES)}")
     if names and names[0] in ('-h', '--help'):
         print(usage)
         sys.exit(runner.OK)

@@ -11,7 +11,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from beetle_omni_ros.control.base import Controller, PoseTarget
-from beetle_omni_ros.nodes import convert, health, qos
+from beetle_omni_ros.nodes import convert, health, qos, targets
 from beetle_omni_ros.nodes.node import FlightNode
 
 ODOM_AGE = 0.05         # s, an older estimate is not worth a command
@@ -57,9 +57,9 @@ class ControllerNode(FlightNode):
                     stale_after=None)
         # Latched by those who follow INTERFACES, volatile from a quick tool: both are heard.
         for profile in (qos.LATCHED, qos.EVENT):
-            self.listen(PoseStamped, 'target_pose', convert.pose_target, self._on_target,
+            self.listen(PoseStamped, 'target_pose', targets.pose_target, self._on_target,
                         profile, stale_after=None)
-        self.listen(MultiDOFJointTrajectory, 'target_trajectory', convert.trajectory_target,
+        self.listen(MultiDOFJointTrajectory, 'target_trajectory', targets.trajectory_target,
                     self._on_target, qos.EVENT, stale_after=None)
         self.create_subscription(String, 'supervisor/state', self._on_mode, qos.LATCHED)
         self.health.track_compute(self._controller.period)

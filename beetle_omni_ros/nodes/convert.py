@@ -12,13 +12,18 @@ from dataclasses import dataclass
 from math import isfinite
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, PoseStamped, Quaternion, Transform, Twist, Vector3, WrenchStamped
+from geometry_msgs.msg import (
+    Point,
+    PoseStamped,
+    Quaternion,
+    Vector3,
+    WrenchStamped,
+)
 from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import BatteryState, Imu, JointState
-from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
 
-from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
+from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
@@ -86,8 +91,8 @@ def time_message(stamp: float) -> Time:
 def imu_sample(message: Imu) -> ImuSample:
     """Read one IMU message."""
     return ImuSample(seconds(message.header.stamp),
-                     _finite(_xyz(message.linear_acceleration), 'linear_acceleration'),
-                     _finite(_xyz(message.angular_velocity), 'angular_velocity'))
+                     finite(xyz(message.linear_acceleration), 'linear_acceleration'),
+                     finite(xyz(message.angular_velocity), 'angular_velocity'))
 
 
 def imu_message(sample) -> Imu:
@@ -103,8 +108,8 @@ def imu_message(sample) -> Imu:
 def pose_sample(message: PoseStamped) -> PoseSample:
     """Read one motion-capture pose; the estimator judges the quaternion by its own tolerance."""
     return PoseSample(seconds(message.header.stamp),
-                      _finite(_xyz(message.pose.position), 'position'),
-                      _finite(_xyzw(message.pose.orientation), 'orientation'))
+                      finite(xyz(message.pose.position), 'position'),
+                      finite(xyzw(message.pose.orientation), 'orientation'))
 
 
 def pose_message(stamp: float, position: np.ndarray, rotation: np.ndarray) -> PoseStamped:
@@ -112,55 +117,6 @@ def pose_message(stamp: float, position: np.ndarray, rotation: np.ndarray) -> Po
     message = PoseStamped()
     _header(message, stamp, WORLD)
     _set_pose(message.pose, position, rotation)
-    return message
-
-
-def pose_target(message: PoseStamped) -> PoseTarget:
-    """Read a target pose."""
-    position, rotation = _pose(message.pose)
-    if message.header.frame_id not in ('', WORLD):
-        raise MessageError(f"frame_id '{message.header.frame_id}' is not '{WORLD}'")
-    return PoseTarget(position, rotation, seconds(message.header.stamp))
-
-
-def trajectory_target(message: MultiDOFJointTrajectory) -> TrajectoryTarget:
-    """Read a trajectory; times count from the header's stamp."""
-    start, points = seconds(message.header.stamp), message.points
-    if len(points) < 2:
-        raise MessageError(f'a trajectory needs 2 points or more, found {len(points)}')
-    for point in points:
-        if len(point.transforms) != 1 or len(point.velocities) != 1:
-            raise MessageError('each trajectory point needs one transform and one velocity')
-    times = np.array([start + p.time_from_start.sec + p.time_from_start.nanosec * 1e-9
-                      for p in points])
-    if np.any(np.diff(times) <= 0):
-        raise MessageError('trajectory times do not increase')
-    rotation = np.array([_xyzw(p.transforms[0].rotation) for p in points])
-    return TrajectoryTarget(
-        times,
-        _finite(np.array([_xyz(p.transforms[0].translation) for p in points]), 'translation'),
-        np.array([_unit(q) for q in rotation]),
-        _finite(np.array([_xyz(p.velocities[0].linear) for p in points]), 'velocity'),
-        _finite(np.array([_xyz(p.velocities[0].angular) for p in points]), 'angular velocity'),
-        stamp=start)
-
-
-def target_message(target: PoseTarget | TrajectoryTarget) -> PoseStamped | MultiDOFJointTrajectory:
-    """Write a target; a trajectory's angular velocities stay in the reference's body frame."""
-    if isinstance(target, PoseTarget):
-        return pose_message(target.stamp, target.position, target.quaternion)
-    message = MultiDOFJointTrajectory(joint_names=[BODY])
-    _header(message, target.stamp, WORLD)
-    for k, time in enumerate(target.times):
-        point = MultiDOFJointTrajectoryPoint()
-        offset = round((time - target.stamp) * 1e9)
-        point.time_from_start.sec = offset // 1_000_000_000
-        point.time_from_start.nanosec = offset % 1_000_000_000
-        point.transforms = [Transform(translation=vector(target.positions[k]),
-                                      rotation=quaternion(target.quaternions[k]))]
-        point.velocities = [Twist(linear=vector(target.velocities[k]),
-                                  angular=vector(target.angular_velocities[k]))]
-        message.points.append(point)
     return message
 
 
@@ -194,9 +150,9 @@ def odometry_message(stamp, position, velocity, rotation, angular_velocity,
 
 def odom(message: Odometry) -> Odom:
     """Read an odometry message into world velocity."""
-    position, rotation = _pose(message.pose.pose)
-    velocity = _finite(_xyz(message.twist.twist.linear), 'linear velocity')
-    rate = _finite(_xyz(message.twist.twist.angular), 'angular velocity')
+    position, rotation = checked_pose(message.pose.pose)
+    velocity = finite(xyz(message.twist.twist.linear), 'linear velocity')
+    rate = finite(xyz(message.twist.twist.angular), 'angular velocity')
     return Odom(seconds(message.header.stamp), position,
                 rotations.matrix(rotation) @ velocity, rotation, rate)
 
@@ -214,8 +170,8 @@ def joints(message: JointState) -> Joints:
     position = _values(message.position, order, 'position')
     velocity = _values(message.velocity, order, 'velocity') if len(message.velocity) \
         else np.zeros(4)
-    return Joints(seconds(message.header.stamp), _finite(position, 'position'),
-                  _finite(velocity, 'velocity'))
+    return Joints(seconds(message.header.stamp), finite(position, 'position'),
+                  finite(velocity, 'velocity'))
 
 
 def joint_message(stamp, position, velocity, effort=()) -> JointState:
@@ -231,8 +187,8 @@ def command(message: JointState) -> Command:
     order = _order(message.name, COMMAND_NAMES)
     tilt = _values(message.position, order[:4], 'position')
     thrust = _values(message.effort, order[4:], 'effort')
-    return Command(seconds(message.header.stamp), _finite(tilt, 'tilt'),
-                   _finite(thrust, 'thrust'))
+    return Command(seconds(message.header.stamp), finite(tilt, 'tilt'),
+                   finite(thrust, 'thrust'))
 
 
 def command_message(value: Command) -> JointState:
@@ -265,8 +221,8 @@ def battery(message: BatteryState) -> Battery:
 
 def wrench(message: WrenchStamped) -> Wrench:
     """Read an external wrench: force in world, torque in base_link, whatever the frame_id."""
-    return Wrench(seconds(message.header.stamp), _finite(_xyz(message.wrench.force), 'force'),
-                  _finite(_xyz(message.wrench.torque), 'torque'))
+    return Wrench(seconds(message.header.stamp), finite(xyz(message.wrench.force), 'force'),
+                  finite(xyz(message.wrench.torque), 'torque'))
 
 
 def wrench_message(stamp: float, force: np.ndarray, torque: np.ndarray) -> WrenchStamped:
@@ -299,26 +255,31 @@ def _set_pose(pose, position, rotation):
     pose.orientation = quaternion(rotation)
 
 
-def _pose(pose):
-    return _finite(_xyz(pose.position), 'position'), _unit(_xyzw(pose.orientation))
+def checked_pose(pose) -> tuple[np.ndarray, np.ndarray]:
+    """Position (3,) and unit quaternion (4,) of a pose message."""
+    return finite(xyz(pose.position), 'position'), unit(xyzw(pose.orientation))
 
 
-def _xyz(v) -> np.ndarray:
+def xyz(v) -> np.ndarray:
+    """Three fields as an array."""
     return np.array([v.x, v.y, v.z])
 
 
-def _xyzw(q) -> np.ndarray:
+def xyzw(q) -> np.ndarray:
+    """Four fields as an array."""
     return np.array([q.x, q.y, q.z, q.w])
 
 
-def _unit(q):
+def unit(q: np.ndarray) -> np.ndarray:
+    """Normalise a quaternion; refuse one that was not meant to be one."""
     norm = float(q @ q) ** 0.5
     if not abs(norm - 1) < UNIT_TOLERANCE:      # catches NaN as well
         raise MessageError('orientation is not a unit quaternion')
     return q / norm
 
 
-def _finite(values, what):
+def finite(values: np.ndarray, what: str) -> np.ndarray:
+    """Refuse what is not finite."""
     if not np.isfinite(values).all():
         raise MessageError(f'{what} is not finite')
     return values

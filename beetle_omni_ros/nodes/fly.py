@@ -116,8 +116,9 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
     try:
         graph.start()
         operator = Operator(graph.domain, controller)
-        with Progress(TextColumn('{task.description}'), BarColumn(), TextColumn('{task.fields[at]}'),
-                      TimeElapsedColumn(), console=console, transient=True) as bars:
+        columns = (TextColumn('{task.description}'), BarColumn(),
+                   TextColumn('{task.fields[at]}'), TimeElapsedColumn())
+        with Progress(*columns, console=console, transient=True) as bars:
             flight = Flight(graph, operator, task, bars)
             try:
                 flight.fly()

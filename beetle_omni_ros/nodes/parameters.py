@@ -9,12 +9,16 @@ key's name, by the same checks that read the parameter files.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import get_args, get_origin, get_type_hints, Union
 import types
+from typing import get_args, get_origin, get_type_hints, Union
 
 import numpy as np
-from rcl_interfaces.msg import (FloatingPointRange, IntegerRange, ParameterDescriptor,
-                                SetParametersResult)
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.node import Node
 
 from beetle_omni_ros.robot import schema

@@ -13,8 +13,8 @@ from beetle_omni_ros.nodes import health, qos, runner
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.bag import BagError, BagWriter
-from beetle_omni_ros.runs.topics import Topic, TOPICS
 from beetle_omni_ros.runs.topics import LATCHED as LATCHED_TOPIC
+from beetle_omni_ros.runs.topics import Topic, TOPICS
 
 FLUSH_PERIOD = 0.4      # s; a crash loses at most what came after the last flush
 OWN_TOPICS = {'reference/state': Topic('std_msgs/msg/String', LATCHED_TOPIC)}

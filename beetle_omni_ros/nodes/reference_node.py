@@ -13,7 +13,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
-from beetle_omni_ros.nodes import convert, health, qos, runner
+from beetle_omni_ros.nodes import convert, health, qos, runner, targets
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import parameter
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer
@@ -102,7 +102,7 @@ class ReferenceNode(FlightNode):
     def _start_target(self, target):
         self._trajectory = None
         if isinstance(target, PoseTarget):
-            self._poses.publish(convert.target_message(target))
+            self._poses.publish(targets.target_message(target))
         else:
             self._trajectory, self._window_end = target, target.times[0]
 
@@ -117,7 +117,7 @@ class ReferenceNode(FlightNode):
             np.array([getattr(sample, name) for sample in samples])
             for name in ('position', 'quaternion', 'velocity', 'angular_velocity')),
             stamp=float(times[0]))
-        self._trajectories.publish(convert.target_message(window))
+        self._trajectories.publish(targets.target_message(window))
         self._window_end = end if end < path.times[-1] else float('inf')
 
     def _disturb(self, now, moment):

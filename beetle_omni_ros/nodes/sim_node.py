@@ -11,19 +11,12 @@ from sensor_msgs.msg import BatteryState, Imu, JointState
 
 from beetle_omni_ros.nodes import convert, health, qos, runner
 from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.nodes.pacing import Pacing
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
-# After a stall of the computer the plant catches up by so much and forgets the rest:
-# a node that tried to make good every lost tick would never be on time again.
-CATCH_UP_TICKS = 8
-EARLY = 0.3             # part of a tick that the timer may come before the tick
-PHASE_WINDOW = 50       # calls of the timer that tell its phase
-SLEW = 0.01             # most that a tick's stamp may be stretched for it
-CLOCK_STEP = 0.005      # s of change between ROS and steady time: the clock was set
-CLOCK_READING = 0.001   # s in which both clocks must have been read to be compared
 COMMAND_AGE = 0.1       # s, older commands are not executed
 
 
@@ -59,12 +52,7 @@ class SimNode(FlightNode):
             self._robot, SimulatorParameters.load(given.simulator_file or None),
             conditions=given.conditions, seed=given.seed)
         self._simulator.set_payload(given.payload)
-        self._tick = self._simulator.tick
-        self._started = None        # steady time of the first tick
-        self._epoch = None          # ROS time at which simulated time is 0
-        self._clock_offset = self.now() - time.monotonic()
-        self._ticks = self._lost_ticks = self._clock_steps = 0
-        self._lateness, self._slew = [], 0.0
+        self._pacing = Pacing(self._simulator.tick, time.monotonic, self.now)
         self._latency = health.Distribution()
         self._publish_to = {
             'mocap': self.create_publisher(PoseStamped, 'mocap/pose', qos.SENSOR),
@@ -76,61 +64,21 @@ class SimNode(FlightNode):
                     max_age=COMMAND_AGE)
         self.listen(WrenchStamped, 'disturbance', convert.wrench, self._on_wrench, qos.EVENT,
                     stale_after=None)
-        self.health.track_compute(self._tick)
-        self.health.report('pacing', self._pacing)
+        self.health.track_compute(self._simulator.tick)
+        self.health.report('pacing', self._pacing_status)
         self.health.report('latency', self._latency_status)
-        self.create_timer(self._tick, self._on_timer, clock=self.steady_clock)
+        self.create_timer(self._simulator.tick, self._on_timer, clock=self.steady_clock)
 
     def _changed(self, new):
         self._simulator.set_payload(new.payload)
         self.get_logger().info(f'payload {new.payload:g} kg')
 
     def _on_timer(self):
-        now, tick = time.monotonic(), self._tick
-        if self._started is None:
-            self._started = now - tick
-        self._follow_clock()
-        due = int((now - self._started) / tick + EARLY) - self._ticks
-        lost = max(0, due - CATCH_UP_TICKS)
-        self._lost_ticks += lost
-        self._started += lost * tick
-        self._follow_timer(now, due - lost)
-        self._epoch = self._clock_offset + self._started
-        for _ in range(due - lost):
-            self._ticks += 1
+        for _ in range(self._pacing.due()):
             self._publish(self.timed(self._simulator.step))
 
-    def _follow_timer(self, now, due):
-        """
-        Let the times of the ticks glide to those at which the timer fires.
-
-        Its phase is unknown at first; a tick that is always due some milliseconds before
-        the timer would make every stamp that much too old.
-        """
-        tick = self._tick
-        if due > 0:
-            self._lateness.append(now - self._started - (self._ticks + due) * tick)
-        if len(self._lateness) == PHASE_WINDOW:
-            self._slew = min(self._lateness)
-            self._lateness.clear()
-        step = min(max(self._slew, -SLEW * tick), SLEW * tick)
-        self._slew -= step
-        self._started += step
-
-    def _follow_clock(self):
-        """Keep ROS time minus steady time, unless the clock was set."""
-        before = time.monotonic()
-        ros = self.now()
-        after = time.monotonic()
-        if after - before > CLOCK_READING:
-            return      # held up between the readings, they do not belong together
-        offset = ros - 0.5 * (before + after)
-        if abs(offset - self._clock_offset) > CLOCK_STEP:
-            self._clock_steps += self._epoch is not None
-            self._clock_offset = offset
-
     def _publish(self, frame):
-        epoch, publish_to = self._epoch, self._publish_to
+        epoch, publish_to = self._pacing.epoch, self._publish_to
         # What is old already goes first, so that the estimate that the IMU sample triggers has it.
         if frame.mocap is not None:
             publish_to['mocap'].publish(convert.pose_message(
@@ -153,17 +101,18 @@ class SimNode(FlightNode):
 
     def _on_command(self, command):
         self._latency.add(self.now() - command.stamp)
-        if self._epoch is not None:
-            self._simulator.command(replace(command, stamp=command.stamp - self._epoch))
+        if self._pacing.started:
+            self._simulator.command(replace(command, stamp=command.stamp - self._pacing.epoch))
 
     def _on_wrench(self, wrench):
         self._simulator.set_wrench(wrench.force, wrench.torque)
 
-    def _pacing(self):
-        level = health.WARN if self._lost_ticks else health.OK
-        return level, f'{self._lost_ticks} ticks lost', {
-            'ticks': self._ticks, 'lost_ticks': self._lost_ticks,
-            'clock_steps': self._clock_steps, 'simulated_s': self._simulator.time}
+    def _pacing_status(self):
+        pacing = self._pacing
+        level = health.WARN if pacing.lost_ticks else health.OK
+        return level, f'{pacing.lost_ticks} ticks lost', {
+            'ticks': pacing.ticks, 'lost_ticks': pacing.lost_ticks,
+            'clock_steps': pacing.clock_steps, 'simulated_s': self._simulator.time}
 
     def _latency_status(self):
         times = self._latency

@@ -11,7 +11,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA, String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from beetle_omni_ros.nodes import convert, qos, runner
+from beetle_omni_ros.nodes import convert, qos, runner, targets
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -57,7 +57,7 @@ class ViewerNode(FlightNode):
         self.listen(JointState, 'joint_states', convert.joints, self._keep('_joints'))
         self.listen(JointState, 'command', convert.command, self._keep('_command'), qos.SENSOR,
                     stale_after=None)
-        self.listen(PoseStamped, 'target_pose', convert.pose_target, self._keep('_target'),
+        self.listen(PoseStamped, 'target_pose', targets.pose_target, self._keep('_target'),
                     qos.LATCHED, stale_after=None)
         self.create_timer(1 / given.rate, self._draw, clock=self.steady_clock)
 

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from beetle_omni_ros.nodes import domain  # noqa: E402
+from beetle_omni_ros.nodes import domain
 
 
 @pytest.fixture

@@ -8,10 +8,9 @@ import rclpy
 from rclpy.parameter import Parameter
 
 from beetle_omni_ros.control.base import Command, PoseTarget
-from beetle_omni_ros.nodes import convert, sim_node
+from beetle_omni_ros.nodes import convert, targets
 from beetle_omni_ros.nodes.controller_node import ControllerNode
-from beetle_omni_ros.nodes.ekf_node import EkfNode
-from beetle_omni_ros.nodes.ekf_node import EkfNodeParameters
+from beetle_omni_ros.nodes.ekf_node import EkfNode, EkfNodeParameters
 from beetle_omni_ros.nodes.reference_node import ReferenceNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
@@ -124,38 +123,6 @@ def test_the_newest_target_counts_and_an_unset_stamp_means_now(make):
     assert node.follower.asked[-1][1].stamp == pytest.approx(node.now(), abs=5)
 
 
-def test_a_stalled_computer_costs_ticks_but_never_a_spiral(make, monkeypatch):
-    node = make(SimNode)
-    clock = SimpleNamespace(now=1000.0)
-    monkeypatch.setattr(sim_node.time, 'monotonic', lambda: clock.now)
-    monkeypatch.setattr(node, 'now', lambda: 5e8 + clock.now)
-    for _ in range(100):
-        node._on_timer()
-        clock.now += 0.005
-    assert node._ticks == 100
-    clock.now += 3.0                        # everything stood still
-    node._on_timer()
-    assert node._ticks == 100 + sim_node.CATCH_UP_TICKS
-    for _ in range(100):
-        clock.now += 0.005
-        node._on_timer()
-    assert node._ticks == 200 + sim_node.CATCH_UP_TICKS
-    assert node._lost_ticks == pytest.approx(3.0 / 0.005 - sim_node.CATCH_UP_TICKS, abs=2)
-    # Stamps stayed with ROS time.
-    assert node._epoch + node._simulator.time == pytest.approx(node.now(), abs=0.01)
-
-
-def test_the_stamps_follow_a_clock_that_was_set(make, monkeypatch):
-    node = make(SimNode)
-    offset = SimpleNamespace(value=0.0)
-    monkeypatch.setattr(node, 'now', lambda: 5e8 + sim_node.time.monotonic() + offset.value)
-    node._on_timer()
-    offset.value = 60.0
-    node._on_timer()
-    assert node._epoch + node._simulator.time == pytest.approx(node.now(), abs=0.02)
-    assert node._clock_steps == 1
-
-
 def test_the_payload_changes_in_flight_within_its_range(make):
     node = make(SimNode, 'payload:=0.25')
     assert node.set_parameters([Parameter('payload', value=1.0)])[0].successful
@@ -219,12 +186,12 @@ def test_trajectory_windows_join_without_a_gap_and_keep_to_the_path(make, monkey
         clock.now += 0.02
         assert clock.now < 2200
         if node._trajectories and clock.now < path.times[-1] - 0.1:
-            window = convert.trajectory_target(node._trajectories[-1])
+            window = targets.trajectory_target(node._trajectories[-1])
             assert window.times[0] <= clock.now and clock.now + 1.0 < max(
                 window.times[-1], path.times[-1] - 0.1 + 1.2)
             assert np.linalg.norm(window.at(clock.now).position
                                   - path.at(clock.now).position) < 1e-3
-    assert convert.trajectory_target(node._trajectories[0]).times[0] == pytest.approx(2008.0)
+    assert targets.trajectory_target(node._trajectories[0]).times[0] == pytest.approx(2008.0)
 
 
 def test_the_estimator_publishes_only_what_it_believes(make):

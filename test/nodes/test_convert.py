@@ -7,7 +7,7 @@ from sensor_msgs.msg import JointState
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.estimation.samples import ImuSample
-from beetle_omni_ros.nodes import convert
+from beetle_omni_ros.nodes import convert, targets
 from beetle_omni_ros.robot import rotations
 
 
@@ -77,13 +77,13 @@ def test_odometry_carries_the_twist_in_base_link(rng):
 
 def test_targets_round_trip(rng):
     pose = PoseTarget(rng.normal(size=3), unit(rng), 8.0)
-    back = convert.pose_target(over_the_wire(convert.target_message(pose)))
+    back = targets.pose_target(over_the_wire(targets.target_message(pose)))
     assert np.allclose(back.quaternion, pose.quaternion) and back.stamp == pytest.approx(8)
     times = 100 + np.cumsum(rng.uniform(0.01, 0.2, size=30))
     path = TrajectoryTarget(times, rng.normal(size=(30, 3)),
                             np.array([unit(rng) for _ in times]), rng.normal(size=(30, 3)),
                             rng.normal(size=(30, 3)), stamp=100.0)
-    back = convert.trajectory_target(over_the_wire(convert.target_message(path)))
+    back = targets.trajectory_target(over_the_wire(targets.target_message(path)))
     for name in ('times', 'positions', 'quaternions', 'velocities', 'angular_velocities'):
         assert np.allclose(getattr(back, name), getattr(path, name), atol=1e-8), name
 
@@ -99,6 +99,6 @@ def test_bad_messages_are_refused_with_a_reason(rng):
         convert.joints(JointState(name=['gimbal1', 'gimbal2', 'gimbal3', 'gimbal4'],
                                   position=[0.0]))
     with pytest.raises(convert.MessageError, match='unit quaternion'):
-        convert.pose_target(convert.pose_message(0.0, np.zeros(3), [0, 0, 0, 0.9]))
+        targets.pose_target(convert.pose_message(0.0, np.zeros(3), [0, 0, 0, 0.9]))
     with pytest.raises(convert.MessageError, match='position is not finite'):
         convert.pose_sample(convert.pose_message(0.0, [0, float('inf'), 0], [0, 0, 0, 1]))

@@ -1,0 +1,88 @@
+"""Ticks in real time: no spiral after a stall, stamps that stay with the clock."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.nodes.pacing import CATCH_UP_TICKS, Pacing
+
+TICK, ROS = 0.005, 1.8e9
+
+
+@pytest.fixture
+def clock():
+    """Steady time and ROS time minus steady time; both are what the test says."""
+    return SimpleNamespace(now=1000.0, offset=ROS)
+
+
+@pytest.fixture
+def pacing(clock):
+    return Pacing(TICK, lambda: clock.now, lambda: clock.now + clock.offset)
+
+
+def run(pacing, clock, seconds, jitter=None):
+    """Fire the timer once a tick; return the ages of the stamps at each call."""
+    ages = []
+    for k in range(round(seconds / TICK)):
+        late = jitter[k] if jitter is not None else 0.0
+        clock.now += late
+        if pacing.due():
+            ages.append(clock.now + clock.offset - pacing.epoch - pacing.ticks * TICK)
+        clock.now += TICK - late
+    return np.array(ages)
+
+
+def test_one_tick_a_call_and_stamps_of_now(pacing, clock):
+    ages = run(pacing, clock, 2.0)
+    assert pacing.ticks == 400
+    assert np.abs(ages).max() < 1e-6
+
+
+def test_a_late_first_call_does_not_make_all_stamps_old(pacing, clock):
+    clock.now += 0.0043
+    pacing.due()
+    clock.now += TICK - 0.0043
+    ages = run(pacing, clock, 4.0)
+    assert np.abs(ages[-100:]).max() < 1e-4
+    assert pacing.ticks == pytest.approx(801, abs=1)
+
+
+def test_jitter_costs_no_ticks(pacing, clock):
+    ages = run(pacing, clock, 10.0, np.random.default_rng(2).uniform(0, 0.003, 2000))
+    assert pacing.ticks == pytest.approx(2000, abs=1) and pacing.lost_ticks == 0
+    assert ages.max() < 0.0035 and ages.min() > -0.002
+
+
+def test_a_stall_costs_ticks_but_never_a_spiral(pacing, clock):
+    run(pacing, clock, 0.5)
+    clock.now += 3.0                        # everything stood still
+    assert pacing.due() == CATCH_UP_TICKS
+    clock.now += TICK
+    assert np.abs(run(pacing, clock, 0.5)).max() < 1e-4
+    assert pacing.ticks == 200 + CATCH_UP_TICKS
+    assert pacing.lost_ticks == pytest.approx(3.0 / TICK - CATCH_UP_TICKS, abs=2)
+
+
+def test_stamps_follow_a_clock_that_was_set(pacing, clock):
+    run(pacing, clock, 0.5)
+    clock.offset += 60.0
+    assert np.abs(run(pacing, clock, 0.5)).max() < 1e-4
+    assert pacing.clock_steps == 1
+    clock.offset -= 3600.0
+    assert np.abs(run(pacing, clock, 0.5)).max() < 1e-4
+    assert pacing.ticks == 300 and pacing.lost_ticks == 0
+
+
+def test_a_preemption_between_the_clock_readings_changes_no_stamp(clock):
+    readings = SimpleNamespace(hold=0.0)
+
+    def ros():
+        clock.now += readings.hold          # held up in the middle of the comparison
+        return clock.now + ROS
+
+    pacing = Pacing(TICK, lambda: clock.now, ros)
+    run(pacing, clock, 0.5)
+    readings.hold = 0.02
+    pacing.due()
+    assert pacing.clock_steps == 0
