@@ -7,8 +7,6 @@ from typing import Protocol
 
 import numpy as np
 
-from beetle_omni_ros.robot import rotations
-
 ROTORS = 4
 
 
@@ -111,20 +109,30 @@ class TrajectoryTarget:
     stamp: float = field(default=0.0)
 
     def at(self, time: float) -> Reference:
-        """The reference at ``time``, interpolated between samples (slerp for attitude)."""
-        times = self.times
-        if time <= times[0] or time >= times[-1]:
-            end = 0 if time <= times[0] else -1
-            return Reference(self.positions[end], self.quaternions[end], np.zeros(3), np.zeros(3))
-        k = int(np.searchsorted(times, time, side='right')) - 1
-        s = (time - times[k]) / (times[k + 1] - times[k])
-        relative = rotations.log(rotations.multiply(
-            rotations.conjugate(self.quaternions[k]), self.quaternions[k + 1]))
+        """The reference at ``time``, see :meth:`sample`."""
+        many = self.sample(np.array([time]))
+        return Reference(many.position[0], many.quaternion[0], many.velocity[0],
+                         many.angular_velocity[0])
+
+    def sample(self, times: np.ndarray) -> Reference:
+        """
+        References at (M,) times, each field with M rows.
+
+        Positions and rates are interpolated linearly, quaternions linearly and
+        normalised, which at the spacing of a trajectory's samples is a slerp to 1e-6 rad.
+        """
+        own = self.times
+        k = np.clip(np.searchsorted(own, times, side='right') - 1, 0, len(own) - 2)
+        s = np.clip((times - own[k]) / (own[k + 1] - own[k]), 0.0, 1.0)[:, None]
+        first, second = self.quaternions[k], self.quaternions[k + 1]
+        same = np.where(np.sum(first * second, axis=1, keepdims=True) < 0, -1.0, 1.0)
+        quaternion = (1 - s) * first + s * same * second
+        quaternion /= np.sqrt(np.sum(quaternion * quaternion, axis=1, keepdims=True))
+        moving = ((times > own[0]) & (times < own[-1]))[:, None]
         return Reference(
-            (1 - s) * self.positions[k] + s * self.positions[k + 1],
-            rotations.multiply(self.quaternions[k], rotations.exp(s * relative)),
-            (1 - s) * self.velocities[k] + s * self.velocities[k + 1],
-            (1 - s) * self.angular_velocities[k] + s * self.angular_velocities[k + 1])
+            (1 - s) * self.positions[k] + s * self.positions[k + 1], quaternion,
+            moving * ((1 - s) * self.velocities[k] + s * self.velocities[k + 1]),
+            moving * ((1 - s) * self.angular_velocities[k] + s * self.angular_velocities[k + 1]))
 
 
 Target = PoseTarget | TrajectoryTarget

@@ -47,14 +47,15 @@ class NmpcController:
         p = self._parameters = parameters or NmpcParameters.load()
         self._robot = robot
         problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag)
-        intervals = np.full(p.horizon.intervals, p.horizon.interval)
+        intervals = p.horizon.intervals
         soft = (p.limits.slack_linear, p.limits.slack_quadratic) if p.limits.soft else None
         options = (problem, intervals, soft, p.solver.tolerance, p.solver.max_iterations)
         advance = model.integrator(robot)
         self._rti, self.compiled = self._make_solver(options, advance, p.solver.compile)
         library = self._rti.library if self.compiled else None
         self._estimator = DisturbanceEstimator(robot, p, FunctionCall(advance, library))
-        self._planner = ReferencePlanner(robot, np.r_[0.0, np.cumsum(intervals)], p.nearest_turn)
+        self._planner = ReferencePlanner(robot, np.r_[0.0, np.cumsum(intervals)], p.nearest_turn,
+                                         p.model.servo_lag)
         self._state_size = problem.state_size
         self._weights = p.weights.vector()
         thrust_max = p.limits.thrust_max
@@ -106,7 +107,7 @@ class NmpcController:
             for _ in range(FIRST_ITERATIONS):
                 self._rti.step(x0, references, disturbance, self._weights, self._bounds)
         else:
-            self._rti.shift(self.period / self._parameters.horizon.interval)
+            self._rti.shift(self.period)
         status, self._iterations = self._rti.step(x0, references, disturbance, self._weights,
                                                   self._bounds)
         self._statuses[status] = self._statuses.get(status, 0) + 1

@@ -10,17 +10,25 @@ import numpy as np
 from beetle_omni_ros.control.ocp import WEIGHTS
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import group, parameter
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+
+LONGEST_HORIZON = 64  # MAX_STAGES of rti.c
 
 
 @dataclass(frozen=True, kw_only=True)
 class HorizonParameters:
     """How far and how finely the controller looks ahead."""
 
-    intervals: int = parameter(10, doc='number of shooting intervals', low=2, high=60,
-                               read_only=True)
-    interval: float = parameter(0.1, doc='length of each', unit='s', low=0.005, high=0.5,
-                                read_only=True)
+    intervals: np.ndarray = parameter(
+        [0.02, 0.03, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.2], unit='s',
+        doc='lengths of the shooting intervals, first to last; together the horizon',
+        low=0.005, high=0.5, read_only=True)
+
+    def __post_init__(self):
+        """Refuse a grid that the solver has no room for."""
+        if self.intervals.ndim != 1 or not 2 <= len(self.intervals) <= LONGEST_HORIZON:
+            raise ParameterError(f'horizon.intervals: expected 2 to {LONGEST_HORIZON} lengths '
+                                 f'[s], found {self.intervals.tolist()}')
 
 
 @dataclass(frozen=True, kw_only=True)

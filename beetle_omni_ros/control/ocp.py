@@ -5,9 +5,9 @@ One shooting interval: rigid body by Runge-Kutta 4, while the first-order lags o
 and rotors are evaluated in closed form at the start, middle and end of the interval. So
 an interval may be much longer than a servo's time constant, which an explicit rule on
 the whole state would not survive. The cost is least squares in position, velocity, the
-vector part of the attitude error quaternion, body rates, tilts, thrusts and command
-changes; with the reference attitude fixed it is linear in the state, so its
-Gauss-Newton Hessian is exact.
+vector part of the attitude error quaternion, body rates, tilts, thrusts and the lead of
+commands over what has been reached (beyond the lead that a moving reference needs). With
+the reference attitude fixed it is linear in the state, so its Gauss-Newton Hessian is exact.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 WEIGHTS = ('position_xy', 'position_z', 'velocity', 'attitude_xy', 'attitude_z', 'rate', 'tilt',
            'thrust', 'tilt_change', 'thrust_change', 'thrust_command')
 INPUT_SIZE = 8
-REFERENCE_SIZE = 21  # position, velocity, quaternion, rate, tilt, thrust
+# position, velocity, quaternion, rate, tilt, thrust, lead of tilt and of thrust commands
+REFERENCE_SIZE = 29
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool) -> Ocp:
     h = ca.SX.sym('h')
 
     x_next = _interval(robot, servo_lag, rotor_lag, x, u, d, h)
-    residual, weight = _residual(rotor_lag, x, u, reference, weights)
+    residual, weight = _residual(rotor_lag, x, u, d, reference, weights)
     z = ca.vertcat(x, u)
     jacobian = ca.jacobian(residual, z)
     hessian = h * (jacobian.T @ ca.diag(weight) @ jacobian)
@@ -71,7 +72,7 @@ def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool) -> Ocp:
         hessian[:size, :size], hessian[size:, size:], hessian[size:, :size],
         gradient[:size], gradient[size:])])
 
-    residual, weight = _residual(rotor_lag, x, None, reference, weights)
+    residual, weight = _residual(rotor_lag, x, None, None, reference, weights)
     jacobian = ca.jacobian(residual, x)
     terminal = ca.Function('terminal', [x, reference, weights], [ca.densify(e) for e in (
         jacobian.T @ ca.diag(weight) @ jacobian, jacobian.T @ (weight * residual))])
@@ -109,7 +110,7 @@ def _interval(robot, servo_lag, rotor_lag, x, u, d, h):
     return ca.vertcat(*parts, thrust) if rotor_lag else ca.vertcat(*parts)
 
 
-def _residual(rotor_lag, x, u, reference, weights):
+def _residual(rotor_lag, x, u, d, reference, weights):
     """Least-squares residual and its weights; without ``u``, the terminal ones."""
     w = dict(zip(WEIGHTS, ca.vertsplit(weights)))
     xr, yr, zr, wr = ca.vertsplit(reference[6:10])
@@ -126,11 +127,11 @@ def _residual(rotor_lag, x, u, reference, weights):
         residual.append(x[17:21] - reference[17:21])
         weight += [w['thrust']] * 4
     if u is not None:
-        residual.append(u[:4] - x[13:17])
+        residual.append(u[:4] + d[dynamics.TILT_OFFSET] - x[13:17] - reference[21:25])
         weight += [w['tilt_change']] * 4
         if rotor_lag:
-            residual.append(u[4:] - x[17:21])
+            residual.append(u[4:] - x[17:21] - reference[25:29])
             weight += [w['thrust_change']] * 4
-        residual.append(u[4:] - reference[17:21])
+        residual.append(u[4:] - reference[17:21] - reference[25:29])
         weight += [w['thrust_command']] * 4
     return ca.vertcat(*residual), ca.vertcat(*weight)

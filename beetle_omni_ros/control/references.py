@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from beetle_omni_ros.control.base import PoseTarget, Target
+from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
 from beetle_omni_ros.control.ocp import REFERENCE_SIZE
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
@@ -12,6 +12,8 @@ from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 DIFFERENCE_STEP = 1e-3  # [s] for the reference's acceleration
+TILT, THRUST, TILT_LEAD, THRUST_LEAD = (slice(13, 17), slice(17, 21), slice(21, 25),
+                                        slice(25, 29))
 
 
 class ReferencePlanner:
@@ -20,24 +22,31 @@ class ReferencePlanner:
 
     Tilts and thrusts are what holds the target pose (or follows the trajectory) with the
     estimated disturbances cancelled, each tilt on the legal turn nearest the present angle.
+    Where they move, a command held over an interval must lead: to bring a first-order lag
+    from one node's value to the next, it exceeds the first by the change / (1 - exp(-h / lag)).
 
     Args:
         robot: what the controller believes.
         times: (N + 1,) node times from the horizon's start [s].
         nearest_turn: whether tilts are unwound towards the present ones.
+        servo_lag: time constant of the servos [s].
 
     """
 
-    def __init__(self, robot: RobotParameters, times: np.ndarray, nearest_turn: bool):
+    def __init__(self, robot: RobotParameters, times: np.ndarray, nearest_turn: bool,
+                 servo_lag: float):
         """See the class."""
-        self._robot, self._times, self._nearest = robot, times, nearest_turn
+        self._times, self._nearest = times, nearest_turn
         self._allocator = Allocator(robot)
         self._inertia = np.asarray(robot.inertia)
+        length = np.diff(times)[:, None]
+        self._tilt_lead = 1 / -np.expm1(-length / servo_lag)
+        self._thrust_lead = 1 / -np.expm1(-length / robot.rotors.time_constant)
 
     def plan(self, target: Target, start: float, tilt: np.ndarray,
              disturbance: np.ndarray) -> np.ndarray:
         """
-        Reference (N + 1, 21): position, velocity, quaternion, rates, tilts, thrusts.
+        Reference (N + 1, 29): position, velocity, quaternion, rates, tilts, thrusts, leads.
 
         Args:
             target: pose or trajectory.
@@ -47,25 +56,32 @@ class ReferencePlanner:
 
         """
         references = np.zeros((len(self._times), REFERENCE_SIZE))
+        present = tilt if self._nearest else np.zeros(4)
         if isinstance(target, PoseTarget):
-            references[:] = self._node(target.at(start), np.zeros(3), np.zeros(3), tilt,
-                                       disturbance)
+            allocation = self._allocator.hover(target.quaternion, present,
+                                               -disturbance[model.FORCE],
+                                               -disturbance[model.TORQUE])
+            references[:, 0:3] = target.position
+            references[:, 6:10] = rotations.normalized(target.quaternion)
+            references[:, TILT], references[:, THRUST] = allocation.tilt, allocation.thrust
             return references
-        for k, time in enumerate(start + self._times):
-            sample, ahead = target.at(time), target.at(time + DIFFERENCE_STEP)
-            acceleration = (ahead.velocity - sample.velocity) / DIFFERENCE_STEP
-            angular = (ahead.angular_velocity - sample.angular_velocity) / DIFFERENCE_STEP
-            references[k] = self._node(sample, acceleration, angular, tilt, disturbance)
-            tilt = references[k, 13:17]
+        self._follow(target, start + self._times, present, disturbance, references)
         return references
 
-    def _node(self, sample, acceleration, angular_acceleration, tilt, disturbance):
-        rate = sample.angular_velocity
+    def _follow(self, target: TrajectoryTarget, times, present, disturbance, references):
+        now, ahead = target.sample(times), target.sample(times + DIFFERENCE_STEP)
+        rate = now.angular_velocity
+        acceleration = (ahead.velocity - now.velocity) / DIFFERENCE_STEP
+        angular_acceleration = (ahead.angular_velocity - rate) / DIFFERENCE_STEP
+        force = self._allocator.mass * acceleration - disturbance[model.FORCE]
         torque = self._inertia * angular_acceleration \
             + np.cross(rate, self._inertia * rate) - disturbance[model.TORQUE]
-        allocation = self._allocator.hover(
-            sample.quaternion, tilt if self._nearest else np.zeros(4),
-            self._allocator.mass * acceleration - disturbance[model.FORCE], torque)
-        return np.concatenate([sample.position, sample.velocity,
-                               rotations.normalized(sample.quaternion), rate, allocation.tilt,
-                               allocation.thrust])
+        references[:, 0:3], references[:, 3:6] = now.position, now.velocity
+        references[:, 6:10], references[:, 10:13] = now.quaternion, rate
+        for k, quaternion in enumerate(now.quaternion):
+            allocation = self._allocator.hover(quaternion, present, force[k], torque[k])
+            references[k, TILT], references[k, THRUST] = allocation.tilt, allocation.thrust
+            if self._nearest:
+                present = allocation.tilt
+        references[:-1, TILT_LEAD] = self._tilt_lead * np.diff(references[:, TILT], axis=0)
+        references[:-1, THRUST_LEAD] = self._thrust_lead * np.diff(references[:, THRUST], axis=0)

@@ -13,7 +13,7 @@
 #include <hpipm_d_ocp_qp_sol.h>
 
 #define NU 8
-#define NREF 21
+#define NREF 29
 #define MAX_STAGES 64
 
 struct rti {
@@ -111,16 +111,20 @@ void rti_fill(struct rti *s, const double *x, const double *u)
     for (int k = 0; k < s->horizon; k++) memcpy(s->u + k * NU, u, NU * sizeof(double));
 }
 
-/* Move the stored trajectory forward in time by a part of each interval. */
-void rti_shift(struct rti *s, double part)
+/* Move the stored trajectory forward by a time no longer than the shortest interval. */
+void rti_shift(struct rti *s, double time)
 {
     int nx = s->nx;
-    for (int k = 0; k < s->horizon; k++)
+    for (int k = 0; k < s->horizon; k++) {
+        double part = time / s->interval[k];
         for (int i = 0; i < nx; i++)
             s->x[k * nx + i] += part * (s->x[(k + 1) * nx + i] - s->x[k * nx + i]);
-    for (int k = 0; k + 1 < s->horizon; k++)
+    }
+    for (int k = 0; k + 1 < s->horizon; k++) {
+        double part = time / s->interval[k];
         for (int i = 0; i < NU; i++)
             s->u[k * NU + i] += part * (s->u[(k + 1) * NU + i] - s->u[k * NU + i]);
+    }
 }
 
 static int finite_all(const double *values, int count)

@@ -64,9 +64,9 @@ class CompiledRti:
         """Store one state and one input over the whole horizon."""
         self.states[:], self.inputs[:] = x, u
 
-    def shift(self, part: float):
-        """Move the stored trajectory forward by ``part`` of each interval."""
-        self.library.rti_shift(self._handle, part)
+    def shift(self, time: float):
+        """Move the stored trajectory forward by ``time`` [s], at most the shortest interval."""
+        self.library.rti_shift(self._handle, time)
 
     def step(self, x0, references, disturbance, weights, bounds) -> tuple[int, int]:
         """
@@ -74,7 +74,7 @@ class CompiledRti:
 
         Args:
             x0: (nx,) present state.
-            references: (N + 1, 21).
+            references: (N + 1, 29).
             disturbance: (10,) force in world, torque in body, tilt offsets.
             weights: (11,) in the order of ``ocp.WEIGHTS``.
             bounds: (18,) lower and upper input bounds, limits of |v| and |w|.
@@ -113,10 +113,11 @@ class InterpretedRti:
         """Store one state and one input over the whole horizon."""
         self.states[:], self.inputs[:] = x, u
 
-    def shift(self, part: float):
-        """Move the stored trajectory forward by ``part`` of each interval."""
+    def shift(self, time: float):
+        """As :meth:`CompiledRti.shift`."""
+        part = time / self._intervals[:, None]
         self.states[:-1] += part * np.diff(self.states, axis=0)
-        self.inputs[:-1] += part * np.diff(self.inputs, axis=0)
+        self.inputs[:-1] += part[:-1] * np.diff(self.inputs, axis=0)
 
     def step(self, x0, references, disturbance, weights, bounds) -> tuple[int, int]:
         """As :meth:`CompiledRti.step`."""

@@ -134,12 +134,12 @@ class FlightLoop:
                                 pose_covariance(estimate),
                                 twist_covariance(estimate, self._gyroscope_noise))
         command = supervisor.update(now)
-        if command is not None and command is not self._command:
+        if command is None:
+            self._command = None
+        elif self._command is None or command.stamp > self._command.stamp:
             self._command = command
             simulator.command(command)
             recorder.write_command(command.stamp, command.tilt, command.thrust, received=now)
-        elif command is None:
-            self._command = None
         self._note_state(now)
 
     def _sense(self, frame):

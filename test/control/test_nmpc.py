@@ -110,7 +110,7 @@ def test_a_moving_reference_is_tracked_with_its_future(controller):
     x = hovering((0.0, 0.0, 1.0))
     x[3] = 2 * np.pi / 8
     trace = fly(controller, target, 6.0, x=x)
-    assert errors(trace, target)[0] < 0.02
+    assert errors(trace, target)[0] < 0.004   # at 0.8 m/s: 5 ms
 
 
 def test_commands_keep_the_limits_whatever_the_target(controller):
@@ -151,7 +151,7 @@ def test_a_nan_state_repeats_the_plan_and_does_not_poison_the_next_cycles(contro
 
 
 def test_a_horizon_of_another_length_works_too():
-    parameters = NmpcParameters(horizon=HorizonParameters(intervals=14, interval=0.08),
+    parameters = NmpcParameters(horizon=HorizonParameters(intervals=np.linspace(0.05, 0.12, 14)),
                                 solver=SolverParameters(compile=False))
     target = PoseTarget(np.array([0.5, 0.5, 1.2]), rotations.from_rpy(0.4, 0.4, 0))
     position, angle = errors(fly(NmpcController(ROBOT, parameters), target, 4.0), target)
@@ -162,7 +162,8 @@ def test_a_horizon_of_another_length_works_too():
 def test_the_published_settings_stay_the_published_ones():
     p = NmpcParameters.load(share_path('params/nmpc_published.yaml'))
     assert not p.model.rotor_lag
-    assert (p.horizon.intervals * p.horizon.interval, p.limits.velocity) == (2.0, 1.0)
+    assert p.horizon.intervals.tolist() == [0.1] * 20
+    assert p.limits.velocity == 1.0
     assert (p.weights.position_xy, p.weights.position_z, p.weights.tilt) == (300, 400, 2)
     assert (p.weights.tilt_change, p.weights.thrust_command) == (250, 2)
     assert not p.limits.soft

@@ -22,7 +22,7 @@ def random_point(seed, size):
     x = rng.normal(size=size)
     x[6:10] = rotations.normalized(rng.normal(size=4))
     u = np.r_[rng.uniform(-3, 3, 4), rng.uniform(2, 18, 4)]
-    reference = rng.normal(size=21)
+    reference = rng.normal(size=29)
     reference[6:10] = rotations.normalized(rng.normal(size=4))
     return x, u, 0.1 * rng.normal(size=10), reference
 
@@ -70,9 +70,10 @@ def test_cost_gradient_and_hessian_belong_to_one_quadratic_cost(problem, seed):
 def test_the_cost_vanishes_at_the_reference_and_ignores_the_quaternion_sign():
     problem = ocp.build(ROBOT, SERVO_LAG, True)
     _, _, d, reference = random_point(1, 21)
-    u = np.r_[reference[13:17], reference[17:21]]
+    reference[21:] = 0
+    u = np.r_[reference[13:17] - d[6:], reference[17:21]]
     for sign in (1, -1):
-        x = reference.copy()
+        x = reference[:21].copy()
         x[6:10] *= sign
         *_, q, r = problem.stage(x, u, d, reference, WEIGHTS, 0.1)
         assert np.allclose(np.array(q), 0, atol=1e-9)

@@ -25,7 +25,8 @@ def problem():
 def setting(thrust=None):
     x = np.zeros(21)
     x[2], x[9], x[17:] = 1.0, 1.0, ROBOT.hover_thrust
-    references = np.tile(x, (len(INTERVALS) + 1, 1))
+    references = np.zeros((len(INTERVALS) + 1, ocp.REFERENCE_SIZE))
+    references[:, :21] = x
     references[:, 0] = 1.5
     references[:, 6:10] = [np.sin(0.5), 0, 0, np.cos(0.5)]
     bounds = np.r_[np.full(4, -3.96), np.zeros(4), np.full(4, 3.96), np.full(4, 20.0), 0.2, 1.0]
@@ -93,7 +94,7 @@ def test_compiled_and_interpreted_iterations_are_the_same(problem, tmp_path, mon
         rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
         trace = []
         for k in range(12):
-            rti.shift(0.1)
+            rti.shift(0.01)
             start = x0 if k % 2 else np.r_[x0[:6], -x0[6:10], x0[10:]]
             trace.append(rti.step(start, references, disturbance, WEIGHTS, bounds))
         results.append((trace, rti.states.copy(), rti.inputs.copy()))
