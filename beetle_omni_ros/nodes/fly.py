@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import contextmanager, ExitStack
-import json
 import os
 from pathlib import Path
 import signal
@@ -23,6 +22,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import add_meta, BagError, check_new, read_bag
+from beetle_omni_ros.runs.json_file import check_writable, write_json
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 
@@ -72,8 +72,8 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
             bag = Path(bag).absolute() if bag else folder / 'bag'
             check_new(bag)
-            if json_path and not Path(json_path).absolute().parent.is_dir():
-                raise ParameterError(f'{json_path}: its folder does not exist')
+            if json_path:
+                check_writable(json_path)
             flown = make_task(task, seed)
             RobotParameters.load(plant or robot)
             meta = {'task': task, 'conditions': conditions, 'seed': seed,
@@ -262,7 +262,7 @@ def _report(bag, controller, task, meta, json_path, console) -> int:
                       f"{measured['latency_p99_ms']:.2f} ms, max "
                       f"{measured['latency_max_ms']:.1f} ms")
     if json_path:
-        Path(json_path).write_text(json.dumps(results, indent=1) + '\n')
+        write_json(json_path, results)
     return runner.OK if not results[controller].get('crashed') else runner.FAILED
 
 

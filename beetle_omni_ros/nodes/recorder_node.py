@@ -30,6 +30,8 @@ class RecorderNodeParameters:
 class RecorderNode(FlightNode):
     """Writes every topic of the package as it comes from the wire."""
 
+    real_time = True        # the times of arrival in the bag are measurements
+
     def __init__(self):
         """Create the bag, then listen."""
         super().__init__('recorder_node', RecorderNodeParameters)

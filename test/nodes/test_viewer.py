@@ -1,0 +1,54 @@
+"""The viewer draws what the topics say."""
+
+import numpy as np
+import pytest
+import rclpy
+
+from beetle_omni_ros.control.base import Command, PoseTarget
+from beetle_omni_ros.nodes import convert
+from beetle_omni_ros.nodes.viewer_node import ViewerNode
+from beetle_omni_ros.robot import rotations
+
+
+class Sent(list):
+    """A publisher that keeps what it is given."""
+
+    publish = list.append
+
+
+@pytest.fixture
+def viewer(ros_domain):
+    rclpy.init(domain_id=ros_domain)
+    node = ViewerNode()
+    node._markers = Sent()
+    yield node
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
+    rotation = rotations.from_rpy(0.4, -0.2, 1.0)
+    position, tilt = np.array([1.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, 0.0, -0.3])
+    viewer._draw()
+    assert not viewer._markers              # nothing known yet
+    viewer._odom = convert.Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
+    viewer._joints = convert.Joints(5.0, tilt, np.zeros(4))
+    viewer._command = Command(5.0, tilt, np.array([8.0, 4.0, 0.0, 20.0]))
+    viewer._target = PoseTarget(position, rotation)
+    viewer._draw()
+    markers = {marker.ns: marker for marker in viewer._markers[-1].markers}
+    assert set(markers) == {'body', 'rotor1', 'rotor2', 'rotor3', 'rotor4', 'target'}
+    arrows = np.array([[[p.x, p.y, p.z] for p in markers[f'rotor{k}'].points]
+                       for k in (1, 2, 3, 4)])
+    thrust = (arrows[:, 1] - arrows[:, 0]) @ rotations.matrix(rotation) \
+        * viewer.parameters.newton_per_metre
+    assert np.linalg.norm(thrust, axis=1) == pytest.approx([8, 4, 0, 20])
+    assert thrust[0] == pytest.approx([0, 0, 8])                        # q = 0: up
+    axis = viewer._robot.tilt_axes[1]
+    assert thrust[1] == pytest.approx(4 * np.cross(axis, [0, 0, 1]))    # a quarter turn about it
+    assert markers['rotor1'].header.frame_id == 'world'
+
+
+def test_the_description_is_the_shipped_one():
+    from beetle_omni_ros.nodes.viewer_node import _text
+    assert '<robot' in _text('')
