@@ -6,15 +6,13 @@ from dataclasses import dataclass
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-import numpy as np
 from sensor_msgs.msg import Imu
 
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
+from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.samples import ATTITUDE, GYROSCOPE_BIAS, POSITION, VELOCITY
 from beetle_omni_ros.nodes import convert, health, qos, runner
 from beetle_omni_ros.nodes.node import FlightNode
-from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
 
@@ -42,7 +40,6 @@ class EkfNode(FlightNode):
         robot = RobotParameters.load(self.parameters.robot_file or None)
         self._ekf = ErrorStateEkf(self.parameters, robot.gravity)
         self._status = self._ekf.status
-        self._rate_variance = self.parameters.imu.gyroscope_noise ** 2
         self._publisher = self.create_publisher(Odometry, 'odom', qos.ESTIMATE)
         self.listen(Imu, 'imu/data_raw', convert.imu_sample, self._on_imu, max_age=SENSOR_AGE)
         self.listen(PoseStamped, 'mocap/pose', convert.pose_sample, self._on_pose,
@@ -64,20 +61,10 @@ class EkfNode(FlightNode):
             self._publish(self._ekf.estimate)
 
     def _publish(self, estimate):
-        body_to_world = rotations.matrix(estimate.quaternion)
-        twist = np.zeros((6, 6))
-        covariance = estimate.covariance
-        # ROS states rotation errors about fixed axes, the filter about body axes.
-        turn = np.eye(6)
-        turn[3:, 3:] = body_to_world
-        both = np.r_[POSITION, ATTITUDE]
-        pose = turn @ covariance[np.ix_(both, both)] @ turn.T
-        twist[:3, :3] = body_to_world.T @ covariance[VELOCITY, VELOCITY] @ body_to_world
-        twist[3:, 3:] = covariance[GYROSCOPE_BIAS, GYROSCOPE_BIAS] \
-            + self._rate_variance * np.eye(3)
         self._publisher.publish(convert.odometry_message(
             estimate.stamp, estimate.position, estimate.velocity, estimate.quaternion,
-            estimate.angular_velocity, pose, twist))
+            estimate.angular_velocity, pose_covariance(estimate),
+            twist_covariance(estimate, self.parameters.imu.gyroscope_noise)))
 
     def _estimator_status(self):
         level = {'tracking': health.OK, 'dead_reckoning': health.WARN, 'lost': health.ERROR}
