@@ -48,6 +48,9 @@ REQUIREMENTS = [
     'rosbags>=0.11,<0.12',
     'scipy>=1.11,<2',
     'typer>=0.12',
+    # Comes with mujoco 3. From 1.14 on it needs Python 3.11; where an index does not say so,
+    # the pip 23.0 of Python 3.10 searches without end.
+    'etils<1.14; python_version < "3.11"',
 ]
 
 # The plain name ros-rclpy on PyPI follows newer distributions; the names with jazzy stay.
