@@ -22,7 +22,8 @@ from rich.table import Table
 from beetle_omni_ros.nodes.fly import run_fly
 
 TARGETS = {'cpu_percent': 60.0, 'latency_p99_ms': 5.0}   # of the composed graph
-COLUMNS = ('cpu_percent', 'latency_median_ms', 'latency_p99_ms', 'latency_max_ms')
+COLUMNS = {'cpu_percent': 'CPU [%]', 'latency_median_ms': 'median [ms]',
+           'latency_p99_ms': '99 % [ms]', 'latency_max_ms': 'max [ms]'}
 POSES = ['0,0,1,0,0,0', '0.5,0,1,30,0,0', '0,0.5,1.2,0,-25,45']
 POSE_SECONDS = 8
 
@@ -46,7 +47,7 @@ def main():
     arguments.add_argument('--seconds', type=float, default=24, help='flight time of each')
     arguments.add_argument('--json', type=Path, help='file for the numbers')
     given = arguments.parse_args()
-    table = Table('arrangement', *COLUMNS)
+    table = Table('arrangement', *COLUMNS.values())
     measured = {}
     with tempfile.TemporaryDirectory() as folder:
         for name, composed in (('one process', True), ('separate processes', False)):

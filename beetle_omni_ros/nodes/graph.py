@@ -90,20 +90,24 @@ class Graph:
             Names of the processes that had to be killed.
 
         """
-        stubborn = []
         last = [name for name in self.processes if name == 'recorder_node']
-        for group in ([n for n in self.processes if n not in last], last):
-            for name in group:
+        return self._end([n for n in self.processes if n not in last]) + self._end(last)
+
+    def _end(self, names):
+        """Interrupt, again each second: a process that still imports may swallow the first."""
+        deadline = time.monotonic() + STOP_TIMEOUT
+        left = list(names)
+        while left and time.monotonic() < deadline:
+            for name in left:
                 if self.processes[name].poll() is None:
                     self.processes[name].send_signal(signal.SIGINT)
-            deadline = time.monotonic() + STOP_TIMEOUT
-            for name in group:
-                try:
-                    self.processes[name].wait(max(0.0, deadline - time.monotonic()))
-                except subprocess.TimeoutExpired:
-                    stubborn.append(name)
-                    self.kill(name)
-        return stubborn
+            again = time.monotonic() + 1.0
+            while left and time.monotonic() < again:
+                time.sleep(0.02)
+                left = [name for name in left if self.processes[name].poll() is None]
+        for name in left:
+            self.kill(name)
+        return left
 
     def warnings(self) -> list[str]:
         """Lines that the processes logged as warning or error, once each."""
