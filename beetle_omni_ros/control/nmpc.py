@@ -46,7 +46,7 @@ class NmpcController:
         """Build or load the solver; the first time takes some seconds of compilation."""
         p = self._parameters = parameters or NmpcParameters.load()
         self._robot = robot
-        problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag)
+        problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag, p.horizon.change_time)
         intervals = p.horizon.intervals
         soft = (p.limits.slack_linear, p.limits.slack_quadratic) if p.limits.soft else None
         options = (problem, intervals, soft, p.solver.tolerance, p.solver.max_iterations)

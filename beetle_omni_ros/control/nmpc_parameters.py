@@ -24,6 +24,10 @@ class HorizonParameters:
         doc='lengths of the shooting intervals, first to last; together the horizon',
         low=0.005, high=0.5, read_only=True)
 
+    change_time: float = parameter(
+        0.1, doc='the cost of command leads counts at least this long in each interval', unit='s',
+        low=0, high=1, read_only=True)
+
     def __post_init__(self):
         """Refuse a grid that the solver has no room for."""
         if self.intervals.ndim != 1 or not 2 <= len(self.intervals) <= LONGEST_HORIZON:

@@ -44,7 +44,8 @@ class Ocp:
     terminal: ca.Function
 
 
-def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool) -> Ocp:
+def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool,
+          change_time: float = 0.0) -> Ocp:
     """
     Write the stage functions for a robot.
 
@@ -53,6 +54,8 @@ def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool) -> Ocp:
         servo_lag: time constant of the servos' first-order reduction [s].
         rotor_lag: whether thrust is a state with the robot's rotor time constant
             (21 states) or follows its command at once (17 states).
+        change_time: the cost of command leads counts for at least this long in each
+            interval [s]; else short first intervals would make violent commands cheap.
 
     """
     size = 21 if rotor_lag else 17
@@ -62,7 +65,8 @@ def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool) -> Ocp:
     h = ca.SX.sym('h')
 
     x_next = _interval(robot, servo_lag, rotor_lag, x, u, d, h)
-    residual, weight = _residual(rotor_lag, x, u, d, reference, weights)
+    part = ca.fmax(h, change_time) / h
+    residual, weight = _residual(rotor_lag, x, u, d, reference, weights, part)
     z = ca.vertcat(x, u)
     jacobian = ca.jacobian(residual, z)
     hessian = h * (jacobian.T @ ca.diag(weight) @ jacobian)
@@ -72,7 +76,7 @@ def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool) -> Ocp:
         hessian[:size, :size], hessian[size:, size:], hessian[size:, :size],
         gradient[:size], gradient[size:])])
 
-    residual, weight = _residual(rotor_lag, x, None, None, reference, weights)
+    residual, weight = _residual(rotor_lag, x, None, None, reference, weights, 1)
     jacobian = ca.jacobian(residual, x)
     terminal = ca.Function('terminal', [x, reference, weights], [ca.densify(e) for e in (
         jacobian.T @ ca.diag(weight) @ jacobian, jacobian.T @ (weight * residual))])
@@ -110,8 +114,8 @@ def _interval(robot, servo_lag, rotor_lag, x, u, d, h):
     return ca.vertcat(*parts, thrust) if rotor_lag else ca.vertcat(*parts)
 
 
-def _residual(rotor_lag, x, u, d, reference, weights):
-    """Least-squares residual and its weights; without ``u``, the terminal ones."""
+def _residual(rotor_lag, x, u, d, reference, weights, change):
+    """Residual and weights, those of leads times ``change``; without ``u``, the terminal ones."""
     w = dict(zip(WEIGHTS, ca.vertsplit(weights)))
     xr, yr, zr, wr = ca.vertsplit(reference[6:10])
     qx, qy, qz, qw = ca.vertsplit(x[6:10])
@@ -128,10 +132,10 @@ def _residual(rotor_lag, x, u, d, reference, weights):
         weight += [w['thrust']] * 4
     if u is not None:
         residual.append(u[:4] + d[dynamics.TILT_OFFSET] - x[13:17] - reference[21:25])
-        weight += [w['tilt_change']] * 4
+        weight += [change * w['tilt_change']] * 4
         if rotor_lag:
             residual.append(u[4:] - x[17:21] - reference[25:29])
-            weight += [w['thrust_change']] * 4
+            weight += [change * w['thrust_change']] * 4
         residual.append(u[4:] - reference[17:21] - reference[25:29])
         weight += [w['thrust_command']] * 4
     return ca.vertcat(*residual), ca.vertcat(*weight)

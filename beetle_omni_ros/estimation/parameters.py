@@ -25,7 +25,7 @@ class ImuParameters:
         0.005, doc='standard deviation of one angular-rate sample, each axis', unit='rad/s',
         low=1e-6, high=1)
     accelerometer_bias_walk: float = parameter(
-        0.001, doc='random walk of the accelerometer bias', unit='m/s^2/sqrt(s)', low=0, high=1)
+        0.003, doc='random walk of the accelerometer bias', unit='m/s^2/sqrt(s)', low=0, high=1)
     gyroscope_bias_walk: float = parameter(
         0.0001, doc='random walk of the gyroscope bias', unit='rad/s/sqrt(s)', low=0, high=1)
     position: np.ndarray = parameter(

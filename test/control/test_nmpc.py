@@ -151,8 +151,8 @@ def test_a_nan_state_repeats_the_plan_and_does_not_poison_the_next_cycles(contro
 
 
 def test_a_horizon_of_another_length_works_too():
-    parameters = NmpcParameters(horizon=HorizonParameters(intervals=np.linspace(0.05, 0.12, 14)),
-                                solver=SolverParameters(compile=False))
+    horizon = HorizonParameters(change_time=0.05, intervals=np.linspace(0.05, 0.12, 14))
+    parameters = NmpcParameters(horizon=horizon, solver=SolverParameters(compile=False))
     target = PoseTarget(np.array([0.5, 0.5, 1.2]), rotations.from_rpy(0.4, 0.4, 0))
     position, angle = errors(fly(NmpcController(ROBOT, parameters), target, 4.0), target)
     assert position < 5e-3
