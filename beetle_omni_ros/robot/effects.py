@@ -134,7 +134,7 @@ CATALOGUE: dict[str, Effect] = {
                         _body_drag, 'F = -c |v| v'),
     'rotor_drag': Effect('body', {'coefficient': EffectParameter('N s/m', 0.0, 0.0, 5.0)},
                          _rotor_drag,
-                         'H-force of Faessler et al. 2018, growing with rotor speed sqrt(f / f_h)'),
+                         'H-force of Faessler et al. 2018, grows with rotor speed sqrt(f / f_h)'),
 }
 
 
