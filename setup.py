@@ -33,14 +33,15 @@ def shared(*folders):
 
 
 # Everything that simulates, flies in one process and reads bags; no ROS, no compiler.
-# Lower bounds admit what apt gives on Ubuntu 24.04; mujoco 4 has no wheels for Python 3.10.
+# Lower bounds admit what apt gives on Ubuntu 24.04. casadi: the wheel holds the BLASFEO that the
+# compiled controller links to; mujoco: energy of free bodies, and 4 has no wheel for Python 3.10.
 REQUIREMENTS = [
-    'casadi>=3.7,<4',
+    'casadi>=3.8,<4',
     'filterpy>=1.4.5,<3',
     'matplotlib>=3.6,<4',
     'mcap>=1.2,<2',
     'mcap-ros2-support>=0.5,<1',
-    'mujoco>=3.2,<5',
+    'mujoco>=3.3.7,<5',
     'numpy>=1.26,<3',
     'onnxruntime>=1.18,<2',
     'pyyaml>=6.0',
@@ -76,7 +77,7 @@ TRAIN = [
 # colcon looks for pytest under the name `test` before it runs pytest.
 TEST = [
     'hypothesis>=6.100',
-    'pytest>=7.4',
+    'pytest>=8',
     'pytest-timeout>=2.2',
 ]
 
