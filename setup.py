@@ -34,7 +34,7 @@ def shared(*folders):
 
 # Everything that simulates, flies in one process and reads bags; no ROS, no compiler.
 # Lower bounds admit what apt gives on Ubuntu 24.04. casadi: the wheel holds the BLASFEO that the
-# compiled controller links to; mujoco: energy of free bodies, and 4 has no wheel for Python 3.10.
+# compiled controller links to; mujoco: as far back as the tests pass, 4 has no Python 3.10 wheel.
 REQUIREMENTS = [
     'casadi>=3.8,<4',
     'filterpy>=1.4.5,<3',
