@@ -38,7 +38,7 @@ report: setup  ## one HTML page about the runs in runs_out/ (or RUNS='DIR...')
 	@runs='$(RUNS)'; for bag in runs_out/*/metadata.yaml; do \
 	    [ -n '$(RUNS)' ] || [ ! -f "$$bag" ] || runs="$$runs $${bag%/*}"; done; \
 	if [ -z "$$runs" ]; then echo 'no runs in runs_out/: make fly first, or RUNS=DIR' >&2; exit 2; fi; \
-	echo $(TOOL) report $$runs $(ARGS); $(TOOL) report $$runs $(ARGS)
+	mkdir -p runs_out; $(TOOL) report $$runs --output runs_out/report.html $(ARGS)
 
 clean:  ## remove the environment and what builds and tools leave; keeps runs_out/
 	rm -rf .venv build install log dist *.egg-info .pytest_cache .ruff_cache .hypothesis
