@@ -54,7 +54,7 @@ class NmpcController:
         self._rti, self.compiled = self._make_solver(options, advance, p.solver.compile)
         library = self._rti.library if self.compiled else None
         self._estimator = DisturbanceEstimator(robot, p, FunctionCall(advance, library))
-        self._planner = ReferencePlanner(robot, np.r_[0.0, np.cumsum(intervals)], p.nearest_turn,
+        self._planner = ReferencePlanner(robot, np.r_[0.0, np.cumsum(intervals)], p.unwind,
                                          p.model.servo_lag)
         self._state_size = problem.state_size
         self._weights = p.weights.vector()

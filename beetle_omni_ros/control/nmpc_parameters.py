@@ -130,8 +130,10 @@ class NmpcParameters:
     weights: NmpcWeights = group(NmpcWeights, 'cost')
     disturbance: DisturbanceParameters = group(DisturbanceParameters, 'offset-free control')
     solver: SolverParameters = group(SolverParameters, 'numerics')
-    nearest_turn: bool = parameter(True, doc='tilt references on the legal turn nearest the '
-                                   'present angle, instead of the raw arctangent')
+    unwind: float = parameter(
+        4.0, doc='a tilt reference takes its turn within +-pi unless that is farther than the '
+        'nearest legal turn by more than this; 0: always nearest, 6.3: always within +-pi',
+        unit='rad', low=0, high=6.3)
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> NmpcParameters:

@@ -21,22 +21,24 @@ class ReferencePlanner:
     Poses, rates, tilts and thrusts over the horizon.
 
     Tilts and thrusts are what holds the target pose (or follows the trajectory) with the
-    estimated disturbances cancelled, each tilt on the legal turn nearest the present angle.
+    estimated disturbances cancelled, each tilt on the legal turn nearest the present angle,
+    unless the turn within +-pi is not much farther: a joint near its stop has a long way to
+    go at the next pose, during which the robot falls.
     Where they move, a command held over an interval must lead: to bring a first-order lag
     from one node's value to the next, it exceeds the first by the change / (1 - exp(-h / lag)).
 
     Args:
         robot: what the controller believes.
         times: (N + 1,) node times from the horizon's start [s].
-        nearest_turn: whether tilts are unwound towards the present ones.
+        unwind: extra travel [rad] for which a tilt still goes to its turn within +-pi.
         servo_lag: time constant of the servos [s].
 
     """
 
-    def __init__(self, robot: RobotParameters, times: np.ndarray, nearest_turn: bool,
+    def __init__(self, robot: RobotParameters, times: np.ndarray, unwind: float,
                  servo_lag: float):
         """See the class."""
-        self._times, self._nearest = times, nearest_turn
+        self._times, self._unwind = times, unwind
         self._allocator = Allocator(robot)
         self._inertia = np.asarray(robot.inertia)
         length = np.diff(times)[:, None]
@@ -56,17 +58,23 @@ class ReferencePlanner:
 
         """
         references = np.zeros((len(self._times), REFERENCE_SIZE))
-        present = tilt if self._nearest else np.zeros(4)
         if isinstance(target, PoseTarget):
-            allocation = self._allocator.hover(target.quaternion, present,
+            allocation = self._allocator.hover(target.quaternion, tilt,
                                                -disturbance[model.FORCE],
                                                -disturbance[model.TORQUE])
             references[:, 0:3] = target.position
             references[:, 6:10] = rotations.normalized(target.quaternion)
-            references[:, TILT], references[:, THRUST] = allocation.tilt, allocation.thrust
+            references[:, TILT] = self._unwound(allocation.tilt, tilt)
+            references[:, THRUST] = allocation.thrust
             return references
-        self._follow(target, start + self._times, present, disturbance, references)
+        self._follow(target, start + self._times, tilt, disturbance, references)
         return references
+
+    def _unwound(self, tilt, present):
+        """Take the turn within +-pi unless that costs the joint too much more travel."""
+        other = tilt - 2 * np.pi * np.sign(tilt)
+        detour = np.abs(other - present) - np.abs(tilt - present)
+        return np.where((np.abs(tilt) > np.pi) & (detour < self._unwind), other, tilt)
 
     def _follow(self, target: TrajectoryTarget, times, present, disturbance, references):
         now, ahead = target.sample(times), target.sample(times + DIFFERENCE_STEP)
@@ -80,8 +88,8 @@ class ReferencePlanner:
         references[:, 6:10], references[:, 10:13] = now.quaternion, rate
         for k, quaternion in enumerate(now.quaternion):
             allocation = self._allocator.hover(quaternion, present, force[k], torque[k])
-            references[k, TILT], references[k, THRUST] = allocation.tilt, allocation.thrust
-            if self._nearest:
-                present = allocation.tilt
+            references[k, TILT] = self._unwound(allocation.tilt, present)
+            references[k, THRUST] = allocation.thrust
+            present = references[k, TILT]
         references[:-1, TILT_LEAD] = self._tilt_lead * np.diff(references[:, TILT], axis=0)
         references[:-1, THRUST_LEAD] = self._thrust_lead * np.diff(references[:, THRUST], axis=0)

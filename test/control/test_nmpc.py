@@ -167,4 +167,4 @@ def test_the_published_settings_stay_the_published_ones():
     assert (p.weights.position_xy, p.weights.position_z, p.weights.tilt) == (300, 400, 2)
     assert (p.weights.tilt_change, p.weights.thrust_command) == (250, 2)
     assert not p.limits.soft
-    assert not p.nearest_turn
+    assert p.unwind > 2 * np.pi

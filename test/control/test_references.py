@@ -1,0 +1,105 @@
+"""The reference over the horizon: what it holds, where joints unwind, what leads what."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
+from beetle_omni_ros.control.references import (
+    ReferencePlanner,
+    THRUST,
+    THRUST_LEAD,
+    TILT,
+    TILT_LEAD,
+)
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs import lemniscate
+
+ROBOT = RobotParameters.load()
+TIMES = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4])
+LAG = 0.03
+LIMIT = ROBOT.joints.position_limit
+
+
+def planner(unwind=4.0):
+    return ReferencePlanner(ROBOT, TIMES, unwind, LAG)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_pose_is_held_against_the_estimated_disturbance(seed):
+    rng = np.random.default_rng(seed)
+    quaternion = rotations.normalized(rng.normal(size=4))
+    disturbance = np.r_[rng.normal(size=3), 0.1 * rng.normal(size=3), np.zeros(4)]
+    reference = planner().plan(PoseTarget(np.ones(3), quaternion), 5.0, np.zeros(4), disturbance)
+    assert np.all(reference == reference[0])
+    # with the disturbance acting, the model does not accelerate
+    x = np.concatenate([np.zeros(6), quaternion, np.zeros(3), reference[0, TILT], np.zeros(4),
+                        reference[0, THRUST]])
+    u = np.r_[reference[0, TILT], reference[0, THRUST]]
+    assert np.allclose(np.array(model.full_model(ROBOT)(x, u, disturbance)), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_joints_rest_within_half_a_turn_unless_that_is_far(seed):
+    rng = np.random.default_rng(seed)
+    target = PoseTarget(np.zeros(3), rotations.normalized(rng.normal(size=4)))
+    present = rng.uniform(-LIMIT, LIMIT, 4)
+    nearest = planner(0.0).plan(target, 0.0, present, np.zeros(10))[0, TILT]
+    unwound = planner(4.0).plan(target, 0.0, present, np.zeros(10))[0, TILT]
+    principal = planner(6.3).plan(target, 0.0, present, np.zeros(10))[0, TILT]
+    assert np.allclose(np.cos(nearest - unwound), 1)
+    assert np.allclose(np.cos(nearest - principal), 1)
+    assert np.all(np.abs(principal) <= np.pi + 1e-12)
+    extra = np.abs(unwound - present) - np.abs(nearest - present)
+    assert np.all(extra < 4.0)
+    assert np.all((np.abs(unwound) <= np.pi) | (unwound == nearest))
+    assert np.all(np.abs(unwound) <= LIMIT)
+
+
+def test_a_joint_that_follows_a_moving_reference_does_not_jump_at_half_a_turn():
+    """Rolling over while hovering carries joints through pi."""
+    time = np.linspace(0, 4, 201)
+    quaternions = np.array([rotations.from_rpy(angle, 0, 0) for angle in np.pi * time / 4])
+    zeros = np.zeros((len(time), 3))
+    rates = zeros.copy()
+    rates[:, 0] = np.pi / 4
+    target = TrajectoryTarget(time, zeros, quaternions, zeros, rates)
+    tilt, plan = np.zeros(4), planner()
+    for start in np.arange(0.1, 3.5, 0.05):
+        reference = plan.plan(target, start, tilt, np.zeros(10))
+        assert np.abs(np.diff(reference[:, TILT], axis=0)).max() < 2.0
+        tilt = reference[0, TILT]
+
+
+def test_commands_lead_a_moving_reference_so_that_the_lag_arrives_on_time():
+    target = lemniscate.target(0.0)
+    reference = planner().plan(target, 20.0, np.zeros(4), np.zeros(10))
+    for values, lead, lag in ((TILT, TILT_LEAD, LAG),
+                              (THRUST, THRUST_LEAD, ROBOT.rotors.time_constant)):
+        for k, length in enumerate(np.diff(TIMES)):
+            command = reference[k, values] + reference[k, lead]
+            reached = command + (reference[k, values] - command) * np.exp(-length / lag)
+            assert np.allclose(reached, reference[k + 1, values], atol=1e-12)
+
+
+def test_a_trajectory_samples_its_own_derivatives():
+    target = lemniscate.target(3.0)
+    times, step = np.linspace(12, 80, 50), 1e-3
+    before, now, after = (target.sample(times + s) for s in (-step, 0, step))
+    assert np.allclose((after.position - before.position) / (2 * step), now.velocity, atol=6e-3)
+    for k in range(len(times)):
+        turn = rotations.log(rotations.multiply(rotations.conjugate(before.quaternion[k]),
+                                                after.quaternion[k])) / (2 * step)
+        assert np.allclose(turn, now.angular_velocity[k], atol=2e-2)
+        single = target.at(times[k])
+        assert np.allclose(single.position, now.position[k])
+        assert np.allclose(single.quaternion, now.quaternion[k])
+
+
+def test_before_and_after_its_time_a_trajectory_rests_at_its_ends():
+    target = lemniscate.target(3.0)
+    for time, end in ((0.0, 0), (1e4, -1)):
+        sample = target.at(time)
+        assert np.array_equal(sample.position, target.positions[end])
+        assert not sample.velocity.any() and not sample.angular_velocity.any()
