@@ -15,7 +15,6 @@ import beetle_omni_ros
 from beetle_omni_ros.control.hover import HoverParameters
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -33,6 +32,7 @@ KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-r
 PARAMETER_CLASSES = {
     'ekf.yaml': EkfParameters, 'hover.yaml': HoverParameters, 'nmpc.yaml': NmpcParameters,
     'nmpc_published.yaml': NmpcParameters, 'robot.yaml': RobotParameters,
+    'robot_weak_and_heavy.yaml': RobotParameters,
     'simulator.yaml': SimulatorParameters, 'supervisor.yaml': SupervisorParameters}
 
 
@@ -156,7 +156,7 @@ def test_each_parameter_file_is_read_by_its_class():
     shipped = sorted(path.name for path in (ROOT / 'params').glob('*.yaml'))
     assert shipped == sorted(PARAMETER_CLASSES)
     for name, kind in PARAMETER_CLASSES.items():
-        assert isinstance(schema.load(kind, share_path(f'params/{name}')), kind)
+        assert isinstance(kind.load(share_path(f'params/{name}')), kind)
 
 
 def test_checkout_wins_over_an_installation(tmp_path, monkeypatch):

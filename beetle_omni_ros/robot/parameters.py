@@ -172,11 +172,15 @@ class RobotParameters:
         """
         Read a robot file; without a path, the shipped one.
 
+        A file may begin with ``extends: FILE`` (beside it, or one of the shipped params) and
+        then names only what differs.
+
         Raises:
             ParameterError: naming file, key and what was expected.
 
         """
-        return schema.load(cls, path if path else share_path('params/robot.yaml'))
+        path = Path(path) if path else share_path('params/robot.yaml')
+        return schema.bind(cls, _merged(path, ()), str(path))
 
     @property
     def tilt_axes(self) -> np.ndarray:
@@ -209,3 +213,30 @@ class RobotParameters:
         data = plain(self)
         del data['name'], data['provenance']
         return data
+
+
+def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
+    """Content of a robot file on top of the one that it extends."""
+    content = schema.load_yaml(path)
+    if 'extends' not in content:
+        return content
+    name = content.pop('extends')
+    base = path.parent / str(name)
+    if not base.is_file():
+        try:
+            base = share_path(f'params/{name}')
+        except FileNotFoundError:
+            raise ParameterError(f"{path}: key 'extends': no file {name!r} beside it or among the "
+                                 'shipped params') from None
+    if base.resolve() in (*seen, path.resolve()):
+        raise ParameterError(f"{path}: key 'extends': {name} extends itself")
+    return _overlaid(_merged(base, (*seen, path.resolve())), content)
+
+
+def _overlaid(base: dict, content: dict) -> dict:
+    """Nested mappings merged, ``content`` first; the effects of a file replace those below."""
+    merged = dict(base)
+    for key, value in content.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = _overlaid(merged[key], value) if both and key != 'effects' else value
+    return merged

@@ -69,3 +69,35 @@ def test_a_bad_robot_file_is_refused_by_name(tmp_path, content, change, says):
     assert says in str(error.value)
     assert 'robot.yaml' in str(error.value)
     assert '\n' not in str(error.value)
+
+
+def test_a_file_that_extends_another_names_only_what_differs(tmp_path):
+    (tmp_path / 'mine.yaml').write_text(
+        'extends: robot.yaml\nmass: 3.2\nrotors: {thrust_max: 18.0}\n')
+    (tmp_path / 'other.yaml').write_text(
+        'extends: mine.yaml\neffects: {wind: {force: [1, 0, 0]}}\n')
+    shipped, mine = RobotParameters.load(), RobotParameters.load(tmp_path / 'other.yaml')
+    assert (mine.mass, mine.rotors.thrust_max) == (3.2, 18.0)
+    assert mine.effects == {'wind': {'force': (1.0, 0.0, 0.0)}}
+    assert np.array_equal(mine.rotors.positions, shipped.rotors.positions)
+    assert mine.joints == shipped.joints
+
+
+@pytest.mark.parametrize('text, says', [
+    ('extends: nowhere.yaml\n', "key 'extends': no file 'nowhere.yaml'"),
+    ('extends: mine.yaml\n', 'extends itself'),
+    ('extends: robot.yaml\nmas: 3\n', "key 'mas': unknown key; did you mean 'mass'?"),
+])
+def test_a_bad_extension_is_refused_by_name(tmp_path, text, says):
+    (tmp_path / 'mine.yaml').write_text(text)
+    with pytest.raises(ParameterError) as error:
+        RobotParameters.load(tmp_path / 'mine.yaml')
+    assert says in str(error.value)
+    assert 'mine.yaml' in str(error.value)
+
+
+def test_the_weak_and_heavy_plant_is_what_its_name_says():
+    shipped = RobotParameters.load()
+    plant = RobotParameters.load(share_path('params/robot_weak_and_heavy.yaml'))
+    assert plant.mass == pytest.approx(1.05 * shipped.mass)
+    assert plant.effects == {'thrust_coefficient': {'scale': 0.93}}
