@@ -143,7 +143,7 @@ class Supervisor(Inputs):
     def _watch(self, now):
         """Faults that end or change a flight, whoever flies it."""
         vehicle, envelope = self.vehicle, self._parameters.envelope
-        if vehicle.battery_low(self._parameters.battery.warn):
+        if vehicle.battery_low:
             self._say(now, WARNING, f'battery low: {vehicle.voltage:.1f} V', 'battery')
         if self.state == LANDING:
             return

@@ -47,16 +47,16 @@ class Vehicle:
         self.backup = BackupEstimator(parameters.backup, robot.gravity)
         self.refused: Counter = Counter()
         self.last_refusal = ''
-        self._low, self._lost = 0.0, 0.0
+        self._low, self._empty, self._lost = 0.0, 0.0, 0.0
 
     def tick(self, dt: float) -> None:
         """``dt`` seconds passed."""
         for source in (self.estimate, self.joints, self.imu, self.mocap):
             source.tick(dt)
         self.backup.imu_alive = not self.imu.silent
-        low = self.voltage is not None and self.voltage < self._cells * \
-            self._parameters.battery.land
-        self._low = self._low + dt if low else 0.0
+        battery = self._parameters.battery
+        self._low = self._low + dt if self._below(battery.warn) else 0.0
+        self._empty = self._empty + dt if self._below(battery.land) else 0.0
         self._lost = self._lost + dt if self.state is not None and self._tumbling() else 0.0
 
     def clock_went_back(self, now: float, by: float) -> None:
@@ -140,14 +140,15 @@ class Vehicle:
             return f'battery at {self.voltage:.1f} V, at least {battery.arm * self._cells:.1f} V'
         return ''
 
-    def battery_low(self, threshold: float) -> bool:
-        """Whether the last voltage is below ``threshold`` [V for each cell]."""
-        return self.voltage is not None and self.voltage < threshold * self._cells
+    @property
+    def battery_low(self) -> bool:
+        """Whether the pack has been below its warning voltage for long enough."""
+        return self._low >= self._parameters.battery.time
 
     @property
     def battery_empty(self) -> bool:
         """Whether the pack has been below its landing voltage for long enough."""
-        return self._low >= self._parameters.battery.time
+        return self._empty >= self._parameters.battery.time
 
     @property
     def lost(self) -> bool:
@@ -160,6 +161,9 @@ class Vehicle:
         fence = self._parameters.envelope
         x, y, z = np.abs(self.state.position)
         return bool(max(x, y) > fence.half_width or z > fence.height)
+
+    def _below(self, threshold):
+        return self.voltage is not None and self.voltage < threshold * self._cells
 
     def _tumbling(self):
         fence, state = self._parameters.envelope, self.state

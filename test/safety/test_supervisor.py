@@ -228,6 +228,12 @@ def test_fault_before_lift_off_just_stops_the_motors():
 
 def test_low_battery_warns_then_lands():
     puppet = Puppet().fly()
+    full = puppet.voltage
+    puppet.voltage = (PARAMETERS.battery.land - 0.05) * ROBOT.battery.cells
+    puppet.run(PARAMETERS.battery.time / 2)     # the sag of a manoeuvre
+    puppet.voltage = full
+    puppet.run(PARAMETERS.battery.time)
+    assert not any('battery' in t for t in puppet.texts())
     puppet.voltage = (PARAMETERS.battery.warn - 0.05) * ROBOT.battery.cells
     puppet.run(3.0)
     assert puppet.supervisor.state == 'flying' and any('battery low' in t for t in puppet.texts())
