@@ -74,3 +74,18 @@ def test_half_a_second_without_mocap_in_simulated_flight():
             worst = np.maximum(worst, errors(ekf, truth))
     assert 0 < worst[0] < 0.05 and 0 < worst[2] < np.deg2rad(1)
     assert ekf.status == 'tracking'
+
+
+def test_its_covariance_is_honest_on_the_multibody_plant():
+    """NEES of position, velocity and attitude; jolts of the modules make it no exact chi-square."""
+    nees = []
+    for seed in range(4):
+        for k, (ekf, truth) in enumerate(fly('nominal', seed)):
+            if truth.stamp > 3.0 and k % 50 == 0:
+                estimate = ekf.estimate
+                error = np.concatenate([
+                    truth.position - estimate.position, truth.velocity - estimate.velocity,
+                    rotations.log(rotations.multiply(rotations.conjugate(estimate.quaternion),
+                                                     truth.quaternion))])
+                nees.append(error @ np.linalg.solve(estimate.covariance[:9, :9], error))
+    assert 5.5 < np.mean(nees) < 12.5   # 9 for an exact filter; point-sampled IMU: 24
