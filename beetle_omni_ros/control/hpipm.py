@@ -36,10 +36,12 @@ class OcpQp:
         soft: linear and quadratic slack weight on all state bounds, or None for hard ones.
         tolerance: residual at which the interior-point method stops.
         max_iterations: its iteration limit.
+        general: N + 1 pairs of matrices (C on the state, D on the input), or None.
 
     """
 
-    def __init__(self, state_sizes, input_sizes, state_bounds, soft, tolerance, max_iterations):
+    def __init__(self, state_sizes, input_sizes, state_bounds, soft, tolerance, max_iterations,
+                 general):
         """Allocate HPIPM's structures; see the class."""
         self._lib = lib = _library()
         self._memory = []
@@ -49,7 +51,8 @@ class OcpQp:
                                 self._allocate(lib.d_ocp_qp_dim_memsize(horizon)))
         for k in range(horizon + 1):
             for field, value in (('nx', state_sizes[k]), ('nu', input_sizes[k]),
-                                 ('nbx', len(state_bounds[k])), ('nbu', input_sizes[k]), ('ng', 0),
+                                 ('nbx', len(state_bounds[k])), ('nbu', input_sizes[k]),
+                                 ('ng', len(general[k][0]) if general[k] else 0),
                                  ('ns', len(state_bounds[k]) if soft else 0)):
                 getattr(lib, f'd_ocp_qp_dim_set_{field}')(k, int(value), self.dim)
         self.qp = self._create('d_ocp_qp', self.dim)
@@ -61,6 +64,10 @@ class OcpQp:
             getattr(lib, f'd_ocp_qp_ipm_arg_set_tol_{name}')(byref(c_double(tolerance)), self.arg)
         self.ws = self._create('d_ocp_qp_ipm_ws', self.dim, self.arg)
         self._set_structure(input_sizes, state_bounds, soft)
+        for k, pair in enumerate(general):
+            if pair:
+                self.set('C', k, pair[0])
+                self.set('D', k, pair[1])
 
     def _allocate(self, size):
         buffer = np.zeros(int(size) + 128, dtype=np.uint8)

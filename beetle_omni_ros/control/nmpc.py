@@ -49,7 +49,8 @@ class NmpcController:
         problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag, p.horizon.change_time)
         intervals = p.horizon.intervals
         soft = (p.limits.slack_linear, p.limits.slack_quadratic) if p.limits.soft else None
-        options = (problem, intervals, soft, p.solver.tolerance, p.solver.max_iterations)
+        options = (problem, intervals, soft, p.solver.tolerance, p.solver.max_iterations,
+                   p.limits.tilt_rate_intervals - 1)
         advance = model.integrator(robot)
         self._rti, self.compiled = self._make_solver(options, advance, p.solver.compile)
         library = self._rti.library if self.compiled else None
@@ -62,7 +63,10 @@ class NmpcController:
         tilt = min(p.limits.tilt, robot.joints.position_limit)
         self._bounds = np.r_[np.full(4, -tilt), np.full(4, robot.rotors.thrust_min),
                              np.full(4, tilt), np.full(4, thrust_max),
-                             p.limits.velocity, p.limits.rate]
+                             p.limits.velocity, p.limits.rate,
+                             # how far a held target may lead for the lag to keep the rate
+                             p.limits.tilt_rate * intervals / -np.expm1(
+                                 -intervals / p.model.servo_lag)]
         self.reset()
 
     @staticmethod

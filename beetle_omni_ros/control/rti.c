@@ -14,10 +14,14 @@
 
 #define NU 8
 #define NREF 29
+#define NT 4                            /* tilts, states TILT to TILT + 3 and inputs 0 to 3 */
+#define TILT 13
+#define OFFSET 6                        /* of the servos' offsets in the disturbance */
 #define MAX_STAGES 64
 
 struct rti {
     int horizon, nx, soft;          /* intervals, states, whether v and w are softly bounded */
+    int reaches;                    /* intervals beyond the first with a bounded command lead */
     double interval[MAX_STAGES];    /* length of each interval [s] */
     double *x, *u;                  /* stored trajectory (N+1) x nx, N x NU */
     double *x_saved, *u_saved;
@@ -48,14 +52,15 @@ void rti_free(struct rti *s)
     free(s);
 }
 
-/* soft_weights: linear and quadratic weight of the slacks on v and w. */
+/* soft_weights: linear and quadratic weight of the slacks on v and w. reaches: intervals beyond
+ * the first in which tilt targets keep within reach of the tilts. */
 struct rti *rti_create(int horizon, const double *interval, int nx, int soft,
-                       const double *soft_weights, double tolerance, int max_iterations)
+                       const double *soft_weights, double tolerance, int max_iterations, int reaches)
 {
     if (horizon < 1 || horizon > MAX_STAGES) return NULL;
     struct rti *s = calloc(1, sizeof(struct rti));
     if (!s) return NULL;
-    s->horizon = horizon, s->nx = nx, s->soft = soft;
+    s->horizon = horizon, s->nx = nx, s->soft = soft, s->reaches = reaches;
     memcpy(s->interval, interval, horizon * sizeof(double));
     s->x = block(s, 2 * (horizon + 1) * nx * sizeof(double));
     s->u = block(s, 2 * horizon * NU * sizeof(double));
@@ -71,7 +76,7 @@ struct rti *rti_create(int horizon, const double *interval, int nx, int soft,
         d_ocp_qp_dim_set_nu(k, k < horizon ? NU : 0, &s->dim);
         d_ocp_qp_dim_set_nbx(k, bounded, &s->dim);
         d_ocp_qp_dim_set_nbu(k, k < horizon ? NU : 0, &s->dim);
-        d_ocp_qp_dim_set_ng(k, 0, &s->dim);
+        d_ocp_qp_dim_set_ng(k, k > 0 && k <= reaches ? NT : 0, &s->dim);
         d_ocp_qp_dim_set_ns(k, soft ? bounded : 0, &s->dim);
     }
     d_ocp_qp_create(&s->dim, &s->qp, block(s, d_ocp_qp_memsize(&s->dim)));
@@ -87,15 +92,17 @@ struct rti *rti_create(int horizon, const double *interval, int nx, int soft,
                            block(s, d_ocp_qp_ipm_ws_memsize(&s->dim, &s->arg)));
 
     int input_index[NU], state_index[6] = {3, 4, 5, 10, 11, 12}, slack_index[6];
-    double zero[6] = {0}, linear[6], quadratic[6];
+    double zero[6] = {0}, linear[6], quadratic[6], C[NT * 21] = {0}, D[NT * NU] = {0};
+    for (int i = 0; i < NT; i++) C[(TILT + i) * NT + i] = -1, D[i * NT + i] = 1;
     for (int i = 0; i < NU; i++) input_index[i] = i;
     for (int i = 0; i < 6; i++) linear[i] = soft_weights[0], quadratic[i] = soft_weights[1];
     for (int k = 0; k <= horizon; k++) {
         if (k < horizon) d_ocp_qp_set_idxbu(k, input_index, &s->qp);
         if (k == 0) continue;
+        if (k <= reaches) d_ocp_qp_set_C(k, C, &s->qp), d_ocp_qp_set_D(k, D, &s->qp);
         d_ocp_qp_set_idxbx(k, state_index, &s->qp);
         if (!soft) continue;
-        for (int i = 0; i < 6; i++) slack_index[i] = i + (k < horizon ? NU : 0);
+        for (int i = 0; i < 6; i++) slack_index[i] = i + (k < horizon ? NU : 0);   /* bu, bx, g */
         d_ocp_qp_set_idxs(k, slack_index, &s->qp);
         d_ocp_qp_set_Zl(k, quadratic, &s->qp), d_ocp_qp_set_Zu(k, quadratic, &s->qp);
         d_ocp_qp_set_zl(k, linear, &s->qp), d_ocp_qp_set_zu(k, linear, &s->qp);
@@ -134,7 +141,7 @@ static int finite_all(const double *values, int count)
 }
 
 /* One iteration. references: (N+1) x NREF; disturbance: 10; bounds: lower u (NU), upper u (NU),
- * limit of |v| and |w| by component. Returns the QP status: 0 solved, 1 iteration limit,
+ * limit of |v| and |w| by component, reach of the tilt targets (N). Returns the QP status: 0 solved, 1 iteration limit,
  * 2 step length, 3 NaN; on 2 and 3 the stored trajectory stays as it was. */
 int rti_step(struct rti *s, const double *x0, const double *references, const double *disturbance,
              const double *weights, const double *bounds)
@@ -168,6 +175,17 @@ int rti_step(struct rti *s, const double *x0, const double *references, const do
         }
         for (int i = 0; i < NU; i++)
             lower[i] = bounds[i] - u[k * NU + i], upper[i] = bounds[NU + i] - u[k * NU + i];
+        if (k <= s->reaches) {
+            double reach = bounds[2 * NU + 2 + k], low[NT], high[NT];
+            for (int i = 0; i < NT; i++) {
+                double lead = u[k * NU + i] + disturbance[OFFSET + i] - x[k * nx + TILT + i];
+                low[i] = -reach - lead, high[i] = reach - lead;
+                if (k > 0) continue;        /* the first state is given: a bound on the input */
+                double bottom = lower[i], top = upper[i];
+                lower[i] = fmin(fmax(low[i], bottom), top), upper[i] = fmax(fmin(high[i], top), bottom);
+            }
+            if (k > 0) d_ocp_qp_set_lg(k, low, &s->qp), d_ocp_qp_set_ug(k, high, &s->qp);
+        }
         d_ocp_qp_set_lbu(k, lower, &s->qp), d_ocp_qp_set_ubu(k, upper, &s->qp);
     }
     arg[0] = x + N * nx, arg[1] = references + N * NREF, arg[2] = weights;

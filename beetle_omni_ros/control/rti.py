@@ -9,9 +9,10 @@ import numpy as np
 from beetle_omni_ros.control.compiler import compiled_library
 from beetle_omni_ros.control.hpipm import OcpQp
 from beetle_omni_ros.control.ocp import INPUT_SIZE, Ocp, REFERENCE_SIZE
+from beetle_omni_ros.robot.dynamics import TILT_OFFSET
 
 BOUNDED_STATES = [3, 4, 5, 10, 11, 12]  # velocity and body rates
-QUATERNION = slice(6, 10)
+QUATERNION, TILT = slice(6, 10), slice(13, 17)
 _DOUBLES = POINTER(c_double)
 
 
@@ -25,6 +26,7 @@ class CompiledRti:
         soft: linear and quadratic slack weight of the velocity and rate limits, or None.
         tolerance: residual at which the QP counts as solved.
         max_iterations: of the QP.
+        reaches: intervals beyond the first in which tilt targets keep within reach.
         extra: further CasADi functions to compile into the same library.
 
     Raises:
@@ -32,11 +34,12 @@ class CompiledRti:
 
     """
 
-    def __init__(self, ocp: Ocp, intervals, soft, tolerance, max_iterations, extra=()):
+    def __init__(self, ocp: Ocp, intervals, soft, tolerance, max_iterations, reaches=0, extra=()):
         """Compile (or load) and allocate; see the class."""
         self.library = lib = compiled_library([ocp.stage, ocp.terminal, *extra])
         lib.rti_create.restype = c_void_p
-        lib.rti_create.argtypes = [c_int, _DOUBLES, c_int, c_int, _DOUBLES, c_double, c_int]
+        lib.rti_create.argtypes = [c_int, _DOUBLES, c_int, c_int, _DOUBLES, c_double, c_int,
+                                   c_int]
         for name in ('rti_states', 'rti_inputs'):
             getattr(lib, name).restype = _DOUBLES
             getattr(lib, name).argtypes = [c_void_p]
@@ -48,7 +51,8 @@ class CompiledRti:
         interval = np.array(intervals, dtype=float)
         weights = np.array(soft if soft else (0.0, 0.0), dtype=float)
         self._handle = lib.rti_create(n, interval.ctypes.data_as(_DOUBLES), size, int(bool(soft)),
-                                      weights.ctypes.data_as(_DOUBLES), tolerance, max_iterations)
+                                      weights.ctypes.data_as(_DOUBLES), tolerance, max_iterations,
+                                      reaches)
         if not self._handle:
             raise MemoryError(f'the NMPC could not be allocated for {n} intervals')
         self.states = np.ctypeslib.as_array(lib.rti_states(self._handle), (n + 1, size))
@@ -77,7 +81,8 @@ class CompiledRti:
             references: (N + 1, 29).
             disturbance: (10,) force in world, torque in body, tilt offsets.
             weights: (11,) in the order of ``ocp.WEIGHTS``.
-            bounds: (18,) lower and upper input bounds, limits of |v| and |w|.
+            bounds: (18 + N,) lower and upper input bounds, limits of |v| and |w|, and for each
+                interval how far a tilt target may lead its tilt.
 
         Returns:
             QP status (0 solved) and iterations; above 1 nothing has changed.
@@ -92,13 +97,14 @@ class CompiledRti:
 class InterpretedRti:
     """The same iteration without a compiler: CasADi's interpreter and HPIPM through ctypes."""
 
-    def __init__(self, ocp: Ocp, intervals, soft, tolerance, max_iterations):
+    def __init__(self, ocp: Ocp, intervals, soft, tolerance, max_iterations, reaches=0):
         """Allocate; arguments as for :class:`CompiledRti`."""
         n, size = len(intervals), ocp.state_size
         self._ocp, self._intervals = ocp, np.array(intervals, dtype=float)
         self.states, self.inputs = np.zeros((n + 1, size)), np.zeros((n, INPUT_SIZE))
         self._qp = OcpQp([0] + [size] * n, [INPUT_SIZE] * n + [0], [[]] + [BOUNDED_STATES] * n,
-                         soft, tolerance, max_iterations)
+                         soft, tolerance, max_iterations, self._lead_constraints(n, size, reaches))
+        self._reaches = reaches
         self._buffer, self._evaluate = ocp.stage.buffer()
         shapes = [ocp.stage.size_out(i) for i in range(ocp.stage.n_out())]
         flat = [np.zeros(rows * columns) for rows, columns in shapes]
@@ -129,12 +135,11 @@ class InterpretedRti:
         for k in range(n):
             f = self._linearise(x[k], u[k], disturbance, references[k], weights, k)
             qp.set('b', k, f.ravel() - x[k + 1])
-            qp.set('lbu', k, bounds[:INPUT_SIZE] - u[k])
-            qp.set('ubu', k, bounds[INPUT_SIZE:2 * INPUT_SIZE] - u[k])
+            self._bound_inputs(k, x[k], u[k], disturbance, bounds)
         hessian, gradient = self._ocp.terminal(x[n], references[n], weights)
         qp.set('Q', n, np.array(hessian))
         qp.set('q', n, np.array(gradient).ravel())
-        limit = np.repeat(bounds[2 * INPUT_SIZE:], 3)
+        limit = np.repeat(bounds[2 * INPUT_SIZE:2 * INPUT_SIZE + 2], 3)
         for k in range(1, n + 1):
             qp.set('lbx', k, -limit - x[k, BOUNDED_STATES])
             qp.set('ubx', k, limit - x[k, BOUNDED_STATES])
@@ -147,6 +152,27 @@ class InterpretedRti:
         if status <= 1:
             self.states[:], self.inputs[:] = x, u
         return status, iterations
+
+    @staticmethod
+    def _lead_constraints(n, size, reaches):
+        tilt_lead = np.zeros((4, size)), np.eye(4, INPUT_SIZE)
+        tilt_lead[0][:, TILT] = -np.eye(4)
+        return [tilt_lead if 0 < k <= reaches else None for k in range(n + 1)]
+
+    def _bound_inputs(self, k, x, u, disturbance, bounds):
+        lower, upper = bounds[:INPUT_SIZE] - u, bounds[INPUT_SIZE:2 * INPUT_SIZE] - u
+        if k <= self._reaches:
+            reach = bounds[2 * INPUT_SIZE + 2 + k]
+            lead = u[:4] + disturbance[TILT_OFFSET] - x[TILT]
+            if k > 0:
+                self._qp.set('lg', k, -reach - lead)
+                self._qp.set('ug', k, reach - lead)
+            else:  # the first state is given: a bound on the input
+                bottom, top = lower[:4].copy(), upper[:4].copy()
+                lower[:4] = np.clip(-reach - lead, bottom, top)
+                upper[:4] = np.clip(reach - lead, bottom, top)
+        self._qp.set('lbu', k, lower)
+        self._qp.set('ubu', k, upper)
 
     def _linearise(self, x, u, disturbance, reference, weights, k):
         values = (x, u, disturbance, reference, weights, self._intervals[k])

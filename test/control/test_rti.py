@@ -13,6 +13,8 @@ ROBOT = RobotParameters.load()
 WEIGHTS = NmpcWeights().vector()
 INTERVALS = np.full(4, 0.1)
 SOFT = (10.0, 100.0)
+REACH = 0.15   # [rad]
+REACHES = 2
 needs_compiler = pytest.mark.skipif(
     not compiler.shutil.which('gcc') and not compiler.shutil.which('cc'), reason='no C compiler')
 
@@ -29,7 +31,8 @@ def setting(thrust=None):
     references[:, :21] = x
     references[:, 0] = 1.5
     references[:, 6:10] = [np.sin(0.5), 0, 0, np.cos(0.5)]
-    bounds = np.r_[np.full(4, -3.96), np.zeros(4), np.full(4, 3.96), np.full(4, 20.0), 0.2, 1.0]
+    bounds = np.r_[np.full(4, -3.96), np.zeros(4), np.full(4, 3.96), np.full(4, 20.0), 0.2, 1.0,
+                   np.full(len(INTERVALS), REACH)]
     return x, references, 0.05 * np.ones(10), bounds
 
 
@@ -53,7 +56,12 @@ def qp_by_casadi(problem, x, u, x0, references, disturbance, bounds):
         high.append(bounds[nu:2 * nu] - u[k])
     hessian, gradient = problem.terminal(x[n], references[n], WEIGHTS)
     cost += 0.5 * opti_x[n].T @ hessian @ opti_x[n] + gradient.T @ opti_x[n]
-    limit = np.repeat(bounds[2 * nu:], 3)
+    for k in range(REACHES + 1):
+        tilt = (x[k] if k else x0)[13:17] + (opti_x[k][13:17] if k else 0)
+        inequality.append(u[k, :4] + opti_u[k][:4] + disturbance[6:] - tilt)
+        low.append(np.full(4, -REACH))
+        high.append(np.full(4, REACH))
+    limit = np.repeat(bounds[2 * nu:2 * nu + 2], 3)
     for k in range(1, n + 1):
         s = slack[k - 1]
         cost += SOFT[0] * ca.sum1(s) + 0.5 * SOFT[1] * ca.sumsqr(s)
@@ -74,7 +82,7 @@ def qp_by_casadi(problem, x, u, x0, references, disturbance, bounds):
 
 def test_the_first_command_is_that_of_an_independent_qp_solver(problem):
     x0, references, disturbance, bounds = setting()
-    rti = InterpretedRti(problem, INTERVALS, SOFT, 1e-9, 60)
+    rti = InterpretedRti(problem, INTERVALS, SOFT, 1e-9, 60, REACHES)
     rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
     x, u = rti.states.copy(), rti.inputs.copy()
     status, _ = rti.step(x0, references, disturbance, WEIGHTS, bounds)
@@ -87,8 +95,8 @@ def test_the_first_command_is_that_of_an_independent_qp_solver(problem):
 def test_compiled_and_interpreted_iterations_are_the_same(problem, tmp_path, monkeypatch):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     x0, references, disturbance, bounds = setting()
-    both = [CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50),
-            InterpretedRti(problem, INTERVALS, SOFT, 1e-6, 50)]
+    both = [CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES),
+            InterpretedRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)]
     results = []
     for rti in both:
         rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
@@ -106,17 +114,17 @@ def test_compiled_and_interpreted_iterations_are_the_same(problem, tmp_path, mon
 @needs_compiler
 def test_a_compiled_solver_is_built_once_and_found_again(problem, tmp_path, monkeypatch):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
-    CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50)
+    CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
     built = {p: p.stat().st_mtime_ns for p in compiler.cache_folder().iterdir()}
     CompiledRti(problem, INTERVALS[:2], None, 1e-6, 50)
     assert {p: p.stat().st_mtime_ns for p in compiler.cache_folder().iterdir()} == built
-    CompiledRti(ocp.build(ROBOT, 0.05, True), INTERVALS, SOFT, 1e-6, 50)
+    CompiledRti(ocp.build(ROBOT, 0.05, True), INTERVALS, SOFT, 1e-6, 50, REACHES)
     assert len(list(compiler.cache_folder().iterdir())) == 2
 
 
 def test_an_unsolved_qp_leaves_the_plan_as_it_was(problem):
     x0, references, disturbance, bounds = setting()
-    rti = InterpretedRti(problem, INTERVALS, SOFT, 1e-6, 50)
+    rti = InterpretedRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
     rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
     rti.step(x0, references, disturbance, WEIGHTS, bounds)
     before = rti.states.copy(), rti.inputs.copy()
@@ -131,7 +139,7 @@ def test_an_unsolved_qp_leaves_the_plan_as_it_was(problem):
 def test_inputs_stay_inside_their_bounds(problem):
     x0, references, disturbance, bounds = setting()
     references[:, 2] = 30.0
-    rti = InterpretedRti(problem, INTERVALS, SOFT, 1e-8, 80)
+    rti = InterpretedRti(problem, INTERVALS, SOFT, 1e-8, 80, REACHES)
     rti.fill(x0, np.r_[np.zeros(4), x0[17:]])
     for _ in range(5):
         rti.step(x0, references, disturbance, WEIGHTS, bounds)
@@ -144,7 +152,7 @@ def test_an_unusable_compiler_is_named(problem, tmp_path, monkeypatch, compilers
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     monkeypatch.setenv('CC', compilers)
     with pytest.raises(compiler.CompilerError, match=says):
-        CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50)
+        CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
 
 
 @needs_compiler
@@ -153,4 +161,4 @@ def test_an_unwritable_cache_is_named(problem, tmp_path, monkeypatch):
     blocked.write_text('')
     monkeypatch.setenv('XDG_CACHE_HOME', str(blocked))
     with pytest.raises(compiler.CompilerError, match='cannot build in'):
-        CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50)
+        CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
