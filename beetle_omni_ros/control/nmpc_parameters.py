@@ -56,7 +56,7 @@ class LimitParameters:
     rate: float = parameter(6.0, doc='of each component of the body rate', unit='rad/s', low=0.1,
                             high=50)
     tilt: float = parameter(3.96, doc='of the tilt targets', unit='rad', low=0.1, high=20)
-    tilt_rate: float = parameter(10.0, doc='of the tilts, as a bound on the lead of their targets',
+    tilt_rate: float = parameter(7.0, doc='of the tilts, as a bound on the lead of their targets',
                                  unit='rad/s', low=0.1, high=1000)
     tilt_rate_intervals: int = parameter(
         5, doc='intervals in which tilt_rate is kept; 0: none', low=0, high=60, read_only=True)

@@ -77,7 +77,7 @@ def test_half_a_second_without_mocap_in_simulated_flight():
 
 
 def test_its_covariance_is_honest_on_the_multibody_plant():
-    """NEES of position, velocity and attitude; jolts of the modules make it no exact chi-square."""
+    """NEES of position, velocity and attitude; jolts of the modules spoil an exact chi-square."""
     nees = []
     for seed in range(4):
         for k, (ekf, truth) in enumerate(fly('nominal', seed)):
