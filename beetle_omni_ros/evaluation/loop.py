@@ -15,7 +15,7 @@ from collections.abc import Callable
 from beetle_omni_ros.control.base import Controller, PoseTarget, State, Target
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
-from beetle_omni_ros.evaluation.compute import ComputeTimer
+from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.sim.simulator import Simulator
@@ -80,7 +80,11 @@ class FlightLoop:
             FlightError: it did not take off.
 
         """
-        self._take_off()
+        with collector_off():
+            self._take_off()
+            return self._play(task, progress)
+
+    def _play(self, task, progress):
         player = TaskPlayer(task, self._simulator.time)
         reported = self._simulator.time
         while True:
