@@ -130,6 +130,15 @@ class Simulator:
             raise ValueError(f'payload: expected a mass of 0 kg or more, found {mass!r}')
         self._plant.set_payload(float(mass))
 
+    @property
+    def charge(self) -> float:
+        """What is left in the pack, 1 is full."""
+        return self._battery.charge
+
+    def swap_battery(self) -> None:
+        """Put in a fresh pack, also in flight: a task may be longer than a charge."""
+        self._battery.reset()
+
     def step(self) -> Frame:
         """Advance one tick; return what became available in it."""
         plant, link, battery = self._plant, self._link, self._battery

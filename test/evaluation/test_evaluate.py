@@ -1,5 +1,6 @@
 """The in-process flight: deterministic, complete, honest about what went wrong."""
 
+from dataclasses import replace
 import io
 import json
 
@@ -15,6 +16,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag_reader import read_bag
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task
+from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 ROBOT = RobotParameters.load()
 
@@ -105,3 +107,15 @@ def test_a_force_task_ends_with_the_level_that_was_too_much():
     levels = [segment.level for segment in task.segments if segment.level]
     assert np.isfinite(log.truth_position).all()
     assert any(str(level) in json.dumps(lost) for level in levels)
+
+
+def test_an_empty_pack_is_swapped_at_the_next_target(tmp_path, monkeypatch):
+    small = SimulatorParameters.load()
+    small = replace(small, battery=replace(small.battery, capacity=0.3))
+    monkeypatch.setattr(command.SimulatorParameters, 'load', lambda: small)
+    task = make_task('random5')
+    log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)
+    assert not log.meta['crashed']
+    assert metrics(log, task)['success_rate'] == 1.0
+    drawn = -np.sum(log.battery_current[:-1] * np.diff(log.battery_t)) / 3600
+    assert drawn > 0.3   # [A h] more than one pack holds
