@@ -29,8 +29,8 @@ app = typer.Typer(no_args_is_help=True, add_completion=False,
                   help='Fly, evaluate and report on the tiltable quadrotor.')
 
 TaskOption = Annotated[str, typer.Option(
-    '--task', help='CSV file of poses, or waypoints, random100, lemniscate, hover, force, torque '
-                   'or payload.', metavar='TASK')]
+    '--task', help='CSV file of poses, or waypoints, randomN (random100), lemniscate, hover, '
+                   'force, torque or payload.', metavar='TASK')]
 ConditionsOption = Annotated[str, typer.Option(
     '--conditions', metavar='nominal|published',
     help="The simulator as measured, or with the publication's randomisation drawn from --seed.")]
@@ -62,7 +62,7 @@ def _common(version: Annotated[bool, typer.Option(
 def fly(bag: Annotated[Path, typer.Option(
             '--bag', metavar='DIR', help='New folder for the recorded bag.')],
         controller: Annotated[str, typer.Option(
-            '--controller', metavar='nmpc|rl', help='The active controller.')] = 'nmpc',
+            '--controller', metavar='nmpc', help='The active controller.')] = 'nmpc',
         task: TaskOption = 'waypoints',
         conditions: ConditionsOption = 'nominal',
         seed: SeedOption = 0,
@@ -103,7 +103,8 @@ def evaluate(controllers: Annotated[str, typer.Option(
              robot: RobotOption = None,
              plant: PlantOption = None,
              nmpc_file: Annotated[Optional[Path], typer.Option(
-                 '--nmpc', metavar='FILE', help='Other parameters for the NMPC.')] = None,
+                 '--nmpc', metavar='FILE',
+                 help="Other parameters for the controller 'nmpc'.")] = None,
              bag: Annotated[Optional[Path], typer.Option(
                  '--bag', metavar='DIR', help='New folder for the bag; with several controllers '
                                               'it holds one bag for each.')] = None,
@@ -118,6 +119,9 @@ def evaluate(controllers: Annotated[str, typer.Option(
     if not names or len(set(names)) != len(names):
         raise ParameterError(f"--controllers '{controllers}': expected different names, "
                              'separated by commas')
+    if nmpc_file and 'nmpc' not in names:
+        raise ParameterError(f"--nmpc {nmpc_file}: for the controller 'nmpc', which is not among "
+                             f"{', '.join(names)}")
     _check(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
            files=(robot, plant, nmpc_file))
     from beetle_omni_ros.evaluation.command import run_evaluate

@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+import shutil
 import subprocess
 import sys
 
@@ -82,6 +83,26 @@ def test_unusable_input_is_refused_before_the_flight(capsys, tmp_path, command):
 def test_controllers_must_be_different_names(capsys):
     for value in ('', 'nmpc,nmpc', ' , '):
         assert '--controllers' in refused(capsys, 'evaluate', '--controllers', value)
+
+
+def test_parameters_for_a_controller_that_does_not_fly_are_refused(capsys, tmp_path):
+    other = tmp_path / 'nmpc.yaml'
+    other.touch()
+    assert '--nmpc' in refused(capsys, 'evaluate', '--controllers', 'hover', '--nmpc', other)
+
+
+def test_fly_refuses_a_controller_without_a_node(capsys, tmp_path):
+    pytest.importorskip('rclpy')
+    line = refused(capsys, 'fly', '--controller', 'nmpc_published', '--bag', tmp_path / 'bag')
+    assert "controller 'nmpc_published': no node for it; expected nmpc" in line
+
+
+def test_report_takes_a_folder_of_bags(capsys, bag, tmp_path):
+    shutil.copytree(bag, tmp_path / 'both' / 'first')
+    shutil.copytree(bag, tmp_path / 'both' / 'second')
+    page = tmp_path / 'page.html'
+    assert cli.main(['report', str(tmp_path / 'both'), '-o', str(page)]) == 0
+    assert 'first' in page.read_text() and 'second' in page.read_text()
 
 
 def test_report_writes_one_page_that_needs_no_network(capsys, bag, tmp_path):

@@ -35,6 +35,7 @@ LANDING_TIMEOUT = 30.0  # s
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
 LOOK_PERIOD = 0.1       # s between looks at processes and progress
 INTERRUPTED = 130
+CONTROLLERS = ('nmpc',)  # that have a node
 
 
 class FlightError(RuntimeError):
@@ -80,6 +81,9 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
                     'controller': controller, 'composed': composed}
+            if controller not in CONTROLLERS:
+                raise ParameterError(f"controller '{controller}': no node for it; expected "
+                                     f"{' or '.join(CONTROLLERS)}")
             parameters = _parameters(controller, task, bag, seed, conditions, robot, plant)
             number = stack.enter_context(domain.reserved()) if domain_id is None else domain_id
             graph = Graph(parameters, folder, number, composed)
@@ -138,7 +142,7 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
     for name in stubborn:
         print(f'beetle_omni fly: error: {name} did not stop and was killed', file=sys.stderr)
     for line in graph.warnings():
-        console.print(line, markup=False, highlight=False, style='yellow')
+        console.print(line, markup=False, emoji=False, highlight=False, style='yellow')
     return status
 
 
@@ -249,7 +253,7 @@ def _report(bag, controller, task, meta, json_path, console) -> int:
         add_meta(bag, {k: v for k, v in meta.items() if k != 'graph'})
     log = read_bag(bag)
     for line in log.warnings:
-        console.print(line, markup=False, style='yellow')
+        console.print(line, markup=False, emoji=False, style='yellow')
     results = {'meta': meta, controller: metrics(log, task)}
     table.print_results(results, console)
     measured = meta.get('graph', {})

@@ -133,7 +133,7 @@ def _stop_on_signal() -> Future:
 
     def wait():
         waiting.recv(1)
-        stop.set_result(written)     # keeps the descriptor open until then
+        stop.set_result((waiting, written))     # keeps both ends open for further signals
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)

@@ -30,7 +30,7 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     Read runs, print their result table and write the page.
 
     Args:
-        paths: bags.
+        paths: bags, or folders of bags.
         output: HTML file.
         json_path: file for the results.
         console: where to print.
@@ -44,6 +44,7 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
 
     """
     console = console or Console()
+    paths = [run for path in paths for run in _runs_in(path)]
     if len(paths) > MAX_RUNS:
         raise ParameterError(f'{len(paths)} runs; a page shows at most {MAX_RUNS} side by side')
     logs = []
@@ -184,3 +185,10 @@ def fault_grids(run: Run) -> list[table.Grid]:
     if not made:
         made.append(table.Grid(f'{run.label}: no fault, nothing rejected', [escape('')], []))
     return made
+
+
+def _runs_in(path: Path) -> list[Path]:
+    """Find the bags of a folder that is none itself, such as `evaluate` makes; else the path."""
+    if path.is_dir() and not any(path.glob('*.mcap')):
+        return sorted({file.parent for file in path.glob('*/*.mcap')}) or [path]
+    return [path]

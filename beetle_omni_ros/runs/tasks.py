@@ -217,7 +217,8 @@ def make_task(name: str | Path, seed: int = 0) -> Task:
                 'payload': _payload_task}[name](name)
     if name.lower().endswith('.csv') or Path(name).exists():
         return _pose_task(name, pose_file.read_poses(name))
-    raise TaskError(f"task '{name}': expected a CSV file of poses or one of {', '.join(NAMES)}")
+    raise TaskError(f"task '{name}': expected a CSV file of poses, randomN or one of "
+                    f"{', '.join(NAMES)}")
 
 
 def random_poses(count: int, seed: int) -> np.ndarray:
