@@ -1,0 +1,114 @@
+"""
+What a policy sees: the table of its inputs, and how they follow from state and reference.
+
+Nothing is scaled here: a policy takes plain units, whatever it makes of them is inside its
+file. All vectors are in base_link, so that neither place nor heading matters beyond what the
+attitude columns say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Reference, State
+
+
+@dataclass(frozen=True)
+class Block:
+    """
+    One named part of the observation.
+
+    Attributes:
+        name: of the quantity.
+        size: numbers that it takes.
+        unit: SI unit, '1' for pure numbers.
+        frame: in which it is expressed, or what it belongs to.
+
+    """
+
+    name: str
+    size: int
+    unit: str
+    frame: str
+
+
+OBSERVATIONS = (
+    Block('velocity', 3, 'm/s', 'base_link'),                 # R^T (v - v_ref)
+    Block('angular_velocity', 3, 'rad/s', 'base_link'),       # w - R^T R_ref w_ref
+    Block('target_position', 3, 'm', 'base_link'),            # R^T (p_ref - p)
+    Block('attitude', 6, '1', 'world'),                       # x and z axis of base_link
+    Block('target_attitude', 6, '1', 'world'),                # x and z axis of the reference
+    Block('tilt', 4, 'rad', 'joint'),                         # measured
+    Block('previous_action', 8, '1', 'action'),               # the command in force
+)
+DISTURBANCES = (
+    Block('disturbance_force', 3, 'N', 'base_link'),          # estimated external force
+    Block('disturbance_torque', 3, 'N m', 'base_link'),       # estimated external torque
+)
+
+
+def blocks(memory: bool) -> tuple[Block, ...]:
+    """Table of a policy's inputs; ``memory``: with the estimated disturbance."""
+    return OBSERVATIONS + DISTURBANCES if memory else OBSERVATIONS
+
+
+def size(table: tuple[Block, ...]) -> int:
+    """Length of the observation with the blocks of ``table``."""
+    return sum(block.size for block in table)
+
+
+def observation(state: State, reference: Reference, previous_action,
+                disturbance: np.ndarray | None = None) -> np.ndarray:
+    """
+    Observation (33,), with a disturbance (39,), as float64.
+
+    Args:
+        state: position, velocity, attitude, rates and tilts of the robot.
+        reference: what to follow, already at the time looked ahead to.
+        previous_action: (8,) the command in force as an action.
+        disturbance: (6,) or longer: external force in world [N], torque in base_link [N m].
+
+    """
+    return np.array(observed(state, reference, previous_action, disturbance))
+
+
+def observed(state, reference, previous_action, disturbance=None) -> list[float]:
+    """
+    Give the numbers of :func:`observation` as a list, for the control loop.
+
+    Plain floats: on vectors of three, numpy's calls cost ten times the arithmetic.
+    """
+    x, y, z, w = state.quaternion.tolist()
+    xx, xy, xz, yz = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), \
+        2 * (y * z - x * w)
+    yx, yy, zx = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (x * z - y * w)
+    zy, zz = 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    a, b, c, d = reference.quaternion.tolist()
+    x_x, x_y, x_z = 1 - 2 * (b * b + c * c), 2 * (a * b + c * d), 2 * (a * c - b * d)
+    z_x, z_y, z_z = 2 * (a * c + b * d), 2 * (b * c - a * d), 1 - 2 * (a * a + b * b)
+
+    px, py, pz = (reference.position - state.position).tolist()
+    vx, vy, vz = (state.velocity - reference.velocity).tolist()
+    wx, wy, wz = state.angular_velocity.tolist()
+    p, q, r = reference.angular_velocity.tolist()
+    if p or q or r:
+        # the reference's y axis, only needed here; its rates to world, then to base_link
+        y_x, y_y, y_z = 2 * (a * b - c * d), 1 - 2 * (a * a + c * c), 2 * (b * c + a * d)
+        p, q, r = (x_x * p + y_x * q + z_x * r, x_y * p + y_y * q + z_y * r,
+                   x_z * p + y_z * q + z_z * r)
+        wx -= xx * p + yx * q + zx * r
+        wy -= xy * p + yy * q + zy * r
+        wz -= xz * p + yz * q + zz * r
+    values = [xx * vx + yx * vy + zx * vz, xy * vx + yy * vy + zy * vz,
+              xz * vx + yz * vy + zz * vz, wx, wy, wz,
+              xx * px + yx * py + zx * pz, xy * px + yy * py + zy * pz,
+              xz * px + yz * py + zz * pz,
+              xx, yx, zx, xz, yz, zz, x_x, x_y, x_z, z_x, z_y, z_z,
+              *state.tilt.tolist(), *previous_action]
+    if disturbance is not None:
+        fx, fy, fz, tx, ty, tz = disturbance[:6].tolist()
+        values += [xx * fx + yx * fy + zx * fz, xy * fx + yy * fy + zy * fz,
+                   xz * fx + yz * fy + zz * fz, tx, ty, tz]
+    return values
