@@ -52,9 +52,13 @@ def thrust_direction(arm_yaw: float, tilt):
 
 
 def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, tilt, thrust,
-               force_world=0, torque_body=0):
+               force_world=None, torque_body=None, tilt_acceleration=None, effects=None):
     """
     Newton-Euler equations of the robot as one rigid body.
+
+    Forces are summed at base_link, the body turns about its centre of mass, and the
+    acceleration is that of base_link's origin, which is the centre of mass unless an
+    effect moves it.
 
     Args:
         robot: parameters, with the effects that apply.
@@ -65,6 +69,8 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
         thrust: (4,) after the rotors' lag [N].
         force_world: (3,) external force in world [N].
         torque_body: (3,) external torque in body [N m].
+        tilt_acceleration: (4,) of the joints [rad/s^2], for effects that react to it.
+        effects: name -> parameter -> value or symbol, in place of the robot file's.
 
     Returns:
         (3,) acceleration in world [m/s^2], (3,) angular acceleration in body [rad/s^2].
@@ -72,25 +78,39 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
     """
     rotors = robot.rotors
     terms = Terms(
-        mass=robot.mass, thrust=thrust, velocity=velocity, angular_velocity=angular_velocity,
+        mass=robot.mass, inertia=ca.DM(robot.inertia), centre_of_mass=None, torque=_given(torque_body, 3),
+        tilt=tilt, tilt_acceleration=_given(tilt_acceleration, 4),
+        tilt_axes=[ca.DM(axis) for axis in robot.tilt_axes],
+        thrust=thrust, velocity=velocity, angular_velocity=angular_velocity,
         rotation=rotation_matrix(quaternion),
         thrust_directions=[thrust_direction(rotors.arm_yaw[i], tilt[i]) for i in range(4)],
         rotor_positions=[ca.DM(rotors.positions[i]) for i in range(4)],
-        hover_thrust=robot.hover_thrust, force_world=force_world, rotor_forces=[0] * 4,
+        hover_thrust=robot.hover_thrust, force_world=_given(force_world, 3), rotor_forces=[0] * 4,
         torque_ratio=rotors.torque_to_thrust_ratio)
-    for name, values in robot.effects.items():
+    for name, values in (robot.effects if effects is None else effects).items():
         CATALOGUE[name].apply(terms, **values)
-    force, torque = 0, torque_body
+    force, torque = 0, terms.torque
     for i in range(4):
         rotor_force = terms.thrust[i] * terms.thrust_directions[i] + terms.rotor_forces[i]
         force = force + rotor_force
         torque = torque + ca.cross(terms.rotor_positions[i], rotor_force) \
             - rotors.spin[i] * terms.torque_ratio * terms.thrust[i] * terms.thrust_directions[i]
-    inertia = ca.DM(robot.inertia)
     acceleration = (terms.rotation @ force + terms.force_world) / terms.mass \
         + ca.DM([0, 0, -robot.gravity])
-    momentum = inertia * angular_velocity
-    return acceleration, (torque - ca.cross(angular_velocity, momentum)) / inertia
+    centre = terms.centre_of_mass
+    if centre is not None:
+        torque = torque - ca.cross(centre, force + terms.rotation.T @ terms.force_world)
+    angular_acceleration = (torque - ca.cross(angular_velocity, terms.inertia * angular_velocity)
+                            ) / terms.inertia
+    if centre is not None:
+        acceleration = acceleration - terms.rotation @ (
+            ca.cross(angular_acceleration, centre)
+            + ca.cross(angular_velocity, ca.cross(angular_velocity, centre)))
+    return acceleration, angular_acceleration
+
+
+def _given(value, size):
+    return ca.DM.zeros(size) if value is None else value
 
 
 def servo_acceleration(robot: RobotParameters, tilt, tilt_rate, target):

@@ -18,6 +18,9 @@ import numpy as np
 from beetle_omni_ros.robot.schema import ParameterError
 
 
+_UP = ca.DM([0, 0, 1])
+
+
 @dataclass(frozen=True)
 class EffectParameter:
     """One number, or vector, of an effect: unit, value of no effect, legal range."""
@@ -35,6 +38,12 @@ class Terms:
 
     Attributes:
         mass: [kg].
+        inertia: (3,) diagonal about the centre of mass [kg m^2].
+        centre_of_mass: (3,) seen from base_link's origin [m], or None where it is the origin.
+        torque: (3,) torque added on the body, in base_link [N m].
+        tilt: (4,) tilt angles [rad].
+        tilt_acceleration: (4,) of the tilt joints [rad/s^2].
+        tilt_axes: list of four (3,) unit vectors in base_link, outward along the arms.
         thrust: (4,) rotor thrusts after their lag [N].
         velocity: (3,) of the centre of gravity in world [m/s].
         angular_velocity: (3,) in base_link [rad/s].
@@ -49,6 +58,12 @@ class Terms:
     """
 
     mass: ca.SX
+    inertia: ca.SX
+    centre_of_mass: ca.SX | None
+    torque: ca.SX
+    tilt: ca.SX
+    tilt_acceleration: ca.SX
+    tilt_axes: list
     thrust: ca.SX
     velocity: ca.SX
     angular_velocity: ca.SX
@@ -84,6 +99,33 @@ def _mass(terms, mass):
     terms.mass = mass
 
 
+def _inertia(terms, inertia):
+    terms.inertia = _vector(inertia)
+
+
+def _centre_of_mass(terms, offset):
+    terms.centre_of_mass = _moved(terms.centre_of_mass, _vector(offset))
+
+
+def _module_reaction(terms, module_inertia, mass_moment):
+    shift = 0
+    for i in range(4):
+        terms.torque = terms.torque - module_inertia * terms.tilt_acceleration[i] \
+            * terms.tilt_axes[i]
+        # The module's centre of mass hangs below the joint axis: it moves against the thrust.
+        shift = shift - mass_moment / terms.mass * (terms.thrust_directions[i] - _UP)
+    terms.centre_of_mass = _moved(terms.centre_of_mass, shift)
+
+
+def _moved(centre, shift):
+    return shift if centre is None else centre + shift
+
+
+def _vector(values):
+    return ca.vertcat(*ca.vertsplit(ca.SX(ca.vertcat(*values)))) if isinstance(values, tuple) \
+        else values
+
+
 def _thrust_coefficient(terms, scale):
     terms.thrust = scale * terms.thrust
 
@@ -98,7 +140,7 @@ def _torque_coefficient(terms, torque_to_thrust_ratio):
 
 
 def _wind(terms, force):
-    terms.force_world = terms.force_world + ca.vertcat(*ca.vertsplit(ca.SX(ca.vertcat(*force))))
+    terms.force_world = terms.force_world + _vector(force)
 
 
 def _body_drag(terms, coefficient):
@@ -119,6 +161,15 @@ def _rotor_drag(terms, coefficient):
 CATALOGUE: dict[str, Effect] = {
     'mass': Effect('body', {'mass': EffectParameter('kg', float('nan'), 0.05, 200)}, _mass,
                    "m v' = F"),
+    'inertia': Effect('body', {'inertia': EffectParameter('kg m^2', (float('nan'),) * 3, 1e-5, 50)},
+                      _inertia, "I w' = tau - w x I w"),
+    'centre_of_mass': Effect(
+        'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2)}, _centre_of_mass,
+        'forces turn the body about its centre of mass, base_link moves with it'),
+    'module_reaction': Effect(
+        'body', {'module_inertia': EffectParameter('kg m^2', 0.0, 0.0, 0.1),
+                 'mass_moment': EffectParameter('kg m', 0.0, 0.0, 1.0)}, _module_reaction,
+        "servo torque J q'' on the body; centre of mass moved by -moment / m (t(q) - t(0))"),
     'thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0)}, _thrust_coefficient,
         'f = scale f*'),

@@ -13,7 +13,9 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
-BUILT_IN = ('mass', 'thrust_coefficient', 'rotor_thrust_coefficient', 'torque_coefficient')
+# The plant's modules turn and swing as bodies of their own, whatever the file says of them.
+BUILT_IN = ('mass', 'inertia', 'centre_of_mass', 'module_reaction', 'thrust_coefficient',
+            'rotor_thrust_coefficient', 'torque_coefficient')
 FORCES = ('wind', 'body_drag', 'rotor_drag')
 
 

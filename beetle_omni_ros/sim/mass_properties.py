@@ -115,10 +115,12 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
     if main_mass <= 0:
         raise ParameterError(f'multibody: modules and end-effector weigh {mass - main_mass:g} kg, '
                              f'the whole robot {mass:g} kg; nothing is left for the main body')
-    centre = variation.centre_of_mass
+    offset = robot.effects.get('centre_of_mass', {}).get('offset', (0.0,) * 3)
+    total_inertia = np.array(robot.effects.get('inertia', {}).get('inertia', robot.inertia))
+    centre = variation.centre_of_mass + np.array(offset)
     main_centre = (mass * centre - sum(part.mass * part.centre for part in known)) / main_mass
     point_mass = RigidPart(main_mass, main_centre, np.zeros((3, 3)))
-    inertia = np.diag(robot.inertia * variation.inertia_scale) - sum(
+    inertia = np.diag(total_inertia * variation.inertia_scale) - sum(
         part.inertia_about(centre) for part in [point_mass, *known])
     moments = np.linalg.eigvalsh(inertia)
     if moments[0] <= 0 or moments[0] + moments[1] < moments[2]:

@@ -129,13 +129,36 @@ def with_effect(**effects):
 
 @pytest.mark.parametrize('name', list(CATALOGUE))
 def test_an_effect_at_its_neutral_value_changes_nothing(name):
-    own = {'mass': ROBOT.mass, 'torque_to_thrust_ratio': ROBOT.rotors.torque_to_thrust_ratio}
+    own = {'mass': ROBOT.mass, 'inertia': tuple(ROBOT.inertia), 'torque_to_thrust_ratio': ROBOT.rotors.torque_to_thrust_ratio}
     values = {key: own.get(key, spec.neutral) for key, spec in CATALOGUE[name].parameters.items()}
     state = random_state(7)
     plain = model.body_acceleration(ROBOT)(*state)
     neutral = model.body_acceleration(with_effect(**{name: values}))(*state)
     for a, b in zip(plain, neutral):
         assert np.allclose(np.array(a), np.array(b), atol=1e-12)
+
+
+def test_a_shifted_centre_of_mass_is_the_same_body_seen_from_another_point():
+    offset = np.array([0.01, -0.02, 0.03])
+    v, q, w, tilt, thrust = random_state(9)
+    shifted = with_effect(centre_of_mass={'offset': tuple(offset)})
+    rotors = replace(ROBOT.rotors, positions=ROBOT.rotors.positions - offset)
+    at_centre = newton_euler(replace(ROBOT, rotors=rotors), v, q, w, tilt, thrust)
+    linear, angular = (np.array(a).ravel() for a in model.body_acceleration(shifted)(v, q, w, tilt,
+                                                                             thrust))
+    lever = -offset    # from the centre of mass to base_link's origin
+    expected = at_centre[0] + Rotation.from_quat(q).apply(
+        np.cross(at_centre[1], lever) + np.cross(w, np.cross(w, lever)))
+    assert np.allclose(angular, at_centre[1], atol=1e-9)
+    assert np.allclose(linear, expected, atol=1e-9)
+
+
+def test_inertia_scales_the_angular_acceleration_at_rest():
+    v, q, _, tilt, thrust = random_state(10)
+    doubled = with_effect(inertia={'inertia': tuple(2 * ROBOT.inertia)})
+    ours = model.body_acceleration(doubled)(v, q, np.zeros(3), tilt, thrust)[1]
+    reference = newton_euler(ROBOT, v, q, np.zeros(3), tilt, thrust)[1]
+    assert np.allclose(np.array(ours).ravel(), reference / 2)
 
 
 def test_thrust_scale_scales_force_and_torque():

@@ -15,6 +15,8 @@ from beetle_omni_ros.sim import effects as plant_effects
 EFFECTS = {
     'none': {},
     'mass': {'mass': {'mass': 3.3}},
+    'inertia': {'inertia': {'inertia': (0.08, 0.07, 0.11)}},
+    'centre_of_mass': {'centre_of_mass': {'offset': (0.01, -0.015, 0.02)}},
     'thrust_coefficient': {'thrust_coefficient': {'scale': 0.93}},
     'rotor_thrust_coefficient': {'rotor_thrust_coefficient': {'scale': [1.0, 0.9, 1.05, 0.97]}},
     'torque_coefficient': {'torque_coefficient': {'torque_to_thrust_ratio': 0.021}},
@@ -49,6 +51,29 @@ def test_plant_without_module_inertia_agrees_with_casadi(name):
         found = made.acceleration(p, q, v, w, tilt, tilt_rate, thrust)
         assert difference(found[:3], np.array(linear).ravel()) < 1e-6
         assert difference(found[3:6], np.array(angular).ravel()) < 1e-6
+
+
+def held_target(made, state, tilt):
+    """Tilt targets at which no joint accelerates: the response to a target is linear."""
+    rest = made.acceleration(*state, tilt_target=tilt)[6:]
+    response = np.stack([(made.acceleration(*state, tilt_target=tilt + 0.01 * unit)[6:] - rest)
+                         / 0.01 for unit in np.eye(4)], axis=1)
+    return tilt - np.linalg.solve(response, rest)
+
+
+def test_module_reaction_is_how_the_tilting_modules_shift_the_centre_of_mass():
+    module = ROBOT.multibody.module
+    depth = -module.centre_of_mass[2]
+    effects = {'module_reaction': {'module_inertia': module.inertia[0] + module.mass * depth ** 2,
+                                   'mass_moment': module.mass * depth}}
+    made = plant(ROBOT)
+    plain, shifted = (body_acceleration(replace(ROBOT, effects=e)) for e in ({}, effects))
+    for p, q, v, _, tilt, _, thrust in random_states(20, seed=4):
+        state = (p, q, v, np.zeros(3), tilt, np.zeros(4), thrust)
+        found = made.acceleration(*state, tilt_target=held_target(made, state, tilt))
+        without, with_shift = (np.linalg.norm(found[:3] - np.array(
+            model(v, q, np.zeros(3), tilt, thrust)[0]).ravel()) for model in (plain, shifted))
+        assert with_shift < 0.15 * without
 
 
 def test_plant_without_module_inertia_agrees_with_newton_euler():
