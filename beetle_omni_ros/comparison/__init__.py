@@ -1,0 +1,1 @@
+"""Every published experiment for several controllers: one sweep of flights, one page."""

@@ -1,0 +1,89 @@
+"""What decides the numbers of a flight, as a short text that changes with any of it."""
+
+from __future__ import annotations
+
+from functools import cache
+import hashlib
+from importlib import metadata
+from pathlib import Path
+import platform
+import subprocess
+
+from beetle_omni_ros.comparison.plan import Flight
+from beetle_omni_ros.robot.resources import PACKAGE, share_path
+
+ROOMS = ('control', 'estimation', 'evaluation', 'robot', 'runs', 'safety', 'sim')
+LIBRARIES = ('casadi', 'filterpy', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
+LENGTH = 16  # hexadecimal digits kept
+
+
+@cache
+def code_fingerprint() -> str:
+    """Digest of the code that flies and judges, its parameters and its libraries."""
+    package = Path(__file__).resolve().parents[1]
+    files = [path for room in ROOMS for path in (package / room).rglob('*.*')
+             if path.suffix in ('.py', '.c', '.h')]
+    files += [package / 'comparison' / 'flight.py', *share_path('params').glob('*.yaml')]
+    digest = hashlib.sha256()
+    for path in sorted(files, key=lambda path: (path.parent.name, path.name)):
+        digest.update(f'{path.parent.name}/{path.name}'.encode())
+        digest.update(path.read_bytes())
+    for library in LIBRARIES:
+        digest.update(f'{library} {_version(library)}'.encode())
+    digest.update(f'{platform.machine()} {platform.python_version()}'.encode())
+    return digest.hexdigest()[:LENGTH]
+
+
+def _version(library):
+    try:
+        return metadata.version(library)
+    except metadata.PackageNotFoundError:
+        return 'absent'
+
+
+def file_digest(path: str | Path) -> str:
+    """Digest of a file's content; 'absent' without it."""
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:LENGTH]
+    except OSError:
+        return 'absent'
+
+
+def policy_file(controller: str) -> Path | None:
+    """File of a controller's policy; None for a controller that needs none or where it is absent."""
+    if not controller.startswith('rl'):
+        return None
+    try:
+        return share_path(f'policies/{controller}.onnx')
+    except FileNotFoundError:
+        return None
+
+
+def flight_key(flight: Flight) -> str:
+    """Digest of all that determines a flight's numbers."""
+    parts = [code_fingerprint(), flight.controller, flight.conditions, str(flight.seed)]
+    is_file = Path(flight.task).is_file()
+    parts.append(file_digest(flight.task) if is_file else flight.task)
+    if policy := policy_file(flight.controller):
+        parts.append(file_digest(policy))
+    return hashlib.sha256('\n'.join(parts).encode()).hexdigest()[:LENGTH]
+
+
+def commit() -> str | None:
+    """Commit of the checkout, with '+' where files of it are changed; None outside one."""
+    folder = Path(__file__).resolve().parents[2]
+    if not (folder / '.git').exists():
+        return None
+    try:
+        text = subprocess.run(
+            ['git', 'describe', '--always', '--abbrev=10', '--dirty=+', '--exclude=*'],
+            cwd=folder, capture_output=True, text=True, timeout=20, check=True).stdout
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return text.strip() or None
+
+
+def versions() -> dict[str, str]:
+    """Versions of the package's code and of what it computes with."""
+    return {PACKAGE: _version(PACKAGE), 'python': platform.python_version(),
+            **{library: _version(library) for library in LIBRARIES}}

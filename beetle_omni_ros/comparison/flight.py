@@ -1,0 +1,110 @@
+"""
+One flight of a comparison: flown, judged and thinned to what the page draws.
+
+Runs in a worker, maybe on another computer; nothing here prints or writes.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+import warnings
+
+import numpy as np
+
+from beetle_omni_ros.comparison.fingerprint import code_fingerprint
+from beetle_omni_ros.comparison.plan import Flight
+from beetle_omni_ros.evaluation.command import fly
+from beetle_omni_ros.evaluation.loop import FlightError
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.body import errors, motion
+from beetle_omni_ros.runs.log import FlightLog
+from beetle_omni_ros.runs.metrics import metrics
+from beetle_omni_ros.runs.tasks import Task
+
+TRACE_PERIOD = 0.02  # [s] between samples of a trace
+LONG_TRACE_PERIOD = 0.05  # [s] the same in a task of many poses
+LONG = 300.0  # [s] of flight, above which a task counts as one of many poses
+COMMAND_WINDOW = 2.0  # [s] of commands kept at the end of a flight
+
+
+def fly_flight(flight: Flight, task: Task, code: str | None = None) -> dict:
+    """
+    Fly and judge; a flight that fails is a result too.
+
+    Args:
+        flight: which.
+        task: its task, made where the pose file is.
+        code: fingerprint that this computer's code must have, so that a cluster's workers
+            cannot mix versions; None does not ask.
+
+    Returns:
+        A dictionary with ``failure`` (None or one line), ``metrics`` (None or as in INTERFACES,
+        with ``steps``, how many times the controller was stepped), ``cpu_s``, ``host`` and
+        ``trace`` (name -> array, see :func:`trace`).
+
+    """
+    start = time.process_time()
+    result = {'failure': None, 'metrics': None, 'trace': {}, 'host': platform.node()}
+    if code is not None and code != code_fingerprint():
+        result['failure'] = (f'{platform.node()} has another version of the code or its '
+                             'parameters than the computer that asks')
+        return result
+    try:
+        robot = RobotParameters.load()
+        with warnings.catch_warnings():
+            # A flight that goes wrong may overflow; it is judged by what came of it.
+            warnings.simplefilter('ignore', RuntimeWarning)
+            log = fly(flight.controller, task, robot=robot, plant=robot,
+                      conditions=flight.conditions, seed=flight.seed,
+                      meta={'task': flight.task, 'conditions': flight.conditions,
+                            'seed': flight.seed})
+            result['metrics'] = judged = metrics(log, task)
+            judged['steps'] = log.compute.get(flight.controller, {}).get('count', 0)
+            result['trace'] = trace(log, task)
+    except (FlightError, ParameterError) as error:
+        result['failure'] = _line(error)
+    except Exception as error:  # whatever a controller does, the other flights go on
+        result['failure'] = f'{type(error).__name__}: {_line(error)}'
+    result['cpu_s'] = time.process_time() - start
+    return result
+
+
+def _line(error):
+    return ' '.join(str(error).split()) or type(error).__name__
+
+
+def trace(log: FlightLog, task: Task) -> dict[str, np.ndarray]:
+    """
+    Thin a flight to what figures show.
+
+    Returns:
+        t (N,) since the first target [s], position (N, 3) [m], quaternion (N, 4), speed (N,)
+        [m/s], rate (N,) [rad/s], position_error (N,) [m], orientation_error (N,) [deg], NaN
+        where no target was in force; and command_t (M,) [s], command_tilt (M, 4) [rad],
+        command_thrust (M, 4) [N] of the last 2 s.
+
+    """
+    if not log.targets:
+        return {}
+    body, start = motion(log), log.targets[0].stamp
+    every = LONG_TRACE_PERIOD if task.duration > LONG else TRACE_PERIOD
+    end = min(body.t[-1], start + task.duration)
+    index = np.unique(np.searchsorted(body.t, np.arange(start, end, every)))
+    index = index[index < len(body.t)]
+    apart = np.full((2, len(body.t)), np.nan)
+    for target, until in zip(log.targets, [*(t.stamp for t in log.targets[1:]), np.inf],
+                             strict=True):
+        window = body.window(target.stamp, min(until, end))
+        apart[:, window] = errors(body, target, window)
+    recent = (log.command_t > end - COMMAND_WINDOW) & (log.command_t <= end)
+    kept = {'t': body.t[index] - start, 'position': body.position[index],
+            'quaternion': body.quaternion[index],
+            'speed': np.linalg.norm(body.velocity[index], axis=1),
+            'rate': np.linalg.norm(body.angular_velocity[index], axis=1),
+            'position_error': apart[0, index], 'orientation_error': apart[1, index],
+            'command_t': log.command_t[recent] - start,
+            'command_tilt': log.command_tilt[recent],
+            'command_thrust': log.command_thrust[recent]}
+    return {name: values.astype(np.float32) for name, values in kept.items()}

@@ -1,0 +1,88 @@
+"""
+Which flights a comparison needs.
+
+A flight is one controller, task, set of conditions and seed. It is the unit that is
+computed, kept and repeated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+import re
+
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.tasks import make_task, Task
+
+CONTROLLERS = ('rl', 'rl_memory', 'nmpc', 'nmpc_published')
+TASKS = ('random100', 'waypoints', 'lemniscate', 'force', 'torque', 'payload', 'hover')
+CONDITIONS = ('nominal', 'published')
+SEEDS = (0, 1)
+
+# Core seconds for a simulated second, measured on one x86 core. They decide the order of the
+# flights and the remaining time shown, no result.
+COST = {'rl': 0.07, 'rl_memory': 0.08, 'nmpc': 0.1, 'nmpc_published': 0.13, 'hover': 0.05}
+START_COST = 2.0  # core seconds to build simulator and controller
+
+
+@dataclass(frozen=True, order=True)
+class Flight:
+    """
+    One flight of a comparison.
+
+    Attributes:
+        task: name, or path of a pose file.
+        conditions: 'nominal' or 'published'.
+        controller: name.
+        seed: of the task's poses and of everything random in the simulation.
+
+    """
+
+    task: str
+    conditions: str
+    controller: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """What the flight is called in messages."""
+        return f'{self.controller}, {self.task}, {self.conditions}, seed {self.seed}'
+
+    @property
+    def slug(self) -> str:
+        """The name as part of a file name."""
+        return re.sub(r'[^A-Za-z0-9.]+', '_', self.name)[-100:]
+
+    @cached_property
+    def cost(self) -> float:
+        """Rough time that the flight takes [core seconds]."""
+        return START_COST + COST.get(self.controller, 0.1) * self.make_task().duration
+
+    def make_task(self) -> Task:
+        """Make the task that is flown."""
+        return make_task(self.task, self.seed)
+
+
+def plan(controllers, tasks=TASKS, conditions=CONDITIONS, seeds=SEEDS) -> list[Flight]:
+    """
+    List all flights, the longest first, so that no long one is left over at the end.
+
+    Raises:
+        ParameterError: an entry that stands there twice, or none; unknown conditions or task.
+
+    """
+    for option, entries in (('--controllers', controllers), ('--tasks', tasks),
+                            ('--conditions', conditions), ('--seeds', seeds)):
+        if not entries or len(set(entries)) != len(entries):
+            text = ','.join(str(entry) for entry in entries)
+            raise ParameterError(f"{option} '{text}': expected different entries, "
+                                 'separated by commas')
+    for entry in conditions:
+        if entry not in CONDITIONS:
+            raise ParameterError(f"--conditions '{entry}': expected {' or '.join(CONDITIONS)}")
+    for task in tasks:
+        make_task(task)
+    flights = [Flight(task, condition, controller, seed) for task, condition, controller, seed
+               in product(tasks, conditions, controllers, seeds)]
+    return sorted(flights, key=lambda flight: -flight.cost)
