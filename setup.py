@@ -77,6 +77,7 @@ TRAIN = [
 # colcon looks for pytest under the name `test` before it runs pytest.
 TEST = [
     'hypothesis>=6.100',
+    'onnx>=1.16',
     'pytest>=8',
     'pytest-timeout>=2.2',
 ]

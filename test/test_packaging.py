@@ -14,6 +14,7 @@ import pytest
 import beetle_omni_ros
 from beetle_omni_ros.control.hover import HoverParameters
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.control.policy import PolicyParameters
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
@@ -31,8 +32,8 @@ KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-r
        'casadi': 'casadi-pip', 'serial': 'python3-serial'}
 PARAMETER_CLASSES = {
     'ekf.yaml': EkfParameters, 'hover.yaml': HoverParameters, 'nmpc.yaml': NmpcParameters,
-    'nmpc_published.yaml': NmpcParameters, 'robot.yaml': RobotParameters,
-    'robot_weak_and_heavy.yaml': RobotParameters,
+    'nmpc_published.yaml': NmpcParameters, 'rl.yaml': PolicyParameters,
+    'robot.yaml': RobotParameters, 'robot_weak_and_heavy.yaml': RobotParameters,
     'simulator.yaml': SimulatorParameters, 'supervisor.yaml': SupervisorParameters}
 
 

@@ -71,44 +71,47 @@ def observation(state: State, reference: Reference, previous_action,
         disturbance: (6,) or longer: external force in world [N], torque in base_link [N m].
 
     """
-    return np.array(observed(state, reference, previous_action, disturbance))
+    values = observed(state, reference, previous_action)
+    if disturbance is not None:
+        values += disturbed(state, disturbance)
+    return np.array(values)
 
 
-def observed(state, reference, previous_action, disturbance=None) -> list[float]:
-    """
-    Give the numbers of :func:`observation` as a list, for the control loop.
+# Plain floats below: on vectors of three, numpy's calls cost ten times the arithmetic.
 
-    Plain floats: on vectors of three, numpy's calls cost ten times the arithmetic.
-    """
-    x, y, z, w = state.quaternion.tolist()
-    xx, xy, xz, yz = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), \
-        2 * (y * z - x * w)
-    yx, yy, zx = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (x * z - y * w)
-    zy, zz = 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
-    a, b, c, d = reference.quaternion.tolist()
-    x_x, x_y, x_z = 1 - 2 * (b * b + c * c), 2 * (a * b + c * d), 2 * (a * c - b * d)
-    z_x, z_y, z_z = 2 * (a * c + b * d), 2 * (b * c - a * d), 1 - 2 * (a * a + b * b)
 
+def observed(state, reference, previous_action) -> list[float]:
+    """Give the first 33 numbers of :func:`observation` as a list, for the control loop."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(state.quaternion)
+    ax, bx, cx, ay, by, cy, az, bz, cz = _rotation(reference.quaternion)
     px, py, pz = (reference.position - state.position).tolist()
     vx, vy, vz = (state.velocity - reference.velocity).tolist()
     wx, wy, wz = state.angular_velocity.tolist()
     p, q, r = reference.angular_velocity.tolist()
-    if p or q or r:
-        # the reference's y axis, only needed here; its rates to world, then to base_link
-        y_x, y_y, y_z = 2 * (a * b - c * d), 1 - 2 * (a * a + c * c), 2 * (b * c + a * d)
-        p, q, r = (x_x * p + y_x * q + z_x * r, x_y * p + y_y * q + z_y * r,
-                   x_z * p + y_z * q + z_z * r)
+    if p or q or r:     # the reference's rates, to world and from there to base_link
+        p, q, r = ax * p + bx * q + cx * r, ay * p + by * q + cy * r, az * p + bz * q + cz * r
         wx -= xx * p + yx * q + zx * r
         wy -= xy * p + yy * q + zy * r
         wz -= xz * p + yz * q + zz * r
-    values = [xx * vx + yx * vy + zx * vz, xy * vx + yy * vy + zy * vz,
-              xz * vx + yz * vy + zz * vz, wx, wy, wz,
-              xx * px + yx * py + zx * pz, xy * px + yy * py + zy * pz,
-              xz * px + yz * py + zz * pz,
-              xx, yx, zx, xz, yz, zz, x_x, x_y, x_z, z_x, z_y, z_z,
-              *state.tilt.tolist(), *previous_action]
-    if disturbance is not None:
-        fx, fy, fz, tx, ty, tz = disturbance[:6].tolist()
-        values += [xx * fx + yx * fy + zx * fz, xy * fx + yy * fy + zy * fz,
-                   xz * fx + yz * fy + zz * fz, tx, ty, tz]
-    return values
+    return [xx * vx + yx * vy + zx * vz, xy * vx + yy * vy + zy * vz,
+            xz * vx + yz * vy + zz * vz, wx, wy, wz,
+            xx * px + yx * py + zx * pz, xy * px + yy * py + zy * pz,
+            xz * px + yz * py + zz * pz,
+            xx, yx, zx, xz, yz, zz, ax, ay, az, cx, cy, cz,
+            *state.tilt.tolist(), *previous_action]
+
+
+def disturbed(state, disturbance) -> list[float]:
+    """Give the last six numbers of :func:`observation`: force and torque in base_link."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(state.quaternion)
+    fx, fy, fz, *torque = disturbance[:6].tolist()
+    return [xx * fx + yx * fy + zx * fz, xy * fx + yy * fy + zy * fz,
+            xz * fx + yz * fy + zz * fz, *torque]
+
+
+def _rotation(quaternion):
+    """Matrix of a unit quaternion (x, y, z, w), row by row."""
+    x, y, z, w = quaternion.tolist()
+    return (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))

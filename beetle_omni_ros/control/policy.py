@@ -1,0 +1,166 @@
+"""A trained policy as a controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Command, PoseTarget, State, Target
+from beetle_omni_ros.control.call import FunctionCall
+from beetle_omni_ros.control.disturbance import DisturbanceEstimator
+from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
+from beetle_omni_ros.control.observation import disturbed, observed
+from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import group, parameter
+
+DEFAULT = 'policies/rl.onnx'
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateParameters:
+    """What the estimate of disturbances must know beside the robot."""
+
+    command_delay: float = parameter(0.01, doc='from the state stamp to the actuators', unit='s',
+                                     low=0, high=0.1, read_only=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyParameters:
+    """Which policy, and what stands around it; params/rl.yaml says why."""
+
+    policy: str = parameter(DEFAULT, doc="ONNX file, in the package's share or any path",
+                            read_only=True)
+    allow_other_robot: bool = parameter(
+        False, doc='fly a policy that was trained for other robot parameters', read_only=True)
+    trajectory_lookahead: float = parameter(
+        0.0, doc="a trajectory's reference is taken so far ahead of the state", unit='s', low=0,
+        high=1)
+    action_limit: float = parameter(
+        100.0, doc='a larger output is a fault and not cut to the limits of the actuators',
+        unit='1', low=1, high=1e6)
+    model: EstimateParameters = group(EstimateParameters, 'for the estimate')
+    disturbance: DisturbanceParameters = group(
+        DisturbanceParameters, 'what a policy with memory sees')
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> PolicyParameters:
+        """Read a file; without a path, the shipped params/rl.yaml."""
+        return schema.load(cls, path if path else share_path('params/rl.yaml'))
+
+
+class PolicyController:
+    """
+    The learnt controller: a :class:`control.base.Controller`.
+
+    Its previous action is the command in force, whoever gave it, so that it takes over where
+    another controller leaves off. Targets are cut to the limits of the actuators, as they were
+    in training; an output that is not finite or absurdly large goes out as it is, for the
+    supervisor to refuse.
+
+    Args:
+        robot: what the controller believes about the robot.
+        parameters: which policy and how.
+
+    Attributes:
+        contract: what the policy's file says about itself.
+
+    Raises:
+        ParameterError: the file is missing, broken, or does not fit; one line.
+
+    """
+
+    def __init__(self, robot: RobotParameters, parameters: PolicyParameters | None = None):
+        """Load the policy and run it a few times."""
+        p = self._parameters = parameters or PolicyParameters.load()
+        self._network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
+        self.contract = contract = self._network.contract
+        self.name = 'rl_memory' if contract.memory else 'rl'
+        self.period = 1 / contract.rate_hz
+        self._scale, self._offset = contract.action_scale.tolist(), contract.action_offset.tolist()
+        tilt, rotors = robot.joints.position_limit, robot.rotors
+        self._limits = [(-tilt, tilt)] * 4 + [(rotors.thrust_min, rotors.thrust_max)] * 4
+        self._hover = [robot.hover_thrust] * 4
+        self._estimator = DisturbanceEstimator(
+            robot, p, FunctionCall(model.integrator(robot), None)) if contract.memory else None
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last command, the estimate and all counts."""
+        self._command: Command | None = None
+        self._steps = self._rejected = self._faults = self._cut = 0
+        if self._estimator:
+            self._estimator.reset()
+
+    def step(self, state: State, target: Target) -> Command:
+        """One command for one state; a non-finite state repeats the last command."""
+        self._steps += 1
+        observation = self._observe(state, target)
+        if observation is None:
+            self._rejected += 1
+            return self._repeated(state)
+        values = self._targets(self._network(observation))
+        self._command = Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
+        return self._command
+
+    def diagnostics(self) -> dict[str, float | int | str]:
+        """Counts since reset, and what a policy with memory estimates."""
+        told = {'policy': self.contract.name, 'steps': self._steps,
+                'rejected_states': self._rejected, 'faulty_actions': self._faults,
+                'steps_at_a_limit': self._cut}
+        if self._estimator:
+            d = self._estimator.disturbance
+            told['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
+            told['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
+        return told
+
+    def _observe(self, state, target):
+        """Numbers for the network, or None when one of them is not finite."""
+        time = state.stamp
+        if not isinstance(target, PoseTarget):
+            time += self._parameters.trajectory_lookahead
+        observation = observed(state, target.at(time), self._previous_action(state))
+        if not isfinite(sum(observation)):
+            return None
+        if self._estimator:
+            if not isfinite(sum(state.tilt_velocity.tolist())):
+                return None
+            self._estimator.update(state)
+            if not isfinite(sum(self._estimator.disturbance.tolist())):
+                self._estimator.reset()
+            observation += disturbed(state, self._estimator.disturbance)
+        return observation
+
+    def _previous_action(self, state):
+        """The command in force, before the first the measured tilts and hover thrust."""
+        command = state.command
+        values = state.tilt.tolist() + self._hover if command is None else \
+            command.tilt.tolist() + command.thrust.tolist()
+        return [(v - o) / s for v, o, s in zip(values, self._offset, self._scale)]
+
+    def _targets(self, action):
+        """Tilt and thrust targets, within limits unless the action is a fault."""
+        values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
+        limit = self._parameters.action_limit
+        # also false for what is no number
+        if not all(-limit <= a <= limit for a in action):
+            self._faults += 1
+            return values
+        cut = [low if v < low else high if v > high else v
+               for v, (low, high) in zip(values, self._limits)]
+        self._cut += cut != values
+        return cut
+
+    def _repeated(self, state):
+        """The last command under the state's stamp; before the first, hover thrust."""
+        last = self._command
+        if last is not None:
+            return Command(state.stamp, last.tilt, last.thrust)
+        tilt = state.tilt if np.isfinite(state.tilt).all() else np.zeros(4)
+        return Command(state.stamp, tilt, np.array(self._hover))

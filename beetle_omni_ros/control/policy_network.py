@@ -1,0 +1,146 @@
+"""A policy file as a function: loaded, compared with its contract, warmed up, called cheaply."""
+
+from __future__ import annotations
+
+import logging
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+from beetle_omni_ros.control.policy_file import ACTIONS, INPUT, OUTPUT, PolicyContract
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import ParameterError
+
+log = logging.getLogger(__name__)
+WARM_UP = 20            # calls at start, so that none in flight is the slow first one
+FATAL_ONLY = 4          # onnxruntime's log level: what fails is raised, and said once by us
+LEVEL = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0)   # x and z axis of a level body
+
+
+class PolicyNetwork:
+    """
+    One policy, ready to be called.
+
+    Runs on the calling thread alone, with fixed buffers for input and output.
+
+    Args:
+        path: ONNX file with the metadata of :class:`PolicyContract`.
+        robot: what it shall fly.
+        allow_other_robot: accept one that was trained for other robot parameters.
+
+    Attributes:
+        contract: what the file says about itself.
+
+    Raises:
+        ParameterError: one line with the file and what is missing, broken or different.
+
+    """
+
+    def __init__(self, path: str | Path, robot: RobotParameters,
+                 allow_other_robot: bool = False):
+        """Load, check, warm up."""
+        path = find(path)
+        self._session = _session(path)
+        try:
+            self.contract = PolicyContract.from_metadata(
+                self._session.get_modelmeta().custom_metadata_map)
+            warning = self.contract.check(robot, allow_other_robot)
+            size = self.contract.observation_size
+            _check_tensor('input', self._session.get_inputs(), INPUT, size)
+            _check_tensor('output', self._session.get_outputs(), OUTPUT, len(ACTIONS))
+            self._bind(size)
+            self._warm_up()
+        except ParameterError as error:
+            raise ParameterError(f'policy {path}: {error}') from None
+        if warning:
+            log.warning('policy %s: %s', path, warning)
+
+    def __call__(self, observation: list[float]) -> list[float]:
+        """Action (8) for an observation (n), both in plain numbers."""
+        self._input[0] = observation
+        self._run(self._binding, None)
+        return self._output[0].tolist()
+
+    def _bind(self, size):
+        """Let the session read and write the same two arrays at every call."""
+        self._input = np.zeros((1, size), np.float32)
+        self._output = np.zeros((1, len(ACTIONS)), np.float32)
+        binding = self._session.io_binding()
+        for bind, name, array in ((binding.bind_input, INPUT, self._input),
+                                  (binding.bind_output, OUTPUT, self._output)):
+            bind(name, 'cpu', 0, np.float32, array.shape, array.ctypes.data)
+        self._io = binding      # owns what the line below calls with
+        self._binding, self._run = binding._iobinding, self._session._sess.run_with_iobinding
+
+    def _warm_up(self):
+        """Call as in level flight; a network that answers with anything but numbers is broken."""
+        rest = []
+        for block in self.contract.observations:
+            rest += LEVEL if 'attitude' in block.name else [0.0] * block.size
+        try:
+            for _ in range(WARM_UP):
+                action = self(rest)
+        except Exception as error:
+            raise ParameterError(f'cannot be run ({_reason(error)})') from None
+        if not all(map(isfinite, action)):
+            raise ParameterError('the action for a robot at rest is not finite')
+
+
+def find(path: str | Path) -> Path:
+    """
+    Locate a policy: an absolute path, or one in the package's share or the present folder.
+
+    Raises:
+        ParameterError: there is no such file.
+
+    """
+    path = Path(path)
+    try:
+        found = share_path(str(path))
+    except FileNotFoundError:
+        found = path
+    if not found.is_file():
+        where = '' if path.is_absolute() else \
+            f", neither in the package's share nor in {Path.cwd()}"
+        raise ParameterError(f'policy {path}: no such file{where}')
+    return found
+
+
+def _session(path):
+    """Open a file with onnxruntime: one thread that sleeps when it has nothing to do."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.add_session_config_entry('session.intra_op.allow_spinning', '0')
+    options.add_session_config_entry('session.inter_op.allow_spinning', '0')
+    options.log_severity_level = FATAL_ONLY
+    try:
+        return onnxruntime.InferenceSession(str(path), options,
+                                            providers=['CPUExecutionProvider'])
+    except Exception as error:      # its exceptions have no common class of their own
+        raise ParameterError(f'policy {path}: not a readable ONNX file, truncated perhaps '
+                             f'({_reason(error)})') from None
+
+
+def _reason(error):
+    """The telling end of onnxruntime's messages, which begin with codes."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0].split(' : ')[-1].strip()
+
+
+def _check_tensor(kind, found, name, size):
+    """One tensor of the contract's name, type and size (1, n)."""
+    if len(found) != 1 or found[0].name != name:
+        names = ', '.join(repr(tensor.name) for tensor in found) or 'none'
+        raise ParameterError(f'{kind}: expected one, {name!r}, found {names}')
+    tensor = found[0]
+    if tensor.type != 'tensor(float)':
+        raise ParameterError(f'{kind} {name}: expected tensor(float), found {tensor.type}')
+    shape = list(tensor.shape)
+    # the batch may be left open, the size may not
+    if len(shape) != 2 or shape[1] != size or (isinstance(shape[0], int) and shape[0] != 1):
+        raise ParameterError(f'{kind} {name}: expected size (1, {size}), found '
+                             f"({', '.join(map(str, shape))})")

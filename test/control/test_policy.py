@@ -1,0 +1,261 @@
+"""The policy as a controller: what it loads, what it refuses, what it does with bad numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
+from beetle_omni_ros.control.observation import observation
+from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
+from beetle_omni_ros.control.policy_file import PolicyContract
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import ParameterError
+
+pytest.importorskip('onnx')
+
+from onnx import TensorProto
+from policy_files import write
+
+ROBOT = RobotParameters.load()
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+TARGET = PoseTarget(np.array([0.0, 0.0, 1.0]), LEVEL)
+PREVIOUS = slice(25, 33)
+
+
+def controller(path, robot=ROBOT, **changed):
+    return PolicyController(robot, replace(PolicyParameters.load(), policy=str(path), **changed))
+
+
+def state(stamp=1.0, command=None, **changed):
+    values = {'position': np.array([0.1, -0.2, 1.0]), 'velocity': np.array([0.1, 0.0, -0.1]),
+              'quaternion': np.array([0.1, 0.2, 0.0, np.sqrt(0.95)]),
+              'angular_velocity': np.array([0.0, 0.3, 0.1]),
+              'tilt': np.array([0.1, -0.1, 0.2, 0.0]), 'tilt_velocity': np.zeros(4), **changed}
+    return State(stamp, **values, tilt_stamp=stamp - 0.01, command=command)
+
+
+def selecting(rows):
+    """Weights (33, 8) of a policy whose action is these rows of the observation."""
+    weights = np.zeros((33, 8))
+    weights[np.arange(33)[rows], np.arange(8)] = 1.0
+    return weights
+
+
+@pytest.mark.parametrize('memory', [False, True])
+def test_targets_follow_from_the_observation_by_scale_and_offset(tmp_path, memory):
+    rng = np.random.default_rng(1)
+    size = 39 if memory else 33
+    weights, bias = 0.05 * rng.normal(size=(size, 8)), 0.1 * rng.normal(size=8)
+    policy = controller(write(tmp_path / 'p.onnx', memory=memory, weights=weights, bias=bias))
+    assert policy.name == ('rl_memory' if memory else 'rl') and policy.period == 0.01
+    given = state(command=Command(0.99, np.full(4, 0.1), np.full(4, 7.0)))
+    contract = policy.contract
+    before = (np.r_[given.command.tilt, given.command.thrust] - contract.action_offset) \
+        / contract.action_scale
+    seen = observation(given, TARGET.at(1.0), before, np.zeros(6) if memory else None)
+    expected = contract.action_scale * (seen @ weights + bias) + contract.action_offset
+    command = policy.step(given, TARGET)
+    assert command.stamp == given.stamp
+    assert np.allclose(np.r_[command.tilt, command.thrust], expected, atol=1e-5)
+
+
+def test_a_policy_that_repeats_its_last_action_takes_over_without_a_jump(tmp_path):
+    policy = controller(write(tmp_path / 'p.onnx', weights=selecting(PREVIOUS)))
+    others = Command(0.99, np.array([0.3, -1.2, 3.0, 0.0]), np.array([3.0, 8.0, 12.0, 6.0]))
+    taken = policy.step(state(command=others), TARGET)
+    assert np.allclose(taken.tilt, others.tilt, atol=1e-6)
+    assert np.allclose(taken.thrust, others.thrust, atol=1e-5)
+
+
+def test_before_the_first_command_it_stands_on_measured_tilts_and_hover_thrust(tmp_path):
+    policy = controller(write(tmp_path / 'p.onnx', weights=selecting(PREVIOUS)))
+    command = policy.step(state(), TARGET)
+    assert np.allclose(command.tilt, state().tilt, atol=1e-6)
+    assert np.allclose(command.thrust, ROBOT.hover_thrust, atol=1e-5)
+
+
+def test_targets_are_cut_to_the_limits_of_the_actuators(tmp_path):
+    bias = np.array([50.0, -50, 0, 0, 50, -50, 0, 0])
+    policy = controller(write(tmp_path / 'p.onnx', bias=bias))
+    command = policy.step(state(), TARGET)
+    limit = ROBOT.joints.position_limit
+    assert np.allclose(command.tilt, [limit, -limit, 0, 0])
+    assert np.allclose(command.thrust, [ROBOT.rotors.thrust_max, ROBOT.rotors.thrust_min,
+                                        ROBOT.hover_thrust, ROBOT.hover_thrust])
+    assert policy.diagnostics()['steps_at_a_limit'] == 1
+
+
+def test_an_absurd_action_goes_out_for_the_supervisor_to_refuse(tmp_path):
+    policy = controller(write(tmp_path / 'p.onnx', bias=np.r_[np.zeros(7), 1e6]))
+    command = policy.step(state(), TARGET)
+    assert command.thrust[3] > 1e5
+    assert policy.diagnostics()['faulty_actions'] == 1
+
+
+def test_an_action_that_is_no_number_goes_out_too(tmp_path):
+    policy = controller(write(tmp_path / 'p.onnx', poison=True))
+    far = PoseTarget(np.array([0.0, 0.0, 5.0]), LEVEL)
+    assert np.isfinite(policy.step(state(), TARGET).thrust).all()
+    assert np.isnan(policy.step(state(1.01), far).thrust).all()
+    assert np.isfinite(policy.step(state(1.02), TARGET).thrust).all()
+
+
+@pytest.mark.parametrize('memory', [False, True])
+@pytest.mark.parametrize('field', ['position', 'velocity', 'quaternion', 'angular_velocity',
+                                   'tilt'])
+@pytest.mark.parametrize('bad', [np.nan, np.inf])
+def test_a_state_that_is_not_finite_repeats_the_last_command(tmp_path, memory, field, bad):
+    path = write(tmp_path / 'p.onnx', memory=memory, hidden=(16,))
+    policy = controller(path)
+    last = policy.step(state(1.0), TARGET)
+    broken = getattr(state(), field).copy()
+    broken[1] = bad
+    command = policy.step(state(1.01, command=last, **{field: broken}), TARGET)
+    assert command.stamp == 1.01
+    assert np.array_equal(command.tilt, last.tilt)
+    assert np.array_equal(command.thrust, last.thrust)
+    assert policy.diagnostics()['rejected_states'] == 1
+    # and nothing of it stays
+    fresh = controller(path)
+    fresh.step(state(1.0), TARGET)
+    after, expected = (p.step(state(1.02, command=last), TARGET) for p in (policy, fresh))
+    assert np.allclose(after.tilt, expected.tilt, atol=1e-9)
+
+
+def test_a_first_state_that_is_not_finite_gives_a_finite_command(tmp_path):
+    policy = controller(write(tmp_path / 'p.onnx'))
+    command = policy.step(state(tilt=np.full(4, np.nan)), TARGET)
+    assert np.isfinite(command.tilt).all()
+    assert np.allclose(command.thrust, ROBOT.hover_thrust)
+
+
+@pytest.mark.parametrize('memory', [False, True])
+def test_the_same_states_give_the_same_commands_and_reset_forgets(tmp_path, memory):
+    policy = controller(write(tmp_path / 'p.onnx', memory=memory, hidden=(32, 16), seed=4))
+
+    def flight():
+        rng, command, commands = np.random.default_rng(0), None, []
+        for k in range(30):
+            command = policy.step(state(1 + 0.01 * k, command, velocity=rng.normal(size=3)),
+                                  TARGET)
+            commands.append(np.r_[command.tilt, command.thrust])
+        return np.array(commands)
+
+    first = flight()
+    policy.reset()
+    assert policy.diagnostics()['steps'] == 0
+    assert np.array_equal(flight(), first)
+
+
+def test_the_policy_with_memory_sees_a_push_in_its_own_axes(tmp_path):
+    # action = disturbance_force / 20, on the rotors
+    weights = np.zeros((39, 8))
+    weights[33:36, 4:7] = 0.05 * np.eye(3)
+    policy = controller(write(tmp_path / 'p.onnx', memory=True, weights=weights))
+    yaw = np.array([0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)])   # x of the body along y
+    hover = Command(0.0, np.zeros(4), np.full(4, ROBOT.hover_thrust))
+    for k in range(400):    # level thrust carries the weight; 6 N along world y speed it up
+        stamp = 0.01 * (k + 1)
+        given = state(stamp, replace(hover, stamp=stamp - 0.01), quaternion=yaw,
+                      velocity=np.array([0, 6.0 / ROBOT.mass * stamp, 0]),
+                      angular_velocity=np.zeros(3), tilt=np.zeros(4))
+        command = policy.step(given, TARGET)
+    force = (command.thrust[:3] - ROBOT.hover_thrust) / 0.5 / 0.05
+    assert np.allclose(force, [6.0, 0.0, 0.0], atol=0.3)
+    assert policy.diagnostics()['force_estimate_N'] == pytest.approx(6.0, abs=0.3)
+
+
+def test_a_trajectory_is_looked_ahead_at_and_a_pose_is_not(tmp_path):
+    # action = target_position / 4, on the rotors
+    weights = np.zeros((33, 8))
+    weights[6:9, 4:7] = 0.25 * np.eye(3)
+    path = write(tmp_path / 'p.onnx', weights=weights)
+    times = np.linspace(0, 10, 101)
+    line = TrajectoryTarget(times, np.outer(times, [0.5, 0, 0]), np.tile(LEVEL, (101, 1)),
+                            np.tile([0.5, 0, 0], (101, 1)), np.zeros((101, 3)))
+    at_rest = state(2.0, position=np.array([1.0, 0, 0]), quaternion=LEVEL)
+
+    def ahead(lookahead, target):
+        command = controller(path, trajectory_lookahead=lookahead).step(at_rest, target)
+        return (command.thrust[0] - ROBOT.hover_thrust) / 0.5 / 0.25
+
+    assert ahead(0.0, line) == pytest.approx(0.0, abs=1e-5)
+    assert ahead(0.2, line) == pytest.approx(0.1, abs=1e-5)
+    held = PoseTarget(np.array([1.5, 0, 0]), LEVEL)
+    assert ahead(0.0, held) == ahead(0.2, held)
+
+
+def refusal(path, robot=ROBOT, **changed):
+    """The one line about a file that is not loaded."""
+    with pytest.raises(ParameterError) as caught:
+        controller(path, robot, **changed)
+    text = str(caught.value)
+    assert '\n' not in text and str(path) in text
+    return text
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    assert 'no such file' in refusal(tmp_path / 'none.onnx')
+    assert 'no such file' in refusal(tmp_path)
+    assert "package's share" in refusal('policies/none.onnx')
+
+
+def test_a_file_cut_short_at_any_place_is_refused(tmp_path):
+    whole = write(tmp_path / 'whole.onnx', hidden=(16,)).read_bytes()
+    for share in np.linspace(0, 1, 40, endpoint=False):
+        cut = tmp_path / 'cut.onnx'
+        cut.write_bytes(whole[:int(share * len(whole))])
+        assert refusal(cut)
+
+
+def test_a_file_that_is_no_onnx_is_refused(tmp_path):
+    for content in (b'', b'not a network', np.random.default_rng(0).bytes(5000)):
+        path = tmp_path / 'garbage.onnx'
+        path.write_bytes(content)
+        assert 'not a readable ONNX file' in refusal(path)
+
+
+@pytest.mark.parametrize('options, named', [
+    ({'inputs': 30}, ['input observation', '33', '30']),
+    ({'outputs': 7}, ['output action', '8', '7']),
+    ({'memory': True, 'inputs': 33}, ['input observation', '39', '33']),
+    ({'names': ('obs', 'action')}, ["'observation'", "'obs'"]),
+    ({'names': ('observation', 'actions')}, ["'action'", "'actions'"]),
+    ({'dtype': TensorProto.DOUBLE}, ['tensor(float)', 'tensor(double)']),
+    ({'drop': ('format',)}, ["'format'"]),
+    ({'drop': ('robot_hash',)}, ["'robot_hash'"]),
+    ({'metadata': {'actions': '["a"]'}}, ['actions']),
+    ({'bias': np.full(8, np.nan)}, ['at rest', 'not finite']),
+])
+def test_a_file_that_does_not_fit_is_refused_by_what_differs(tmp_path, options, named):
+    text = refusal(write(tmp_path / 'p.onnx', **options))
+    assert all(part in text for part in named), text
+
+
+def test_another_robot_needs_to_be_allowed(tmp_path, caplog):
+    other = RobotParameters.load(share_path('params/robot_weak_and_heavy.yaml'))
+    path = write(tmp_path / 'p.onnx')
+    assert 'robot_hash' in refusal(path, robot=other)
+    policy = controller(path, robot=other, allow_other_robot=True)
+    assert 'robot_hash' in caplog.text
+    # The offset of training stays: the network knows no other.
+    assert np.allclose(policy.step(state(), TARGET).thrust, ROBOT.hover_thrust)
+
+
+def test_the_batch_may_be_open(tmp_path):
+    import onnx
+    path = write(tmp_path / 'p.onnx')
+    network = onnx.load(path)
+    for tensor in (network.graph.input[0], network.graph.output[0]):
+        tensor.type.tensor_type.shape.dim[0].dim_param = 'batch'
+    onnx.save(network, path)
+    assert np.isfinite(controller(path).step(state(), TARGET).thrust).all()
+
+
+def test_a_contract_of_the_trainer_loads(tmp_path):
+    contract = PolicyContract.default(ROBOT, memory=True)
+    path = write(tmp_path / 'p.onnx', memory=True, metadata=replace(
+        contract, name='mine', training={'seed': 1}).to_metadata())
+    assert controller(path).diagnostics()['policy'] == 'mine'
