@@ -12,7 +12,7 @@ import re
 from setuptools import find_packages, setup
 
 PACKAGE = 'beetle_omni_ros'
-NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node', 'reference_node',
+NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node',
          'recorder_node', 'viewer_node')
 
 

@@ -42,6 +42,11 @@ RobotOption = Annotated[Optional[Path], typer.Option(
                                     'Default: the shipped params/robot.yaml.')]
 PlantOption = Annotated[Optional[Path], typer.Option(
     '--plant', metavar='FILE', help='What is true in the simulation. Default: as --robot.')]
+PolicyOption = Annotated[Optional[Path], typer.Option(
+    '--policy', metavar='FILE', help="Another policy (ONNX) for the controller 'rl'.")]
+OtherRobotOption = Annotated[bool, typer.Option(
+    '--allow-other-robot', help='Fly a policy although it was trained for other robot '
+                                'parameters.')]
 JsonOption = Annotated[Optional[Path], typer.Option(
     '--json', metavar='FILE', help='Write the results there as JSON.')]
 
@@ -62,12 +67,17 @@ def _common(version: Annotated[bool, typer.Option(
 def fly(bag: Annotated[Path, typer.Option(
             '--bag', metavar='DIR', help='New folder for the recorded bag.')],
         controller: Annotated[str, typer.Option(
-            '--controller', metavar='nmpc', help='The active controller.')] = 'nmpc',
+            '--controller', metavar='nmpc|rl', help='The active controller.')] = 'nmpc',
         task: TaskOption = 'waypoints',
         conditions: ConditionsOption = 'nominal',
         seed: SeedOption = 0,
         robot: RobotOption = None,
         plant: PlantOption = None,
+        policy: PolicyOption = None,
+        allow_other_robot: OtherRobotOption = False,
+        standby: Annotated[bool, typer.Option(
+            '--standby/--alone', help='The other controller runs too, to be selected in flight; '
+                                      'or only the active one.')] = True,
         composed: Annotated[bool, typer.Option(
             '--composed/--separate', help='All nodes in one process, or one process each.')]
         = True,
@@ -81,11 +91,12 @@ def fly(bag: Annotated[Path, typer.Option(
     Example: beetle_omni fly --controller nmpc --task waypoints --bag my_flight
     """
     _check(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
-           files=(robot, plant))
+           files=(robot, plant, policy))
     from beetle_omni_ros.nodes.fly import FlightError, run_fly
     try:
         code = run_fly(controller=controller, task=task, bag=bag, seed=seed,
-                       conditions=conditions, robot=robot, plant=plant, composed=composed,
+                       conditions=conditions, robot=robot, plant=plant, policy=policy,
+                       allow_other_robot=allow_other_robot, standby=standby, composed=composed,
                        json_path=json_path, domain_id=domain_id)
     except FlightError as error:
         raise typer.Exit(_fail(error, FAILED)) from None
@@ -95,7 +106,8 @@ def fly(bag: Annotated[Path, typer.Option(
 @app.command()
 def evaluate(controllers: Annotated[str, typer.Option(
                  '--controllers', metavar='NAME,...',
-                 help='Controllers to fly one after the other, e.g. nmpc,nmpc_published.')]
+                 help='Controllers to fly one after the other: nmpc, rl, rl_memory, '
+                      'nmpc_published, hover.')]
              = 'nmpc',
              task: TaskOption = 'random100',
              conditions: ConditionsOption = 'nominal',
@@ -105,6 +117,8 @@ def evaluate(controllers: Annotated[str, typer.Option(
              nmpc_file: Annotated[Optional[Path], typer.Option(
                  '--nmpc', metavar='FILE',
                  help="Other parameters for the controller 'nmpc'.")] = None,
+             policy: PolicyOption = None,
+             allow_other_robot: OtherRobotOption = False,
              bag: Annotated[Optional[Path], typer.Option(
                  '--bag', metavar='DIR', help='New folder for the bag; with several controllers '
                                               'it holds one bag for each.')] = None,
@@ -119,16 +133,19 @@ def evaluate(controllers: Annotated[str, typer.Option(
     if not names or len(set(names)) != len(names):
         raise ParameterError(f"--controllers '{controllers}': expected different names, "
                              'separated by commas')
-    if nmpc_file and 'nmpc' not in names:
-        raise ParameterError(f"--nmpc {nmpc_file}: for the controller 'nmpc', which is not among "
-                             f"{', '.join(names)}")
+    for option, file, name in (('--nmpc', nmpc_file, 'nmpc'), ('--policy', policy, 'rl')):
+        if file and name not in names:
+            raise ParameterError(f"{option} {file}: for the controller '{name}', which is not "
+                                 f"among {', '.join(names)}")
     _check(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
-           files=(robot, plant, nmpc_file))
-    from beetle_omni_ros.evaluation.command import run_evaluate
+           files=(robot, plant, nmpc_file, policy))
+    from beetle_omni_ros.evaluation.command import ControllerFiles, run_evaluate
     from beetle_omni_ros.evaluation.loop import FlightError
     try:
         run_evaluate(controllers=names, task=task, conditions=conditions, robot=robot,
-                     plant=plant, seed=seed, bag=bag, json_path=json_path, nmpc_file=nmpc_file)
+                     plant=plant, seed=seed, bag=bag, json_path=json_path,
+                     files=ControllerFiles(nmpc=nmpc_file, policy=policy,
+                                           allow_other_robot=allow_other_robot))
     except FlightError as error:
         raise typer.Exit(_fail(error, FAILED)) from None
 

@@ -19,7 +19,10 @@ ARGUMENTS = {
     # name: (default, choices or None, description)
     'backend': ('sim', ['sim', 'none'],
                 'who provides sensors and actuators: the simulator, or nodes started elsewhere'),
-    'controller': ('nmpc', ['nmpc'], 'the active controller'),
+    'controller': ('nmpc', ['nmpc', 'rl'], 'the active controller'),
+    'standby': ('true', ['true', 'false'], 'the other controller runs too, to be selected in '
+                                           'flight; the policy only if it fits the robot'),
+    'policy': ('', None, 'policy (ONNX) for rl_node; empty: the shipped one'),
     'task': ('', None, 'task for reference_node; empty: targets come from elsewhere'),
     'record': ('', None, 'folder for a bag; empty: no recording'),
     'namespace': ('', None, 'namespace of every node and topic'),
@@ -42,6 +45,7 @@ def has_ros2_bag():
 
 def node_parameters(given):
     """Node name -> parameters, for the nodes that the arguments ask for."""
+    from beetle_omni_ros.nodes.standby import controller_nodes
     robot = {'robot_file': given['robot_file']} if given['robot_file'] else {}
     seed = int(given['seed'])
     nodes = {}
@@ -50,7 +54,12 @@ def node_parameters(given):
         if given['plant_file'] or given['robot_file']:
             nodes['sim_node']['robot_file'] = given['plant_file'] or given['robot_file']
     nodes['ekf_node'] = robot
-    nodes[f"{given['controller']}_node"] = robot
+    controllers, left_out = controller_nodes(
+        given['controller'], robot_file=given['robot_file'], policy=given['policy'],
+        standby=given['standby'] == 'true')
+    if left_out:
+        print(f'rl does not stand by: {left_out}', file=sys.stderr)
+    nodes.update(controllers)
     nodes['supervisor_node'] = {**robot, 'controller': given['controller']}
     if given['task']:
         nodes['reference_node'] = {'task': given['task'], 'seed': seed}

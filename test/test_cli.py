@@ -65,6 +65,7 @@ def test_usage_errors_are_one_line(capsys):
 @pytest.mark.parametrize('command', ['evaluate', 'fly'])
 def test_unusable_input_is_refused_before_the_flight(capsys, tmp_path, command):
     base = [command, '--bag', tmp_path / 'new']
+    rl = ['--controllers' if command == 'evaluate' else '--controller', 'rl']
     poses = tmp_path / 'poses.csv'
     poses.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,oops\n')
     for arguments, named in (
@@ -73,11 +74,22 @@ def test_unusable_input_is_refused_before_the_flight(capsys, tmp_path, command):
             (['--conditions', 'windy'], 'windy'),
             (['--robot', tmp_path / 'none.yaml'], 'none.yaml'),
             (['--plant', tmp_path / 'none.yaml'], 'none.yaml'),
+            ([*rl, '--policy', tmp_path / 'none.onnx'], 'none.onnx: no such file'),
             (['--json', tmp_path / 'no' / 'folder.json'], 'folder.json'),
             (['--json', tmp_path], str(tmp_path)),
             (['--bag', tmp_path], 'exists already')):
         assert named in refused(capsys, *base, *arguments)
     assert sorted(p.name for p in tmp_path.iterdir()) == ['poses.csv']
+
+
+def test_a_policy_that_is_none_is_refused_before_anything_flies(capsys, tmp_path):
+    path = tmp_path / 'policy.onnx'
+    path.write_bytes(b'no network')
+    for names in ('rl', 'nmpc,rl'):
+        line = refused(capsys, 'evaluate', '--controllers', names, '--policy', path,
+                       '--bag', tmp_path / 'bag')
+        assert 'policy.onnx: not a readable ONNX file' in line
+    assert not (tmp_path / 'bag').exists()
 
 
 def test_controllers_must_be_different_names(capsys):
@@ -88,7 +100,8 @@ def test_controllers_must_be_different_names(capsys):
 def test_parameters_for_a_controller_that_does_not_fly_are_refused(capsys, tmp_path):
     other = tmp_path / 'nmpc.yaml'
     other.touch()
-    assert '--nmpc' in refused(capsys, 'evaluate', '--controllers', 'hover', '--nmpc', other)
+    for option in ('--nmpc', '--policy'):
+        assert option in refused(capsys, 'evaluate', '--controllers', 'hover', option, other)
 
 
 def test_fly_refuses_a_controller_without_a_node(capsys, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -13,6 +14,7 @@ from beetle_omni_ros.control.base import Controller
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
@@ -31,34 +33,59 @@ from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
-CONTROLLERS = ('nmpc', 'nmpc_published', 'hover')
+CONTROLLERS = ('nmpc', 'rl', 'rl_memory', 'nmpc_published', 'hover')
+POLICIES = {'rl': 'policies/rl.onnx', 'rl_memory': 'policies/rl_memory.onnx'}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerFiles:
+    """
+    Files in place of the shipped ones.
+
+    Attributes:
+        nmpc: parameters of 'nmpc'.
+        policy: network of 'rl'.
+        allow_other_robot: fly policies that were trained for other robot parameters.
+
+    """
+
+    nmpc: Path | None = None
+    policy: Path | None = None
+    allow_other_robot: bool = False
 
 
 def make_controller(name: str, robot: RobotParameters,
-                    nmpc_file: Path | None = None) -> Controller:
+                    files: ControllerFiles = ControllerFiles()) -> Controller:
     """
     Build a controller by name.
 
     Args:
-        name: 'nmpc', 'nmpc_published' (the publication's settings) or 'hover'.
+        name: 'nmpc', 'nmpc_published' (the publication's settings), 'rl', 'rl_memory' (with
+            the estimated disturbance) or 'hover'.
         robot: what it believes about the robot.
-        nmpc_file: parameter file for 'nmpc' in place of the shipped one.
+        files: in place of the shipped ones.
 
     Raises:
         ParameterError: unknown name, or an unusable file.
 
     """
     if name == 'nmpc':
-        return NmpcController(robot, NmpcParameters.load(nmpc_file))
+        return NmpcController(robot, NmpcParameters.load(files.nmpc))
     if name == 'nmpc_published':
         return NmpcController(robot, NmpcParameters.load(share_path('params/nmpc_published.yaml')))
+    if name in POLICIES:
+        policy = files.policy if name == 'rl' and files.policy else POLICIES[name]
+        parameters = PolicyParameters.load()
+        return PolicyController(robot, replace(
+            parameters, policy=str(policy),
+            allow_other_robot=parameters.allow_other_robot or files.allow_other_robot))
     if name == 'hover':
         return HoverController(robot)
     raise ParameterError(f"controller '{name}': expected one of {', '.join(CONTROLLERS)}")
 
 
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,
-        conditions: str = 'nominal', seed: int = 0, nmpc_file: Path | None = None,
+        conditions: str = 'nominal', seed: int = 0, files: ControllerFiles = ControllerFiles(),
         bag: Path | None = None, meta: dict | None = None,
         progress=lambda part: None) -> FlightLog:
     """
@@ -81,7 +108,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         loop = FlightLoop(
             Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed),
             ErrorStateEkf(estimator, robot.gravity),
-            {controller: make_controller(controller, robot, nmpc_file)}, supervisor, recorder,
+            {controller: make_controller(controller, robot, files)}, supervisor, recorder,
             estimator.imu.gyroscope_noise)
         supervisor.select(controller)
         stayed = loop.fly(task, progress)
@@ -92,7 +119,8 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
 def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nominal',
                  robot: Path | None = None, plant: Path | None = None, seed: int = 0,
                  bag: Path | None = None, json_path: Path | None = None,
-                 nmpc_file: Path | None = None, console: Console | None = None) -> dict:
+                 files: ControllerFiles = ControllerFiles(),
+                 console: Console | None = None) -> dict:
     """
     Fly a task with each controller and report.
 
@@ -105,7 +133,7 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
         seed: of the task's poses and of everything random in the simulation.
         bag: folder for a bag; with several controllers, one bag for each inside it.
         json_path: file for the results.
-        nmpc_file: parameter file for 'nmpc' in place of the shipped one.
+        files: of controllers, in place of the shipped ones.
         console: where to print.
 
     Returns:
@@ -120,11 +148,13 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
     true = RobotParameters.load(plant) if plant else believed
     flown = make_task(task, seed)
     for name in controllers:
-        if name not in CONTROLLERS:
-            make_controller(name, believed)
+        if name not in CONTROLLERS or name in POLICIES:     # refused before anything flies
+            make_controller(name, believed, files)
     meta = {'task': task, 'conditions': conditions, 'seed': seed,
             'robot': str(robot) if robot else 'params/robot.yaml',
             'plant': str(plant) if plant else None, 'version': __version__}
+    if files.policy:
+        meta['policy'] = str(files.policy)
     results: dict = {'meta': meta}
     columns = (TextColumn('{task.description}'), BarColumn(),
                TextColumn('{task.percentage:>3.0f} %'), TimeElapsedColumn(), TimeRemainingColumn())
@@ -133,7 +163,7 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
             bar = bars.add_task(f'{name}: {task}, {conditions}', total=1.0)
             folder = bag / name if bag and len(controllers) > 1 else bag
             log = fly(name, flown, robot=believed, plant=true, conditions=conditions, seed=seed,
-                      nmpc_file=nmpc_file if name == 'nmpc' else None, bag=folder, meta=meta,
+                      files=files, bag=folder, meta=meta,
                       progress=lambda part, bar=bar: bars.update(bar, completed=part))
             results[name] = metrics_of_runs.metrics(log, flown)
     table.print_results(results, console)

@@ -8,8 +8,9 @@ import sys
 from beetle_omni_ros.nodes import runner
 
 NODES = {'sim_node': 'SimNode', 'ekf_node': 'EkfNode', 'nmpc_node': 'NmpcNode',
-         'supervisor_node': 'SupervisorNode', 'reference_node': 'ReferenceNode',
-         'recorder_node': 'RecorderNode', 'viewer_node': 'ViewerNode'}
+         'rl_node': 'RlNode', 'supervisor_node': 'SupervisorNode',
+         'reference_node': 'ReferenceNode', 'recorder_node': 'RecorderNode',
+         'viewer_node': 'ViewerNode'}
 
 
 def main(args=None):

@@ -18,6 +18,7 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.nodes import domain, runner
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
+from beetle_omni_ros.nodes.standby import controller_nodes
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table
@@ -35,7 +36,6 @@ LANDING_TIMEOUT = 30.0  # s
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
 LOOK_PERIOD = 0.1       # s between looks at processes and progress
 INTERRUPTED = 130
-CONTROLLERS = ('nmpc',)  # that have a node
 
 
 class FlightError(RuntimeError):
@@ -44,19 +44,24 @@ class FlightError(RuntimeError):
 
 def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | None = None,
             seed: int = 0, conditions: str = 'nominal', robot: Path | None = None,
-            plant: Path | None = None, composed: bool = True, json_path: Path | None = None,
+            plant: Path | None = None, policy: Path | None = None,
+            allow_other_robot: bool = False, standby: bool = True, composed: bool = True,
+            json_path: Path | None = None,
             domain_id: int | None = None, console: Console | None = None) -> int:
     """
     Fly a task through the ROS graph and print what the bag says.
 
     Args:
-        controller: the active controller, 'nmpc'.
+        controller: the active controller, 'nmpc' or 'rl'.
         task: name or pose file.
         bag: folder to create; None: the bag is thrown away.
         seed: of the task and the simulation.
         conditions: 'nominal' or 'published'.
         robot: file that estimator and controller believe; default the shipped one.
         plant: file that is true in the simulation; default ``robot``.
+        policy: file for 'rl'; default the shipped one.
+        allow_other_robot: fly a policy that was trained for other robot parameters.
+        standby: run the other controller too, so that it can be selected in flight.
         composed: all nodes in one process, or one process for each.
         json_path: file for the results.
         domain_id: ROS domain; default a free one.
@@ -81,10 +86,14 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
                     'controller': controller, 'composed': composed}
-            if controller not in CONTROLLERS:
-                raise ParameterError(f"controller '{controller}': no node for it; expected "
-                                     f"{' or '.join(CONTROLLERS)}")
-            parameters = _parameters(controller, task, bag, seed, conditions, robot, plant)
+            controllers, left_out = controller_nodes(
+                controller, robot_file=str(Path(robot).absolute()) if robot else '',
+                policy=str(policy or ''), allow_other_robot=allow_other_robot, standby=standby)
+            if left_out:
+                console.print(f'rl does not stand by: {left_out}', markup=False, emoji=False,
+                              highlight=False)
+            parameters = _parameters(controllers, task, bag, seed, conditions, robot, plant)
+            parameters['supervisor_node']['controller'] = controller
             number = stack.enter_context(domain.reserved()) if domain_id is None else domain_id
             graph = Graph(parameters, folder, number, composed)
             stack.enter_context(_terminable())
@@ -100,7 +109,7 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
         return INTERRUPTED
 
 
-def _parameters(controller, task, bag, seed, conditions, robot, plant):
+def _parameters(controllers, task, bag, seed, conditions, robot, plant):
     """Node name -> parameters of the graph."""
     believed = {'robot_file': str(Path(robot).absolute())} if robot else {}
     true = {'robot_file': str(Path(plant).absolute())} if plant else believed
@@ -108,8 +117,8 @@ def _parameters(controller, task, bag, seed, conditions, robot, plant):
     return {'recorder_node': {'bag': str(bag)},
             'sim_node': {**true, 'conditions': conditions, 'seed': int(seed)},
             'ekf_node': believed,
-            f'{controller}_node': believed,
-            'supervisor_node': {**believed, 'controller': controller},
+            **controllers,
+            'supervisor_node': dict(believed),
             'reference_node': {'task': task_file, 'seed': int(seed)}}
 
 

@@ -6,8 +6,9 @@ from types import ModuleType
 
 import pytest
 
-from beetle_omni_ros.nodes import composed
+from beetle_omni_ros.nodes import composed, standby
 from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.topics import TOPICS
 
 
@@ -30,6 +31,7 @@ def bringup(monkeypatch):
         for member in members:
             setattr(module, member, type(member, (Recorded,), {}))
         monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(standby, 'unfit', lambda *_: '')    # a policy that fits is there
     spec = spec_from_file_location('bringup', share_path('launch/bringup.launch.py'))
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -58,7 +60,7 @@ def test_composed_is_one_process_with_every_node(bringup):
     process, = bringup.start(seed='7', namespace='/robot1')
     command = process.kwargs['cmd']
     nodes = command[3:command.index('--ros-args')]
-    assert nodes == ['sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node']
+    assert nodes == ['sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node']
     assert set(nodes) <= set(composed.NODES)
     assert 'sim_node:seed:=7' in command
     assert command[-2:] == ['-r', '__ns:=/robot1']
@@ -68,7 +70,7 @@ def test_separate_nodes_and_no_simulator_for_another_backend(bringup):
     nodes = bringup.start(composed='false', backend='none', task='waypoints', viewer='true',
                           namespace='robot1')
     assert [n.kwargs['executable'] for n in nodes] == [
-        'ekf_node', 'nmpc_node', 'supervisor_node', 'reference_node', 'viewer_node']
+        'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node', 'viewer_node']
     assert all(n.kwargs['namespace'] == 'robot1' for n in nodes)
 
 
@@ -76,7 +78,27 @@ def test_the_plant_may_differ_from_what_is_believed(bringup):
     nodes = bringup.start(composed='false', robot_file='a.yaml', plant_file='b.yaml')
     given = {n.kwargs['name']: n.kwargs['parameters'][0].get('robot_file') for n in nodes}
     assert given == {'sim_node': 'b.yaml', 'ekf_node': 'a.yaml', 'nmpc_node': 'a.yaml',
-                     'supervisor_node': 'a.yaml'}
+                     'rl_node': 'a.yaml', 'supervisor_node': 'a.yaml'}
+
+
+def test_either_controller_is_active_and_the_other_stands_by(bringup, capsys, monkeypatch):
+    def controllers(**arguments):
+        nodes = bringup.start(composed='false', **arguments)
+        active = next(n.kwargs['parameters'][0]['controller'] for n in nodes
+                      if n.kwargs['name'] == 'supervisor_node')
+        return active, {n.kwargs['name']: n.kwargs['parameters'][0] for n in nodes
+                        if n.kwargs['name'] in ('nmpc_node', 'rl_node')}
+
+    assert controllers() == ('nmpc', {'nmpc_node': {}, 'rl_node': {}})
+    assert controllers(controller='rl', standby='false') == ('rl', {'rl_node': {}})
+    assert controllers(controller='rl', policy='/p.onnx') == (
+        'rl', {'rl_node': {'policy': '/p.onnx'}, 'nmpc_node': {}})
+    assert not capsys.readouterr().err
+    monkeypatch.setattr(standby, 'unfit', lambda *_: 'robot_hash: another robot')
+    assert controllers() == ('nmpc', {'nmpc_node': {}})
+    assert 'rl does not stand by: robot_hash' in capsys.readouterr().err
+    with pytest.raises(ParameterError, match='robot_hash'):
+        controllers(controller='rl')
 
 
 @pytest.mark.parametrize('installed', [True, False])
