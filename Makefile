@@ -12,7 +12,7 @@ unexport LD_LIBRARY_PATH
 endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONHOME VIRTUAL_ENV
 
-.PHONY: help setup fly test lint evaluate report clean
+.PHONY: help setup fly test lint evaluate compare report clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1|/p' Makefile | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -33,6 +33,10 @@ lint: setup  ## style of every Python file
 evaluate: setup  ## 100 random poses, in one process and faster than real time
 	@mkdir -p runs_out
 	$(TOOL) evaluate --controllers nmpc --task random100 --json runs_out/evaluate_$(RUN).json $(ARGS)
+
+compare: setup  ## every experiment for RL and NMPC, to docs/comparison/; goes on where it was left
+	@mkdir -p docs/comparison runs_out
+	$(TOOL) compare --output docs/comparison --cache runs_out/comparison $(ARGS)
 
 report: setup  ## one HTML page about the runs in runs_out/ (or RUNS='DIR...')
 	@runs='$(RUNS)'; for bag in runs_out/*/metadata.yaml; do \

@@ -38,12 +38,14 @@ def shared(*folders):
 REQUIREMENTS = [
     'casadi>=3.8,<4',
     'filterpy>=1.4.5,<3',
+    'joblib>=1.4,<2',
     'matplotlib>=3.6,<4',
     'mcap>=1.2,<2',
     'mcap-ros2-support>=0.5,<1',
     'mujoco>=3.3.7,<5',
     'numpy>=1.26,<3',
     'onnxruntime>=1.18,<2',
+    'pillow>=9.1',
     'pyyaml>=6.0',
     'rich>=13.7',
     'rosbags>=0.11,<0.12',
@@ -72,6 +74,11 @@ TRAIN = [
     'rsl-rl-lib>=3.0',
     'tensorboard>=2.16',
     'torch>=2.6',
+]
+
+# A cluster for `beetle_omni compare --backend ray`; no wheel for other systems or Python 3.14 yet.
+RAY = [
+    'ray>=2.44',
 ]
 
 # colcon looks for pytest under the name `test` before it runs pytest.
@@ -110,6 +117,7 @@ setup(
         'ros': ROS,
         'hardware': HARDWARE,
         'train': TRAIN,
+        'ray': RAY,
         'test': TEST,
         'dev': DEVELOPMENT,
     },

@@ -151,6 +151,58 @@ def evaluate(controllers: Annotated[str, typer.Option(
 
 
 @app.command()
+def compare(controllers: Annotated[Optional[str], typer.Option(
+                '--controllers', metavar='NAME,...',
+                help='Default: rl, rl_memory, nmpc and nmpc_published, as far as there.')] = None,
+            tasks: Annotated[Optional[str], typer.Option(
+                '--tasks', metavar='TASK,...', help='Names or pose files; default: all.')] = None,
+            conditions: Annotated[str, typer.Option(
+                '--conditions', metavar='NAME,...')] = ','.join(CONDITIONS),
+            seeds: Annotated[str, typer.Option('--seeds', metavar='N,...')] = '0,1',
+            policy: PolicyOption = None,
+            jobs: Annotated[Optional[int], typer.Option(
+                '--jobs', '-j', min=1, help='Flights at a time. Default: one a core.')] = None,
+            backend: Annotated[str, typer.Option(
+                '--backend', metavar='processes|ray', help='This computer, or Ray.')]
+            = 'processes',
+            address: Annotated[Optional[str], typer.Option(
+                '--ray-address', metavar='ADDRESS', envvar='RAY_ADDRESS',
+                help='Of a running cluster. Default: Ray on this computer.')] = None,
+            output: Annotated[Path, typer.Option(
+                '--output', '-o', metavar='DIR', help='Folder for page, pictures and JSON.')]
+            = Path('comparison'),
+            cache: Annotated[Optional[Path], typer.Option(
+                '--cache', metavar='DIR', help='Where finished flights are kept. '
+                                               'Default: .flights in the output.')] = None,
+            fresh: Annotated[bool, typer.Option(
+                '--fresh', help='Fly again what is kept.')] = False,
+            json_path: JsonOption = None):
+    """
+    Fly every experiment with several controllers and write one page about it.
+
+    An interrupted or repeated comparison flies only what is missing.
+    Example: beetle_omni compare --controllers rl,nmpc --tasks waypoints --seeds 0,1,2
+    """
+    from beetle_omni_ros.comparison.arguments import names, numbers
+    from beetle_omni_ros.runs.json_file import check_writable
+    arguments = {'controllers': names('--controllers', controllers),
+                 'tasks': names('--tasks', tasks),
+                 'conditions': names('--conditions', conditions),
+                 'seeds': numbers('--seeds', seeds)}
+    if policy and not policy.is_file():
+        raise ParameterError(f'{policy}: no such file')
+    if json_path:
+        check_writable(json_path)
+    from beetle_omni_ros.comparison.command import run_compare
+    from beetle_omni_ros.comparison.sweep import SweepError
+    try:
+        run_compare(**arguments, output=output, jobs=jobs, backend=backend, address=address,
+                    cache=cache, fresh=fresh, policy=policy, json_path=json_path)
+    except SweepError as error:
+        raise typer.Exit(_fail(error, FAILED)) from None
+
+
+@app.command()
 def report(runs: Annotated[list[Path], typer.Argument(
                metavar='RUN...', help='Recorded bags: rosbag2 folders, or one of their files.')],
            output: Annotated[Path, typer.Option(

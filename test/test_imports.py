@@ -19,8 +19,10 @@ ALLOWED = {
     'safety': ('robot', 'control.base'),
     'runs': ('robot', 'control.base'),
     'evaluation': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs'),
+    'comparison': ('robot', 'runs', 'evaluation'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs'),
-    'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'nodes'),
+    'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
+            'nodes'),
 }
 
 # Library -> the only room that imports it.

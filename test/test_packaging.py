@@ -27,9 +27,9 @@ HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 # Import name -> distribution on PyPI, where they differ; import name -> rosdep key.
 DISTRIBUTION = {'yaml': 'pyyaml', 'mcap_ros2': 'mcap-ros2-support', 'serial': 'pyserial',
-                'dynamixel_sdk': 'dynamixel-sdk'}
+                'dynamixel_sdk': 'dynamixel-sdk', 'PIL': 'pillow'}
 KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-ros2-support',
-       'casadi': 'casadi-pip', 'serial': 'python3-serial'}
+       'casadi': 'casadi-pip', 'serial': 'python3-serial', 'PIL': 'python3-pil'}
 PARAMETER_CLASSES = {
     'ekf.yaml': EkfParameters, 'hover.yaml': HoverParameters, 'nmpc.yaml': NmpcParameters,
     'nmpc_published.yaml': NmpcParameters, 'rl.yaml': PolicyParameters,
@@ -140,7 +140,8 @@ def test_data_files_are_where_ros_looks(setup_arguments):
 
 def test_every_import_is_a_declared_requirement(setup_arguments):
     extras = setup_arguments['extras_require']
-    lines = setup_arguments['install_requires'] + extras['hardware'] + extras['train']
+    lines = [*setup_arguments['install_requires'],
+             *(line for extra in ('hardware', 'train', 'ray') for line in extras[extra])]
     declared = {re.split(r'[\[<>=~;! ]', line)[0] for line in lines}
     keys = dependencies('exec_depend', 'depend')
     for module in third_party_imports():
@@ -148,7 +149,7 @@ def test_every_import_is_a_declared_requirement(setup_arguments):
             assert module in keys, f'{module}: not in package.xml'
             continue
         assert DISTRIBUTION.get(module, module) in declared, f'{module}: not in setup.py'
-        if module not in ('torch', 'onnx', 'onnxscript', 'rsl_rl', 'tensorboard'):
+        if module not in ('torch', 'onnx', 'onnxscript', 'rsl_rl', 'tensorboard', 'ray'):
             candidates = {KEY.get(module), f'python3-{module}', f'python3-{module}-pip', module}
             assert keys & candidates, f'{module}: no rosdep key in package.xml'
 

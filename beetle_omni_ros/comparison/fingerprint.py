@@ -10,6 +10,7 @@ import platform
 import subprocess
 
 from beetle_omni_ros.comparison.plan import Flight
+from beetle_omni_ros.evaluation.command import POLICIES
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 
 ROOMS = ('control', 'estimation', 'evaluation', 'robot', 'runs', 'safety', 'sim')
@@ -49,12 +50,22 @@ def file_digest(path: str | Path) -> str:
         return 'absent'
 
 
-def policy_file(controller: str) -> Path | None:
-    """File of a controller's policy; None for a controller that needs none or where it is absent."""
-    if not controller.startswith('rl'):
-        return None
+def policy_file(controller: str, other: str | Path | None = None) -> Path | None:
+    """
+    Locate a controller's policy.
+
+    Args:
+        controller: name.
+        other: file in place of the shipped policy of 'rl'.
+
+    Returns:
+        None for a controller that needs none, or whose file is absent.
+
+    """
+    if controller == 'rl' and other:
+        return Path(other)
     try:
-        return share_path(f'policies/{controller}.onnx')
+        return share_path(POLICIES[controller]) if controller in POLICIES else None
     except FileNotFoundError:
         return None
 
@@ -64,7 +75,7 @@ def flight_key(flight: Flight) -> str:
     parts = [code_fingerprint(), flight.controller, flight.conditions, str(flight.seed)]
     is_file = Path(flight.task).is_file()
     parts.append(file_digest(flight.task) if is_file else flight.task)
-    if policy := policy_file(flight.controller):
+    if policy := policy_file(flight.controller, flight.policy):
         parts.append(file_digest(policy))
     return hashlib.sha256('\n'.join(parts).encode()).hexdigest()[:LENGTH]
 

@@ -6,6 +6,7 @@ Runs in a worker, maybe on another computer; nothing here prints or writes.
 
 from __future__ import annotations
 
+from pathlib import Path
 import platform
 import time
 import warnings
@@ -14,7 +15,7 @@ import numpy as np
 
 from beetle_omni_ros.comparison.fingerprint import code_fingerprint
 from beetle_omni_ros.comparison.plan import Flight
-from beetle_omni_ros.evaluation.command import fly
+from beetle_omni_ros.evaluation.command import ControllerFiles, fly
 from beetle_omni_ros.evaluation.loop import FlightError
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -58,6 +59,7 @@ def fly_flight(flight: Flight, task: Task, code: str | None = None) -> dict:
             warnings.simplefilter('ignore', RuntimeWarning)
             log = fly(flight.controller, task, robot=robot, plant=robot,
                       conditions=flight.conditions, seed=flight.seed,
+                      files=ControllerFiles(policy=Path(flight.policy) if flight.policy else None),
                       meta={'task': flight.task, 'conditions': flight.conditions,
                             'seed': flight.seed})
             result['metrics'] = judged = metrics(log, task)

@@ -7,9 +7,11 @@ computed, kept and repeated.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from pathlib import Path
 import re
 
 from beetle_omni_ros.robot.schema import ParameterError
@@ -36,6 +38,7 @@ class Flight:
         conditions: 'nominal' or 'published'.
         controller: name.
         seed: of the task's poses and of everything random in the simulation.
+        policy: file in place of the shipped policy of 'rl', '' for none.
 
     """
 
@@ -43,6 +46,7 @@ class Flight:
     conditions: str
     controller: str
     seed: int
+    policy: str = ''
 
     @property
     def name(self) -> str:
@@ -64,9 +68,18 @@ class Flight:
         return make_task(self.task, self.seed)
 
 
-def plan(controllers, tasks=TASKS, conditions=CONDITIONS, seeds=SEEDS) -> list[Flight]:
+def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
+         conditions: Sequence[str] = CONDITIONS, seeds: Sequence[int] = SEEDS,
+         policy: Path | None = None) -> list[Flight]:
     """
     List all flights, the longest first, so that no long one is left over at the end.
+
+    Args:
+        controllers: names.
+        tasks: names, or paths of pose files.
+        conditions: 'nominal', 'published'.
+        seeds: numbers from 0.
+        policy: file in place of the shipped policy of 'rl'.
 
     Raises:
         ParameterError: an entry that stands there twice, or none; unknown conditions or task.
@@ -83,6 +96,8 @@ def plan(controllers, tasks=TASKS, conditions=CONDITIONS, seeds=SEEDS) -> list[F
             raise ParameterError(f"--conditions '{entry}': expected {' or '.join(CONDITIONS)}")
     for task in tasks:
         make_task(task)
-    flights = [Flight(task, condition, controller, seed) for task, condition, controller, seed
+    other = {'rl': str(policy)} if policy else {}
+    flights = [Flight(task, condition, controller, seed, other.get(controller, ''))
+               for task, condition, controller, seed
                in product(tasks, conditions, controllers, seeds)]
     return sorted(flights, key=lambda flight: -flight.cost)

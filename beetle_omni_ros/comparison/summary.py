@@ -70,6 +70,10 @@ def _group(task, results):
     for kind, make in (('trajectory', _tracking), ('payload', _payload), ('hover', _hover)):
         if kind in judged[0]:
             made[kind] = make([m[kind] for m in judged if kind in m])
+    if 'payload' in made:
+        made['payload_height_max_m'] = _most(
+            abs(end) for entry in made['payload']
+            for end in _known(entry['height_error_m'][which] for which in ('min', 'max')))
     for kind, unit in (('force', 'N'), ('torque', 'N_m')):
         if kind in judged[0]:
             made[kind] = _levels([m[kind] for m in judged if kind in m], unit)

@@ -1,0 +1,229 @@
+"""`beetle_omni compare`: every experiment for several controllers, from nothing to the page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import platform
+import sys
+
+import joblib
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+from rich.text import Text
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.comparison import grids_other, page
+from beetle_omni_ros.comparison.fingerprint import commit, file_digest, policy_file, versions
+from beetle_omni_ros.comparison.grid import Grid, Number
+from beetle_omni_ros.comparison.plan import CONDITIONS, CONTROLLERS, Flight, plan, SEEDS, TASKS
+from beetle_omni_ros.comparison.store import Store
+from beetle_omni_ros.comparison.style import look
+from beetle_omni_ros.comparison.summary import summarise
+from beetle_omni_ros.comparison.sweep import sweep
+from beetle_omni_ros.evaluation.command import ControllerFiles, make_controller
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.json_file import write_json
+
+PAGE, NUMBERS, TEXT = 'comparison.html', 'comparison.json', 'README.md'
+WIDE = 120  # characters of a terminal that takes all columns
+KEPT = '.flights'  # folder of finished flights in the output's, unless another is named
+
+
+def run_compare(*, output: Path, controllers: list[str] | None = None,
+                tasks: list[str] | None = None, conditions: list[str] | None = None,
+                seeds: list[int] | None = None, jobs: int | None = None,
+                backend: str = 'processes', address: str | None = None,
+                cache: Path | None = None, fresh: bool = False, policy: Path | None = None,
+                json_path: Path | None = None, console: Console | None = None) -> dict:
+    """
+    Fly what is missing, then write page, pictures and numbers.
+
+    Args:
+        output: folder for ``comparison.html``, ``comparison.json``, ``README.md`` and pictures.
+        controllers: names; None takes all that are there, and says which are not.
+        tasks: names or pose files; None is all.
+        conditions: 'nominal', 'published'; None is both.
+        seeds: None is 0 and 1.
+        jobs: flights at a time; None is one on each core.
+        backend: 'processes' or 'ray'.
+        address: of a Ray cluster; None starts Ray on this computer.
+        cache: folder of finished flights; None is in the output.
+        fresh: fly again what is kept.
+        policy: another policy for 'rl'.
+        json_path: a second place for the numbers.
+        console: where to print.
+
+    Returns:
+        What ``comparison.json`` holds.
+
+    Raises:
+        ParameterError: unusable input; SweepError: workers were lost.
+
+    """
+    console = console or Console()
+    wanted = controllers or list(CONTROLLERS)
+    arguments = (wanted, tasks or TASKS, conditions or CONDITIONS, seeds or SEEDS)
+    plan(*arguments)  # refuses unusable input before anything is made
+    there, skipped = _available(wanted, policy, refuse=controllers is not None)
+    for name, reason in skipped.items():
+        print(f'beetle_omni: {name} is left out: {reason}', file=sys.stderr)
+    flights = plan(there, *arguments[1:], policy=policy)
+    output = Path(output)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ParameterError(f'{output}: cannot write there ({error.strerror})') from None
+    flown = _fly(flights, Store(cache or output / KEPT), console, backend=backend, jobs=jobs,
+                 fresh=fresh, address=address)
+    results = _results(flown, arguments, there, skipped, policy)
+    _write(results, flown, output, console)
+    if json_path:
+        write_json(json_path, results)
+    return results
+
+
+def _available(wanted, policy, refuse):
+    """
+    Build each controller once, which also compiles what the workers would all compile.
+
+    Returns the names that can fly and the reason for each other one; with ``refuse`` the
+    first of these is raised instead.
+    """
+    robot, there, skipped = RobotParameters.load(), [], {}
+    for name in wanted:
+        try:
+            make_controller(name, robot, ControllerFiles(policy=policy))
+            there.append(name)
+        except (ParameterError, FileNotFoundError) as error:
+            if refuse:
+                raise ParameterError(str(error)) from None
+            skipped[name] = ' '.join(str(error).split())
+    if policy and 'rl' not in there:
+        raise ParameterError(f"--policy {policy}: for the controller 'rl', which does not fly")
+    return there, skipped
+
+
+def _fly(flights, store, console, **options):
+    columns = (SpinnerColumn(), TextColumn('{task.description}'), BarColumn(),
+               TimeElapsedColumn(), TextColumn('left'), TimeRemainingColumn())
+    count = {'done': 0}
+    with Progress(*columns, console=console, transient=True,
+                  speed_estimate_period=1200) as progress:
+        bar = progress.add_task('', total=sum(flight.cost for flight in flights))
+
+        def done(flight, result, kept):
+            count['done'] += 1
+            progress.update(bar, advance=flight.cost,
+                            description=f"{count['done']} of {len(flights)} flights")
+            progress.console.print(_line(flight, result, kept), highlight=False,
+                                   style='red' if result['failure'] else 'dim' if kept else None)
+
+        progress.update(bar, description=f'0 of {len(flights)} flights')
+        return sweep(flights, store=store, done=done, **options)
+
+
+def _line(flight, result, kept):
+    if result['failure']:
+        return f"{flight.name}: failed, {result['failure']}"
+    metrics, parts = result['metrics'], []
+    poses = metrics['poses']
+    if len(poses) > 1:
+        parts.append(f"{sum(pose['reached'] for pose in poses)} of {len(poses)} reached")
+    for kind, unit in (('force', 'N'), ('torque', 'N_m')):
+        if kind in metrics:
+            level = metrics[kind][f'lost_at_{unit}']
+            parts.append('control never lost' if level is None else
+                         f"control lost at {level:g} {unit.replace('_', ' ')}")
+    if metrics['crashed'] and not ('force' in metrics or 'torque' in metrics):
+        parts.append('touched the ground')
+    parts.append('kept' if kept else f"{result['cpu_s']:.0f} s")
+    return f"{flight.name}: {', '.join(parts)}"
+
+
+def _results(flown, arguments, there, skipped, policy):
+    """What the JSON holds; made of plain values only, so that it reads back equal."""
+    _, tasks, conditions, seeds = arguments
+    order = {name: k for k, name in enumerate((*tasks, *conditions, *there))}
+    flights = sorted(flown, key=lambda flight: (
+        order[flight.task], order[flight.conditions], order[flight.controller], flight.seed))
+    files = {name: policy_file(name, policy) for name in there}
+    command = (f"beetle_omni compare --controllers {','.join(there)} --tasks {','.join(tasks)} "
+               f"--conditions {','.join(conditions)} --seeds {','.join(map(str, seeds))}")
+    return {
+        'meta': {'version': __version__, 'commit': commit(), 'command': command,
+                 'controllers': there, 'skipped': skipped, 'tasks': list(tasks),
+                 'conditions': list(conditions), 'seeds': list(seeds),
+                 'policies': {name: f'{file.name} ({file_digest(file)})'
+                              for name, file in files.items() if file},
+                 'cpu_s': sum(result.get('cpu_s', 0.0) for result in flown.values()),
+                 'machine': {'processor': _processor(), 'cores': joblib.cpu_count(),
+                             'system': f'{platform.system()} {platform.machine()}'},
+                 'versions': versions()},
+        'summary': summarise({flight: flown[flight] for flight in flights}),
+        'flights': [{'task': flight.task, 'conditions': flight.conditions,
+                     'controller': flight.controller, 'seed': flight.seed,
+                     **{key: flown[flight].get(key) for key in (
+                         'failure', 'cpu_s', 'host', 'metrics')}} for flight in flights]}
+
+
+def _processor():
+    try:
+        lines = Path('/proc/cpuinfo').read_text().splitlines()
+        return next(line.partition(':')[2].strip() for line in lines if 'model name' in line)
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _write(results, flown, output, console):
+    ordered = {flight: flown[flight] for flight in sorted(
+        flown, key=lambda flight: (results['meta']['controllers'].index(flight.controller),
+                                   flight))}
+    made = page.sections(results, ordered)
+    try:
+        for picture in page.pictures(made):
+            (output / f'{picture.name}.png').write_bytes(picture.data)
+        for name, text in ((PAGE, page.page(results, made)),
+                           (TEXT, page.markdown(results, made))):
+            temporary = output / f'{name}.tmp'
+            temporary.write_text(text, encoding='utf-8')
+            temporary.replace(output / name)
+    except OSError as error:
+        raise ParameterError(f'{output}: cannot write the page ({error.strerror})') from None
+    write_json(output / NUMBERS, results)
+    console.print(_rich(grids_other.glance(results), results, console.width))
+    failed = sum(bool(result['failure']) for result in flown.values())
+    if failed:
+        console.print(f'{failed} of {len(flown)} flights failed, see above and on the page',
+                      style='red', highlight=False)
+    console.print(f'{output / PAGE}', highlight=False)
+
+
+def _rich(grid: Grid, results: dict, width: int) -> Table:
+    """Table for the terminal, a narrow one without the published columns."""
+    shown = [k for k, column in enumerate(grid.columns)
+             if column.group != 'published' or width >= WIDE]
+    table = Table(title=grid.title, title_justify='left', title_style='bold', box=None,
+                  header_style='dim', padding=(0, 2, 0, 0))
+    table.add_column('', min_width=24)
+    for column in (grid.columns[k] for k in shown):
+        is_ours = column.group != 'published'
+        name = look(column.controller).label
+        table.add_column(Text(name if is_ours else f'published {name}'), justify='right',
+                         style=None if is_ours else 'dim')
+    for name, cells in grid.rows:
+        table.add_row(Text(name), *(Text(''.join(
+            part.text(results) if isinstance(part, Number) else part
+            for part in [*cells[k].main, *cells[k].small])) for k in shown))
+    return table
+
+
+__all__ = ['Flight', 'run_compare']

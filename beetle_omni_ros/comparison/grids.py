@@ -1,0 +1,263 @@
+"""The tables of a comparison, as the publication lays them out where it has them."""
+
+from __future__ import annotations
+
+from beetle_omni_ros.comparison.grid import Cell, Column, GAZEBO, Grid, Number, OURS, REAL
+from beetle_omni_ros.comparison.style import task_title
+
+PAPER = ('published_rl', 'published_nmpc')
+GROUP = {'random': GAZEBO, 'force': GAZEBO, 'torque': GAZEBO, 'waypoints': REAL,
+         'lemniscate': REAL}
+SINGLE = {'U_position_m': 4, 'U_orientation_deg': 2, 'L_position_m': 3, 'L_orientation_deg': 2}
+"""Key of a pose error -> digits shown."""
+NAMES = {'U_position_m': 'U ‖p error‖ [m]', 'U_orientation_deg': 'U ‖θ error‖ [deg]',
+         'L_position_m': 'L ‖p error‖ [m]', 'L_orientation_deg': 'L ‖θ error‖ [deg]'}
+
+
+class Task:
+    """Where a table finds its numbers: a task under one set of conditions."""
+
+    def __init__(self, results: dict, task: str, conditions: str):
+        """See the class."""
+        self.results, self.task, self.conditions = results, task, conditions
+        self.numbers = results['summary']['tasks'][task]
+        self.ours = [name for name in results['meta']['controllers']
+                     if name in self.numbers.get(conditions, {})]
+        kind = 'random' if task.startswith('random') else task
+        self.paper = [name for name in PAPER if name in self.numbers.get('paper', {})]
+        self.columns = [*(Column(name, OURS) for name in self.ours),
+                        *(Column(name, GROUP[kind]) for name in self.paper)]
+
+    def path(self, controller, *keys):
+        """Path of a number of one column."""
+        conditions = 'paper' if controller in PAPER else self.conditions
+        return ('summary', 'tasks', self.task, conditions, controller, *keys)
+
+    def number(self, controller, *keys, digits=None):
+        """Build a number; published ones are printed as they were."""
+        return Number(self.path(controller, *keys), None if controller in PAPER else digits)
+
+    def value(self, controller, *keys):
+        """Look a number up."""
+        return Number(self.path(controller, *keys)).value(self.results)
+
+    def row(self, name, cell, best=None):
+        """
+        Build one row.
+
+        Args:
+            name: of the row.
+            cell: controller -> Cell.
+            best: keys of the number that is best where it is least; None marks nothing.
+
+        """
+        cells = {column.controller: cell(column.controller) for column in self.columns}
+        if best and len(self.ours) > 1:
+            values = {name: self.value(name, *best) for name in self.ours}
+            known = {name: abs(value) for name, value in values.items() if value is not None}
+            if known:
+                winner = min(known, key=known.get)
+                cells[winner] = Cell(cells[winner].main, cells[winner].small, best=True)
+        return name, list(cells.values())
+
+    def mean_range(self, *keys, digits):
+        """Cells of a mean with its least and largest value."""
+        def cell(name):
+            if self.value(name, *keys, 'mean') is None:
+                return Cell()
+            small = []
+            if self.value(name, *keys, 'max') is not None:
+                low = self.number(name, *keys, 'min', digits=digits)
+                high = self.number(name, *keys, 'max', digits=digits)
+                small = ['[', low, ', ', high, ']'] if low.value(self.results) is not None \
+                    else ['max ', high]
+            return Cell([self.number(name, *keys, 'mean', digits=digits)], small)
+        return cell
+
+    def mean_std(self, *keys, digits):
+        """Cells of a mean with its standard deviation."""
+        def cell(name):
+            if self.value(name, *keys, 'mean') is None:
+                return Cell()
+            return Cell([self.number(name, *keys, 'mean', digits=digits)],
+                        ['± ', self.number(name, *keys, 'std', digits=digits)])
+        return cell
+
+    def plain(self, *keys, digits=None, unit=''):
+        """Cells of one number."""
+        return lambda name: Cell([self.number(name, *keys, digits=digits), unit]) \
+            if self.value(name, *keys) is not None else Cell()
+
+    def commands(self):
+        """Shell lines that fly what the table shows."""
+        seeds = sorted({seed for name in self.ours for seed in
+                        self.numbers[self.conditions][name]['seeds']})
+        return [f"beetle_omni evaluate --controllers {','.join(self.ours)} --task {self.task} "
+                f'--conditions {self.conditions} --seed {seed}' for seed in seeds]
+
+    def grid(self, title, rows, notes=()):
+        """Put the table together."""
+        seeds = sorted({seed for name in self.ours for seed in
+                        self.numbers[self.conditions][name]['seeds']})
+        text = f"Seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}."
+        return Grid(f'{title}, {self.conditions} conditions', self.columns, rows,
+                    [text, *notes], self.commands())
+
+
+def reached(task: Task):
+    """Cells of how many poses were reached."""
+    def cell(name):
+        if task.value(name, 'reached') is None:
+            return Cell()
+        return Cell([task.number(name, 'reached', digits=0), ' of ',
+                     task.number(name, 'poses', digits=0)])
+    return cell
+
+
+def _crashed(task):
+    def cell(name):
+        if task.value(name, 'crashed') is None:
+            return Cell()
+        return Cell([task.number(name, 'crashed', digits=0), ' of ',
+                     task.number(name, 'flights', digits=0)])
+    return cell
+
+
+def poses(results: dict, name: str, conditions: str) -> Grid:
+    """Poses: the publication's table of 100 random poses, and what ours adds to it."""
+    task = Task(results, name, conditions)
+    rows = [task.row(f'{NAMES[key]}, mean [min, max]', task.mean_range(key, digits=digits),
+                     best=(key, 'mean')) for key, digits in SINGLE.items()]
+    rows += [
+        task.row('‖v‖ at the target ± std [m/s]',
+                 task.mean_std('hover_speed_m_s', digits=4), best=('hover_speed_m_s', 'mean')),
+        task.row('‖ω‖ at the target ± std [rad/s]',
+                 task.mean_std('hover_angular_speed_rad_s', digits=4),
+                 best=('hover_angular_speed_rad_s', 'mean')),
+        task.row('|q* − q| ± std [rad]', task.mean_std('joint_error_rad', digits=4),
+                 best=('joint_error_rad', 'mean')),
+        task.row('the same, at the target only', task.plain('joint_error_hover_rad', 'mean',
+                                                            digits=4)),
+        task.row('thrust f* ± std [N]', task.mean_std('thrust_N', digits=2),
+                 best=('thrust_N', 'mean')),
+        task.row('tilt command change in 10 ms at the target, RMS [rad]',
+                 task.plain('command_change_rms', 'joint_rad', digits=4),
+                 best=('command_change_rms', 'joint_rad')),
+        task.row('poses reached', reached(task)),
+        task.row('flights that touched the ground', _crashed(task))]
+    notes = ['U: mean over 7.0 to 7.5 s of the 8 s of a pose; L: over 1.0 to 7.0 s; both '
+             'averaged over the poses. Reached: U below 0.10 m and 10 deg. Bold: least of ours.']
+    if name.startswith('random'):
+        notes.append('The published poses are drawn from the same ranges, not the same; whether '
+                     'its |q* − q| counts the whole flight or the hover is not stated.')
+    return task.grid(task_title(name), rows, notes)
+
+
+def waypoints(results: dict, conditions: str) -> Grid:
+    """Five waypoints, one row a pose, as the publication's table of the real robot."""
+    task = Task(results, 'waypoints', conditions)
+    targets = task.numbers[conditions][task.ours[0]].get('by_pose', []) if task.ours else []
+    rows = []
+    for k, entry in enumerate(targets):
+        pose = '[{:g}, {:g}, {:g}] m, [{:g}, {:g}, {:g}] deg'.format(*entry['target'])
+        rows.append(task.row(pose, _both(task, 'by_pose', k)))
+    rows.append(task.row('mean', _both(task), best=('U_position_m', 'mean')))
+    rows += [task.row(f'{NAMES[key]}, mean [min, max]', task.mean_range(key, digits=SINGLE[key]))
+             for key in ('L_position_m', 'L_orientation_deg')]
+    rows.append(task.row('poses reached', reached(task)))
+    return task.grid(
+        'Five waypoints, three rounds: U position [m] / orientation [deg]', rows,
+        ['Ours is simulated, the published columns are measured on the real robot: not the same '
+         'experiment. Means over the rounds and seeds.'])
+
+
+def _both(task, *keys):
+    """U of position and orientation in one cell."""
+    def cell(name):
+        if task.value(name, *keys, 'U_position_m', 'mean') is None:
+            return Cell()
+        return Cell([task.number(name, *keys, 'U_position_m', 'mean', digits=4), ' / ',
+                     task.number(name, *keys, 'U_orientation_deg', 'mean', digits=2)])
+    return cell
+
+
+def lemniscate(results: dict, conditions: str) -> Grid:
+    """Tracking errors over the rounds."""
+    task = Task(results, 'lemniscate', conditions)
+    rows = []
+    for text, key, digits in (('position error [m]', 'position_m', 4),
+                              ('orientation error [deg]', 'orientation_deg', 2)):
+        rows += [task.row(f'{text}, mean ± std', task.mean_std('trajectory', key, digits=digits),
+                          best=('trajectory', key, 'mean')),
+                 task.row('range of the means of the rounds', _round_range(task, key, digits)),
+                 task.row('largest', task.plain('trajectory', key, 'max', digits=digits))]
+    rows.append(task.row('rounds', task.plain('trajectory', 'rounds', digits=0)))
+    return task.grid(
+        '3D lemniscate, five rounds', rows,
+        ['Ours is simulated, the published columns are measured on the real robot. The '
+         "publication does not state its curve's size and speed: for orientation only."])
+
+
+def _round_range(task, key, digits):
+    def cell(name):
+        if task.value(name, 'trajectory', key, 'round_min') is None:
+            return Cell()
+        low, high = (task.number(name, 'trajectory', key, end, digits=digits)
+                     for end in ('round_min', 'round_max'))
+        return Cell([low, ' to ', high])
+    return cell
+
+
+def disturbance(results: dict, kind: str, conditions: str) -> Grid:
+    """Peak errors at every level, and the level at which control was lost."""
+    task = Task(results, kind, conditions)
+    unit = 'N' if kind == 'force' else 'N m'
+    levels = sorted({entry['level'] for name in task.ours
+                     for entry in task.value(name, kind, 'levels') or []})
+    rows = [task.row(f'{level:g} {unit}', _level(task, kind, level)) for level in levels]
+    rows += [task.row('control lost at', lost(task, kind, unit)),
+             task.row('withstood in every flight',
+                      task.plain(kind, 'withstood_min', unit=f' {unit}'))]
+    what = 'Upward force for 2 s at each level, without a pause' if kind == 'force' else \
+        'Torque about x for 0.05 s at each level, one every 2 s'
+    notes = [f'{what}, while hovering at [0, 0, 1.5] m with 25 deg of roll. Cells: largest '
+             'position [m] / orientation error [deg] in the 2 s, mean over the seeds; × where '
+             'control was lost: more than 1.5 m away, on the ground, or turned by more than 90 '
+             'deg when the next level is due. That ends the flight.']
+    if kind == 'torque':
+        notes.append('Published: RL "loses stability rapidly" between 15 and 25 N m, neither '
+                     'recovers above 25 N m.')
+    return task.grid(task_title(kind), rows, notes)
+
+
+def _level(task, kind, level):
+    def cell(name):
+        entries = task.value(name, kind, 'levels') or []
+        for k, entry in enumerate(entries):
+            if entry['level'] == level:
+                main = [task.number(name, kind, 'levels', k, 'peak_position_m', 'mean', digits=3),
+                        ' / ', task.number(name, kind, 'levels', k, 'peak_orientation_deg',
+                                           'mean', digits=1)]
+                small = []
+                if entry['lost']:
+                    small = ['× lost in ', task.number(name, kind, 'levels', k, 'lost', digits=0),
+                             ' of ', task.number(name, kind, 'levels', k, 'flown', digits=0)]
+                return Cell(main, small)
+        return Cell([''] if name not in task.ours else ['–'])
+    return cell
+
+
+def lost(task: Task, kind: str, unit: str):
+    """Cells of the level at which control was lost, over all flights."""
+    def cell(name):
+        low, high = (task.number(name, kind, f'lost_{end}') for end in ('min', 'max'))
+        first, last = low.value(task.results), high.value(task.results)
+        if task.value(name, kind) is None:
+            return Cell()
+        if first is None:
+            return Cell(['never'])
+        if first == last:
+            return Cell([low, f' {unit}'])
+        return Cell([low, ' to ', high, f' {unit}'] if last is not None
+                    else [low, f' {unit} or never'])
+    return cell

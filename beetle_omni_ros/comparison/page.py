@@ -1,0 +1,266 @@
+"""The comparison as one HTML page that needs no network, and as Markdown with pictures."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from dataclasses import dataclass, field
+from html import escape
+from io import BytesIO
+
+import matplotlib
+from matplotlib.figure import Figure
+from PIL import Image
+
+from beetle_omni_ros.comparison import figures_poses, figures_tasks, grid, grids, grids_other
+from beetle_omni_ros.comparison.grid import Grid
+from beetle_omni_ros.comparison.style import CONDITIONS, look, task_title
+from beetle_omni_ros.runs import figures
+
+DOTS = 180  # per inch
+COLOURS = 128  # of a picture; its lines are few and their edges smooth
+TITLE = 'RL and NMPC under one architecture'
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A drawing as PNG, with the name of its file and what it shows."""
+
+    name: str
+    caption: str
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading, a paragraph, pictures and tables in the order in which they are shown."""
+
+    title: str
+    text: str
+    blocks: list[Grid | Picture] = field(default_factory=list)
+
+
+def sections(results: dict, flown: dict) -> list[Section]:
+    """
+    Draw and tabulate everything that was flown.
+
+    Args:
+        results: as written to JSON.
+        flown: flights and their results with traces.
+
+    """
+    made = [Section('At a glance', '', [grids_other.glance(results)])]
+    with matplotlib.rc_context(figures.STYLE):
+        for task, by_conditions in results['summary']['tasks'].items():
+            blocks: list[Grid | Picture] = []
+            for conditions in (c for c in by_conditions if c in CONDITIONS):
+                blocks += _blocks(results, flown, task, conditions)
+            made.append(Section(task_title(task), TEXTS.get(_kind(task), ''), blocks))
+    made.append(Section('Compute time', '', [grids_other.compute(results)]))
+    return made
+
+
+TEXTS = {
+    'random': 'One pose after the other, 8 s each, x and y within 2 m, z from 0.6 to 2 m, any '
+              'attitude, upside down included.',
+    'waypoints': 'The five poses of the real-world experiment, 8 s each, three rounds.',
+    'lemniscate': 'Position, roll, pitch and yaw follow a figure of eight in space, five rounds; '
+                  'the policies were trained for poses, not for trajectories.',
+    'force': 'A vertical force that rises until control is lost.',
+    'torque': 'Torque impulses that rise until control is lost.',
+    'payload': 'Masses attached while hovering, unknown to estimator and controllers.',
+    'hover': 'How still the robot stands, and how smooth its commands are.'}
+
+
+def _kind(task):
+    return 'random' if task.startswith('random') else task
+
+
+def _blocks(results, flown, task, conditions):
+    """Pictures and table of a task under one set of conditions."""
+    def picture(name, caption, figure):
+        return [Picture(f'{_kind(task)}_{name}_{conditions}'.replace('/', '_'),
+                        f'{caption} ({conditions} conditions)', png(figure))] if figure else []
+
+    kind = _kind(task)
+    if kind == 'waypoints':
+        return [grids.waypoints(results, conditions), *picture(
+            'states', 'States in a round: mean of all rounds, least to largest as a band',
+            figures_poses.waypoints(flown, conditions))]
+    if kind == 'lemniscate':
+        return [grids.lemniscate(results, conditions), *picture(
+            'path', 'Path, mean of all rounds', figures_tasks.lemniscate_path(flown, conditions)),
+            *picture('errors', 'Tracking errors in a round: mean of all rounds, least to largest '
+                     'as a band', figures_tasks.lemniscate_errors(flown, conditions))]
+    if kind in ('force', 'torque'):
+        return [*picture('errors', 'Errors in time, the disturbance dashed; × where control was '
+                         'lost; thin lines: further seeds' + (
+                             '; each torque lasts 0.05 s' if kind == 'torque' else ''),
+                         figures_tasks.disturbance(flown, kind, conditions)),
+                grids.disturbance(results, kind, conditions)]
+    if kind == 'payload':
+        return [*picture('errors', 'Errors against the payload, range over the seeds; right: '
+                         'height in time', figures_tasks.payload(flown, conditions)),
+                grids_other.payload(results, conditions)]
+    if kind == 'hover':
+        return [grids_other.hover(results, conditions), *picture(
+            'commands', 'Commands at the end of the hover, four joints and four rotors',
+            figures_tasks.hover_commands(flown, conditions))]
+    return [grids.poses(results, task, conditions),
+            *picture('errors', 'Errors at the target; stars: published means, with their ranges',
+                     figures_poses.distributions(flown, task, conditions)),
+            *picture('convergence', 'Errors after a pose was asked for: median and 10 to '
+                     '90 % band over all poses',
+                     figures_poses.convergence(flown, task, conditions))]
+
+
+def pictures(made: list[Section]) -> list[Picture]:
+    """All pictures of all sections."""
+    return [block for section in made for block in section.blocks if isinstance(block, Picture)]
+
+
+def png(figure: Figure) -> bytes:
+    """Draw a figure as PNG of few colours, a third of the size of one with all."""
+    buffer, small = BytesIO(), BytesIO()
+    with matplotlib.rc_context(figures.STYLE):
+        figure.savefig(buffer, format='png', dpi=DOTS)
+    Image.open(buffer).convert('RGB').quantize(COLOURS, dither=Image.Dither.NONE).save(
+        small, format='png', optimize=True)
+    return small.getvalue()
+
+
+def legend(results: dict) -> list[tuple[str, str]]:
+    """Term and meaning, of controllers and conditions that the page shows."""
+    meta = results['meta']
+    made = [(look(name).label, look(name).text) for name in meta['controllers']]
+    made += [(f'{name} conditions', CONDITIONS[name]) for name in meta['conditions']]
+    made += [(f'{name}: not flown', reason) for name, reason in meta['skipped'].items()]
+    return made
+
+
+def facts(results: dict) -> list[str]:
+    """What was computed by which code, where and how."""
+    meta = results['meta']
+    code = f"beetle_omni_ros {meta['version']}" + \
+        (f", commit {meta['commit']}" if meta.get('commit') else '')
+    failed = sum(bool(flight['failure']) for flight in results['flights'])
+    lines = [code, f"{len(results['flights'])} flights, {failed} failed; seeds "
+                   f"{', '.join(map(str, meta['seeds']))}",
+             f"{meta['cpu_s'] / 60:.1f} core minutes on {meta['machine']['processor']}"]
+    lines += [f'{look(name).label}: policy {digest}' for name, digest in meta['policies'].items()]
+    return lines
+
+
+def page(results: dict, made: list[Section]) -> str:
+    """Put the page together; everything it needs is in it."""
+    body = ''.join(_html_section(section, results) for section in made)
+    links = ' · '.join(f'<a href="#{_anchor(section.title)}">{escape(section.title)}</a>'
+                       for section in made)
+    terms = ''.join(f'<dt>{escape(term)}</dt><dd>{escape(text)}</dd>'
+                    for term, text in legend(results))
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{TITLE}</title>
+<style>{CSS}</style>
+</head>
+<body>
+<main>
+<header><h1>{TITLE}</h1>
+<p>{'<br>'.join(escape(line) for line in facts(results))}</p>
+<nav>{links}</nav></header>
+<section><p>Every number of ours is <b class="ours">simulated</b>: the same plant, sensors, EKF,
+supervisor, actuator models and limits for every controller. Published numbers are
+<b class="gazebo">simulated in Gazebo</b> or measured on the <b class="real">real robot</b>,
+as each table says.</p><dl>{terms}</dl>
+<pre>{escape(results['meta']['command'])}</pre></section>
+{body}
+<section><details><summary>All flights</summary><div class="scroll"><table class="flights">
+<thead><tr><th>task</th><th>conditions</th><th>controller</th><th>seed</th><th>end</th>
+<th>core s</th></tr></thead><tbody>{grids_other.flights(results)}</tbody></table></div></details>
+</section>
+</main>
+</body>
+</html>
+"""
+
+
+def _anchor(title):
+    return title.lower().replace(' ', '-')
+
+
+def _html_section(section, results):
+    blocks = ''.join(grid.html(block, results) if isinstance(block, Grid) else
+                     f'<figure><img alt="{escape(block.caption)}" src="data:image/png;base64,'
+                     f'{b64encode(block.data).decode()}">'
+                     f'<p class="note">{escape(block.caption)}.</p></figure>'
+                     for block in section.blocks)
+    text = f'<p>{escape(section.text)}</p>' if section.text else ''
+    return (f'<section id="{_anchor(section.title)}"><h2>{escape(section.title)}</h2>{text}'
+            f'{blocks}</section>\n')
+
+
+def markdown(results: dict, made: list[Section]) -> str:
+    """Write the same for readers of the repository, with pictures as files beside it."""
+    parts = [f'# {TITLE}\n', 'Made by `make compare`; the same with every detail is '
+             '`comparison.html`, all numbers are in `comparison.json`. '
+             '[How it is made](../comparison.md).\n',
+             '\n'.join(f'- {line}' for line in facts(results)) + '\n',
+             '\n'.join(f'- **{term}**: {text}' for term, text in legend(results)) + '\n']
+    for section in made:
+        parts.append(f'## {section.title}\n')
+        parts += [section.text + '\n'] if section.text else []
+        parts += [grid.markdown(block, results) if isinstance(block, Grid) else
+                  f'![{block.caption}]({block.name}.png)\n\n{block.caption}.\n'
+                  for block in section.blocks]
+    return '\n'.join(parts)
+
+
+CSS = """
+:root { --ink: #22272e; --faint: #66707b; --line: #e3e7ec; --paper: #fff; --wash: #f6f7f9;
+  --gazebo: #f7f3e6; --real: #eaf3ee; }
+* { box-sizing: border-box; }
+html { scroll-behavior: smooth; }
+body { margin: 0; background: var(--wash); color: var(--ink);
+  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", sans-serif; }
+main { max-width: 1180px; margin: 0 auto; padding: 40px 28px 80px; }
+header h1 { font-size: 28px; font-weight: 650; letter-spacing: -0.01em; margin: 0; }
+header p { color: var(--faint); margin: 4px 0 12px; font-size: 13.5px; }
+nav { margin: 0 0 22px; font-size: 14px; } a { color: #1b5fb4; text-decoration: none; }
+h2 { font-size: 19px; font-weight: 650; margin: 0 0 2px; }
+section { background: var(--paper); border: 1px solid var(--line); border-radius: 8px;
+  padding: 22px 26px; margin: 0 0 18px; }
+section > p { margin: 0 0 14px; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: 3px 18px; margin: 0 0 14px;
+  font-size: 13.5px; } dt { font-weight: 600; } dd { margin: 0; color: var(--faint); }
+b.gazebo, b.real, b.ours { font-weight: 500; padding: 0 5px; border-radius: 3px; }
+b.gazebo, .gazebo { background: var(--gazebo); } b.real, .real { background: var(--real); }
+b.ours { background: var(--wash); }
+img { width: 100%; height: auto; display: block; }
+figure { margin: 14px 0 26px; } figure:last-child { margin-bottom: 0; }
+figcaption { font-weight: 600; margin: 0 0 6px; }
+.note { color: var(--faint); font-size: 13px; margin: 6px 0 0; }
+pre { background: var(--wash); font-size: 12px; padding: 8px 12px; border-radius: 5px;
+  margin: 8px 0 0; white-space: pre-wrap; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; width: 100%; font-size: 13.5px;
+  font-variant-numeric: tabular-nums; }
+th { font-weight: 500; }
+th, td { padding: 5px 10px; text-align: right; vertical-align: top; white-space: nowrap; }
+thead th { border-bottom: 1px solid var(--ink); vertical-align: bottom; white-space: normal;
+  max-width: 130px; }
+thead tr.groups th { border-bottom: 0; color: var(--faint); font-size: 12px; text-align: center; }
+th:first-child { text-align: left; padding-left: 0; }
+tbody th { color: var(--ink); font-weight: 400; white-space: normal; min-width: 250px; }
+thead i { display: inline-block; width: 9px; height: 9px; border-radius: 2px;
+  margin-right: 6px; }
+tbody td, tbody th { border-bottom: 1px solid var(--line); }
+td small { display: block; color: var(--faint); font-size: 11.5px; line-height: 1.3; }
+td.best { font-weight: 650; } td.best small { font-weight: 400; }
+td.first, th.first { border-left: 1px solid var(--line); }
+.flights td, .flights th { text-align: left; }
+summary { cursor: pointer; font-weight: 600; }
+@media print { body { background: none; } section { break-inside: auto; } figure
+  { break-inside: avoid; } }
+"""

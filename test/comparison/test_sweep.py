@@ -1,0 +1,176 @@
+"""Flights of a comparison: planned, flown by either backend, kept, and honest when they fail."""
+
+import importlib.util
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from beetle_omni_ros.comparison import command, fingerprint, sweep
+from beetle_omni_ros.comparison import flight as flight_module
+from beetle_omni_ros.comparison.plan import CONDITIONS, CONTROLLERS, Flight, plan, TASKS
+from beetle_omni_ros.comparison.store import Store
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.tasks import make_task
+
+HAS_RAY = importlib.util.find_spec('ray') is not None
+
+
+@pytest.fixture
+def poses(tmp_path):
+    """A pose file of one near pose, so that a flight is short."""
+    path = tmp_path / 'poses.csv'
+    path.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0.2,0.1,1.1,10,-20,40\n')
+    return str(path)
+
+
+def without_times(result):
+    """Return what a flight gives, less what the computer's load decides."""
+    metrics = {key: value for key, value in result['metrics'].items() if key != 'compute_ms'}
+    return json.dumps(metrics), {name: values.tolist() for name, values in
+                                 result['trace'].items()}
+
+
+def never(*arguments):
+    """Stand in for a flight that must not take place."""
+    raise AssertionError('flown again')
+
+
+def test_a_plan_holds_every_combination_once_and_begins_with_the_longest():
+    flights = plan(CONTROLLERS, seeds=(0, 5))
+    assert len(flights) == len(set(flights)) == \
+        len(CONTROLLERS) * len(TASKS) * len(CONDITIONS) * 2
+    costs = [flight.cost for flight in flights]
+    assert costs == sorted(costs, reverse=True)
+    assert flights[0].task == 'random100'
+    assert len({flight.slug for flight in flights}) == len(flights)
+
+
+@pytest.mark.parametrize(('changes', 'named'), [
+    ({'tasks': ['wayponts']}, 'wayponts'), ({'conditions': ['windy']}, 'windy'),
+    ({'seeds': []}, '--seeds'), ({'seeds': [1, 1]}, '--seeds'),
+    ({'controllers': ['nmpc', 'nmpc']}, '--controllers')])
+def test_what_cannot_be_planned_is_named(changes, named):
+    with pytest.raises(ParameterError, match=named):
+        plan(**{'controllers': ['nmpc'], **changes})
+
+
+def test_processes_give_the_numbers_of_a_flight_in_this_process(poses, tmp_path):
+    flights = plan(['hover', 'nmpc'], [poses], ['published'], [3])
+    flown = sweep.sweep(flights, store=Store(tmp_path / 'kept'), jobs=2)
+    assert list(flown) == flights
+    for flight, result in flown.items():
+        here = flight_module.fly_flight(flight, flight.make_task())
+        assert without_times(here) == without_times(result)
+
+
+@pytest.mark.skipif(not HAS_RAY, reason='ray is not installed')
+@pytest.mark.timeout(180)
+def test_ray_gives_the_numbers_of_processes(poses, tmp_path):
+    flights = plan(['hover', 'nmpc'], [poses], ['nominal'], [0, 1])
+    by_ray = sweep.sweep(flights, store=Store(tmp_path / 'ray'), backend='ray', jobs=2)
+    by_processes = sweep.sweep(flights, store=Store(tmp_path / 'processes'), jobs=2)
+    assert list(by_ray) == list(by_processes) == flights
+    for flight in flights:
+        assert by_ray[flight]['failure'] is None
+        assert without_times(by_ray[flight]) == without_times(by_processes[flight])
+    import ray
+    assert not ray.is_initialized()
+
+
+def test_without_ray_one_line_says_how_to_get_it(poses, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__('sys').modules, 'ray', None)
+    with pytest.raises(ParameterError, match=r'beetle_omni_ros\[ray\]'):
+        sweep.sweep(plan(['hover'], [poses]), store=Store(tmp_path), backend='ray')
+
+
+def test_an_unknown_backend_is_refused(poses, tmp_path):
+    with pytest.raises(ParameterError, match="--backend 'threads': expected processes or ray"):
+        sweep.sweep(plan(['hover'], [poses]), store=Store(tmp_path), backend='threads')
+
+
+def test_finished_flights_are_kept_and_only_missing_ones_are_flown(poses, tmp_path, monkeypatch):
+    store = Store(tmp_path / 'kept')
+    flights = plan(['hover'], [poses], ['nominal'], [0, 1])
+    first = sweep.sweep(flights[:1], store=store, jobs=1)
+    told = []
+    both = sweep.sweep(flights, store=store, jobs=1,
+                       done=lambda flight, result, kept: told.append((flight, kept)))
+    assert told == [(flights[0], True), (flights[1], False)]
+    assert without_times(first[flights[0]]) == without_times(both[flights[0]])
+    assert both[flights[0]]['metrics']['compute_ms'] == first[flights[0]]['metrics']['compute_ms']
+    monkeypatch.setattr(sweep, 'fly_flight', never)
+    assert list(sweep.sweep(flights, store=store, jobs=1)) == flights
+    with pytest.raises(AssertionError, match='flown again'):
+        sweep.sweep(flights, store=store, jobs=1, fresh=True)
+
+
+def test_an_interrupted_sweep_keeps_what_was_finished(poses, tmp_path):
+    store = Store(tmp_path / 'kept')
+    flights = plan(['hover'], [poses], ['nominal'], [0, 1, 2])
+
+    def interrupt(flight, result, kept):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sweep.sweep(flights, store=store, jobs=1, done=interrupt)
+    assert sum(store.load(flight) is not None for flight in flights) == 1
+
+
+def test_a_kept_flight_counts_only_for_what_it_was_flown_with(poses, tmp_path, monkeypatch):
+    store, flight = Store(tmp_path / 'kept'), Flight(poses, 'nominal', 'hover', 0)
+    store.save(flight, {'failure': None, 'metrics': {}, 'trace': {}})
+    assert store.load(flight) is not None
+    assert store.load(Flight(poses, 'nominal', 'hover', 1)) is None
+    with open(poses, 'a') as file:
+        file.write('0,0,1,0,0,0\n')
+    assert store.load(flight) is None
+    store.save(flight, {'failure': None, 'metrics': {}, 'trace': {}})
+    monkeypatch.setattr(fingerprint, 'code_fingerprint', lambda: 'other code')
+    assert store.load(flight) is None
+
+
+def test_another_policy_file_is_another_flight(tmp_path):
+    flights = []
+    for text in ('one', 'two'):
+        file = tmp_path / f'{text}.onnx'
+        file.write_text(text)
+        flights += plan(['rl'], ['hover'], ['nominal'], [0], policy=file)
+    keys = [fingerprint.flight_key(flight) for flight in flights]
+    assert keys[0] != keys[1]
+    (tmp_path / 'two.onnx').write_text('one')
+    assert fingerprint.flight_key(flights[1]) == keys[0]
+
+
+def test_a_cut_off_file_is_flown_again(poses, tmp_path):
+    store, flight = Store(tmp_path), Flight(poses, 'nominal', 'hover', 0)
+    store.save(flight, {'failure': None, 'metrics': {'a': list(range(999))}, 'trace': {}})
+    kept, = tmp_path.glob('*.npz')
+    kept.write_bytes(kept.read_bytes()[:200])
+    assert store.load(flight) is None
+
+
+def test_a_failing_flight_is_a_result_with_its_reason_and_not_kept(poses, tmp_path, monkeypatch):
+    def fly(controller, *arguments, **options):
+        if controller == 'nmpc':
+            raise ZeroDivisionError('no way\nout')
+        return real(controller, *arguments, **options)
+
+    real = flight_module.fly
+    monkeypatch.setattr(flight_module, 'fly', fly)
+    results = command.run_compare(
+        output=tmp_path / 'out', controllers=['nmpc', 'hover'], tasks=[poses],
+        conditions=['nominal'], seeds=[0], jobs=1, console=Console(file=io.StringIO()))
+    failed, flown = sorted(results['flights'], key=lambda entry: entry['failure'] is None)
+    assert (failed['controller'], failed['failure']) == ('nmpc', 'ZeroDivisionError: no way out')
+    assert flown['failure'] is None and flown['metrics']['poses']
+    assert 'ZeroDivisionError: no way out' in (tmp_path / 'out' / 'comparison.html').read_text()
+    assert len(list((tmp_path / 'out' / '.flights').glob('*.npz'))) == 1
+
+
+def test_a_worker_with_other_code_does_not_fly(monkeypatch):
+    monkeypatch.setattr(flight_module, 'fly', never)
+    flight = Flight('hover', 'nominal', 'hover', 0)
+    result = flight_module.fly_flight(flight, make_task('hover'), code='another')
+    assert 'another version of the code' in result['failure']
