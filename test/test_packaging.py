@@ -27,7 +27,7 @@ HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 # Import name -> distribution on PyPI, where they differ; import name -> rosdep key.
 DISTRIBUTION = {'yaml': 'pyyaml', 'mcap_ros2': 'mcap-ros2-support', 'serial': 'pyserial',
-                'dynamixel_sdk': 'dynamixel-sdk', 'PIL': 'pillow'}
+                'dynamixel_sdk': 'dynamixel-sdk', 'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow'}
 KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-ros2-support',
        'casadi': 'casadi-pip', 'serial': 'python3-serial', 'PIL': 'python3-pil'}
 PARAMETER_CLASSES = {

@@ -174,7 +174,7 @@ def _paper(task):
         elif task == 'waypoints':
             made[column] = {**_published_poses(published.WAYPOINTS[real]), 'by_pose': [
                 {key: {'mean': value} for key, value in pose.items()}
-                for pose in published.WAYPOINTS[real]['poses']]}
+                for pose in published.WAYPOINTS[real]['by_pose']]}
         elif task == 'lemniscate':
             tracking = published.LEMNISCATE[real]
             made[column] = {'trajectory': {f'{what}_{unit}': {
