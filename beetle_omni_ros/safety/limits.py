@@ -77,7 +77,10 @@ class CommandStream:
         if reason:
             self.refused[reason] += 1
             self.last_refusal = reason
-            self.good_for = 0.0
+            # A step to a new target looks like a jump for one period and is none afterwards;
+            # one that is none of that is soon silent.
+            if reason != JUMP:
+                self.good_for = 0.0
             return reason
         self.accepted, self.last_refusal = clean, ''
         self.silence.heard()

@@ -33,6 +33,16 @@ class CommandLimits:
 
 
 @dataclass(frozen=True, kw_only=True)
+class HandoverParameters:
+    """How fast the command may change when somebody else takes over."""
+
+    time: float = parameter(0.3, doc='longest; ends when the command has caught up', unit='s',
+                            low=0, high=5)
+    tilt_rate: float = parameter(9.0, doc='of tilt targets', unit='rad/s', low=0.1, high=1000)
+    thrust_rate: float = parameter(300.0, doc='of thrust targets', unit='N/s', low=1, high=1e5)
+
+
+@dataclass(frozen=True, kw_only=True)
 class StateLimits:
     """When the state estimate, the joints and the raw sensors count as gone."""
 
@@ -159,6 +169,7 @@ class SupervisorParameters:
     controller: str = parameter('nmpc', doc='the active controller, also in flight',
                                 choices=('nmpc', 'rl'))
     commands: CommandLimits = group(CommandLimits)
+    handover: HandoverParameters = group(HandoverParameters)
     state: StateLimits = group(StateLimits)
     arming: ArmingLimits = group(ArmingLimits)
     takeoff: TakeoffParameters = group(TakeoffParameters)

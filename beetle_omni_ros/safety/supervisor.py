@@ -13,6 +13,7 @@ from beetle_omni_ros.control.base import Command, Controller, PoseTarget
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
+from beetle_omni_ros.safety.handover import Handover
 from beetle_omni_ros.safety.inputs import Inputs
 from beetle_omni_ros.safety.landing import Landing
 from beetle_omni_ros.safety.limits import within_limits
@@ -48,6 +49,7 @@ class Supervisor(Inputs):
         self._hover = fallback
         self._allocator = Allocator(robot)
         self._gauge = SupportGauge(self._allocator, robot.gravity, robot.rotors.time_constant)
+        self._handover = Handover(parameters.handover)
         self.state, self.source = DISARMED, 'none'
         self._in_force: Command | None = None
         self._takeoff: Takeoff | None = None
@@ -100,6 +102,7 @@ class Supervisor(Inputs):
         if reason:
             return self._refuse(now, f'select refused: {reason}')
         self._selection.active = controller
+        self._handover.start()
         self._say(now, INFO, f'{controller} selected')
         return Answer(True, f'{controller} selected')
 
@@ -204,7 +207,7 @@ class Supervisor(Inputs):
                                         'fallback to hover')
             return self._hold(now, dt)
         self.source = self.active
-        return stream.accepted
+        return self._handover.limit(stream.accepted, self._in_force)
 
     def _hold(self, now, dt):
         if self._selection.stream.good and not self.vehicle.lost:
@@ -252,6 +255,8 @@ class Supervisor(Inputs):
 
     def _enter(self, state, now, severity, text):
         self.state = state
+        if state == FLYING:
+            self._handover.start()
         self._say(now, severity, text)
         return Answer(True, text)
 
@@ -261,6 +266,7 @@ class Supervisor(Inputs):
 
     def _clock_went_back(self, now, by):
         self._hover.reset()
+        self._handover.stop()
         if self.state == TAKEOFF:
             self._takeoff.clock_went_back(by)
         if self.state == LANDING:

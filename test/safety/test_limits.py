@@ -72,6 +72,25 @@ def test_lone_spike_is_refused_but_a_real_step_costs_one_command():
     assert checked.offer(command(NOW + 0.04, far, (16, 16, 16, 16)), NOW + 0.04) == limits.JUMP
 
 
+def test_a_step_to_a_new_target_does_not_cost_the_right_to_be_selected():
+    checked, near, far = stream(), command(), (3.0, 0.2, 0.3, 0.4)
+    for k in range(200):
+        checked.tick(0.01)
+        now = NOW + 0.01 * k
+        checked.offer(command(now, near.tilt if k < 100 else far), now)
+        assert checked.good == (k >= 50)
+    assert checked.refused == {limits.JUMP: 1}
+
+
+def test_one_that_jumps_all_the_time_is_silent_and_not_good():
+    checked, now = stream(), NOW
+    for k in range(100):
+        checked.tick(0.01)
+        now += 0.01
+        checked.offer(command(now, (3.0 * (-1) ** k, 0, 0, 0)), now)
+    assert checked.silence.silent and not checked.good
+
+
 def test_accepted_command_does_not_change_with_the_callers_arrays():
     checked, given = stream(), command()
     checked.offer(given, NOW)

@@ -1,0 +1,154 @@
+"""The learnt controller in the whole loop: switched in flight, broken in flight."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.hover import HoverController
+from beetle_omni_ros.estimation.ekf import ErrorStateEkf
+from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.evaluation import command
+from beetle_omni_ros.evaluation.loop import FlightError, FlightLoop
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.runs.metrics import metrics
+from beetle_omni_ros.runs.recorder import LogRecorder
+from beetle_omni_ros.runs.tasks import make_task
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.supervisor import Supervisor
+from beetle_omni_ros.sim.simulator import Simulator
+
+ROBOT = RobotParameters.load()
+POSES, SWITCHES = 6, 20
+HANDOVER = SupervisorParameters.load().handover
+HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
+
+
+@pytest.fixture(params=['written', 'shipped'])
+def policy(request, tmp_path):
+    """Path of a policy that flies: one made by hand, and the one in policies/."""
+    if request.param == 'shipped':
+        try:
+            return share_path('policies/rl.onnx')
+        except FileNotFoundError:
+            pytest.skip('no policies/rl.onnx in this version')
+    pytest.importorskip('onnx')
+    from hover_policy import write_hover_policy
+    return write_hover_policy(tmp_path / 'hover.onnx', memory=True)
+
+
+class Switching(LogRecorder):
+    """A recorder in whose place the operator sits: selects the other one at given times."""
+
+    def __init__(self, supervisor, times):
+        super().__init__()
+        self.supervisor, self.times, self.switched = supervisor, list(times), []
+
+    def write_odom(self, t, *values):
+        super().write_odom(t, *values)
+        if self.times and t >= self.times[0] and self.supervisor.state == 'flying':
+            self.times.pop(0)
+            other = 'rl' if self.supervisor.active == 'nmpc' else 'nmpc'
+            assert self.supervisor.select(other, t)
+            self.switched.append((t, other))
+
+
+def fly_switching(policy, seed, poses=POSES):
+    """Both controllers in one loop, changed at moments drawn from ``seed``."""
+    estimator = EkfParameters.load()
+    supervisor = Supervisor(SupervisorParameters.load(), ROBOT, HoverController(ROBOT))
+    times = np.sort(np.random.default_rng(seed).uniform(4.0, 4.0 + 8 * poses, SWITCHES))
+    recorder = Switching(supervisor, times)
+    controllers = {name: command.make_controller(name, ROBOT,
+                                                 command.ControllerFiles(policy=policy))
+                   for name in ('nmpc', 'rl')}
+    loop = FlightLoop(Simulator(ROBOT), ErrorStateEkf(estimator, ROBOT.gravity),
+                      controllers, supervisor, recorder, estimator.imu.gyroscope_noise)
+    task = make_task(f'random{poses}')
+    return loop.fly(task), recorder, task
+
+
+def test_twenty_switches_at_random_moments_of_random_poses(policy):
+    stayed, recorder, task = fly_switching(policy, seed=0)
+    log = recorder.log()
+    assert stayed and len(recorder.switched) == SWITCHES
+    # every switch takes effect at its moment, and nothing else changes the state
+    flown = [(t, name) for t, name in zip(log.state_t, log.states) if name.startswith('flying')]
+    assert [name for _, name in flown] == ['flying:nmpc'] + [
+        f'flying:{name}' for _, name in recorder.switched]
+    assert np.allclose([t for t, _ in flown[1:]], [t for t, _ in recorder.switched], atol=0.011)
+    assert not {'fallback', 'landing', 'emergency_stop'} & set(log.states)
+    assert all(pose['reached'] for pose in metrics(log, task)['poses'])
+    # what is executed is what the selected controller asked for, once it has caught up
+    for (start, name), (end, _) in zip(flown, [*flown[1:], (log.end, '')]):
+        asked = log.requests[name.partition(':')[2]]
+        inside = (log.command_received > start + HANDOVER.time) & (log.command_received < end)
+        k = np.searchsorted(asked.t, log.command_t[inside])
+        assert np.allclose(asked.t[k], log.command_t[inside])
+        assert np.allclose(asked.tilt[k], log.command_tilt[inside], atol=1e-9)
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_no_switch_makes_the_command_jump(policy, seed):
+    stayed, recorder, _ = fly_switching(policy, seed)
+    log = recorder.log()
+    assert stayed and len(recorder.switched) == SWITCHES
+    t = log.command_t[1:]
+    tilt = np.abs(np.diff(log.command_tilt, axis=0)).max(axis=1)
+    thrust = np.abs(np.diff(log.command_thrust, axis=0)).max(axis=1)
+    for moment, _ in recorder.switched:
+        k = np.searchsorted(t, moment - 1e-9)
+        step = np.diff(log.command_t)[k:k + 2]
+        assert np.all(tilt[k:k + 2] <= HANDOVER.tilt_rate * step + 1e-6)
+        assert np.all(thrust[k:k + 2] <= HANDOVER.thrust_rate * step + 1e-6)
+
+
+def test_switched_flights_are_the_same_every_time(policy):
+    first, again = (fly_switching(policy, seed=3, poses=2)[1].log() for _ in range(2))
+    assert np.array_equal(first.truth_position, again.truth_position)
+    assert np.array_equal(first.command_tilt, again.command_tilt)
+
+
+def fly_poses(tmp_path, policy, *heights):
+    """Fly level poses at these heights with the policy."""
+    path = tmp_path / 'poses.csv'
+    path.write_text(HEADER + ''.join(f'0,0,{z},0,0,0\n' for z in heights))
+    return command.fly('rl', make_task(path), robot=ROBOT, plant=ROBOT,
+                       files=command.ControllerFiles(policy=policy))
+
+
+def test_answers_that_are_no_numbers_end_in_hover_and_good_ones_fly_again(tmp_path):
+    pytest.importorskip('onnx')
+    from hover_policy import write_hover_policy
+    broken = write_hover_policy(tmp_path / 'broken.onnx', memory=True, blind_above=0.3)
+    log = fly_poses(tmp_path, broken, 1.0, 1.6, 1.1)
+    assert not log.meta['crashed']
+    assert [name for name in log.states if name not in ('disarmed', 'takeoff')] == [
+        'flying:rl', 'fallback', 'flying:rl']
+    begin, fell = log.state_t[log.states.index('flying:rl')], \
+        log.state_t[log.states.index('fallback')]
+    up = log.truth_t > begin
+    assert log.truth_position[up, 2].min() > 0.8
+    # within the supervisor's patience of the first refusal, and on the second target
+    assert begin + 8.0 < fell < begin + 8.2
+    assert np.isfinite(log.command_tilt).all() and np.isfinite(log.command_thrust).all()
+    assert np.isnan(log.requests['rl'].thrust).any()
+
+
+def test_absurd_answers_never_get_control(tmp_path):
+    pytest.importorskip('onnx')
+    from policy_files import write
+    absurd = write(tmp_path / 'absurd.onnx', bias=np.r_[np.zeros(4), np.full(4, 1e6)])
+    with pytest.raises(FlightError, match="'fallback'.*rl_node.*thrust out of range"):
+        fly_poses(tmp_path, absurd, 1.0)
+
+
+def test_another_robot_flies_where_that_is_allowed(tmp_path):
+    pytest.importorskip('onnx')
+    from hover_policy import write_hover_policy
+    files = command.ControllerFiles(policy=write_hover_policy(tmp_path / 'p.onnx'))
+    other = replace(ROBOT, mass=3.1)
+    with pytest.raises(command.ParameterError, match='robot_hash'):
+        command.make_controller('rl', other, files)
+    command.make_controller('rl', other, replace(files, allow_other_robot=True))
