@@ -13,50 +13,19 @@ import subprocess
 import sys
 import time
 
-from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu, JointState
+from witness import HEADER, PATIENT, READY, Witness
 
 from beetle_omni_ros.nodes import convert, qos
 from beetle_omni_ros.nodes.graph import Graph
-from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task
 
-HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
-READY = 240     # s; without a cache the controller is compiled first
-# A busy test machine must not look like a dead node; 80 ms leave the supervisor 20 ms
-# before the actuators stop by themselves.
-PATIENT = {'commands': {'timeout': 0.08, 'stale_after': 0.08},
-           'state': {'timeout': 0.08, 'stale_after': 0.08, 'imu_timeout': 0.08,
-                     'mocap_timeout': 1.0, 'joint_timeout': 1.0}}
 NODES = ('recorder_node', 'sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node',
          'reference_node')
-
-
-class Witness(Operator):
-    """An operator who also sees the truth and the commands."""
-
-    def __init__(self, domain):
-        super().__init__(domain)
-        self.truth, self.last_command, self.height_min = None, None, np.inf
-        self._node.create_subscription(Odometry, 'ground_truth/odom', self._on_truth, qos.SENSOR)
-        self._node.create_subscription(JointState, 'command', self._on_actuators, qos.SENSOR)
-
-    def _on_truth(self, message):
-        self.truth = convert.odom(message)
-        self.height_min = min(self.height_min, self.truth.position[2])
-
-    def _on_actuators(self, message):
-        self.last_command = time.monotonic(), convert.command(message)
-
-    def stays_in_the_air(self, seconds):
-        """Watch for so long; whether the robot never went below half a metre."""
-        self.height_min = np.inf
-        self.spin(seconds)
-        return 0.5 < self.height_min < np.inf
 
 
 @pytest.fixture

@@ -1,0 +1,215 @@
+"""rl_node as a real process, and the change between controllers in a real flight."""
+
+from dataclasses import replace
+import os
+import subprocess
+import sys
+import time
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from sensor_msgs.msg import JointState
+from witness import PATIENT, READY, Witness
+
+from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
+from beetle_omni_ros.nodes import convert, qos
+from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes.standby import controller_nodes, unfit
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+
+pytest.importorskip('onnx')
+
+from hover_policy import write_hover_policy
+from policy_files import write
+
+SWITCHES = 20
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@pytest.fixture
+def process(ros_domain, tmp_path):
+    """rl_node alone in its process, with a policy made by hand; (graph, witness, file)."""
+    policy = write(tmp_path / 'policy.onnx', hidden=(32, 16), seed=5)
+    graph = Graph({'rl_node': {'policy': str(policy)}}, tmp_path, ros_domain, composed=False)
+    witness = None
+    try:
+        graph.start()
+        witness = Witness(ros_domain)
+        yield graph, witness, policy
+    finally:
+        graph.stop()
+        if witness:
+            witness.close()
+
+
+def test_the_node_answers_as_the_controller_does(process):
+    graph, witness, policy = process
+    node = witness._node
+    odom = node.create_publisher(Odometry, 'odom', qos.ESTIMATE)
+    joints = node.create_publisher(JointState, 'joint_states', qos.SENSOR)
+    targets = node.create_publisher(PoseStamped, 'target_pose', qos.LATCHED)
+    answers = []
+    node.create_subscription(JointState, 'rl/command', lambda m: answers.append(
+        convert.command(m)), qos.COMMAND)
+    assert witness.wait(lambda: odom.get_subscription_count() and joints.get_subscription_count()
+                        and targets.get_subscription_count() > 1, 30), graph.dead()
+    tilt = np.array([0.1, -0.2, 0.3, 0.0])
+    controller = PolicyController(RobotParameters.load(), replace(
+        PolicyParameters.load(), policy=str(policy)))
+    target = PoseTarget(np.array([0.2, 0.0, 1.5]), LEVEL)
+    message = convert.pose_message(time.time(), target.position, target.quaternion)
+    targets.publish(message)
+    witness.spin(0.3)
+
+    sent = {}
+    for k in range(20):
+        now = time.time()
+        state = convert.Odom(now, np.array([0.0, 0.1 * k, 1.0]), np.array([0.1, 0.2, -0.3]),
+                             np.array([0.5, 0.5, 0.5, 0.5]), np.array([0.3, 0.0, -0.1]))
+        joints.publish(convert.joint_message(now - 0.01, tilt, np.zeros(4)))
+        witness.spin(0.01)
+        odom.publish(convert.odometry_message(
+            now, state.position, state.velocity, state.quaternion, state.angular_velocity))
+        witness.spin(0.02)
+        sent[round(now, 4)] = controller.step(
+            convert.state(state, convert.Joints(now, tilt, np.zeros(4)), None), target)
+    assert len(answers) >= 10, graph.dead()
+    for answer in answers:
+        expected = sent[round(answer.stamp, 4)]
+        assert np.allclose(answer.tilt, expected.tilt, atol=1e-5)
+        assert np.allclose(answer.thrust, expected.thrust, atol=1e-5)
+    assert witness.wait(lambda: witness.values('rl_node: controller').get('steps'), 5)
+    assert witness.values('rl_node: controller')['policy'] == 'rl'
+    assert not graph.dead()
+
+
+def refusal(*overrides):
+    """What rl_node says when it does not start; status 2 and one line."""
+    arguments = [a for override in overrides for a in ('-p', override)]
+    done = subprocess.run(
+        [sys.executable, '-m', 'beetle_omni_ros.nodes.rl_node', '--ros-args', *arguments],
+        capture_output=True, text=True, timeout=60, check=False, env=dict(os.environ))
+    assert done.returncode == 2, done.stderr
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith('rl_node: error: '), lines
+    return lines[0]
+
+
+def test_a_policy_that_cannot_fly_is_refused_at_the_start(ros_domain, tmp_path):
+    assert 'no such file' in refusal(f"policy:={tmp_path / 'none.onnx'}")
+    cut = tmp_path / 'cut.onnx'
+    cut.write_bytes(write(tmp_path / 'whole.onnx').read_bytes()[:300])
+    assert 'not a readable ONNX file' in refusal(f'policy:={cut}')
+    other = share_path('params/robot_weak_and_heavy.yaml')
+    assert 'robot_hash' in refusal(f"policy:={tmp_path / 'whole.onnx'}", f'robot_file:={other}')
+
+
+def test_a_policy_that_cannot_fly_does_not_stand_by(tmp_path):
+    policy = str(write(tmp_path / 'policy.onnx'))
+    other = str(share_path('params/robot_weak_and_heavy.yaml'))
+    assert list(controller_nodes('nmpc', policy=policy)[0]) == ['nmpc_node', 'rl_node']
+    assert list(controller_nodes('rl', policy=policy)[0]) == ['rl_node', 'nmpc_node']
+    nodes, reason = controller_nodes('nmpc', policy=policy, robot_file=other)
+    assert list(nodes) == ['nmpc_node'] and 'robot_hash' in reason
+    nodes, reason = controller_nodes('nmpc', policy=policy, robot_file=other,
+                                     allow_other_robot=True)
+    assert nodes['rl_node'] == {'robot_file': other, 'policy': policy, 'allow_other_robot': True}
+    assert unfit(policy, other) and not unfit(policy, other, True)
+    with pytest.raises(ParameterError, match='no such file'):
+        controller_nodes('rl', policy=str(tmp_path / 'none.onnx'))
+    with pytest.raises(ParameterError, match="'hover': no node"):
+        controller_nodes('hover')
+
+
+class Pilot(Witness):
+    """A witness who selects controllers as `ros2 param set` does, and keeps every command."""
+
+    def __init__(self, domain):
+        super().__init__(domain)
+        self.client = AsyncParameterClient(self._node, 'supervisor_node')
+        self.taken, self.marks, self.targets = [], [], []
+        self._node.create_subscription(PoseStamped, 'target_pose', self._on_target, qos.LATCHED)
+
+    def _on_target(self, message):
+        self.targets.append(convert.seconds(message.header.stamp))
+
+    def _on_state(self, message):
+        super()._on_state(message)
+        self.marks.append((message.data, len(self.taken)))
+
+    def _on_actuators(self, message):
+        super()._on_actuators(message)
+        self.taken.append(self.last_command[1])
+
+    def select(self, name):
+        """Set the parameter; (accepted, reason)."""
+        future = self.client.set_parameters([Parameter('controller', value=name)])
+        assert self.wait(future.done, 3), 'supervisor_node does not answer'
+        result = future.result().results[0]
+        return result.successful, result.reason
+
+
+@pytest.fixture(params=['written', 'shipped'])
+def flight(request, ros_domain, tmp_path):
+    """The composed graph with both controllers in the air, on its way through random poses."""
+    if request.param == 'written':
+        policy = str(write_hover_policy(tmp_path / 'hover.onnx', memory=True))
+    elif unfit():
+        pytest.skip(unfit())
+    else:
+        policy = ''
+    controllers, reason = controller_nodes('nmpc', policy=policy)
+    assert not reason
+    graph = Graph({'sim_node': {}, 'ekf_node': {}, **controllers, 'supervisor_node': PATIENT,
+                   'reference_node': {'task': 'random20'}}, tmp_path, ros_domain)
+    pilot = None
+    try:
+        graph.start()
+        pilot = Pilot(ros_domain)
+        assert pilot.wait(lambda: pilot.ready and pilot.client.services_are_ready(), READY), \
+            graph.dead()
+        assert pilot.wait(lambda: pilot.call('arm')[0], 10), pilot.call('arm')
+        assert pilot.wait(lambda: pilot.progress.startswith('flying'), 30), pilot.states
+        yield graph, pilot
+    finally:
+        stubborn = graph.stop()
+        if pilot:
+            pilot.close()
+    assert not stubborn
+
+
+def test_twenty_switches_through_the_parameter_in_a_real_flight(flight):
+    graph, pilot = flight
+    names = ['rl', 'nmpc'] * (SWITCHES // 2)
+    for name, wait in zip(names, np.random.default_rng(0).uniform(0.2, 1.4, SWITCHES)):
+        assert pilot.stays_in_the_air(wait) or pilot.height_min > 0.15
+        assert pilot.select(name) == (True, '')
+        assert pilot.wait(lambda name=name: pilot.state == f'flying:{name}', 2), pilot.states
+    pilot.spin(0.5)
+    first = pilot.states.index('flying:nmpc')
+    assert pilot.states[first:] == ['flying:nmpc', *(f'flying:{name}' for name in names)]
+    assert not pilot.select('pid')[0]
+    assert pilot.state == 'flying:nmpc' and not graph.dead()
+    for _, mark in pilot.marks[-SWITCHES:]:
+        assert is_smooth(pilot.taken[mark - 1:mark + 3], pilot.targets)
+
+
+def is_smooth(commands, targets):
+    """Whether a few commands keep to the rates of a hand-over; a new target excuses them."""
+    assert len(commands) == 4
+    if any(commands[0].stamp - 0.05 < target < commands[-1].stamp for target in targets):
+        return True
+    limits = SupervisorParameters.load().handover
+    steps = np.diff([command.stamp for command in commands])[:, None] + 1e-6
+    tilt = np.abs(np.diff([command.tilt for command in commands], axis=0))
+    thrust = np.abs(np.diff([command.thrust for command in commands], axis=0))
+    return np.all(tilt <= limits.tilt_rate * steps) and np.all(thrust
+                                                               <= limits.thrust_rate * steps)

@@ -1,0 +1,41 @@
+"""What tests of real flights share: patient limits, and an operator who sees the truth."""
+
+import time
+
+from nav_msgs.msg import Odometry
+import numpy as np
+from sensor_msgs.msg import JointState
+
+from beetle_omni_ros.nodes import convert, qos
+from beetle_omni_ros.nodes.operator import Operator
+
+HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
+READY = 240     # s; without a cache the controller is compiled first
+# A busy test machine must not look like a dead node; 80 ms leave the supervisor 20 ms
+# before the actuators stop by themselves.
+PATIENT = {'commands': {'timeout': 0.08, 'stale_after': 0.08},
+           'state': {'timeout': 0.08, 'stale_after': 0.08, 'imu_timeout': 0.08,
+                     'mocap_timeout': 1.0, 'joint_timeout': 1.0}}
+
+
+class Witness(Operator):
+    """An operator who also sees the truth and the commands."""
+
+    def __init__(self, domain):
+        super().__init__(domain)
+        self.truth, self.last_command, self.height_min = None, None, np.inf
+        self._node.create_subscription(Odometry, 'ground_truth/odom', self._on_truth, qos.SENSOR)
+        self._node.create_subscription(JointState, 'command', self._on_actuators, qos.SENSOR)
+
+    def _on_truth(self, message):
+        self.truth = convert.odom(message)
+        self.height_min = min(self.height_min, self.truth.position[2])
+
+    def _on_actuators(self, message):
+        self.last_command = time.monotonic(), convert.command(message)
+
+    def stays_in_the_air(self, seconds):
+        """Watch for so long; whether the robot never went below half a metre."""
+        self.height_min = np.inf
+        self.spin(seconds)
+        return 0.5 < self.height_min < np.inf
