@@ -87,7 +87,7 @@ def _points(results):
     values = np.array([[pose['U_position_m'], pose['U_orientation_deg']]
                        for result in results for pose in result['metrics']['poses']
                        if pose['U_position_m'] is not None]).reshape(-1, 2)
-    return np.maximum(values, list(FLOOR.values()))
+    return np.maximum(values[np.all(np.isfinite(values), axis=1)], list(FLOOR.values()))
 
 
 def _published_points(panel, task):
@@ -180,11 +180,13 @@ def waypoints(flown: dict, conditions: str) -> Figure | None:
     for name, results in groups.items():
         style = look(name)
         rounds = _rounds(results, grid, duration)
-        for panel, values in zip(axes.T.ravel(), np.moveaxis(rounds, 2, 0), strict=True):
-            panel.fill_between(grid, values.min(axis=0), values.max(axis=0), color=style.colour,
-                               alpha=0.2, lw=0)
-            panel.plot(grid, values.mean(axis=0), color=style.colour, ls=style.dashes, lw=1.2,
-                       label=style.label)
+        flown = ~np.all(np.isnan(rounds[:, :, 0]), axis=0)
+        for panel, values in zip(axes.T.ravel(), np.moveaxis(rounds[:, flown], 2, 0),
+                                 strict=True):
+            panel.fill_between(grid[flown], np.nanmin(values, axis=0), np.nanmax(values, axis=0),
+                               color=style.colour, alpha=0.2, lw=0)
+            panel.plot(grid[flown], np.nanmean(values, axis=0), color=style.colour,
+                       ls=style.dashes, lw=1.2, label=style.label)
     for panel, label in zip(axes.T.ravel(), (
             'x [m]', 'y [m]', 'z [m]', '‖v‖ [m/s]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]',
             '‖ω‖ [rad/s]'), strict=True):
@@ -198,14 +200,15 @@ def waypoints(flown: dict, conditions: str) -> Figure | None:
 
 
 def _rounds(results, grid, duration):
-    """(R, len(grid), 8) x, y, z, speed, roll, pitch, yaw, rate of each complete round."""
+    """(R, len(grid), 8) x, y, z, speed, roll, pitch, yaw, rate of rounds; NaN after the end."""
     rounds = []
     for result in results:
         trace = result['trace']
         t = trace['t']
         angles = np.degrees(np.unwrap(np.radians(roll_pitch_yaw(trace['quaternion'])), axis=0))
         states = np.column_stack([trace['position'], trace['speed'], angles, trace['rate']])
-        for k in range(int((t[-1] + 0.1) // duration)):
-            rounds.append(np.column_stack([np.interp(grid + k * duration, t, column)
-                                           for column in states.T]))
+        for k in range(max(1, int(np.ceil(t[-1] / duration - 0.01)))):
+            rounds.append(np.column_stack([
+                np.interp(grid + k * duration - 1e-3, t, column, right=np.nan)
+                for column in states.T]))
     return np.array(rounds)

@@ -67,11 +67,11 @@ def _error_curve(panel, result, what, name, k):
     lost = next((value for key, value in result['metrics'][kind].items()
                  if key.startswith('lost_at')), None)
     if lost is not None:
-        last = np.flatnonzero(np.isfinite(values))[-1]
-        panel.plot(t[last], min(values[last], SHOWN[what] * 0.98), marker='X', ms=8,
+        last = np.flatnonzero(np.isfinite(values))[-1:]
+        panel.plot(t[last], np.minimum(values[last], SHOWN[what] * 0.98), marker='X', ms=8,
                    color=style.colour, mec='white', mew=0.8, ls='', zorder=6, clip_on=False)
-    shown = values[t > POSE_DURATION - BEFORE]
-    return float(np.nanmax(shown)) if shown.size else 0.0
+    shown = values[(t > POSE_DURATION - BEFORE) & np.isfinite(values)]
+    return float(np.max(shown)) if shown.size else 0.0
 
 
 def payload(flown: dict, conditions: str) -> Figure | None:

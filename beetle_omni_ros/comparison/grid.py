@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from html import escape
+from math import isfinite
 
 from beetle_omni_ros.comparison.style import look
 
@@ -34,7 +35,7 @@ class Number:
     def text(self, results: dict) -> str:
         """Return what is printed."""
         value = self.value(results)
-        if value is None:
+        if value is None or not isfinite(value):
             return ABSENT
         return f'{value:g}' if self.digits is None else f'{value:.{self.digits}f}'
 

@@ -41,6 +41,10 @@ class Task:
         """Look a number up."""
         return Number(self.path(controller, *keys)).value(self.results)
 
+    def first(self, *keys):
+        """Return a list that all controllers of ours share, from the first that has it."""
+        return next((found for name in self.ours if (found := self.value(name, *keys))), [])
+
     def row(self, name, cell, best=None):
         """
         Build one row.
@@ -156,7 +160,7 @@ def poses(results: dict, name: str, conditions: str) -> Grid:
 def waypoints(results: dict, conditions: str) -> Grid:
     """Five waypoints, one row a pose, as the publication's table of the real robot."""
     task = Task(results, 'waypoints', conditions)
-    targets = task.numbers[conditions][task.ours[0]].get('by_pose', []) if task.ours else []
+    targets = task.first('by_pose')
     rows = []
     for k, entry in enumerate(targets):
         pose = '[{:g}, {:g}, {:g}] m, [{:g}, {:g}, {:g}] deg'.format(*entry['target'])

@@ -12,7 +12,7 @@ from beetle_omni_ros.comparison.style import task_title
 def payload(results: dict, conditions: str) -> Grid:
     """Steady errors against the mass attached."""
     task = Task(results, 'payload', conditions)
-    entries = task.value(task.ours[0], 'payload') or [] if task.ours else []
+    entries = task.first('payload')
     rows = []
     for k, entry in enumerate(entries):
         mass = f"{entry['payload_kg']:g} kg"

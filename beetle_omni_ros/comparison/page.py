@@ -6,6 +6,7 @@ from base64 import b64encode
 from dataclasses import dataclass, field
 from html import escape
 from io import BytesIO
+from pathlib import Path
 
 import matplotlib
 from matplotlib.figure import Figure
@@ -78,7 +79,7 @@ def _kind(task):
 def _blocks(results, flown, task, conditions):
     """Pictures and table of a task under one set of conditions."""
     def picture(name, caption, figure):
-        return [Picture(f'{_kind(task)}_{name}_{conditions}'.replace('/', '_'),
+        return [Picture(f'{Path(_kind(task)).stem}_{name}_{conditions}',
                         f'{caption} ({conditions} conditions)', png(figure))] if figure else []
 
     kind = _kind(task)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from beetle_omni_ros.runs.figures import FAINT, INK
 
@@ -55,4 +56,4 @@ def task_title(task: str) -> str:
               'payload': 'Payload', 'hover': 'Steady hover'}
     if task.startswith('random') and task[6:].isdigit():
         return f'{task[6:]} random poses'
-    return titles.get(task, f'Poses of {task}')
+    return titles.get(task, f'Poses of {Path(task).name}')

@@ -7,6 +7,7 @@ Every number of the page is looked up in what this makes, which is also what the
 from __future__ import annotations
 
 from collections.abc import Iterable
+from math import isfinite
 
 import numpy as np
 
@@ -68,15 +69,15 @@ def _group(task, results):
     if task == 'waypoints':
         made['by_pose'] = _by_pose([pose for m in judged for pose in m['poses']])
     for kind, make in (('trajectory', _tracking), ('payload', _payload), ('hover', _hover)):
-        if kind in judged[0]:
-            made[kind] = make([m[kind] for m in judged if kind in m])
+        if parts := [m[kind] for m in judged if kind in m]:
+            made[kind] = make(parts)
     if 'payload' in made:
         made['payload_height_max_m'] = _most(
             abs(end) for entry in made['payload']
             for end in _known(entry['height_error_m'][which] for which in ('min', 'max')))
     for kind, unit in (('force', 'N'), ('torque', 'N_m')):
-        if kind in judged[0]:
-            made[kind] = _levels([m[kind] for m in judged if kind in m], unit)
+        if parts := [m[kind] for m in judged if kind in m]:
+            made[kind] = _levels(parts, unit)
     return made
 
 
@@ -194,7 +195,7 @@ def _published_poses(numbers):
 
 
 def _known(values: Iterable):
-    return [float(value) for value in values if value is not None]
+    return [float(value) for value in values if value is not None and isfinite(value)]
 
 
 def _mean(values):

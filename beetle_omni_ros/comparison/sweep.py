@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import os
+import socket
 import warnings
 
 import joblib
@@ -22,6 +23,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 BACKENDS = ('processes', 'ray')
 OBJECT_STORE = 200 * 2**20  # [byte] that a Ray of our own may share; traces are far smaller
+REACH_TIMEOUT = 5.0  # [s] for a cluster to answer
 
 
 class SweepError(RuntimeError):
@@ -131,6 +133,7 @@ def _start_ray(jobs, address):
     quiet = {'logging_level': 'ERROR', 'log_to_driver': False}
     try:
         if address:
+            _reach(address)
             ray.init(address=address, **quiet)
         else:
             ray.init(address='local', num_cpus=max(2, jobs or joblib.cpu_count()),
@@ -140,6 +143,13 @@ def _start_ray(jobs, address):
         raise ParameterError(f"--backend ray: cannot use the cluster at '{address or 'local'}' "
                              f'({text})') from None
     return ray
+
+
+def _reach(address):
+    """Knock first: Ray itself tries for a minute, with many lines."""
+    host, _, port = address.rpartition('://')[2].rpartition(':')
+    if host and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=REACH_TIMEOUT).close()
 
 
 def _ray_workers(ray, jobs):

@@ -1,0 +1,54 @@
+"""Results as a sweep gives them, of motions made up in a moment instead of flown."""
+
+import json
+
+from synthetic_flights import fly
+
+from beetle_omni_ros.comparison.flight import trace
+from beetle_omni_ros.comparison.plan import Flight
+from beetle_omni_ros.runs.metrics import metrics
+from beetle_omni_ros.runs.recorder import LogRecorder
+from beetle_omni_ros.runs.tasks import make_task
+
+TASKS = ('random3', 'waypoints', 'lemniscate', 'force', 'torque', 'payload', 'hover')
+FAILED = {'failure': 'no take-off <within> 30 s', 'metrics': None, 'trace': {}, 'cpu_s': 1.0,
+          'host': 'here'}
+
+
+def made(task, duration=None):
+    """Result of one made-up flight of a task, cut off after ``duration`` [s]."""
+    flown = make_task(task)
+    recorder = LogRecorder({'task': task, 'seed': 0})
+    fly(recorder, flown, controller='nmpc', duration=duration)
+    log = recorder.log()
+    judged = metrics(log, flown)
+    judged['steps'] = log.compute['nmpc']['count']
+    return {'failure': None, 'metrics': json.loads(json.dumps(judged)), 'trace': trace(log, flown),
+            'cpu_s': 12.5, 'host': 'here'}
+
+
+def scaled(result, factor):
+    """Return the same result with every measured float multiplied, so that no two are equal."""
+    def scale(value, key=''):
+        if isinstance(value, dict):
+            return {name: scale(entry, name) for name, entry in value.items()}
+        if isinstance(value, list) and key != 'target':
+            return [scale(entry) for entry in value]
+        fixed = key == 'target' or key.startswith(('level', 'lost', 'withstood', 'payload'))
+        return value * factor if isinstance(value, float) and not fixed else value
+
+    return {**result, 'metrics': scale(result['metrics'])}
+
+
+def made_sweep(controllers=('rl', 'nmpc', 'nmpc_published'), tasks=TASKS,
+               conditions=('nominal', 'published'), seeds=(0, 4)):
+    """Results of a whole comparison, all numbers different."""
+    flown, factor = {}, 1.0
+    for task in tasks:
+        result = made(task)
+        for condition in conditions:
+            for controller in controllers:
+                for seed in seeds:
+                    factor += 0.013
+                    flown[Flight(task, condition, controller, seed)] = scaled(result, factor)
+    return flown
