@@ -95,6 +95,32 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(make):
     assert len(node._publisher) == 102
 
 
+@pytest.mark.parametrize('rate', [100, 200])
+def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(make, rate):
+    node = make(FollowerNode)
+    node._on_joints(convert.Joints(100.0, np.zeros(4), np.zeros(4)))
+
+    def steps_from(begin):
+        before = len(node._publisher)
+        for stamp in begin + np.arange(rate) / rate:
+            if round((stamp - begin) * rate) % (rate // 100) == 0 and node._mode == 'flying:rl':
+                node._on_command(Command(stamp, np.zeros(4), np.full(4, 7.5)))
+            fly(node, [stamp])
+        return np.array([convert.seconds(m.header.stamp) for m in node._publisher[before:]])
+
+    alone = steps_from(100.0)
+    assert np.allclose(alone - 100.0, 0.01 * np.arange(100), atol=1e-6)
+    node._on_mode(SimpleNamespace(data='flying:rl'))
+    standby = steps_from(101.0)[5:]
+    if rate > 100:
+        assert np.all(np.abs((standby - 101.0) / 0.01 % 1.0 - 0.5) < 0.26)
+        assert np.allclose(np.diff(standby), 0.01, atol=1e-6)
+    else:       # no estimate lies between: half as often, still in time for the supervisor
+        assert np.allclose(np.diff(standby), 0.02, atol=1e-6)
+    node._on_mode(SimpleNamespace(data='flying:nmpc'))
+    assert np.allclose(np.diff(steps_from(102.0)), 0.01, atol=1e-6)
+
+
 def test_without_a_target_it_holds_the_pose_of_the_hand_over(make):
     node = make(FollowerNode)
     node._on_joints(convert.Joints(100.0, np.zeros(4), np.zeros(4)))
