@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import sqrt
 from typing import Protocol
 
 import numpy as np
@@ -109,10 +110,19 @@ class TrajectoryTarget:
     stamp: float = field(default=0.0)
 
     def at(self, time: float) -> Reference:
-        """The reference at ``time``, see :meth:`sample`."""
-        many = self.sample(np.array([time]))
-        return Reference(many.position[0], many.quaternion[0], many.velocity[0],
-                         many.angular_velocity[0])
+        """The reference at ``time``: :meth:`sample` of one, at a fraction of its cost."""
+        own = self.times
+        k = min(max(int(own.searchsorted(time, side='right')) - 1, 0), len(own) - 2)
+        s = min(max(float((time - own[k]) / (own[k + 1] - own[k])), 0.0), 1.0)
+        first, second = self.quaternions[k], self.quaternions[k + 1]
+        quaternion = (1 - s) * first + (s if first @ second >= 0 else -s) * second
+        quaternion /= sqrt(quaternion @ quaternion)
+        position = (1 - s) * self.positions[k] + s * self.positions[k + 1]
+        if not own[0] < time < own[-1]:
+            return Reference(position, quaternion, np.zeros(3), np.zeros(3))
+        return Reference(
+            position, quaternion, (1 - s) * self.velocities[k] + s * self.velocities[k + 1],
+            (1 - s) * self.angular_velocities[k] + s * self.angular_velocities[k + 1])
 
     def sample(self, times: np.ndarray) -> Reference:
         """

@@ -69,6 +69,14 @@ class DisturbanceEstimator:
             reaches the actuators; slices as in :mod:`robot.dynamics`.
 
         """
+        present = self.observe(state)
+        if self._delay == 0:
+            return present
+        return self._advance(present, self._input(state.stamp, self._delay), self.disturbance,
+                             self._delay)
+
+    def observe(self, state: State) -> np.ndarray:
+        """Take in one state estimate; returns the (25,) full state at its stamp."""
         if state.command is not None and (
                 not self._commands or state.command.stamp > self._commands[-1].stamp):
             self._commands.append(state.command)
@@ -83,10 +91,7 @@ class DisturbanceEstimator:
             self._correct_tilt(state, present, step)
         self._state, self._stamp = present, state.stamp
         self._tilts.append((state.stamp, present[model.TILT].copy()))
-        if self._delay == 0:
-            return present
-        return self._advance(present, self._input(state.stamp, self._delay), self.disturbance,
-                             self._delay)
+        return present
 
     def _restart(self, state):
         thrust = np.zeros(4) if state.command is None else state.command.thrust
@@ -116,19 +121,18 @@ class DisturbanceEstimator:
         change[model.FORCE] = self._force_gain * (state.velocity - predicted[model.VELOCITY])
         change[model.TORQUE] = self._torque_gain * (
             state.angular_velocity - predicted[model.RATE])
-        self.disturbance = np.clip(self.disturbance + change, -self._limit, self._limit)
+        self.disturbance = _clipped(self.disturbance + change, self._limit)
 
     def _correct_tilt(self, state, present, step):
         """Compare the encoders with what the tilt model said at their capture time."""
         modelled = self._modelled_tilt(state.tilt_stamp)
         if modelled is None:
             return
-        error = np.clip(state.tilt - modelled, -self._limit[model.TILT_OFFSET],
-                        self._limit[model.TILT_OFFSET])
+        limit = self._limit[model.TILT_OFFSET]
+        error = _clipped(state.tilt - modelled, limit)
         present[model.TILT] += self._tilt_correction * error
         offset = self.disturbance[model.TILT_OFFSET] + self._tilt_bandwidth * step * error
-        limit = self._limit[model.TILT_OFFSET]
-        self.disturbance[model.TILT_OFFSET] = np.clip(offset, -limit, limit)
+        self.disturbance[model.TILT_OFFSET] = _clipped(offset, limit)
 
     def _modelled_tilt(self, stamp):
         later = None
@@ -140,3 +144,8 @@ class DisturbanceEstimator:
                 return tilt + part * (later[1] - tilt)
             later = (time, tilt)
         return None
+
+
+def _clipped(values, limit):
+    """As np.clip to +-limit, which costs several times as much on a few numbers."""
+    return np.minimum(np.maximum(values, -limit), limit)

@@ -131,7 +131,7 @@ class PolicyController:
         if self._estimator:
             if not isfinite(sum(state.tilt_velocity.tolist())):
                 return None
-            self._estimator.update(state)
+            self._estimator.observe(state)
             if not isfinite(sum(self._estimator.disturbance.tolist())):
                 self._estimator.reset()
             observation += disturbed(state, self._estimator.disturbance)

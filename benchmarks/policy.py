@@ -1,0 +1,157 @@
+"""
+Cost of one step of the policy, side by side with the NMPC's, on one core.
+
+    python benchmarks/policy.py [--poses 20] [--seed 0] [--policy FILE] [--json FILE]
+
+The NMPC flies random poses in process and the policy stands by: both answer the same states, with
+everything else of the flight (plant, sensors, estimator, supervisor) between two steps, so that
+caches are as cold as on board. `step` is all that a controller does for one command; beneath it
+are its parts on the same states, called right afterwards. CPU time, because wall time on a shared
+computer holds the slices of other programs; wall time stands beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+import sys
+import time
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from beetle_omni_ros.control.hover import HoverController
+from beetle_omni_ros.control.nmpc import NmpcController
+from beetle_omni_ros.control.observation import blocks, disturbed, observed, size
+from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
+from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.estimation.ekf import ErrorStateEkf
+from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.evaluation.loop import FlightLoop
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.recorder import LogRecorder
+from beetle_omni_ros.runs.tasks import make_task
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.supervisor import Supervisor
+from beetle_omni_ros.sim.simulator import Simulator
+
+TARGETS = {'median': 0.1, 'p99': 0.2}   # [ms] of the policy's step
+NO_PUSH = np.zeros(6)
+
+
+class Clock:
+    """CPU and wall times of calls, by name."""
+
+    def __init__(self):
+        self.times: dict[str, list] = {}
+
+    def call(self, name, function, *arguments):
+        """Call ``function`` and keep how long it took."""
+        cpu, wall = time.thread_time(), time.perf_counter()
+        result = function(*arguments)
+        self.times.setdefault(name, []).append(
+            (time.thread_time() - cpu, time.perf_counter() - wall))
+        return result
+
+
+class Timed:
+    """A controller whose steps are timed, and after each of them its parts."""
+
+    def __init__(self, controller, clock, parts=None):
+        self.controller, self.name, self.period = controller, controller.name, controller.period
+        self._clock, self._parts = clock, parts
+
+    def reset(self):
+        """Pass on."""
+        self.controller.reset()
+
+    def step(self, state, target):
+        """Pass on, timed."""
+        command = self._clock.call(f'{self.name}: step', self.controller.step, state, target)
+        if self._parts:
+            self._parts(state, target)
+        return command
+
+    def diagnostics(self):
+        """Pass on."""
+        return self.controller.diagnostics()
+
+
+def measure(parameters: PolicyParameters, poses: int, seed: int) -> tuple[Clock, str]:
+    """Fly; return the times and what the policy is."""
+    robot, estimator, clock = RobotParameters.load(), EkfParameters.load(), Clock()
+    policy = PolicyController(robot, parameters)
+    network = PolicyNetwork(parameters.policy, robot, parameters.allow_other_robot)
+    previous = [0.0] * 8
+    told = disturbed if network.contract.memory else lambda *_: []
+
+    def parts(state, target):
+        seen = clock.call(f'{policy.name}: observation', lambda: observed(
+            state, target.at(state.stamp), previous) + told(state, NO_PUSH))
+        clock.call(f'{policy.name}: inference', network, seen)
+
+    supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot))
+    flight = FlightLoop(Simulator(robot, seed=seed), ErrorStateEkf(estimator, robot.gravity),
+                        {'nmpc': Timed(NmpcController(robot), clock),
+                         'rl': Timed(policy, clock, parts)},
+                        supervisor, LogRecorder(), estimator.imu.gyroscope_noise)
+    flight.fly(make_task(f'random{poses}', seed))
+    return clock, f'{network.contract.name}, ' \
+                  f'{size(blocks(network.contract.memory))} inputs, {parameters.policy}'
+
+
+def summary(times: list) -> dict[str, float]:
+    """Milliseconds of one part."""
+    cpu, wall = 1e3 * np.array(times).T
+    return {'steps': len(cpu), 'median': float(np.median(cpu)),
+            'p99': float(np.percentile(cpu, 99)), 'max': float(cpu.max()),
+            'wall_median': float(np.median(wall)), 'wall_p99': float(np.percentile(wall, 99)),
+            'cpu_percent': float(cpu.mean() / 10.0 * 100)}     # of one core, at 100 Hz
+
+
+def main():
+    """Measure and print; status 1 when the policy's step is slower than its target."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--poses', type=int, default=20)
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--policy', help='default: the one of params/rl.yaml')
+    parser.add_argument('--json', type=Path, help='file for the numbers')
+    given = parser.parse_args()
+    if hasattr(os, 'sched_setaffinity'):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    parameters = PolicyParameters.load()
+    if given.policy:
+        parameters = replace(parameters, policy=str(Path(given.policy).absolute()))
+    try:
+        clock, what = measure(parameters, given.poses, given.seed)
+    except ParameterError as error:
+        print(f'benchmarks/policy.py: error: {error}', file=sys.stderr)
+        sys.exit(2)
+    table = Table(title=f'{what}; {given.poses} random poses, seed {given.seed}: CPU [ms]')
+    for column in ('', 'steps', 'median', 'p99', 'max', 'wall median', 'wall p99',
+                   '% of a core at 100 Hz'):
+        table.add_column(column, justify='right' if column else 'left')
+    results = {name: summary(times) for name, times in sorted(
+        clock.times.items(), key=lambda item: (item[0].startswith('nmpc'), ))}
+    for name, numbers in results.items():
+        table.add_row(name, *(f'{value:.3f}' if key not in ('steps', 'cpu_percent')
+                              else f'{value:.1f}'.removesuffix('.0')
+                              for key, value in numbers.items()))
+    Console(width=120).print(table)
+    step = next(numbers for name, numbers in results.items()
+                if name.startswith('rl') and name.endswith('step'))
+    met = all(step[key] <= limit for key, limit in TARGETS.items())
+    print('target of the step: ' + ', '.join(f'{key} {limit:g} ms' for key, limit in
+                                              TARGETS.items()) + (': met' if met else ': missed'))
+    if given.json:
+        given.json.write_text(json.dumps(results, indent=1) + '\n')
+    sys.exit(0 if met else 1)
+
+
+if __name__ == '__main__':
+    main()
