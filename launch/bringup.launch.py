@@ -25,6 +25,8 @@ ARGUMENTS = {
     'policy': ('', None, 'policy (ONNX) for rl_node; empty: the shipped one'),
     'task': ('', None, 'task for reference_node; empty: targets come from elsewhere'),
     'record': ('', None, 'folder for a bag; empty: no recording'),
+    'allow_other_robot': ('false', ['true', 'false'],
+                          'fly a policy that was trained for other robot parameters'),
     'namespace': ('', None, 'namespace of every node and topic'),
     'composed': ('true', ['true', 'false'], 'all nodes in one process'),
     'viewer': ('false', ['true', 'false'], 'description, tf and markers for RViz and Foxglove'),
@@ -56,6 +58,7 @@ def node_parameters(given):
     nodes['ekf_node'] = robot
     controllers, left_out = controller_nodes(
         given['controller'], robot_file=given['robot_file'], policy=given['policy'],
+        allow_other_robot=given['allow_other_robot'] == 'true',
         standby=given['standby'] == 'true')
     if left_out:
         print(f'rl does not stand by: {left_out}', file=sys.stderr)

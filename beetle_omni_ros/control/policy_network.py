@@ -61,19 +61,17 @@ class PolicyNetwork:
     def __call__(self, observation: list[float]) -> list[float]:
         """Action (8) for an observation (n), both in plain numbers."""
         self._input[0] = observation
-        self._run(self._binding, None)
+        self._session.run_with_iobinding(self._binding)
         return self._output[0].tolist()
 
     def _bind(self, size):
         """Let the session read and write the same two arrays at every call."""
         self._input = np.zeros((1, size), np.float32)
         self._output = np.zeros((1, len(ACTIONS)), np.float32)
-        binding = self._session.io_binding()
+        binding = self._binding = self._session.io_binding()
         for bind, name, array in ((binding.bind_input, INPUT, self._input),
                                   (binding.bind_output, OUTPUT, self._output)):
             bind(name, 'cpu', 0, np.float32, array.shape, array.ctypes.data)
-        self._io = binding      # owns what the line below calls with
-        self._binding, self._run = binding._iobinding, self._session._sess.run_with_iobinding
 
     def _warm_up(self):
         """Call as in level flight; a network that answers with anything but numbers is broken."""

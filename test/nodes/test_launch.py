@@ -91,8 +91,10 @@ def test_either_controller_is_active_and_the_other_stands_by(bringup, capsys, mo
 
     assert controllers() == ('nmpc', {'nmpc_node': {}, 'rl_node': {}})
     assert controllers(controller='rl', standby='false') == ('rl', {'rl_node': {}})
-    assert controllers(controller='rl', policy='/p.onnx') == (
-        'rl', {'rl_node': {'policy': '/p.onnx'}, 'nmpc_node': {}})
+    assert controllers(controller='rl', policy='/p.onnx', allow_other_robot='true') == (
+        'rl', {'rl_node': {'policy': '/p.onnx', 'allow_other_robot': True}, 'nmpc_node': {}})
+    process, = bringup.start(allow_other_robot='true')
+    assert 'rl_node:allow_other_robot:=True' in process.kwargs['cmd']
     assert not capsys.readouterr().err
     monkeypatch.setattr(standby, 'unfit', lambda *_: 'robot_hash: another robot')
     assert controllers() == ('nmpc', {'nmpc_node': {}})
