@@ -158,7 +158,9 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
                 '--tasks', metavar='TASK,...', help='Names or pose files; default: all.')] = None,
             conditions: Annotated[str, typer.Option(
                 '--conditions', metavar='NAME,...')] = ','.join(CONDITIONS),
-            seeds: Annotated[str, typer.Option('--seeds', metavar='N,...')] = '0,1',
+            seeds: Annotated[Optional[str], typer.Option(
+                '--seeds', metavar='N,...',
+                help='Default: 0,1, and 0 for tasks of more than 300 s.')] = None,
             policy: PolicyOption = None,
             jobs: Annotated[Optional[int], typer.Option(
                 '--jobs', '-j', min=1, help='Flights at a time. Default: one a core.')] = None,

@@ -34,7 +34,7 @@ def refused(capsys, *arguments):
     return lines[0]
 
 
-@pytest.mark.parametrize('command', [[], ['fly'], ['evaluate'], ['report']])
+@pytest.mark.parametrize('command', [[], ['fly'], ['evaluate'], ['compare'], ['report']])
 def test_every_command_has_help(capsys, command):
     assert cli.main([*command, '--help']) == 0
     assert 'Usage' in capsys.readouterr().out
@@ -102,6 +102,21 @@ def test_parameters_for_a_controller_that_does_not_fly_are_refused(capsys, tmp_p
     other.touch()
     for option in ('--nmpc', '--policy'):
         assert option in refused(capsys, 'evaluate', '--controllers', 'hover', option, other)
+
+
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (['--controllers', 'nmpc,npmc'], 'npmc'), (['--controllers', 'nmpc,nmpc'], '--controllers'),
+    (['--tasks', 'hover,hovr'], 'hovr'), (['--conditions', 'windy'], 'windy'),
+    (['--seeds', '0,x'], "found 'x'"), (['--seeds', '-1'], "found '-1'"),
+    (['--seeds', ''], '--seeds'), (['--backend', 'threads'], 'threads'),
+    (['--jobs', '0'], '--jobs'), (['--policy', 'none.onnx'], 'none.onnx'),
+    (['--json', 'no/folder.json'], 'folder.json')])
+def test_compare_refuses_unusable_input_before_anything_flies(
+        capsys, tmp_path, monkeypatch, arguments, named):
+    monkeypatch.chdir(tmp_path)
+    assert named in refused(capsys, 'compare', '--controllers', 'hover', '--tasks', 'hover',
+                            *arguments)
+    assert not list(tmp_path.rglob('*.html')) and not list(tmp_path.rglob('*.npz'))
 
 
 def test_fly_refuses_a_controller_without_a_node(capsys, tmp_path):

@@ -18,9 +18,11 @@ def names(option: str, text: str | None) -> list[str] | None:
     return found
 
 
-def numbers(option: str, text: str) -> list[int]:
-    """Split a list of whole numbers from 0; others are a ParameterError."""
+def numbers(option: str, text: str | None) -> list[int] | None:
+    """Split a list of whole numbers from 0; None stays None; others are a ParameterError."""
     found = names(option, text)
+    if found is None:
+        return None
     for part in found:
         if not part.isdecimal() or int(part) >= MOST:
             raise ParameterError(f"{option} '{text}': expected whole numbers from 0, separated "

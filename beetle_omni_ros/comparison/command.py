@@ -23,7 +23,7 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.comparison import grids_other, page
 from beetle_omni_ros.comparison.fingerprint import commit, file_digest, policy_file, versions
 from beetle_omni_ros.comparison.grid import Grid, Number
-from beetle_omni_ros.comparison.plan import CONDITIONS, CONTROLLERS, Flight, plan, SEEDS, TASKS
+from beetle_omni_ros.comparison.plan import CONDITIONS, CONTROLLERS, Flight, plan, TASKS
 from beetle_omni_ros.comparison.store import Store
 from beetle_omni_ros.comparison.style import look
 from beetle_omni_ros.comparison.summary import summarise
@@ -52,7 +52,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
         controllers: names; None takes all that are there, and says which are not.
         tasks: names or pose files; None is all.
         conditions: 'nominal', 'published'; None is both.
-        seeds: None is 0 and 1.
+        seeds: None is 0 and 1, and 0 alone for long tasks.
         jobs: flights at a time; None is one on each core.
         backend: 'processes' or 'ray'.
         address: of a Ray cluster; None starts Ray on this computer.
@@ -71,7 +71,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
     """
     console = console or Console()
     wanted = controllers or list(CONTROLLERS)
-    arguments = (wanted, tasks or TASKS, conditions or CONDITIONS, seeds or SEEDS)
+    arguments = (wanted, tasks or TASKS, conditions or CONDITIONS, seeds)
     plan(*arguments)  # refuses unusable input before anything is made
     there, skipped = _available(wanted, policy, refuse=controllers is not None)
     for name, reason in skipped.items():
@@ -157,11 +157,13 @@ def _results(flown, arguments, there, skipped, policy):
         order[flight.task], order[flight.conditions], order[flight.controller], flight.seed))
     files = {name: policy_file(name, policy) for name in there}
     command = (f"beetle_omni compare --controllers {','.join(there)} --tasks {','.join(tasks)} "
-               f"--conditions {','.join(conditions)} --seeds {','.join(map(str, seeds))}")
+               f"--conditions {','.join(conditions)}"
+               + (f" --seeds {','.join(map(str, seeds))}" if seeds else ''))
     return {
         'meta': {'version': __version__, 'commit': commit(), 'command': command,
                  'controllers': there, 'skipped': skipped, 'tasks': list(tasks),
-                 'conditions': list(conditions), 'seeds': list(seeds),
+                 'conditions': list(conditions),
+                 'seeds': sorted({flight.seed for flight in flights}),
                  'policies': {name: f'{file.name} ({file_digest(file)})'
                               for name, file in files.items() if file},
                  'cpu_s': sum(result.get('cpu_s', 0.0) for result in flown.values()),

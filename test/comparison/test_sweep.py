@@ -47,6 +47,13 @@ def test_a_plan_holds_every_combination_once_and_begins_with_the_longest():
     assert len({flight.slug for flight in flights}) == len(flights)
 
 
+def test_only_short_tasks_are_flown_with_several_seeds_unless_asked():
+    flights = plan(['nmpc'], conditions=['nominal'])
+    assert {flight.seed for flight in flights if flight.task == 'random100'} == {0}
+    assert all({flight.seed for flight in flights if flight.task == task} == {0, 1}
+               for task in TASKS if task != 'random100')
+
+
 @pytest.mark.parametrize(('changes', 'named'), [
     ({'tasks': ['wayponts']}, 'wayponts'), ({'conditions': ['windy']}, 'windy'),
     ({'seeds': []}, '--seeds'), ({'seeds': [1, 1]}, '--seeds'),
