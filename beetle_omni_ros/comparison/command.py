@@ -27,7 +27,7 @@ from beetle_omni_ros.comparison.plan import CONDITIONS, CONTROLLERS, Flight, pla
 from beetle_omni_ros.comparison.store import Store
 from beetle_omni_ros.comparison.style import look
 from beetle_omni_ros.comparison.summary import summarise
-from beetle_omni_ros.comparison.sweep import sweep
+from beetle_omni_ros.comparison.sweep import check_backend, sweep
 from beetle_omni_ros.evaluation.command import ControllerFiles, make_controller
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -72,6 +72,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
     console = console or Console()
     wanted = controllers or list(CONTROLLERS)
     arguments = (wanted, tasks or TASKS, conditions or CONDITIONS, seeds)
+    check_backend(backend)
     plan(*arguments)  # refuses unusable input before anything is made
     there, skipped = _available(wanted, policy, refuse=controllers is not None)
     for name, reason in skipped.items():

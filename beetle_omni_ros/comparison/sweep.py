@@ -30,6 +30,12 @@ class SweepError(RuntimeError):
     """Workers were lost; the text says what is kept."""
 
 
+def check_backend(backend: str) -> None:
+    """Refuse an unknown backend with a ParameterError."""
+    if backend not in BACKENDS:
+        raise ParameterError(f"--backend '{backend}': expected {' or '.join(BACKENDS)}")
+
+
 def sweep(flights: list[Flight], *, store: Store, backend: str = 'processes',
           jobs: int | None = None, fresh: bool = False, address: str | None = None,
           done: Callable[[Flight, dict, bool], None] = lambda flight, result, kept: None,
@@ -54,8 +60,7 @@ def sweep(flights: list[Flight], *, store: Store, backend: str = 'processes',
         SweepError: a worker was killed.
 
     """
-    if backend not in BACKENDS:
-        raise ParameterError(f"--backend '{backend}': expected {' or '.join(BACKENDS)}")
+    check_backend(backend)
     results: dict[Flight, dict] = {}
     for flight in flights:
         kept = None if fresh else store.load(flight)
