@@ -1,0 +1,1 @@
+"""Training of the policy: batched environment, PPO, export. The only place that imports torch."""

@@ -1,0 +1,120 @@
+"""
+How good a policy is, measured in the training environment: the task metrics for many robots.
+
+A quick and independent figure while training; what counts is ``beetle_omni evaluate``, with
+the multibody plant, the estimator and the floor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+
+import numpy as np
+import torch
+
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.train import batch
+from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
+from beetle_omni_ros.train.parameters import RandomParameters, StartParameters, TrainParameters
+
+SEGMENT = 8.0                       # [s] of a pose, and the windows of the task metrics [s]
+AT_TARGET, ON_THE_WAY = (7.0, 7.5), (1.0, 7.0)
+# Latencies of the simulated robot, and the publication's table in full.
+NOMINAL = {'command_latency': [0.010, 0.010], 'velocity_latency': [0.0, 0.0],
+           'tilt_latency': [0.010, 0.010]}
+PUBLISHED = {'command_latency': [0.005, 0.015], 'velocity_latency': [0.015, 0.025],
+             'tilt_latency': [0.005, 0.010], 'noise_power': 0.0}
+SILENT = {'force_bias': 0.0, 'torque_bias': 0.0, 'force_noise': 0.0, 'torque_noise': 0.0}
+DISTURBANCES = ('force_share', 'strong_share', 'payload_share', 'push_share')
+
+
+def conditions(name: str, random: RandomParameters) -> RandomParameters:
+    """The randomisation of 'nominal' or 'published' conditions."""
+    if name == 'published':
+        own = {key: np.array(value) if isinstance(value, list) else value
+               for key, value in PUBLISHED.items()}
+        return replace(random, **own, **dict.fromkeys(DISTURBANCES, 0.0))
+    zero = {entry.name: 0.0 for entry in fields(RandomParameters)
+            if isinstance(getattr(random, entry.name), float)}
+    zero.update(push_period=1.0)
+    return replace(random, **zero, **{key: np.array(value) for key, value in NOMINAL.items()})
+
+
+def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParameters,
+           robot: RobotParameters, device='cpu', name: str = 'nominal', robots: int = 1024,
+           segments: int = 3, random: RandomParameters | None = None) -> dict[str, float]:
+    """
+    Fly a policy from pose to pose.
+
+    Args:
+        mean: (N, 33 or 39) observations to (N, 8) actions.
+        parameters: of its training.
+        robot: nominal robot.
+        device: torch device.
+        name: 'nominal' or 'published'.
+        robots: N.
+        segments: poses for each robot; the first, from the start, is flown and not counted.
+        random: randomisation in place of the named one.
+
+    Returns:
+        means U_*, L_*, share reached, share of robots lost, command change in the U windows.
+
+    """
+    start = {entry.name: 0.0 for entry in fields(StartParameters)}
+    start.update(hold=1.0)
+    episode = replace(
+        parameters.episode, duration=1e6, hold_targets=0.0,
+        target_time=np.array([SEGMENT, SEGMENT]), region=np.array([4.0, 4.0, 1.4]))
+    env = TiltableQuadrotorEnv(replace(
+        parameters, ppo=replace(parameters.ppo, robots=robots), episode=episode,
+        start=StartParameters(**start),
+        estimate=replace(parameters.estimate, **SILENT) if name == 'nominal'
+        else parameters.estimate,
+        random=random if random is not None else conditions(name, parameters.random)),
+        robot, device, compiled=False)
+    env.state['age'].zero_()
+    env.state['target_left'].fill_(round(SEGMENT / episode.period))
+    return _fly(mean, env, round(SEGMENT / episode.period), segments, episode.period)
+
+
+@torch.no_grad()
+def _fly(mean, env, length, segments, period):
+    windows = {'U': tuple(round(t / period) for t in AT_TARGET),
+               'L': tuple(round(t / period) for t in ON_THE_WAY)}
+    shape = (segments + 1, env.num_envs)
+    sums = {key: torch.zeros(shape, device=env.device)
+            for key in ('U_position', 'U_attitude', 'L_position', 'L_attitude')}
+    change = torch.zeros(2, device=env.device)
+    lost = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+    stopped = torch.zeros(1, device=env.device)
+    for segment in range(segments + 1):
+        for step in range(length):
+            before = env.state['previous'].clone()
+            env.advance(mean(env.observation))
+            s = env.state
+            lost |= env.done
+            position = (s['x'][:, :3] - s['target_position']).norm(dim=-1)
+            attitude = batch.geodesic(batch.matrix(s['x'][:, model.QUATERNION]),
+                                      batch.matrix(s['target_attitude']))
+            for key, (first, end) in windows.items():
+                if first <= step + 1 < end:
+                    sums[f'{key}_position'][segment] += position / (end - first)
+                    sums[f'{key}_attitude'][segment] += attitude / (end - first)
+            if segment and windows['U'][0] <= step + 1 < windows['U'][1]:
+                delta = (s['previous'] - before) ** 2
+                change += torch.stack((delta[:, :4].mean(), delta[:, 4:].mean()))
+                stopped += (s['x'][:, model.TILT].abs() > 3.9).float().mean()
+    kept = {key: value[1:][:, ~lost] for key, value in sums.items()}
+    count = segments * (windows['U'][1] - windows['U'][0])
+    reached = (kept['U_position'] < 0.10) & (kept['U_attitude'] < np.radians(10))
+    result = {'reached': float(reached.float().mean()), 'lost': float(lost.float().mean()),
+              'tilt_change_rad': float((change[0] / count).sqrt()),
+              'thrust_change_N': float((change[1] / count).sqrt()),
+              'at_stop': float(stopped / count)}
+    for key, value in kept.items():
+        angle = key.endswith('attitude')
+        result[f'{key}_deg' if angle else f'{key}_m'] = float(
+            torch.rad2deg(value.mean()) if angle else value.mean())
+    return result

@@ -1,0 +1,96 @@
+"""Rotations and random numbers of a batch, in torch: rows are robots."""
+
+from __future__ import annotations
+
+import torch
+
+
+def matrix(quaternion: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices (N, 3, 3) of unit quaternions (N, 4), (x, y, z, w)."""
+    x, y, z, w = quaternion.unbind(-1)
+    rows = (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Quaternion product (N, 4), first ``b`` then ``a``."""
+    ax, ay, az, aw = a.unbind(-1)
+    bx, by, bz, bw = b.unbind(-1)
+    return torch.stack((aw * bx + ax * bw + ay * bz - az * by, aw * by - ax * bz + ay * bw + az * bx,
+                        aw * bz + ax * by - ay * bx + az * bw, aw * bw - ax * bx - ay * by - az * bz),
+                       -1)
+
+
+def from_rotation_vector(vector: torch.Tensor) -> torch.Tensor:
+    """Quaternions (N, 4) of rotation vectors (N, 3) [rad]."""
+    half = 0.5 * vector.norm(dim=-1, keepdim=True)
+    return torch.cat((0.5 * vector * torch.sinc(half / torch.pi), torch.cos(half)), -1)
+
+
+def geodesic(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Angle (N,) [rad] between rotation matrices (N, 3, 3), exact also for small angles."""
+    relative = turned_back(a, b)
+    sine = 0.5 * torch.stack((relative[:, 2, 1] - relative[:, 1, 2],
+                              relative[:, 0, 2] - relative[:, 2, 0],
+                              relative[:, 1, 0] - relative[:, 0, 1]), -1).norm(dim=-1)
+    cosine = 0.5 * (relative[:, 0, 0] + relative[:, 1, 1] + relative[:, 2, 2] - 1)
+    return torch.atan2(sine, cosine)
+
+
+def turned_back(rotation: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """R^T other for matrices (N, 3, 3) or vectors (N, 3), without a batched matrix product."""
+    if other.dim() == 2:
+        return (rotation * other[:, :, None]).sum(1)
+    return (rotation[:, :, :, None] * other[:, :, None, :]).sum(1)
+
+
+class Draw:
+    """
+    Hands out columns of a tensor of uniform random numbers, one after the other.
+
+    Drawn at once and handed out by position, so that a step needs one random kernel and a
+    captured step gets fresh numbers.
+
+    Args:
+        numbers: (N, K) uniform in [0, 1).
+
+    """
+
+    def __init__(self, numbers: torch.Tensor):
+        self._numbers, self._used = numbers, 0
+
+    def uniform(self, size: int, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
+        """(N, size) uniform in [low, high)."""
+        first, self._used = self._used, self._used + size
+        if self._used > self._numbers.shape[1]:
+            raise ValueError(f'{self._used} random numbers asked for, {self._numbers.shape[1]} '
+                             'drawn')
+        return low + (high - low) * self._numbers[:, first:self._used]
+
+    def around(self, half_width: float, size: int) -> torch.Tensor:
+        """(N, size) uniform in +-half_width."""
+        return self.uniform(size, -half_width, half_width)
+
+    def chance(self, probability: float) -> torch.Tensor:
+        """(N, 1) bool, true with this probability."""
+        return self.uniform(1) < probability
+
+    def attitude(self) -> torch.Tensor:
+        """
+        (N, 4) quaternions: half of them uniform on SO(3), half a uniform axis and angle.
+
+        The first after K. Shoemake, Uniform random rotations (1992); the second is the
+        publication's.
+        """
+        a, b, c = self.uniform(3).unbind(-1)
+        low, high = torch.sqrt(1 - a), torch.sqrt(a)
+        tau = 2 * torch.pi
+        uniform = torch.stack((low * torch.sin(tau * b), low * torch.cos(tau * b),
+                               high * torch.sin(tau * c), high * torch.cos(tau * c)), -1)
+        z, flat = 2 * a - 1, 2 * torch.sqrt((1 - a) * a)
+        half = 0.5 * torch.pi * (2 * c - 1)[:, None]
+        axis = torch.stack((flat * torch.cos(tau * b), flat * torch.sin(tau * b), z), -1)
+        axis_angle = torch.cat((axis * torch.sin(half), torch.cos(half)), -1)
+        return torch.where(self.chance(0.5), uniform, axis_angle)

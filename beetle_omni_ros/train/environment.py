@@ -1,0 +1,245 @@
+"""
+The batched environment: thousands of robots that fly from target to target.
+
+Physics is the robot's own model (:mod:`train.model`); observations are those of
+:mod:`control.observation`, delayed and noisy as on board. One step has no synchronisation
+with the host, so that a whole rollout can be captured as one CUDA graph.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+import torch
+
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.train import batch, rewards, starts
+from beetle_omni_ros.train.model import CENTRE, MASS, module_reaction, nominal_body
+from beetle_omni_ros.train.observations import actor_observation, critic_observation, Signals
+from beetle_omni_ros.train.parameters import TrainParameters
+from beetle_omni_ros.train.physics import Physics
+from beetle_omni_ros.control.policy_file import PolicyContract
+
+NUMBERS = 136       # random numbers of a robot and a step
+REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] as the task metrics
+
+
+class TiltableQuadrotorEnv(VecEnv):
+    """
+    N robots in one tensor program.
+
+    Args:
+        parameters: of the training.
+        robot: what the robots are.
+        device: torch device.
+        compiled: whether to compile the step (pays on a GPU only).
+
+    Attributes:
+        state: name -> (N, ...) tensor, everything that lasts from step to step.
+        weights: (R,) reward weights in the order of ``rewards.TERMS``, on the device; may be
+            changed between steps.
+        severity: () factor on forces, payloads and pushes, likewise.
+
+    """
+
+    def __init__(self, parameters: TrainParameters, robot: RobotParameters,
+                 device: torch.device | str = 'cpu', compiled: bool | None = None):
+        self.cfg, self.robot, self.device = parameters, robot, torch.device(device)
+        self.num_envs, self.num_actions = parameters.ppo.robots, model.INPUT_SIZE
+        self.max_episode_length = round(parameters.episode.duration / parameters.episode.period)
+        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
+        self.physics = Physics(robot, parameters.episode.period, parameters.episode.substeps,
+                               device)
+        contract = PolicyContract.default(robot, parameters.memory)
+        self.scale = self._tensor(contract.action_scale)
+        self.offset = self._tensor(contract.action_offset)
+        limit, rotors = robot.joints.position_limit, robot.rotors
+        self._low = self._tensor([-limit] * 4 + [rotors.thrust_min] * 4)
+        self._high = self._tensor([limit] * 4 + [rotors.thrust_max] * 4)
+        self._torque_ratio = self._tensor(-np.array(rotors.spin) * rotors.torque_to_thrust_ratio)
+        self._starts = starts.Starts(parameters, robot, self.num_envs, self.device)
+        self.severity = self._starts.severity
+        self._module_moment = module_reaction(robot)['mass_moment'] if robot.multibody else 0.0
+        self._axes = self._tensor(robot.tilt_axes)
+        self._sideways = self._tensor(np.cross(robot.tilt_axes, [0.0, 0.0, 1.0]))
+        self._nominal_mass = nominal_body(robot)[0]
+        self.base_weights = self._tensor([getattr(parameters.reward, name)
+                                          for name in rewards.TERMS]) * parameters.reward.scale
+        self.weights = self.base_weights.clone()
+        numbers = self._numbers()
+        # clones: entries that start equal must not share memory
+        self.state = {name: value.clone()
+                      for name, value in self._starts.draw(batch.Draw(numbers)).items()}
+        age = torch.rand(self.num_envs, device=self.device) * self.max_episode_length
+        self.state['age'] = age.floor()
+        # sums since the last reading: targets finished, reached, errors, rewards, ends
+        self.tally = torch.zeros(8 + len(rewards.TERMS), device=self.device)
+        self._finish = self._after
+        if compiled if compiled is not None else self.device.type == 'cuda':
+            self._finish = torch.compile(self._after, fullgraph=True, dynamic=False)
+        self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 104:]))
+        self.reward = torch.zeros(self.num_envs, device=self.device)
+        self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.timeout = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+
+    def _tensor(self, values):
+        return torch.tensor(np.asarray(values, dtype=float), dtype=torch.float32,
+                            device=self.device)
+
+    def _numbers(self):
+        return torch.rand(self.num_envs, NUMBERS, device=self.device)
+
+    def get_observations(self) -> TensorDict:
+        """Observation groups 'actor' (N, 33 or 39) and 'critic' (N, 41 or 47)."""
+        return TensorDict({'actor': self.observation, 'critic': self.critic},
+                          batch_size=[self.num_envs], device=self.device)
+
+    def step(self, actions: torch.Tensor):
+        """One period for all robots; see :class:`rsl_rl.env.VecEnv`."""
+        self.advance(actions)
+        self.episode_length_buf = self.state['age'].long()
+        return self.get_observations(), self.reward.clone(), self.done.clone(), \
+            {'time_outs': self.timeout.float()}
+
+    def advance(self, actions: torch.Tensor) -> None:
+        """:meth:`step` in place: results stand in observation, critic, reward, done, timeout."""
+        asked = self.offset + self.scale * actions
+        command = torch.clamp(asked, self._low, self._high)
+        s = self.state
+        x = self.physics.advance(s['x'], (command, s['previous'], s['older']), s['delays'][:, :2],
+                                 s['wrench'], s['body'])
+        results = self._finish(s, x, asked, command, self._numbers(), self.weights)
+        new, observation, critic, reward, done, timeout, tally = results
+        torch._foreach_copy_([s[name] for name in new], list(new.values()))
+        self.observation.copy_(observation)
+        self.critic.copy_(critic)
+        self.reward.copy_(reward)
+        self.done.copy_(done)
+        self.timeout.copy_(timeout)
+        self.tally.add_(tally)
+
+    def _after(self, s, x, asked, command, numbers, weights):
+        """All that follows the physics: push, reward, end, new targets, reset, observation."""
+        draw, limits = batch.Draw(numbers), self.cfg.episode
+        x = self._push(s, x, draw)
+        rotation, target = batch.matrix(x[:, model.QUATERNION]), batch.matrix(s['target_attitude'])
+        moment = self._moment(s, x, asked, rotation, target)
+        terms = torch.stack([term(moment) for term in rewards.TERMS.values()], -1)
+        broken = ~torch.isfinite(x).all(-1)
+        died = broken | (moment.position_error > limits.position_limit) \
+            | (moment.speed > limits.velocity_limit) | (moment.rate > limits.rate_limit)
+        reward = torch.where(broken, 0.0, terms @ weights) \
+            + died * (self.cfg.reward.termination * self.cfg.reward.scale)
+        age = s['age'] + 1
+        timeout = (age >= self.max_episode_length) & ~died
+        done = died | timeout
+        due = (s['target_left'] <= 1) & ~done
+        reached = (moment.position_error < REACHED_POSITION) \
+            & (moment.attitude_error < REACHED_ATTITUDE)
+        finished = due & (s['disturbed'][:, 0] < 0.5)
+        tally = torch.cat([torch.stack([
+            finished.sum(), (finished & reached).sum(),
+            (finished * moment.position_error).sum(), (finished * moment.attitude_error).sum(),
+            reward.sum(), died.sum(), timeout.sum(), torch.ones_like(reward).sum()]),
+            torch.where(broken[:, None], 0.0, terms).sum(0)])
+        new = self._carry_on(s, x, command, rotation, age)
+        new = self._retarget(new, due, rotation, draw)
+        fresh = self._starts.draw(draw)
+        new = {name: torch.where(_spread(done, value), fresh[name], value)
+               for name, value in new.items()}
+        observation, critic = self._observe(new, draw)
+        return new, observation, critic, reward, done, timeout, tally
+
+    def _push(self, s, x, draw):
+        r = self.cfg.random
+        chance = s['pushed'] * (self.cfg.episode.period / r.push_period)
+        push = draw.uniform(1) < chance
+        # uniform with the standard deviation that the parameters state
+        kick = torch.cat((draw.around(3 ** 0.5 * r.push_velocity, 3),
+                          draw.around(3 ** 0.5 * r.push_rate, 3)), -1) * push * self.severity
+        return torch.cat((x[:, model.POSITION], x[:, model.VELOCITY] + kick[:, :3],
+                          x[:, model.QUATERNION], x[:, model.RATE] + kick[:, 3:], x[:, 13:]), -1)
+
+    def _moment(self, s, x, asked, rotation, target):
+        return rewards.Moment(
+            position_error=(x[:, model.POSITION] - s['target_position']).norm(dim=-1),
+            attitude_error=batch.geodesic(rotation, target),
+            speed=x[:, model.VELOCITY].norm(dim=-1), rate=x[:, model.RATE].norm(dim=-1),
+            tilt=x[:, model.TILT], tilt_rate=x[:, model.TILT_RATE],
+            previous_tilt_rate=s['x'][:, model.TILT_RATE], thrust=x[:, model.THRUST],
+            tilt_command=asked[:, :4], thrust_command=asked[:, 4:],
+            previous_tilt_command=s['previous'][:, :4],
+            previous_thrust_command=s['previous'][:, 4:],
+            z_axis=rotation[:, :, 2], target_z_axis=target[:, :, 2],
+            depth=(s['floor'][:, 0] - x[:, 2]).clamp(min=0),
+            tilt_limit=self.robot.joints.position_limit,
+            thrust_limit=self.robot.rotors.thrust_max)
+
+    def _carry_on(self, s, x, command, rotation, age):
+        """The state after a step in which nothing ended."""
+        new = dict(s)
+        old = batch.matrix(s['x'][:, model.QUATERNION])
+        motion = torch.cat((batch.turned_back(old, s['x'][:, model.VELOCITY]),
+                            s['x'][:, model.RATE]), -1)
+        new.update(
+            x=x, previous=command, older=s['previous'], age=age,
+            target_left=s['target_left'] - 1,
+            past_motion=torch.cat((motion[:, None], s['past_motion'][:, :2]), 1),
+            past_tilt=torch.cat((s['x'][:, None, model.TILT], s['past_tilt'][:, :1]), 1),
+            estimate=self._follow(s, x, rotation))
+        return new
+
+    def _follow(self, s, x, rotation):
+        """The disturbance estimate: what the nominal model cannot explain, through a lag."""
+        e, period = self.cfg.estimate, self.cfg.episode.period
+        mass = s['body'][:, MASS]
+        weight = torch.zeros_like(s['wrench'][:, :3])
+        weight[:, 2] = -self.robot.gravity
+        tilt = x[:, model.TILT]
+        thrusts = torch.sin(tilt) @ self._sideways
+        up = torch.zeros_like(thrusts)
+        up[:, 2] = (torch.cos(tilt) - 1).sum(-1)
+        centre = s['body'][:, CENTRE] - self._module_moment / mass * (thrusts + up)
+        pull = batch.turned_back(rotation, weight * mass)
+        force = s['wrench'][:, :3] + (mass - self._nominal_mass) * weight
+        torque = s['wrench'][:, 3:] + torch.linalg.cross(centre, pull)
+        lag = torch.cat((torch.full_like(force, e.force_bandwidth * period),
+                         torch.full_like(torque, e.torque_bandwidth * period)), -1)
+        return s['estimate'] + lag * (torch.cat((force, torque), -1) - s['estimate'])
+
+    def _retarget(self, new, due, rotation, draw):
+        target = self._starts.target(draw, new['x'][:, model.POSITION],
+                                     new['x'][:, model.QUATERNION])
+        changed = dict(new)
+        for name, value in target.items():
+            changed[name] = torch.where(_spread(due, value), value, new[name])
+        return changed
+
+    def _observe(self, s, draw):
+        signals = Signals(self.cfg.random, s, draw)
+        previous_action = (s['previous'] - self.offset) / self.scale
+        observation = actor_observation(signals, s, previous_action,
+                                        self.cfg.estimate if self.cfg.memory else None, draw)
+        return observation, critic_observation(s, previous_action, self._torque_ratio,
+                                               self.cfg.memory)
+
+    def read_tally(self) -> dict[str, float]:
+        """Averages since the last reading, then start anew; this waits for the device."""
+        values = self.tally.tolist()
+        self.tally.zero_()
+        targets, steps = max(values[0], 1.0), max(values[7], 1.0)
+        result = {'targets': values[0], 'success_rate': values[1] / targets,
+                  'position_error_m': values[2] / targets,
+                  'attitude_error_deg': float(np.degrees(values[3] / targets)),
+                  'reward': values[4] / steps, 'deaths': values[5], 'episodes': values[5]
+                  + values[6], 'steps': values[7]}
+        for name, value in zip(rewards.TERMS, values[8:]):
+            result[f'reward/{name}'] = value / steps * getattr(self.cfg.reward, name)
+        return result
+
+
+def _spread(mask, like):
+    """Mask (N,) shaped to select rows of ``like`` (N, ...)."""
+    return mask.view(-1, *[1] * (like.dim() - 1))

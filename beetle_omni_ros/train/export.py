@@ -1,0 +1,120 @@
+"""A trained actor as an ONNX file that carries its own contract."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime, timezone
+import logging
+from pathlib import Path
+import subprocess
+import warnings
+
+import numpy as np
+import torch
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.control.policy_file import INPUT, OUTPUT, PolicyContract
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import flatten
+from beetle_omni_ros.train.network import ActorModel, ExportedPolicy
+from beetle_omni_ros.train.parameters import TrainParameters
+
+OPSET = 18
+AGREEMENT = 1e-5     # between torch and onnxruntime, relative to the largest action
+PROBES = 256         # observations on which they are compared
+
+
+class ExportError(RuntimeError):
+    """The written file does not compute what the network computes."""
+
+
+def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
+                  parameters: TrainParameters, training: dict | None = None,
+                  metrics: dict | None = None) -> float:
+    """
+    Write an actor as ONNX and compare the file with it.
+
+    Args:
+        actor: the trained network.
+        path: of the file.
+        robot: that it was trained for.
+        parameters: of the training.
+        training: more to state about it, e.g. its duration.
+        metrics: what it reached.
+
+    Returns:
+        the largest difference between torch and onnxruntime, relative to the largest action.
+
+    Raises:
+        ExportError: they differ by more than ``AGREEMENT``.
+
+    """
+    import onnx
+
+    network = ExportedPolicy(actor).cpu().eval()
+    size = actor.obs_dim
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        logging.getLogger('torch.onnx').setLevel(logging.ERROR)
+        program = torch.onnx.export(
+            network, (torch.zeros(1, size),), input_names=[INPUT], output_names=[OUTPUT],
+            opset_version=OPSET, dynamo=True, verbose=False)
+    written = program.model_proto
+    contract = PolicyContract.default(robot, parameters.memory)
+    flat = {name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, _, _, value in flatten(parameters)}
+    contract = replace(
+        contract, training={**flat, **(training or {})}, metrics=metrics or {},
+        commit=commit(), version=__version__,
+        created=datetime.now(timezone.utc).isoformat(timespec='seconds'))
+    del written.metadata_props[:]
+    for key, value in contract.to_metadata().items():
+        written.metadata_props.add(key=key, value=value)
+    strip_paths(written)
+    path = Path(path)
+    part = path.with_suffix('.part')
+    onnx.save(written, str(part))
+    difference = compare(network, part, size)
+    if not difference <= AGREEMENT:
+        part.unlink()
+        raise ExportError(f'{path}: torch and onnxruntime differ by {difference:.2g}, more than '
+                          f'{AGREEMENT:g}')
+    part.replace(path)
+    return difference
+
+
+def compare(network: torch.nn.Module, path: Path, size: int) -> float:
+    """Largest difference of torch and onnxruntime on random observations, relative."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(path), providers=['CPUExecutionProvider'])
+    generator = torch.Generator().manual_seed(0)
+    probes = torch.randn(PROBES, size, generator=generator)
+    with torch.no_grad():
+        expected = network(probes).numpy()
+    found = np.concatenate([session.run([OUTPUT], {INPUT: row[None].numpy()})[0]
+                            for row in probes])
+    return float(np.abs(found - expected).max() / max(np.abs(expected).max(), 1.0))
+
+
+def strip_paths(proto) -> None:
+    """Take out the exporter's notes on where each node comes from, which name local files."""
+    for node in proto.graph.node:
+        del node.metadata_props[:]
+        node.doc_string = ''
+    for value in (*proto.graph.input, *proto.graph.output, *proto.graph.value_info):
+        del value.metadata_props[:]
+    del proto.graph.metadata_props[:]
+    for function in proto.functions:
+        del function.metadata_props[:]
+
+
+def commit() -> str:
+    """Commit of the working tree this package runs from, '' outside of one."""
+    try:
+        done = subprocess.run(['git', 'describe', '--always', '--dirty', '--abbrev=12'],
+                              cwd=Path(__file__).parent, capture_output=True, text=True,
+                              timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ''
+    return done.stdout.strip()

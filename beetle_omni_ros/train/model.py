@@ -1,0 +1,112 @@
+"""
+The robot as the training environment steps it: one CasADi function, exported to the GPU.
+
+Newton and Euler, the rotors' lag and every effect of the robot file come from
+:mod:`robot.dynamics`; what is added is the integration over one short substep, the limits of
+the servos and what differs from robot to robot: mass, inertia and centre of mass. Where the
+robot file has a multibody section, the tilting modules' reaction and shifting centre of mass
+belong to the model, which is what makes a policy level on the true robot.
+"""
+
+from __future__ import annotations
+
+from math import exp
+
+import casadi as ca
+
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+# What differs from robot to robot: mass [kg], inertia (3) [kg m^2], centre of mass (3) [m].
+MASS, INERTIA, CENTRE = slice(0, 1), slice(1, 4), slice(4, 7)
+BODY_SIZE = 7
+SERVO_STEPS = 2    # in a substep; a servo reaches its rate limit within a millisecond
+WRENCH_SIZE = 6    # external force in world [N], torque in body [N m]
+
+
+def module_reaction(robot: RobotParameters) -> dict[str, float]:
+    """
+    Parameters of the effect ``module_reaction`` that follow from the multibody section.
+
+    Returns:
+        module_inertia [kg m^2] about the joint axis, mass_moment [kg m] of a module.
+
+    """
+    module = robot.multibody.module
+    depth = -float(module.centre_of_mass[2])
+    return {'module_inertia': float(module.inertia[0] + module.mass * depth ** 2),
+            'mass_moment': float(module.mass * depth)}
+
+
+def nominal_body(robot: RobotParameters) -> list[float]:
+    """(7,) mass, inertia and centre of mass as the robot file states them, effects included."""
+    effects = robot.effects
+    return [effects.get('mass', {}).get('mass', robot.mass),
+            *effects.get('inertia', {}).get('inertia', tuple(robot.inertia)),
+            *effects.get('centre_of_mass', {}).get('offset', (0.0, 0.0, 0.0))]
+
+
+def _servo_step(joints, tilt, rate, target, h):
+    """Tilt and rate after ``h`` seconds, within rate limit and stops."""
+    torque = joints.kp * (target - tilt) - joints.kd * rate
+    torque = ca.fmin(ca.fmax(torque, -joints.effort_limit), joints.effort_limit)
+    after = rate + h / joints.inertia * torque
+    after = ca.fmin(ca.fmax(after, -joints.velocity_limit), joints.velocity_limit)
+    free = tilt + h * (rate + after) / 2
+    held = ca.fmin(ca.fmax(free, -joints.position_limit), joints.position_limit)
+    return held, ca.if_else(ca.fabs(free) > joints.position_limit, 0, after)
+
+
+def substep(robot: RobotParameters, duration: float) -> ca.Function:
+    """
+    Build one integration step of the full state.
+
+    The servos take shorter steps of their own, within rate limit and stops, the rotors' lag
+    is exact, the body with the acceleration at the middle thrust and the new tilt.
+
+    Args:
+        robot: parameters and effects.
+        duration: of the step [s].
+
+    Returns:
+        substep(x (25), u (8), wrench (6), body (7)) -> x_next (25), in the slices of
+        :mod:`robot.dynamics` and of this module.
+
+    """
+    x, u = ca.SX.sym('x', model.STATE_SIZE), ca.SX.sym('u', model.INPUT_SIZE)
+    wrench, body = ca.SX.sym('wrench', WRENCH_SIZE), ca.SX.sym('body', BODY_SIZE)
+    h, joints, rotors = duration, robot.joints, robot.rotors
+
+    def clip(value, low, high):
+        return ca.fmin(ca.fmax(value, low), high)
+
+    rate = x[model.TILT_RATE]
+    new_tilt, new_rate = x[model.TILT], rate
+    target = clip(u[model.TILT_COMMAND], -joints.position_limit, joints.position_limit)
+    for _ in range(SERVO_STEPS):
+        new_tilt, new_rate = _servo_step(joints, new_tilt, new_rate, target, h / SERVO_STEPS)
+
+    thrust_target = clip(u[model.THRUST_COMMAND], rotors.thrust_min, rotors.thrust_max)
+    thrust = x[model.THRUST]
+    new_thrust = thrust + (1 - exp(-h / rotors.time_constant)) * (thrust_target - thrust)
+
+    effects = dict(robot.effects)
+    if robot.multibody is not None:
+        effects.setdefault('module_reaction', module_reaction(robot))
+    effects.update(mass={'mass': body[MASS]}, inertia={'inertia': body[INERTIA]},
+                   centre_of_mass={'offset': body[CENTRE]})
+    order = ['mass', *(name for name in effects if name != 'mass')]
+    acceleration, angular_acceleration = model.rigid_body(
+        robot, x[model.VELOCITY], x[model.QUATERNION], x[model.RATE], new_tilt,
+        (thrust + new_thrust) / 2, wrench[:3], wrench[3:], (new_rate - rate) / h,
+        {name: effects[name] for name in order})
+    velocity = x[model.VELOCITY] + h * acceleration
+    angular_velocity = x[model.RATE] + h * angular_acceleration
+    position = x[model.POSITION] + h * (x[model.VELOCITY] + velocity) / 2
+    quaternion = x[model.QUATERNION] + h * model.quaternion_rate(
+        x[model.QUATERNION], (x[model.RATE] + angular_velocity) / 2)
+    quaternion = quaternion / ca.norm_2(quaternion)
+    after = ca.vertcat(position, velocity, quaternion, angular_velocity, new_tilt, new_rate,
+                       new_thrust)
+    return ca.Function('substep', [x, u, wrench, body], [ca.cse(after)],
+                       ['x', 'u', 'wrench', 'body'], ['x_next'])

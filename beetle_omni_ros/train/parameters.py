@@ -1,0 +1,220 @@
+"""Every number of the training; params/train.yaml holds the shipped ones with their sources."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import group, parameter
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeParameters:
+    """Time, targets and the end of an episode."""
+
+    period: float = parameter(0.01, doc='between two actions', unit='s', low=1e-3, high=0.1)
+    substeps: int = parameter(4, doc='integration steps in a period', low=1, high=100)
+    duration: float = parameter(16.0, doc='longest episode', unit='s', low=1, high=1000)
+    target_time: np.ndarray = parameter(
+        [3.0, 8.0], doc='range of the time for which a target stands', unit='s', shape=(2,),
+        low=0.1, high=1000)
+    region: np.ndarray = parameter(
+        [4.0, 4.0, 3.0], doc='edges of the box of targets', unit='m', shape=(3,), low=0.1, high=50)
+    position_limit: float = parameter(9.0, doc='farther from the target ends the episode',
+                                      unit='m', low=1, high=100)
+    velocity_limit: float = parameter(15.0, doc='faster ends it', unit='m/s', low=1, high=100)
+    rate_limit: float = parameter(30.0, doc='turning faster ends it', unit='rad/s', low=1,
+                                  high=200)
+    hold_targets: float = parameter(0.1, doc='share of new targets that are near the present '
+                                             'pose, so that holding is trained', low=0, high=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartParameters:
+    """Shares of the robots in the strata of initial states; they are normalised to one."""
+
+    wound_back: float = parameter(1.0, doc='all joints at -pi', low=0, high=100)
+    level: float = parameter(1.0, doc='all joints at 0', low=0, high=100)
+    wound: float = parameter(1.0, doc='all joints at +pi', low=0, high=100)
+    mixed: float = parameter(1.0, doc='each joint at -pi, 0 or +pi', low=0, high=100)
+    hover: float = parameter(2.0, doc='hovering at a random attitude', low=0, high=100)
+    hold: float = parameter(3.0, doc='hovering, with the first target at the own attitude', low=0,
+                            high=100)
+    moving: float = parameter(1.0, doc='hovering, but with velocities', low=0, high=100)
+    other_branch: float = parameter(
+        0.3, doc='share of the joints of a hover start that are wound by a turn', low=0, high=1)
+    velocity: float = parameter(1.5, doc='of moving starts, each axis up to', unit='m/s', low=0,
+                                high=10)
+    rate: float = parameter(3.0, doc='of moving starts, each axis up to', unit='rad/s', low=0,
+                            high=20)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomParameters:
+    """What differs between robots: half-widths of uniform ranges; latencies are ranges."""
+
+    mass_scale: float = parameter(0.05, doc='mass', low=0, high=0.5)
+    inertia_scale: float = parameter(0.05, doc='inertia, each axis', low=0, high=0.5)
+    centre_of_mass: float = parameter(0.01, doc='each axis', unit='m', low=0, high=0.1)
+    position_bias: float = parameter(0.01, doc='each axis', unit='m', low=0, high=0.2)
+    position_noise: float = parameter(0.01, doc='each axis', unit='m', low=0, high=0.2)
+    attitude_bias: float = parameter(0.01, doc='about each axis', unit='rad', low=0, high=0.2)
+    attitude_noise: float = parameter(0.01, doc='about each axis', unit='rad', low=0, high=0.2)
+    velocity_bias: float = parameter(0.005, doc='each axis', unit='m/s', low=0, high=1)
+    velocity_noise: float = parameter(0.005, doc='each axis', unit='m/s', low=0, high=1)
+    rate_bias: float = parameter(0.005, doc='each axis', unit='rad/s', low=0, high=1)
+    rate_noise: float = parameter(0.005, doc='each axis', unit='rad/s', low=0, high=1)
+    tilt_bias: float = parameter(0.0524, doc='each joint', unit='rad', low=0, high=0.5)
+    tilt_noise: float = parameter(0.0349, doc='each joint', unit='rad', low=0, high=0.5)
+    noise_power: float = parameter(
+        2.0, doc="noise and biases of a robot are scaled by u^power with u uniform in [0, 1]; 0: "
+                 'every robot has them in full', low=0, high=10)
+    velocity_latency: np.ndarray = parameter([0.0, 0.025], doc='age of velocity and rate',
+                                             unit='s', shape=(2,), low=0, high=0.03)
+    tilt_latency: np.ndarray = parameter([0.005, 0.015], doc='age of the joint feedback',
+                                         unit='s', shape=(2,), low=0, high=0.02)
+    command_latency: np.ndarray = parameter([0.005, 0.015], doc='until a command acts', unit='s',
+                                            shape=(2,), low=0, high=0.02)
+    force_share: float = parameter(0.3, doc='share of robots with a constant force', low=0, high=1)
+    force: float = parameter(4.0, doc='its size, each axis up to', unit='N', low=0, high=50)
+    strong_share: float = parameter(0.08, doc='share of robots with a strong constant force',
+                                    low=0, high=1)
+    strong_force: float = parameter(35.0, doc='its size, each axis up to', unit='N', low=0,
+                                    high=200)
+    payload_share: float = parameter(0.2, doc='share of robots with a payload', low=0, high=1)
+    payload: float = parameter(1.1, doc='its mass up to', unit='kg', low=0, high=10)
+    torque: float = parameter(0.1, doc='constant torque of those with a force, each axis up to',
+                              unit='N m', low=0, high=5)
+    push_share: float = parameter(0.25, doc='share of robots that are pushed now and then', low=0,
+                                  high=1)
+    push_period: float = parameter(3.0, doc='mean time between pushes', unit='s', low=0.1,
+                                   high=1000)
+    push_velocity: float = parameter(0.6, doc='change of velocity, standard deviation of an axis',
+                                     unit='m/s', low=0, high=10)
+    push_rate: float = parameter(4.5, doc='change of body rate, standard deviation of an axis',
+                                 unit='rad/s', low=0, high=30)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateParameters:
+    """The disturbance estimate that the policy with memory sees, as the controller makes it."""
+
+    force_bandwidth: float = parameter(3.0, doc='of the force', unit='rad/s', low=0.1, high=50)
+    torque_bandwidth: float = parameter(4.0, doc='of the torque', unit='rad/s', low=0.1, high=50)
+    force_bias: float = parameter(0.6, doc='half-width, scaled like the other biases', unit='N',
+                                  low=0, high=10)
+    torque_bias: float = parameter(0.15, doc='the same, mostly from biased encoders', unit='N m',
+                                   low=0, high=1)
+    force_noise: float = parameter(0.1, doc='half-width', unit='N', low=0, high=10)
+    torque_noise: float = parameter(0.05, doc='half-width', unit='N m', low=0, high=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardWeights:
+    """Weights of the terms in :mod:`train.rewards`, by the terms' names."""
+
+    position: float = parameter(-1.0, doc='published')
+    pose: float = parameter(2.0, doc='published')
+    reach_position: float = parameter(1.0, doc='published')
+    reach_pose: float = parameter(0.75, doc='published')
+    linear_velocity: float = parameter(-0.03, doc='published')
+    angular_velocity: float = parameter(-0.05, doc='published')
+    joint_limit: float = parameter(-0.02, doc='published')
+    thrust_limit: float = parameter(-0.01, doc='published')
+    joint_action_rate: float = parameter(-0.05, doc='published -5e-4')
+    thrust_action_rate: float = parameter(-2e-3, doc='published -1e-4')
+    thrust_power: float = parameter(-1e-5, doc='published')
+    joint_acceleration: float = parameter(-1.5e-5, doc='published')
+    z_axis_align: float = parameter(-0.1, doc='published')
+    thrust_allocation: float = parameter(-1e-5, doc='published')
+    attitude: float = parameter(-1.0, doc='own: slope far from the target')
+    near_position: float = parameter(1.0, doc='own: slope close to the target')
+    near_attitude: float = parameter(1.0, doc='own: slope close to the target')
+    near_pose: float = parameter(1.0, doc='own: slope close to the target')
+    exact_pose: float = parameter(1.0, doc='own: slope in the last centimetres')
+    joint_winding: float = parameter(-0.1, doc='own: joints beyond half a turn')
+    hover_tilt_rate: float = parameter(-5.0, doc='own: smooth commands at the target')
+    hover_thrust_rate: float = parameter(-0.15, doc='own: smooth commands at the target')
+    sinking: float = parameter(-0.5, doc='own: below both start and target')
+    termination: float = parameter(-800.0, doc='own: less than the worst flight would cost')
+    scale: float = parameter(0.01, doc='of the sum')
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkParameters:
+    """The actor and the critic."""
+
+    hidden: np.ndarray = parameter([512, 256, 128], doc='published')
+    output_scale: float = parameter(4.0, doc='action for each unit of the last layer', low=0.01,
+                                    high=100)
+    carry: float = parameter(0.0, doc='part of the previous action that the output is added to',
+                             low=0, high=1)
+    last_gain: float = parameter(0.01, doc='initial gain of the last layer', low=0, high=10)
+    tilt_std: float = parameter(1.0, doc='initial standard deviation of the tilt actions', low=0,
+                                high=10)
+    thrust_std: float = parameter(3.0, doc='of the thrust actions', low=0, high=10)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoParameters:
+    """Proximal policy optimisation; the published hyperparameters."""
+
+    robots: int = parameter(4096, doc='published', low=1, high=1 << 20)
+    steps: int = parameter(48, doc='in an iteration; published', low=1, high=10000)
+    epochs: int = parameter(5, doc='published', low=1, high=100)
+    minibatches: int = parameter(4, doc='in an epoch', low=1, high=1000)
+    clip: float = parameter(0.2, doc='published', low=0, high=1)
+    discount: float = parameter(0.99, doc='published', low=0, high=1)
+    trace: float = parameter(0.95, doc='GAE factor; published', low=0, high=1)
+    gradient_norm: float = parameter(1.0, doc='published', low=0, high=1000)
+    value_weight: float = parameter(1.0, doc='of the value loss', low=0, high=100)
+    learning_rate: float = parameter(1e-3, doc='at the start', low=0, high=1)
+    learning_rate_limits: np.ndarray = parameter([3e-5, 1e-2], doc='of the adaptation', shape=(2,))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScheduleParameters:
+    """What changes while training: linear between two parts of the iterations."""
+
+    begin: float = parameter(0.25, doc='part of the iterations at which the change begins', low=0,
+                             high=1)
+    end: float = parameter(0.8, doc='part at which it is complete', low=0, high=1)
+    kl: np.ndarray = parameter([0.01, 0.005], doc='desired divergence of an update', shape=(2,))
+    entropy: np.ndarray = parameter([5e-4, 0.0], doc='weight of the entropy', shape=(2,))
+    tilt_std_limit: np.ndarray = parameter([1.0, 0.2], doc='largest standard deviation of the '
+                                           'tilt actions, in actions', shape=(2,))
+    thrust_std_limit: np.ndarray = parameter([4.0, 0.5], doc='the same, thrust', shape=(2,))
+    smooth: np.ndarray = parameter([0.1, 1.0], doc='factor on the weights of *_action_rate and '
+                                   'hover_*_rate', shape=(2,))
+    severity: np.ndarray = parameter([0.0, 1.0], doc='factor on forces, payloads and pushes',
+                                     shape=(2,))
+    near: np.ndarray = parameter([0.5, 1.0], doc='factor on the weights of near_*', shape=(2,))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainParameters:
+    """One training, completely: dumped beside its checkpoints."""
+
+    seed: int = parameter(0, doc='of everything random', low=0, high=2**31 - 1)
+    iterations: int = parameter(6000, doc='PPO iterations', low=1, high=10**7)
+    memory: bool = parameter(False, doc='whether the policy sees the estimated disturbance')
+    log_every: int = parameter(50, doc='iterations between two rows of progress', low=1,
+                               high=10**6)
+    save_every: int = parameter(1000, doc='iterations between two checkpoints', low=1, high=10**7)
+    episode: EpisodeParameters = group(EpisodeParameters, 'episodes and targets')
+    start: StartParameters = group(StartParameters, 'initial states')
+    random: RandomParameters = group(RandomParameters, 'randomisation, noise, latency')
+    estimate: EstimateParameters = group(EstimateParameters, 'disturbance estimate')
+    reward: RewardWeights = group(RewardWeights, 'weights')
+    network: NetworkParameters = group(NetworkParameters, 'actor and critic')
+    ppo: PpoParameters = group(PpoParameters, 'optimisation')
+    schedule: ScheduleParameters = group(ScheduleParameters, 'what changes while training')
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> TrainParameters:
+        """Read a training file; without a path, the shipped one."""
+        return schema.load(cls, path if path else share_path('params/train.yaml'))

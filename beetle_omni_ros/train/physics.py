@@ -1,0 +1,153 @@
+"""
+One control period of many robots: delayed commands, substeps of the robot's model.
+
+On a GPU with Triton all substeps run in one kernel, elsewhere as plain torch; both are
+written out from the same CasADi function (:mod:`codegen`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import hashlib
+import importlib.util
+from pathlib import Path
+import tempfile
+
+import torch
+
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.train import codegen, model
+
+BLOCK = 64    # robots of one program; small blocks fill the GPU at a few thousand robots
+
+_KERNEL = '''\
+"""Written by beetle_omni_ros.train.physics; do not edit."""
+import triton
+import triton.language as tl
+
+
+@triton.jit
+def _number(condition):
+    return condition.to(tl.float32)
+
+
+@triton.jit
+def advance(x_in, x_out, newest, previous, oldest, delays, wrench, body, count,
+            SUBSTEPS: tl.constexpr, STEP: tl.constexpr, PERIOD: tl.constexpr,
+            BLOCK: tl.constexpr):
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = i < count
+{loads}
+    tilt_delay = tl.load(delays + 2 * i, mask=mask, other=0.0)
+    thrust_delay = tl.load(delays + 2 * i + 1, mask=mask, other=0.0)
+    for s in range(SUBSTEPS):
+        age = s * STEP + 1e-6
+{commands}
+{step}
+{update}
+{stores}
+'''
+
+
+def _kernel_source(function) -> str:
+    """The Triton module of a substep function."""
+    def lines(depth, items):
+        return '\n'.join(' ' * depth + item for item in items)
+
+    def load(name, array, k, size):
+        return f'{name}_{k} = tl.load({array} + {size} * i + {k}, mask=mask, other=0.0)'
+
+    states, inputs = function.numel_in(0), function.numel_in(1)
+    loads = [load('x', 'x_in', k, states) for k in range(states)]
+    loads += [load(name, name, k, size) for name, size in (
+        ('wrench', function.numel_in(2)), ('body', function.numel_in(3))) for k in range(size)]
+    loads += [load(name, name, k, inputs) for name in ('newest', 'previous', 'oldest')
+              for k in range(inputs)]
+    commands = []
+    for k in range(inputs):
+        delay = 'tilt_delay' if k < 4 else 'thrust_delay'
+        commands.append(f'u_{k} = tl.where(age >= {delay}, newest_{k}, tl.where('
+                        f'age + PERIOD >= {delay}, previous_{k}, oldest_{k}))')
+    out = function.name_out(0)
+    return _KERNEL.format(
+        loads=lines(4, loads), commands=lines(8, commands),
+        step=lines(8, codegen.statements(function, codegen.TRITON)),
+        update=lines(8, [f'x_{k} = {out}_{k}' for k in range(states)]),
+        stores=lines(4, [f'tl.store(x_out + {states} * i + {k}, x_{k}, mask=mask)'
+                         for k in range(states)]))
+
+
+def _load_kernel(source: str):
+    """Import a Triton module; its compiler reads the source from a file."""
+    folder = Path(tempfile.gettempdir()) / f'beetle_omni_{hashlib.md5(source.encode()).hexdigest()}'
+    folder.mkdir(exist_ok=True)
+    path = folder / 'kernel.py'
+    path.write_text(source)
+    spec = importlib.util.spec_from_file_location(folder.name, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.advance
+
+
+class Physics:
+    """
+    Advances a batch of robots.
+
+    Args:
+        robot: nominal parameters and effects.
+        period: of control [s].
+        substeps: integration steps in a period.
+        device: of the tensors.
+        kernel: whether to use the Triton kernel; None: where it can run.
+
+    """
+
+    def __init__(self, robot: RobotParameters, period: float, substeps: int,
+                 device: torch.device | str, kernel: bool | None = None):
+        self._period, self._substeps = period, substeps
+        function = model.substep(robot, period / substeps)
+        if kernel is None:
+            kernel = torch.device(device).type == 'cuda' \
+                and importlib.util.find_spec('triton') is not None
+        self.has_kernel = kernel
+        if kernel:
+            self._kernel = _load_kernel(_kernel_source(function))
+        self._substep: Callable = codegen.torch_function(function)
+
+    def advance(self, x: torch.Tensor, commands: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+                delays: torch.Tensor, wrench: torch.Tensor, body: torch.Tensor) -> torch.Tensor:
+        """
+        States one control period later.
+
+        Args:
+            x: (N, 25) states, slices of :mod:`robot.dynamics`.
+            commands: newest, previous and the one before, each (N, 8).
+            delays: (N, 2) of tilt and thrust commands [s], at most two periods.
+            wrench: (N, 6) external force in world [N], torque in body [N m].
+            body: (N, 7) mass, inertia, centre of mass.
+
+        """
+        if self.has_kernel:
+            return self._launch(x, commands, delays, wrench, body)
+        return self.advance_torch(x, commands, delays, wrench, body)
+
+    def advance_torch(self, x, commands, delays, wrench, body):
+        """:meth:`advance` in plain torch."""
+        step = self._period / self._substeps
+        delay = delays.repeat_interleave(4, dim=1)
+        for s in range(self._substeps):
+            age = s * step + 1e-6
+            command = torch.where(age >= delay, commands[0], torch.where(
+                age + self._period >= delay, commands[1], commands[2]))
+            x = self._substep(x, command, wrench, body)
+        return x
+
+    def _launch(self, x, commands, delays, wrench, body):
+        x, *rest = (a.contiguous() for a in (x, *commands, delays, wrench, body))
+        out = torch.empty_like(x)
+        count = x.shape[0]
+        blocks = (count + BLOCK - 1) // BLOCK
+        self._kernel[(blocks,)](
+            x, out, *rest, count, SUBSTEPS=self._substeps,
+            STEP=self._period / self._substeps, PERIOD=self._period, BLOCK=BLOCK, num_warps=2)
+        return out

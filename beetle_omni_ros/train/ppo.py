@@ -1,0 +1,194 @@
+"""
+PPO of rsl-rl, with the same update and rollout as CUDA graphs.
+
+rsl-rl's loop launches some ten thousand small kernels an iteration and waits for the device
+after each minibatch; the GPU idles most of the time. Here the arithmetic of rsl-rl's
+``PPO.update`` is written without a wait (the learning rate adapts on the device), compiled
+and captured, and so is the rollout. On other devices the same code runs uncaptured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import log, pi
+
+from rsl_rl.algorithms import PPO
+import torch
+from torch import nn
+
+LEARNING_RATE_STEP = 1.5     # rsl-rl's factor of the adaptation
+ADAM_EPSILON = 1e-8          # published
+
+
+class GraphPpo(PPO):
+    """
+    rsl-rl's PPO; :meth:`collect` and :meth:`learn_batch` run as captured graphs on a GPU.
+
+    Attributes:
+        knobs: (4,) on the device: desired KL, entropy weight, bounds of the standard
+            deviations of tilt and thrust actions.
+
+    """
+
+    def prepare(self, env, learning_rate_limits, graphs: bool, compiled: bool) -> None:
+        """
+        Set up the fast path.
+
+        Args:
+            env: the environment, stepped in place.
+            learning_rate_limits: lowest and highest.
+            graphs: capture CUDA graphs.
+            compiled: compile the loss.
+
+        """
+        self.env, self._limits, self._graphs = env, tuple(learning_rate_limits), graphs
+        self._capturable = graphs
+        self.rate = torch.tensor(float(self.learning_rate), device=self.device)
+        self.optimizer = torch.optim.Adam(
+            [*self.actor.parameters(), *self.critic.parameters()],
+            lr=self.rate if self._capturable else float(self.learning_rate), eps=ADAM_EPSILON,
+            capturable=self._capturable, fused=self._capturable or None)
+        self.knobs = torch.tensor([self.desired_kl, self.entropy_coef, 10.0, 10.0],
+                                  device=self.device)
+        self._loss: Callable = torch.compile(self._losses, dynamic=False) if compiled \
+            else self._losses
+        self._mean = torch.compile(self.actor.mean, dynamic=False) if compiled else self.actor.mean
+        s = self.storage
+        shape = (s.num_transitions_per_env, s.num_envs)
+        width = self.actor.distribution.output_dim
+        s.distribution_params = tuple(torch.zeros(*shape, width, device=self.device)
+                                      for _ in range(2))
+        self.losses = torch.zeros(4, device=self.device)
+        self._order = torch.arange(shape[0] * shape[1], device=self.device)
+        self._replay: dict[str, Callable] = {}
+
+    @property
+    def std(self) -> torch.Tensor:
+        """(8,) standard deviations of the actions."""
+        return torch.exp(self.actor.distribution.log_std_param.detach())
+
+    def collect(self) -> None:
+        """One rollout into the storage, advantages and returns included."""
+        self._run('collect', self._collect)
+
+    def learn_batch(self) -> None:
+        """All epochs over the storage; average losses stand in :attr:`losses`."""
+        count = self._order.numel()
+        self._order.copy_(torch.randperm(count, device=self.device))
+        self._run('learn', self._learn)
+
+    def update(self) -> dict[str, float]:
+        """rsl-rl's own update, with the knobs applied: the path of several GPUs."""
+        self.desired_kl, self.entropy_coef = self.knobs[:2].tolist()
+        losses = super().update()
+        self.actor.distribution.bound(self.knobs[2:].repeat_interleave(4))
+        return losses
+
+    def _run(self, name, function):
+        if not self._graphs:
+            function()
+            return
+        if name not in self._replay:
+            self._capture(name, function)
+        self._replay[name]()
+
+    def _capture(self, name, function):
+        """Run once to warm up (compilers, workspaces), then record."""
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            function()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            function()
+        self._replay[name] = graph.replay
+
+    @torch.no_grad()
+    def _collect(self):
+        s, env, std = self.storage, self.env, self.std
+        for t in range(s.num_transitions_per_env):
+            mean = self._mean(env.observation)
+            action = mean + std * torch.randn_like(mean)
+            s.observations['actor'][t].copy_(env.observation)
+            s.observations['critic'][t].copy_(env.critic)
+            s.actions[t].copy_(action)
+            s.distribution_params[0][t].copy_(mean)
+            env.advance(action)
+            s.rewards[t, :, 0].copy_(env.reward)
+            s.dones[t, :, 0].copy_(env.done)
+            # rsl-rl's bootstrap at a time limit, with the value that is filled in below
+            s.advantages[t, :, 0].copy_(env.timeout)
+        s.distribution_params[1].copy_(std.expand_as(s.distribution_params[1]))
+        s.actions_log_prob.copy_(log_probability(
+            s.actions, s.distribution_params[0], std)[..., None])
+        s.values.copy_(self.critic.value(s.observations['critic'].flatten(0, 1)).view_as(s.values))
+        s.rewards.add_(self.gamma * s.values * s.advantages)
+        self._returns(self.critic.value(env.critic))
+
+    def _returns(self, last):
+        """Generalised advantage estimation, Schulman et al. 2016."""
+        s = self.storage
+        alive = 1.0 - s.dones.float()
+        following = torch.cat((s.values[1:], last[None]))
+        delta = s.rewards + alive * self.gamma * following - s.values
+        advantage = torch.zeros_like(last)
+        for t in reversed(range(s.num_transitions_per_env)):
+            advantage = delta[t] + alive[t] * (self.gamma * self.lam) * advantage
+            s.advantages[t].copy_(advantage)
+        s.returns.copy_(s.advantages + s.values)
+        s.advantages.copy_((s.advantages - s.advantages.mean()) / (s.advantages.std() + 1e-8))
+
+    def _learn(self):
+        s, order = self.storage, self._order
+        columns = [s.observations['actor'], s.observations['critic'], s.actions,
+                   s.distribution_params[0], s.actions_log_prob, s.advantages, s.returns]
+        shuffled = [column.flatten(0, 1)[order] for column in columns]
+        old_std = s.distribution_params[1][0, 0].clone()
+        size = order.numel() // self.num_mini_batches
+        self.losses.zero_()
+        for _ in range(self.num_learning_epochs):
+            for k in range(self.num_mini_batches):
+                self._step([column[k * size:(k + 1) * size] for column in shuffled], old_std)
+        self.losses.div_(self.num_learning_epochs * self.num_mini_batches)
+        limits = self.knobs[2:].repeat_interleave(4)
+        self.actor.distribution.bound(limits)
+
+    def _step(self, batch, old_std):
+        self.optimizer.zero_grad(set_to_none=True)
+        loss, parts = self._loss(*batch, old_std)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
+        nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
+        self._adapt(parts[3])
+        self.optimizer.step()
+        self.losses.add_(parts)
+
+    def _losses(self, observation, state, action, old_mean, old_log, advantage, returns, old_std):
+        """The loss and (4,) value loss, surrogate, entropy, divergence."""
+        log_std = self.actor.distribution.log_std_param
+        mean, std = self.actor.mean(observation), torch.exp(log_std)
+        ratio = torch.exp(log_probability(action, mean, std) - old_log[:, 0])
+        clipped = ratio.clamp(1 - self.clip_param, 1 + self.clip_param)
+        surrogate = torch.maximum(-advantage[:, 0] * ratio, -advantage[:, 0] * clipped).mean()
+        value = (returns - self.critic.value(state)).pow(2).mean()
+        entropy = (log_std + 0.5 * (1 + log(2 * pi))).sum()
+        divergence = (torch.log(std / old_std) + (old_std ** 2 + (old_mean - mean) ** 2)
+                      / (2 * std ** 2) - 0.5).sum(-1).mean()
+        loss = surrogate + self.value_loss_coef * value - self.knobs[1] * entropy
+        return loss, torch.stack((value, surrogate, entropy, divergence)).detach()
+
+    def _adapt(self, divergence):
+        """rsl-rl's learning rate by the divergence of the update."""
+        desired, low, high = self.knobs[0], *self._limits
+        factor = torch.where(divergence > 2 * desired, 1 / LEARNING_RATE_STEP, torch.where(
+            (divergence < desired / 2) & (divergence > 0), LEARNING_RATE_STEP, 1.0))
+        self.rate.copy_((self.rate * factor).clamp(low, high))
+        if not self._capturable:
+            self.optimizer.param_groups[0]['lr'] = float(self.rate)
+
+
+def log_probability(action: torch.Tensor, mean: torch.Tensor, std: torch.Tensor) -> torch.Tensor:
+    """(...,) log density of (..., 8) actions under a diagonal Gaussian."""
+    return -(0.5 * ((action - mean) / std) ** 2 + torch.log(std)
+             + 0.5 * log(2 * pi)).sum(-1)

@@ -1,0 +1,192 @@
+"""
+The reward, one function a term; weights in :class:`train.parameters.RewardWeights`.
+
+Published terms follow the publication's reward table, with two readings of it that training
+needs: the thrust limitation counts what exceeds the limits (as printed it would ask for full
+thrust), and the orientation error is the geodesic angle (a difference of Euler angles jumps).
+Terms marked "own" in the parameters are additions.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+
+class Moment(NamedTuple):
+    """
+    What a reward may look at, for N robots after one step.
+
+    Attributes:
+        position_error: (N,) distance to the target [m].
+        attitude_error: (N,) geodesic angle to the target [rad].
+        speed: (N,) [m/s].
+        rate: (N,) norm of the body rate [rad/s].
+        tilt: (N, 4) [rad].
+        tilt_rate: (N, 4) [rad/s].
+        previous_tilt_rate: (N, 4) one step before.
+        thrust: (N, 4) after the lag [N].
+        tilt_command: (N, 4) as the policy asked [rad].
+        thrust_command: (N, 4) as the policy asked [N].
+        previous_tilt_command: (N, 4) in force before [rad].
+        previous_thrust_command: (N, 4) in force before [N].
+        z_axis: (N, 3) body z axis in world.
+        target_z_axis: (N, 3).
+        depth: (N,) how far below both start and target [m], not negative.
+        tilt_limit: travel of the joints [rad].
+        thrust_limit: largest thrust [N].
+
+    """
+
+    position_error: torch.Tensor
+    attitude_error: torch.Tensor
+    speed: torch.Tensor
+    rate: torch.Tensor
+    tilt: torch.Tensor
+    tilt_rate: torch.Tensor
+    previous_tilt_rate: torch.Tensor
+    thrust: torch.Tensor
+    tilt_command: torch.Tensor
+    thrust_command: torch.Tensor
+    previous_tilt_command: torch.Tensor
+    previous_thrust_command: torch.Tensor
+    z_axis: torch.Tensor
+    target_z_axis: torch.Tensor
+    depth: torch.Tensor
+    tilt_limit: float
+    thrust_limit: float
+
+
+def position(m: Moment) -> torch.Tensor:
+    """Distance, saturating."""
+    return torch.tanh(m.position_error / 0.6)
+
+
+def pose(m: Moment) -> torch.Tensor:
+    """Closeness in position and attitude together."""
+    return (1 - torch.tanh(m.attitude_error / 2)) * (1 - torch.tanh(m.position_error / 2))
+
+
+def reach_position(m: Moment) -> torch.Tensor:
+    """At rest at the position."""
+    reached = (m.position_error < 0.02) & (m.speed < 0.02)
+    return reached * (torch.exp(-m.position_error / 0.02) + torch.exp(-m.speed / 0.02))
+
+
+def reach_pose(m: Moment) -> torch.Tensor:
+    """At rest at the pose."""
+    reached = (m.position_error < 0.02) & (m.attitude_error < 0.05) \
+        & (m.speed < 0.02) & (m.rate < 0.02)
+    return reached * (torch.exp(-m.position_error / 0.02) + torch.exp(-m.speed / 0.02)
+                      + torch.exp(-2 * m.attitude_error / 0.05) + torch.exp(-2 * m.rate / 0.02))
+
+
+def linear_velocity(m: Moment) -> torch.Tensor:
+    """Speed, up to 4 m/s."""
+    return (torch.exp(0.6 * m.speed.clamp(max=4.0)) - 1) ** 2
+
+
+def angular_velocity(m: Moment) -> torch.Tensor:
+    """Body rate, up to 6 rad/s."""
+    return (torch.exp(0.4 * m.rate.clamp(max=6.0)) - 1) ** 2
+
+
+def joint_limit(m: Moment) -> torch.Tensor:
+    """Tilt commands beyond the stops."""
+    return (m.tilt_command.abs() - m.tilt_limit).clamp(min=0).sum(-1)
+
+
+def thrust_limit(m: Moment) -> torch.Tensor:
+    """Thrust commands outside the rotors' range."""
+    over = (m.thrust_command - m.thrust_limit).clamp(min=0)
+    under = (-m.thrust_command).clamp(min=0)
+    return (over ** 2 + under ** 2).sum(-1)
+
+
+def joint_action_rate(m: Moment) -> torch.Tensor:
+    """Change of the tilt commands."""
+    return ((m.tilt_command - m.previous_tilt_command) ** 2).sum(-1)
+
+
+def thrust_action_rate(m: Moment) -> torch.Tensor:
+    """Change of the thrust commands."""
+    return ((m.thrust_command - m.previous_thrust_command) ** 2).sum(-1)
+
+
+def thrust_power(m: Moment) -> torch.Tensor:
+    """Effort of the rotors."""
+    return (m.thrust ** 2).sum(-1)
+
+
+def joint_acceleration(m: Moment) -> torch.Tensor:
+    """Change of the joint rates."""
+    return ((m.tilt_rate - m.previous_tilt_rate) ** 2).sum(-1)
+
+
+def z_axis_align(m: Moment) -> torch.Tensor:
+    """Upside down with respect to the target."""
+    return ((m.z_axis - m.target_z_axis).norm(dim=-1) > 1.5).float()
+
+
+def thrust_allocation(m: Moment) -> torch.Tensor:
+    """Uneven thrusts, as far as the robot is level."""
+    uneven = m.thrust_command - m.thrust_command.mean(-1, keepdim=True)
+    return (uneven ** 2).sum(-1) * m.z_axis[:, 2] ** 2
+
+
+def attitude(m: Moment) -> torch.Tensor:
+    """Orientation error with the same slope at any size, which 'pose' lacks far away."""
+    return m.attitude_error / torch.pi
+
+
+def near_position(m: Moment) -> torch.Tensor:
+    """A slope that the published terms lack within the last decimetre."""
+    return torch.exp(-m.position_error / 0.1)
+
+
+def near_attitude(m: Moment) -> torch.Tensor:
+    """The same for the attitude."""
+    return torch.exp(-m.attitude_error / 0.15)
+
+
+def near_pose(m: Moment) -> torch.Tensor:
+    """Both together."""
+    return torch.exp(-m.position_error / 0.1 - m.attitude_error / 0.1)
+
+
+def exact_pose(m: Moment) -> torch.Tensor:
+    """The last centimetres and degrees."""
+    return torch.exp(-m.position_error / 0.02 - m.attitude_error / 0.03)
+
+
+def joint_winding(m: Moment) -> torch.Tensor:
+    """Joints wound beyond half a turn: where they meet a stop sooner or later."""
+    return (m.tilt.abs() - torch.pi).clamp(min=0).sum(-1)
+
+
+def hover_tilt_rate(m: Moment) -> torch.Tensor:
+    """Restless tilt commands at the target."""
+    return near_pose(m) * joint_action_rate(m)
+
+
+def hover_thrust_rate(m: Moment) -> torch.Tensor:
+    """Restless thrust commands at the target."""
+    return near_pose(m) * thrust_action_rate(m)
+
+
+def sinking(m: Moment) -> torch.Tensor:
+    """Below both start and target, where a floor may be."""
+    return m.depth.clamp(max=2.0) ** 2
+
+
+TERMS = {term.__name__: term for term in (
+    position, pose, reach_position, reach_pose, linear_velocity, angular_velocity, joint_limit,
+    thrust_limit, joint_action_rate, thrust_action_rate, thrust_power, joint_acceleration,
+    z_axis_align, thrust_allocation, attitude, near_position, near_attitude, near_pose,
+    exact_pose, joint_winding, hover_tilt_rate, hover_thrust_rate, sinking)}
+
+
+def total(moment: Moment, weights: torch.Tensor) -> torch.Tensor:
+    """(N,) weighted sum; ``weights`` in the order of ``TERMS``."""
+    return torch.stack([term(moment) for term in TERMS.values()], -1) @ weights

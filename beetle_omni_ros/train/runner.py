@@ -1,0 +1,194 @@
+"""The training loop: schedule, progress, TensorBoard, checkpoints, resume."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+import time
+
+import numpy as np
+from rsl_rl.runners import OnPolicyRunner
+import torch
+
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.train import rewards
+from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
+from beetle_omni_ros.train.parameters import TrainParameters
+
+SCHEDULED = {'smooth': ('joint_action_rate', 'thrust_action_rate', 'hover_tilt_rate',
+                        'hover_thrust_rate'),
+             'near': ('near_position', 'near_attitude', 'near_pose')}
+SCHEDULE_EVERY = 10      # iterations between two changes of the schedule
+
+
+def rsl_rl_configuration(p: TrainParameters) -> dict:
+    """The parameters as the mapping that rsl-rl's runner takes."""
+    hidden = [int(size) for size in p.network.hidden]
+    stds = [float(p.network.tilt_std)] * 4 + [float(p.network.thrust_std)] * 4
+    place = 'beetle_omni_ros.train'
+    return {
+        'num_steps_per_env': p.ppo.steps, 'save_interval': p.save_every, 'logger': 'tensorboard',
+        'obs_groups': {'actor': ['actor'], 'critic': ['critic']}, 'check_for_nan': False,
+        'actor': {'class_name': f'{place}.network:ActorModel', 'hidden_dims': hidden,
+                  'activation': 'elu', 'output_scale': p.network.output_scale,
+                  'carry': p.network.carry, 'last_gain': p.network.last_gain,
+                  'distribution_cfg': {'class_name': f'{place}.network:BoundedGaussian',
+                                       'stds': stds}},
+        'critic': {'class_name': f'{place}.network:CriticModel', 'hidden_dims': hidden,
+                   'activation': 'elu'},
+        'algorithm': {'class_name': f'{place}.ppo:GraphPpo', 'num_learning_epochs': p.ppo.epochs,
+                      'num_mini_batches': p.ppo.minibatches, 'clip_param': p.ppo.clip,
+                      'gamma': p.ppo.discount, 'lam': p.ppo.trace,
+                      'value_loss_coef': p.ppo.value_weight,
+                      'entropy_coef': float(p.schedule.entropy[0]),
+                      'learning_rate': p.ppo.learning_rate, 'max_grad_norm': p.ppo.gradient_norm,
+                      'use_clipped_value_loss': False, 'desired_kl': float(p.schedule.kl[0]),
+                      'rnd_cfg': None, 'symmetry_cfg': None}}
+
+
+class Runner(OnPolicyRunner):
+    """
+    rsl-rl's runner with a loop that keeps the GPU busy.
+
+    Args:
+        parameters: of the training.
+        robot: nominal robot.
+        folder: for checkpoints and the TensorBoard log; None: nothing is written.
+        device: torch device.
+        graphs: whether to capture CUDA graphs and compile; None: on one GPU.
+
+    """
+
+    def __init__(self, parameters: TrainParameters, robot: RobotParameters,
+                 folder: Path | None = None, device: str = 'cpu', graphs: bool | None = None):
+        self.parameters, self.folder = parameters, folder
+        torch.manual_seed(parameters.seed)
+        env = TiltableQuadrotorEnv(parameters, robot, device,
+                                   compiled=graphs if graphs is not None else None)
+        super().__init__(env, rsl_rl_configuration(parameters),
+                         str(folder) if folder else None, device)
+        if self.is_distributed:
+            torch.manual_seed(parameters.seed + 1000 * self.gpu_global_rank)
+        if graphs is None:
+            graphs = torch.device(device).type == 'cuda' and not self.is_distributed
+        self.alg.prepare(env, parameters.ppo.learning_rate_limits, graphs, graphs)
+        self.trained_seconds = 0.0
+
+    def knobs(self, part: float) -> tuple[list[float], dict[str, float]]:
+        """
+        The schedule after a part of the iterations.
+
+        Returns:
+            desired KL, entropy weight, bounds of the standard deviations of tilt and thrust
+            actions, severity of disturbances; factors on reward weights by term.
+
+        """
+        s = self.parameters.schedule
+        done = float(np.clip((part - s.begin) / max(s.end - s.begin, 1e-9), 0.0, 1.0))
+
+        def at(span):
+            return float(span[0] + done * (span[1] - span[0]))
+
+        factors = {term: at(getattr(s, name)) for name, terms in SCHEDULED.items()
+                   for term in terms}
+        return [at(s.kl), at(s.entropy), at(s.tilt_std_limit), at(s.thrust_std_limit),
+                at(s.severity)], factors
+
+    def apply_schedule(self, part: float) -> None:
+        """Bring optimiser and environment to the schedule's state at a part of the training."""
+        knobs, factors = self.knobs(part)
+        self.alg.knobs.copy_(torch.tensor(knobs[:4]))
+        self.env.severity.fill_(knobs[4])
+        weights = [factors.get(name, 1.0) for name in rewards.TERMS]
+        self.env.weights.copy_(self.env.base_weights * torch.tensor(
+            weights, device=self.env.device))
+
+    def train(self, progress: Callable[[dict], None] = lambda row: None,
+              stop_after: float | None = None) -> None:
+        """
+        Run the iterations that are left.
+
+        Args:
+            progress: called with a row of numbers every ``log_every`` iterations.
+            stop_after: stop early after so many seconds.
+
+        """
+        p = self.parameters
+        writer = self._writer()
+        began, first = time.monotonic(), self.current_learning_iteration
+        for iteration in range(first, p.iterations):
+            if iteration % SCHEDULE_EVERY == 0 or iteration == first:
+                self.apply_schedule(iteration / p.iterations)
+            self.alg.collect()
+            self.alg.learn_batch()
+            self.current_learning_iteration = iteration + 1
+            last = iteration + 1 == p.iterations
+            if last or (iteration + 1) % p.log_every == 0:
+                row = self._row(time.monotonic() - began, iteration + 1 - first)
+                if not np.isfinite(row['value_loss']):
+                    raise FloatingPointError(
+                        f'iteration {iteration + 1}: the value loss is not finite; the last '
+                        f'checkpoint in {self.folder} is the one to resume from')
+                self._write(writer, row)
+                progress(row)
+                if stop_after is not None and row['seconds'] > stop_after:
+                    break
+            if self.folder and not last and (iteration + 1) % p.save_every == 0:
+                self.checkpoint()
+        self.trained_seconds += time.monotonic() - began
+        if self.folder:
+            self.checkpoint()
+        if writer:
+            writer.close()
+
+    def checkpoint(self) -> Path:
+        """Write ``model_ITERATION.pt``, whole or not at all."""
+        path = self.folder / f'model_{self.current_learning_iteration}.pt'
+        part = path.with_suffix('.part')
+        self.save(str(part))
+        part.replace(path)
+        return path
+
+    def resume(self, path: Path) -> None:
+        """
+        Continue from a checkpoint.
+
+        Raises:
+            ParameterError: unreadable file, or one of another network.
+
+        """
+        try:
+            self.load(str(path), map_location=str(self.env.device))
+        except (OSError, RuntimeError, KeyError, ValueError, EOFError) as error:
+            text = ' '.join(str(error).split())
+            raise ParameterError(f'{path}: no checkpoint that fits this training '
+                                 f'({text[:160]})') from None
+        rate = self.alg.optimizer.param_groups[0]['lr']
+        self.alg.rate.copy_(torch.as_tensor(float(rate)))
+        if self.alg._capturable:
+            self.alg.optimizer.param_groups[0]['lr'] = self.alg.rate
+
+    def _row(self, seconds, iterations):
+        tally = self.env.read_tally()
+        value, surrogate, entropy, divergence = self.alg.losses.tolist()
+        std = self.alg.std.tolist()
+        samples = iterations * self.parameters.ppo.steps * self.env.num_envs
+        return {'iteration': self.current_learning_iteration, 'seconds': seconds,
+                'samples_per_second': samples / max(seconds, 1e-9), **tally,
+                'value_loss': value, 'surrogate_loss': surrogate, 'entropy': entropy,
+                'divergence': divergence, 'learning_rate': float(self.alg.rate),
+                'tilt_std': sum(std[:4]) / 4, 'thrust_std': sum(std[4:]) / 4}
+
+    def _writer(self):
+        if self.folder is None:
+            return None
+        from torch.utils.tensorboard import SummaryWriter
+        return SummaryWriter(str(self.folder))
+
+    def _write(self, writer, row):
+        if writer:
+            for name, value in row.items():
+                if name != 'iteration':
+                    group = name if '/' in name else f'train/{name}'
+                    writer.add_scalar(group, value, row['iteration'])

@@ -1,0 +1,139 @@
+"""Initial states, targets and what is random about a robot: drawn for a whole batch."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.train import batch
+from beetle_omni_ros.train.model import nominal_body
+from beetle_omni_ros.train.parameters import TrainParameters
+
+STRATA = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
+NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
+PAYLOAD_DEPTH = 0.08                   # [m] below base_link, as the simulated plant hangs it
+
+
+class Starts:
+    """
+    Draws new robots; a robot's stratum of initial states follows from its index.
+
+    Args:
+        parameters: of the training.
+        robot: nominal.
+        count: N robots.
+        device: of the tensors.
+
+    Attributes:
+        severity: () factor on forces and payloads of new robots, set by the schedule.
+        stratum: (N,) index into ``STRATA`` of each robot.
+
+    """
+
+    def __init__(self, parameters: TrainParameters, robot: RobotParameters, count: int, device):
+        self._p, self._robot, self._device, self._count = parameters, robot, device, count
+
+        def tensor(values):
+            return torch.tensor(np.asarray(values, dtype=float), dtype=torch.float32,
+                                device=device)
+
+        shares = np.array([getattr(parameters.start, name) for name in STRATA])
+        edges = np.cumsum(shares) / shares.sum()
+        # interleaved, so that any part of the batch holds all strata
+        place = (np.arange(count) * 0.6180339887498949 + 0.5) % 1.0
+        stratum = np.searchsorted(edges, place, side='right').clip(0, len(STRATA) - 1)
+        self._is = {name: torch.tensor(stratum == k, device=device)[:, None]
+                    for k, name in enumerate(STRATA)}
+        self.stratum = stratum
+        self._inverse = tensor(Allocator(robot).inverse[:, :3])
+        self._weight = tensor([0.0, 0.0, nominal_body(robot)[0] * robot.gravity])
+        self._body = tensor(nominal_body(robot))
+        self._region = tensor(parameters.episode.region)
+        self.severity = torch.ones((), device=device)
+        self._limit = float(robot.joints.position_limit)
+        # plain numbers: a compiler would take numpy's for tensors of the host
+        self._target_time = [float(t) / parameters.episode.period
+                             for t in parameters.episode.target_time]
+        r = parameters.random
+        self._latencies = [[float(t) for t in span] for span in (
+            r.command_latency, r.command_latency, r.velocity_latency, r.tilt_latency)]
+
+    def draw(self, d: batch.Draw) -> dict[str, torch.Tensor]:
+        """States of N new robots, every entry of the environment's state."""
+        attitude = d.attitude()
+        hovering = self._is['hover'] | self._is['hold'] | self._is['moving']
+        tilt, thrust = self._hover(d, attitude)
+        third = torch.floor(d.uniform(4) * 3) - 1
+        wound = torch.where(self._is['wound'], 1.0, torch.where(
+            self._is['wound_back'], -1.0, torch.where(self._is['mixed'], third, 0.0)))
+        tilt = torch.where(hovering, tilt, torch.pi * wound)
+        thrust = torch.where(hovering, thrust, self._robot.hover_thrust)
+        start = self._p.start
+        moving = self._is['moving']
+        velocity = moving * d.around(start.velocity, 3)
+        rate = moving * d.around(start.rate, 3)
+        zeros = torch.zeros_like(tilt)
+        x = torch.cat((zeros[:, :3], velocity, attitude, rate, tilt, zeros, thrust), -1)
+        body_velocity = batch.turned_back(batch.matrix(attitude), velocity)
+        motion = torch.cat((body_velocity, rate), -1)
+        command = torch.cat((tilt, thrust), -1)
+        state = {'x': x, 'previous': command, 'older': command,
+                 'past_motion': motion[:, None].expand(-1, 3, -1),
+                 'past_tilt': tilt[:, None].expand(-1, 2, -1),
+                 'age': torch.zeros_like(tilt[:, 0])}
+        state.update(self.target(d, x[:, :3], attitude))
+        state['target_attitude'] = torch.where(self._is['hold'], attitude,
+                                               state['target_attitude'])
+        state.update(self._randomisation(d))
+        return {name: value.contiguous() for name, value in state.items()}
+
+    def _hover(self, d, attitude):
+        """Tilts and thrusts that carry the robot at an attitude, some joints a turn further."""
+        pull = batch.turned_back(batch.matrix(attitude), self._weight.expand(self._count, 3))
+        parts = (pull @ self._inverse.T).unflatten(-1, (4, 2))
+        tilt = torch.atan2(parts[:, :, 1], parts[:, :, 0])
+        turned = tilt - 2 * torch.pi * torch.sign(tilt)
+        other = (d.uniform(4) < self._p.start.other_branch) & (turned.abs() < self._limit - 0.05)
+        return torch.where(other, turned, tilt), parts.norm(dim=-1)
+
+    def target(self, d: batch.Draw, position: torch.Tensor, attitude: torch.Tensor) -> dict:
+        """New targets for robots at a pose, some of them near it."""
+        e = self._p.episode
+        near = d.chance(e.hold_targets)
+        offset = d.uniform(3, -1.0, 1.0)
+        angle = d.around(1.0, 3)
+        place = torch.where(near, position + NEAR_POSITION * offset, 0.5 * self._region * offset)
+        turned = batch.product(attitude, batch.from_rotation_vector(NEAR_ANGLE * angle))
+        target = torch.where(near, turned, d.attitude())
+        return {'target_position': place, 'target_attitude': target,
+                'target_left': torch.floor(d.uniform(1, *self._target_time))[:, 0],
+                'floor': torch.minimum(place[:, 2:], position[:, 2:])}
+
+    def _randomisation(self, d):
+        r = self._p.random
+        body = self._body.expand(self._count, -1)
+        load = self.severity * d.chance(r.payload_share) * d.uniform(1, 0.0, r.payload)
+        mass = body[:, 0:1] * (1 + d.around(r.mass_scale, 1))
+        inertia = body[:, 1:4] * (1 + d.around(r.inertia_scale, 3))
+        centre = body[:, 4:7] + d.around(r.centre_of_mass, 3)
+        down = torch.cat((torch.zeros_like(centre[:, :2]), -PAYLOAD_DEPTH * load), -1)
+        total = mass + load
+        centre = (mass * centre + down) / total
+        forced = d.chance(r.force_share)
+        strong = d.chance(r.strong_share)
+        force = forced * d.around(r.force, 3) + strong * d.around(r.strong_force, 3)
+        wrench = self.severity * torch.cat((force, forced * d.around(r.torque, 3)), -1)
+        noise = d.uniform(1) ** r.noise_power
+        bias = noise * torch.cat((
+            d.around(r.position_bias, 3), d.around(r.attitude_bias, 3),
+            d.around(r.velocity_bias, 3), d.around(r.rate_bias, 3), d.around(r.tilt_bias, 4),
+            d.around(self._p.estimate.force_bias, 3),
+            d.around(self._p.estimate.torque_bias, 3)), -1)
+        delays = torch.cat([d.uniform(1, *span) for span in self._latencies], -1)
+        pushed = d.chance(r.push_share)
+        disturbed = (forced | strong | pushed | (load > 0)).float()
+        return {'body': torch.cat((total, inertia, centre), -1), 'wrench': wrench,
+                'noise': noise, 'bias': bias, 'delays': delays, 'pushed': pushed.float(),
+                'disturbed': disturbed, 'estimate': torch.zeros_like(wrench)}
