@@ -1,6 +1,7 @@
 """rl_node as a real process, and the change between controllers in a real flight."""
 
 from dataclasses import replace
+import json
 import os
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import JointState
-from witness import PATIENT, READY, Witness
+from witness import HEADER, PATIENT, READY, Witness
 
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
@@ -23,6 +24,7 @@ from beetle_omni_ros.nodes.standby import controller_nodes, unfit
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 
 pytest.importorskip('onnx')
@@ -213,3 +215,21 @@ def is_smooth(commands, targets):
     thrust = np.abs(np.diff([command.thrust for command in commands], axis=0))
     return np.all(tilt <= limits.tilt_rate * steps) and np.all(thrust
                                                                <= limits.thrust_rate * steps)
+
+
+def test_one_call_flies_the_policy_and_the_bag_holds_both_controllers(tmp_path):
+    policy = write_hover_policy(tmp_path / 'hover.onnx', memory=True)
+    task, bag, result = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'result.json'
+    task.write_text(HEADER + '0.3,0,1,20,0,0\n')
+    done = subprocess.run(
+        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--controller', 'rl', '--policy',
+         str(policy), '--task', str(task), '--bag', str(bag), '--json', str(result)],
+        capture_output=True, text=True, timeout=READY, check=False)
+    assert done.returncode == 0, done.stderr
+    results = json.loads(result.read_text())
+    assert set(results) == {'meta', 'rl'} and results['rl']['success_rate'] == 1.0
+    log = read_bag(bag)
+    assert 'flying:rl' in log.states and 'flying:nmpc' not in log.states
+    for name in ('nmpc', 'rl'):     # 8 s and the climb, 100 Hz
+        assert len(log.requests[name].t) > 900
+        assert log.compute[name]['count'] > 900
