@@ -83,8 +83,14 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ParameterError(f'{output}: cannot write there ({error.strerror})') from None
-    flown = _fly(flights, Store(cache or output / KEPT), console, backend=backend, jobs=jobs,
-                 fresh=fresh, address=address)
+    store = Store(cache or output / KEPT)
+    try:
+        flown = _fly(flights, store, console, backend=backend, jobs=jobs, fresh=fresh,
+                     address=address)
+    except KeyboardInterrupt:
+        print(f'beetle_omni: finished flights are kept in {store.folder}; the same command goes '
+              'on from there', file=sys.stderr)
+        raise
     results = _results(flown, arguments, there, skipped, policy)
     _write(results, flown, output, console)
     if json_path:
@@ -159,12 +165,14 @@ def _results(flown, arguments, there, skipped, policy):
     files = {name: policy_file(name, policy) for name in there}
     command = (f"beetle_omni compare --controllers {','.join(there)} --tasks {','.join(tasks)} "
                f"--conditions {','.join(conditions)}"
-               + (f" --seeds {','.join(map(str, seeds))}" if seeds else ''))
+               + (f" --seeds {','.join(map(str, seeds))}" if seeds else '')
+               + (f' --policy {policy}' if policy else ''))
     return {
         'meta': {'version': __version__, 'commit': commit(), 'command': command,
                  'controllers': there, 'skipped': skipped, 'tasks': list(tasks),
                  'conditions': list(conditions),
                  'seeds': sorted({flight.seed for flight in flights}),
+                 'policy_file': str(policy) if policy else None,
                  'policies': {name: f'{file.name} ({file_digest(file)})'
                               for name, file in files.items() if file},
                  'cpu_s': sum(result.get('cpu_s', 0.0) for result in flown.values()),
@@ -216,7 +224,7 @@ def _rich(grid: Grid, results: dict, width: int) -> Table:
              if column.group != 'published' or width >= WIDE]
     table = Table(title=grid.title, title_justify='left', title_style='bold', box=None,
                   header_style='dim', padding=(0, 2, 0, 0))
-    table.add_column('', min_width=24)
+    table.add_column('', ratio=1)
     for column in (grid.columns[k] for k in shown):
         is_ours = column.group != 'published'
         name = look(column.controller).label

@@ -37,7 +37,8 @@ class Number:
         value = self.value(results)
         if value is None or not isfinite(value):
             return ABSENT
-        return f'{value:g}' if self.digits is None else f'{value:.{self.digits}f}'
+        text = f'{value:g}' if self.digits is None else f'{value:.{self.digits}f}'
+        return text.removeprefix('-') if float(text) == 0 else text
 
 
 @dataclass(frozen=True)

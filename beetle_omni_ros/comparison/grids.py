@@ -70,7 +70,8 @@ class Task:
             if self.value(name, *keys, 'mean') is None:
                 return Cell()
             small = []
-            if self.value(name, *keys, 'max') is not None:
+            ends = [self.value(name, *keys, end) for end in ('min', 'max')]
+            if ends[0] != ends[1]:
                 low = self.number(name, *keys, 'min', digits=digits)
                 high = self.number(name, *keys, 'max', digits=digits)
                 small = ['[', low, ', ', high, ']'] if low.value(self.results) is not None \
@@ -96,8 +97,10 @@ class Task:
         """Shell lines that fly what the table shows."""
         seeds = sorted({seed for name in self.ours for seed in
                         self.numbers[self.conditions][name]['seeds']})
+        policy = self.results['meta']['policy_file'] if 'rl' in self.ours else None
         return [f"beetle_omni evaluate --controllers {','.join(self.ours)} --task {self.task} "
-                f'--conditions {self.conditions} --seed {seed}' for seed in seeds]
+                f'--conditions {self.conditions} --seed {seed}'
+                + (f' --policy {policy}' if policy else '') for seed in seeds]
 
     def grid(self, title, rows, notes=()):
         """Put the table together."""

@@ -77,7 +77,8 @@ def compute(results: dict) -> Grid:
                      'deadline_misses': ['–', '"occasionally"']}.get(key, ['–', '–'])
         rows.append((text, [*(Cell([number(name, key, digits)]) for name in ours),
                             *(Cell([part]) for part in published)]))
-    columns = [*(Column(name, OURS) for name in ours), *(Column(name, REAL) for name in PAPER)]
+    columns = [*(Column(name, 'ours, on this computer') for name in ours),
+               *(Column(name, REAL) for name in PAPER)]
     machine = results['meta'].get('machine', {})
     return Grid('CPU time of one controller step', columns, rows, [
         'Everything a controller does for one command, over all flights of this page: median of '
