@@ -27,7 +27,7 @@ PARAMETER_FILE, POLICY_FILE = 'train.yaml', 'policy.onnx'
 # A run that shows within a minute on a CPU that everything fits together; it learns nothing.
 SMOKE = {'iterations': 3, 'log_every': 1, 'save_every': 2, 'ppo.robots': 32, 'ppo.steps': 8,
          'ppo.epochs': 2, 'ppo.minibatches': 2, 'network.hidden': [32, 16, 16]}
-SMOKE_ROBOTS, ROBOTS = 8, 1024          # of the final assessment
+ROBOTS, CPU_ROBOTS = 1024, 64            # of the final assessment
 COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}'),
            ('samples_per_second', 'samples/s', '{:.2e}'), ('reward', 'reward', '{:+.4f}'),
            ('success_rate', 'reached', '{:.1%}'), ('position_error_m', 'error m', '{:.3f}'),
@@ -173,7 +173,7 @@ def run_train(*, output: Path, config: Path | None = None, robot: Path | None = 
 def _finish(runner, robot, output, device, seconds, smoke, json_path, console):
     """Assess, export, report."""
     parameters, actor = runner.parameters, runner.alg.actor
-    robots, segments = (SMOKE_ROBOTS, 1) if smoke else (ROBOTS, 3)
+    robots, segments = (ROBOTS, 2) if device.startswith('cuda') else (CPU_ROBOTS, 1)
     metrics = {name: assess(actor.mean, parameters, robot, device, name, robots, segments)
                for name in ('nominal', 'published')} if not smoke else {}
     path = output / POLICY_FILE

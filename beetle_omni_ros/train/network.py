@@ -9,6 +9,8 @@ well as metres. None of them depends on the heading of the world's axes.
 
 from __future__ import annotations
 
+import copy
+
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP
 from rsl_rl.modules.distribution import GaussianDistribution
@@ -130,14 +132,62 @@ class BoundedGaussian(GaussianDistribution):
 
 
 class ExportedPolicy(torch.nn.Module):
-    """What the ONNX file holds: raw observation in, mean action out."""
+    """
+    What the ONNX file holds: raw observation in, mean action out, in few operations.
+
+    The same function as :meth:`ActorModel.mean`, written for a single observation on one core:
+    features in groups that share an operation, all scales folded into the first and the last
+    layer. On board it takes half the time of the original.
+    """
 
     def __init__(self, actor: ActorModel):
         super().__init__()
-        self.mlp: MLP = actor.mlp
-        self.output_scale, self.carry = actor.output_scale, actor.carry
+        self.carry = actor.carry
+        self.mlp: MLP = copy.deepcopy(actor.mlp).cpu()
+        sizes = dict(BLOCKS[:len(BLOCKS) if actor.obs_dim > ACTOR_SIZE else -2])
+        first = dict(zip(sizes, torch.arange(sum(sizes.values())).split(list(sizes.values()))))
+        order = torch.cat([first[name] for name in GROUPED if name in first])
+        scale = torch.cat([torch.full((size,), SCALES.get(name, 1.0))
+                           for name, size in sizes.items()])
+        with torch.no_grad():
+            weight = self.mlp[0].weight * scale
+            self.mlp[0].weight.copy_(weight[:, order])
+            self.mlp[-1].weight.mul_(actor.output_scale)
+            self.mlp[-1].bias.mul_(actor.output_scale)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """(1, 8) action of a (1, 33 or 39) observation."""
-        out = self.output_scale * self.mlp(features(observation))
-        return out + self.carry * observation[..., ACTION] if self.carry else out
+        out = self.mlp(grouped_features(observation))
+        return out + self.carry * observation[:, ACTION] if self.carry else out
+
+
+# Blocks of :func:`features` with their sizes, and the order in which the exported graph makes
+# them, without the scales.
+BLOCKS = (('velocity', 3), ('rate', 3), ('target', 3), ('target_fine', 3), ('relative', 9),
+          ('turn_fine', 3), ('up', 3), ('target_up', 3), ('tilt', 4), ('sine', 4), ('cosine', 4),
+          ('tilt_action', 4), ('thrust_action', 4), ('force', 3), ('torque', 3))
+GROUPED = ('velocity', 'rate', 'target', 'target_fine', 'turn_fine', 'relative', 'up',
+           'target_up', 'sine', 'cosine', 'tilt', 'tilt_action', 'thrust_action', 'force',
+           'torque')
+SCALES = {'rate': RATE, 'tilt_action': TILT_ACTION, 'thrust_action': THRUST_ACTION,
+          'force': FORCE, 'torque': TORQUE}
+
+
+def grouped_features(o: torch.Tensor) -> torch.Tensor:
+    """(1, 50 or 56) features of one observation, unscaled, in the order ``GROUPED``."""
+    def take(values, *places):
+        return torch.index_select(values, -1, torch.tensor(places))
+
+    # y = z x x of body and target, entry by entry: both axes rotated once and twice
+    y = take(o, 13, 14, 12, 19, 20, 18) * take(o, 11, 9, 10, 17, 15, 16) \
+        - take(o, 14, 12, 13, 20, 18, 19) * take(o, 10, 11, 9, 16, 17, 15)
+    axes = torch.cat((o[:, ATTITUDE], o[:, TARGET_ATTITUDE], y), -1)    # x z, x* z*, y y*
+    body = take(axes, 0, 1, 2, 12, 13, 14, 3, 4, 5).reshape(3, 3)
+    goal = take(axes, 6, 15, 9, 7, 16, 10, 8, 17, 11).reshape(3, 3)
+    relative = (body @ goal).reshape(1, 9)
+    turn = 0.5 * (take(relative, 7, 2, 3) - take(relative, 5, 6, 1))
+    errors = torch.cat((o[:, TARGET], turn), 0)
+    up = take(axes, 2, 14, 5, 8, 17, 11)
+    tilt = o[:, TILT]
+    return torch.cat((o[:, :9], _fine(errors).reshape(1, 6), relative, up, torch.sin(tilt),
+                      torch.cos(tilt), o[:, 21:]), -1)

@@ -136,7 +136,7 @@ class RewardWeights:
     near_attitude: float = parameter(1.0, doc='own: slope close to the target')
     near_pose: float = parameter(1.0, doc='own: slope close to the target')
     exact_pose: float = parameter(1.0, doc='own: slope in the last centimetres')
-    joint_winding: float = parameter(-0.1, doc='own: joints beyond half a turn')
+    joint_winding: float = parameter(-1.0, doc='own: joints beyond half a turn')
     hover_tilt_rate: float = parameter(-5.0, doc='own: smooth commands at the target')
     hover_thrust_rate: float = parameter(-0.15, doc='own: smooth commands at the target')
     sinking: float = parameter(-0.5, doc='own: below both start and target')
@@ -151,12 +151,12 @@ class NetworkParameters:
     hidden: np.ndarray = parameter([512, 256, 128], doc='published')
     output_scale: float = parameter(4.0, doc='action for each unit of the last layer', low=0.01,
                                     high=100)
-    carry: float = parameter(0.0, doc='part of the previous action that the output is added to',
+    carry: float = parameter(0.5, doc='part of the previous action that the output is added to',
                              low=0, high=1)
     last_gain: float = parameter(0.01, doc='initial gain of the last layer', low=0, high=10)
-    tilt_std: float = parameter(1.0, doc='initial standard deviation of the tilt actions', low=0,
+    tilt_std: float = parameter(0.7, doc='initial standard deviation of the tilt actions', low=0,
                                 high=10)
-    thrust_std: float = parameter(3.0, doc='of the thrust actions', low=0, high=10)
+    thrust_std: float = parameter(2.0, doc='of the thrust actions', low=0, high=10)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,9 +185,9 @@ class ScheduleParameters:
     end: float = parameter(0.8, doc='part at which it is complete', low=0, high=1)
     kl: np.ndarray = parameter([0.01, 0.005], doc='desired divergence of an update', shape=(2,))
     entropy: np.ndarray = parameter([5e-4, 0.0], doc='weight of the entropy', shape=(2,))
-    tilt_std_limit: np.ndarray = parameter([1.0, 0.2], doc='largest standard deviation of the '
+    tilt_std_limit: np.ndarray = parameter([0.8, 0.15], doc='largest standard deviation of the '
                                            'tilt actions, in actions', shape=(2,))
-    thrust_std_limit: np.ndarray = parameter([4.0, 0.5], doc='the same, thrust', shape=(2,))
+    thrust_std_limit: np.ndarray = parameter([3.0, 0.4], doc='the same, thrust', shape=(2,))
     smooth: np.ndarray = parameter([0.1, 1.0], doc='factor on the weights of *_action_rate and '
                                    'hover_*_rate', shape=(2,))
     severity: np.ndarray = parameter([0.0, 1.0], doc='factor on forces, payloads and pushes',
@@ -200,7 +200,7 @@ class TrainParameters:
     """One training, completely: dumped beside its checkpoints."""
 
     seed: int = parameter(0, doc='of everything random', low=0, high=2**31 - 1)
-    iterations: int = parameter(6000, doc='PPO iterations', low=1, high=10**7)
+    iterations: int = parameter(10000, doc='PPO iterations', low=1, high=10**7)
     memory: bool = parameter(False, doc='whether the policy sees the estimated disturbance')
     log_every: int = parameter(50, doc='iterations between two rows of progress', low=1,
                                high=10**6)

@@ -82,7 +82,9 @@ def _load_kernel(source: str):
     folder = Path(tempfile.gettempdir()) / f'beetle_omni_{hashlib.md5(source.encode()).hexdigest()}'
     folder.mkdir(exist_ok=True)
     path = folder / 'kernel.py'
-    path.write_text(source)
+    with tempfile.NamedTemporaryFile('w', dir=folder, delete=False) as part:
+        part.write(source)
+    Path(part.name).replace(path)    # whole for others that read it at this moment
     spec = importlib.util.spec_from_file_location(folder.name, path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
