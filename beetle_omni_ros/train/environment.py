@@ -108,8 +108,9 @@ class TiltableQuadrotorEnv(VecEnv):
         asked = self.offset + self.scale * actions
         command = torch.clamp(asked, self._low, self._high)
         s = self.state
-        x = self.physics.advance(s['x'], (command, s['previous'], s['older']), s['delays'][:, :2],
-                                 s['wrench'], s['body'])
+        given = tuple(torch.cat((c[:, :4], torch.minimum(c[:, 4:], s['thrust_limit'])), -1)
+                      for c in (command, s['previous'], s['older']))
+        x = self.physics.advance(s['x'], given, s['delays'][:, :2], s['wrench'], s['body'])
         results = self._finish(s, x, asked, command, self._numbers(), self.weights)
         new, observation, critic, reward, done, timeout, tally = results
         torch._foreach_copy_([s[name] for name in new], list(new.values()))

@@ -79,6 +79,9 @@ class RandomParameters:
                                          unit='s', shape=(2,), low=0, high=0.02)
     command_latency: np.ndarray = parameter([0.005, 0.015], doc='until a command acts', unit='s',
                                             shape=(2,), low=0, high=0.02)
+    thrust_limit: np.ndarray = parameter(
+        [17.0, 20.0], doc='largest thrust that the battery gives, whatever is commanded', unit='N',
+        shape=(2,), low=0, high=100)
     force_share: float = parameter(0.3, doc='share of robots with a constant force', low=0, high=1)
     force: float = parameter(4.0, doc='its size, each axis up to', unit='N', low=0, high=50)
     strong_share: float = parameter(0.08, doc='share of robots with a strong constant force',
@@ -127,7 +130,8 @@ class RewardWeights:
     thrust_limit: float = parameter(-0.01, doc='published')
     joint_action_rate: float = parameter(-0.05, doc='published -5e-4')
     thrust_action_rate: float = parameter(-2e-3, doc='published -1e-4')
-    thrust_power: float = parameter(-1e-5, doc='published')
+    thrust_power: float = parameter(-3e-4, doc='published -1e-5; wasted thrust is missing '
+                                                'where a low battery limits it')
     joint_acceleration: float = parameter(-1.5e-5, doc='published')
     z_axis_align: float = parameter(-0.1, doc='published')
     thrust_allocation: float = parameter(-1e-5, doc='published')
@@ -139,7 +143,7 @@ class RewardWeights:
     joint_winding: float = parameter(-1.0, doc='own: joints beyond half a turn')
     hover_tilt_rate: float = parameter(-5.0, doc='own: smooth commands at the target')
     hover_thrust_rate: float = parameter(-0.15, doc='own: smooth commands at the target')
-    sinking: float = parameter(-0.5, doc='own: below both start and target')
+    sinking: float = parameter(-10.0, doc='own: below both start and target')
     termination: float = parameter(-800.0, doc='own: less than the worst flight would cost')
     scale: float = parameter(0.01, doc='of the sum')
 

@@ -59,6 +59,7 @@ class Starts:
         r = parameters.random
         self._latencies = [[float(t) for t in span] for span in (
             r.command_latency, r.command_latency, r.velocity_latency, r.tilt_latency)]
+        self._thrust_limit = [float(t) for t in r.thrust_limit]
 
     def draw(self, d: batch.Draw) -> dict[str, torch.Tensor]:
         """States of N new robots, every entry of the environment's state."""
@@ -134,6 +135,7 @@ class Starts:
         delays = torch.cat([d.uniform(1, *span) for span in self._latencies], -1)
         pushed = d.chance(r.push_share)
         disturbed = (forced | strong | pushed | (load > 0)).float()
-        return {'body': torch.cat((total, inertia, centre), -1), 'wrench': wrench,
+        return {'thrust_limit': d.uniform(1, *self._thrust_limit),
+                'body': torch.cat((total, inertia, centre), -1), 'wrench': wrench,
                 'noise': noise, 'bias': bias, 'delays': delays, 'pushed': pushed.float(),
                 'disturbed': disturbed, 'estimate': torch.zeros_like(wrench)}
