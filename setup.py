@@ -68,12 +68,15 @@ HARDWARE = [
     'pyserial>=3.5,<4',
 ]
 
+# onnxscript and tensorboard: torch's exporter and writer import them; rsl-rl-lib changes its API
+# with each major version.
 TRAIN = [
     'onnx>=1.16',
-    'onnxscript>=0.1',
-    'rsl-rl-lib>=3.0',
+    'onnxscript>=0.5',
+    'rsl-rl-lib>=5.5,<6',
     'tensorboard>=2.16',
-    'torch>=2.6',
+    'tensordict>=0.7',
+    'torch>=2.8,<3',
 ]
 
 # Clusters for `beetle_omni compare --backend ray`; 80 MB. Wheels for Python 3.13 begin with 2.45.

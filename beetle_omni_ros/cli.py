@@ -19,10 +19,9 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130
 CONDITIONS = ('nominal', 'published')
-# Modules that come with ROS, or with the package's extra 'ros'.
-ROS_MODULES = ('rclpy', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs',
-               'geometry_msgs', 'nav_msgs', 'rcl_interfaces', 'sensor_msgs', 'std_msgs',
-               'std_srvs', 'trajectory_msgs')
+# Modules that come with ROS, or with the package's extra 'ros'; those of the extra 'train'.
+ROS_MODULES, ROS_ENDINGS = ('rclpy', 'ament_index_python'), ('_msgs', '_srvs', '_interfaces')
+TRAIN_MODULES = ('onnx', 'onnxscript', 'rsl_rl', 'tensorboard', 'tensordict', 'torch')
 
 app = typer.Typer(no_args_is_help=True, add_completion=False,
                   context_settings={'help_option_names': ['-h', '--help']},
@@ -295,8 +294,11 @@ def main(args: list[str] | None = None) -> int:
         top = (error.name or '').partition('.')[0]
         if top == __package__:
             raise
-        cure = "source a ROS 2 Jazzy environment or pip install 'beetle_omni_ros[ros]'" \
-            if top in ROS_MODULES else 'pip install beetle_omni_ros brings it'
+        cure = 'pip install beetle_omni_ros brings it'
+        if top in ROS_MODULES or top.endswith(ROS_ENDINGS):
+            cure = "source a ROS 2 Jazzy environment or pip install 'beetle_omni_ros[ros]'"
+        elif top in TRAIN_MODULES:
+            cure = "pip install 'beetle_omni_ros[train]'"
         return _fail(f"the module '{top}' is not installed; {cure}", UNUSABLE)
     except ParameterError as error:
         return _fail(error, UNUSABLE)

@@ -21,13 +21,15 @@ ALLOWED = {
     'evaluation': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs'),
     'comparison': ('robot', 'runs', 'evaluation'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs'),
+    'train': ('robot', 'control.observation', 'control.policy_file', 'runs.json_file'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
-            'nodes'),
+            'nodes', 'train'),
 }
 
 # Library -> the only room that imports it.
 KEPT_IN = {'mujoco': 'sim', 'rclpy': 'nodes', 'launch': 'nodes', 'torch': 'train',
-           'dynamixel_sdk': 'drivers', 'pymavlink': 'drivers', 'serial': 'drivers'}
+           'rsl_rl': 'train', 'tensordict': 'train', 'dynamixel_sdk': 'drivers',
+           'pymavlink': 'drivers', 'serial': 'drivers'}
 
 
 def imports(path):

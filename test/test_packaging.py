@@ -20,6 +20,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.train.parameters import TrainParameters
 
 ROOT = Path(__file__).resolve().parents[1]
 MANIFEST = ElementTree.parse(ROOT / 'package.xml').getroot()
@@ -34,7 +35,8 @@ PARAMETER_CLASSES = {
     'ekf.yaml': EkfParameters, 'hover.yaml': HoverParameters, 'nmpc.yaml': NmpcParameters,
     'nmpc_published.yaml': NmpcParameters, 'rl.yaml': PolicyParameters,
     'robot.yaml': RobotParameters, 'robot_weak_and_heavy.yaml': RobotParameters,
-    'simulator.yaml': SimulatorParameters, 'supervisor.yaml': SupervisorParameters}
+    'simulator.yaml': SimulatorParameters, 'supervisor.yaml': SupervisorParameters,
+    'train.yaml': TrainParameters}
 
 
 @pytest.fixture(scope='module')
@@ -149,7 +151,7 @@ def test_every_import_is_a_declared_requirement(setup_arguments):
             assert module in keys, f'{module}: not in package.xml'
             continue
         assert DISTRIBUTION.get(module, module) in declared, f'{module}: not in setup.py'
-        if module not in ('torch', 'onnx', 'onnxscript', 'rsl_rl', 'tensorboard', 'ray'):
+        if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'ray'):
             candidates = {KEY.get(module), f'python3-{module}', f'python3-{module}-pip', module}
             assert keys & candidates, f'{module}: no rosdep key in package.xml'
 

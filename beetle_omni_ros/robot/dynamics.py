@@ -78,8 +78,8 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
     """
     rotors = robot.rotors
     terms = Terms(
-        mass=robot.mass, inertia=ca.DM(robot.inertia), centre_of_mass=None, torque=_given(torque_body, 3),
-        tilt=tilt, tilt_acceleration=_given(tilt_acceleration, 4),
+        mass=robot.mass, inertia=ca.DM(robot.inertia), centre_of_mass=None,
+        torque=_given(torque_body, 3), tilt=tilt, tilt_acceleration=_given(tilt_acceleration, 4),
         tilt_axes=[ca.DM(axis) for axis in robot.tilt_axes],
         thrust=thrust, velocity=velocity, angular_velocity=angular_velocity,
         rotation=rotation_matrix(quaternion),

@@ -17,7 +17,6 @@ import numpy as np
 
 from beetle_omni_ros.robot.schema import ParameterError
 
-
 _UP = ca.DM([0, 0, 1])
 
 
@@ -161,8 +160,9 @@ def _rotor_drag(terms, coefficient):
 CATALOGUE: dict[str, Effect] = {
     'mass': Effect('body', {'mass': EffectParameter('kg', float('nan'), 0.05, 200)}, _mass,
                    "m v' = F"),
-    'inertia': Effect('body', {'inertia': EffectParameter('kg m^2', (float('nan'),) * 3, 1e-5, 50)},
-                      _inertia, "I w' = tau - w x I w"),
+    'inertia': Effect(
+        'body', {'inertia': EffectParameter('kg m^2', (float('nan'),) * 3, 1e-5, 50)}, _inertia,
+        "I w' = tau - w x I w"),
     'centre_of_mass': Effect(
         'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2)}, _centre_of_mass,
         'forces turn the body about its centre of mass, base_link moves with it'),

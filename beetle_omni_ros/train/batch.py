@@ -18,9 +18,10 @@ def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Quaternion product (N, 4), first ``b`` then ``a``."""
     ax, ay, az, aw = a.unbind(-1)
     bx, by, bz, bw = b.unbind(-1)
-    return torch.stack((aw * bx + ax * bw + ay * bz - az * by, aw * by - ax * bz + ay * bw + az * bx,
-                        aw * bz + ax * by - ay * bx + az * bw, aw * bw - ax * bx - ay * by - az * bz),
-                       -1)
+    return torch.stack((aw * bx + ax * bw + ay * bz - az * by,
+                        aw * by - ax * bz + ay * bw + az * bx,
+                        aw * bz + ax * by - ay * bx + az * bw,
+                        aw * bw - ax * bx - ay * by - az * bz), -1)
 
 
 def from_rotation_vector(vector: torch.Tensor) -> torch.Tensor:

@@ -14,7 +14,6 @@ from rich.console import Console
 import torch
 import yaml
 
-
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import bind, flatten, nest, ParameterError
 from beetle_omni_ros.runs.json_file import write_json
@@ -80,7 +79,7 @@ def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
     flat = {name: value for name, _, _, value in flatten(parameters)}
     for key, value in changes.items():
         if key not in flat:
-            raise ParameterError(f"--set {key}: unknown; keys are those of params/train.yaml, "
+            raise ParameterError(f'--set {key}: unknown; keys are those of params/train.yaml, '
                                  'e.g. ppo.robots')
         flat[key] = value
     return bind(TrainParameters, nest(flat), '--set' if changes else str(file or ''))

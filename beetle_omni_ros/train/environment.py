@@ -13,6 +13,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 import torch
 
+from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train import batch, rewards, starts
@@ -20,7 +21,6 @@ from beetle_omni_ros.train.model import CENTRE, MASS, module_reaction, nominal_b
 from beetle_omni_ros.train.observations import actor_observation, critic_observation, Signals
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics
-from beetle_omni_ros.control.policy_file import PolicyContract
 
 NUMBERS = 136       # random numbers of a robot and a step
 REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] as the task metrics

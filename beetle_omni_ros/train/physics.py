@@ -79,7 +79,8 @@ def _kernel_source(function) -> str:
 
 def _load_kernel(source: str):
     """Import a Triton module; its compiler reads the source from a file."""
-    folder = Path(tempfile.gettempdir()) / f'beetle_omni_{hashlib.md5(source.encode()).hexdigest()}'
+    digest = hashlib.md5(source.encode()).hexdigest()
+    folder = Path(tempfile.gettempdir()) / f'beetle_omni_{digest}'
     folder.mkdir(exist_ok=True)
     path = folder / 'kernel.py'
     with tempfile.NamedTemporaryFile('w', dir=folder, delete=False) as part:

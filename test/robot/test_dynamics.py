@@ -129,7 +129,8 @@ def with_effect(**effects):
 
 @pytest.mark.parametrize('name', list(CATALOGUE))
 def test_an_effect_at_its_neutral_value_changes_nothing(name):
-    own = {'mass': ROBOT.mass, 'inertia': tuple(ROBOT.inertia), 'torque_to_thrust_ratio': ROBOT.rotors.torque_to_thrust_ratio}
+    own = {'mass': ROBOT.mass, 'inertia': tuple(ROBOT.inertia),
+           'torque_to_thrust_ratio': ROBOT.rotors.torque_to_thrust_ratio}
     values = {key: own.get(key, spec.neutral) for key, spec in CATALOGUE[name].parameters.items()}
     state = random_state(7)
     plain = model.body_acceleration(ROBOT)(*state)
