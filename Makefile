@@ -12,19 +12,22 @@ unexport LD_LIBRARY_PATH
 endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONHOME VIRTUAL_ENV
 
-.PHONY: help setup fly test lint evaluate compare report clean
+.PHONY: help setup setup-train fly test lint evaluate compare report clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1|/p' Makefile | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
 
-setup:  ## make .venv with everything (also: PYTHON=..., EXTRAS=...)
+setup:  ## make .venv with all but training (also: PYTHON=..., EXTRAS=...)
 	@PYTHON='$(PYTHON)' .ci/setup
+
+setup-train:  # the same with what training needs
+	@PYTHON='$(PYTHON)' .ci/setup train
 
 fly: setup  ## fly the waypoints in real time through ROS nodes; the bag lands in runs_out/
 	@mkdir -p runs_out
 	$(TOOL) fly --controller nmpc --task waypoints --bag runs_out/fly_$(RUN) $(ARGS)
 
-test: setup  ## the whole test suite
+test: setup-train  ## the whole test suite
 	@.venv/bin/python -m pytest $(ARGS)
 
 lint: setup  ## style of every Python file
