@@ -80,7 +80,7 @@ class RandomParameters:
     command_latency: np.ndarray = parameter([0.005, 0.015], doc='until a command acts', unit='s',
                                             shape=(2,), low=0, high=0.02)
     thrust_limit: np.ndarray = parameter(
-        [17.0, 20.0], doc='largest thrust that the battery gives, whatever is commanded', unit='N',
+        [16.0, 20.0], doc='largest thrust that the battery gives, whatever is commanded', unit='N',
         shape=(2,), low=0, high=100)
     force_share: float = parameter(0.3, doc='share of robots with a constant force', low=0, high=1)
     force: float = parameter(4.0, doc='its size, each axis up to', unit='N', low=0, high=50)
@@ -130,7 +130,7 @@ class RewardWeights:
     thrust_limit: float = parameter(-0.01, doc='published')
     joint_action_rate: float = parameter(-0.05, doc='published -5e-4')
     thrust_action_rate: float = parameter(-2e-3, doc='published -1e-4')
-    thrust_power: float = parameter(-3e-4, doc='published -1e-5; wasted thrust is missing '
+    thrust_power: float = parameter(-5e-4, doc='published -1e-5; wasted thrust is missing '
                                                 'where a low battery limits it')
     joint_acceleration: float = parameter(-1.5e-5, doc='published')
     z_axis_align: float = parameter(-0.1, doc='published')
