@@ -1,0 +1,54 @@
+"""Small trainings for the tests of train/; without the extra 'train' every user of this skips."""
+
+import pytest
+
+for module in ('torch', 'tensordict', 'rsl_rl', 'onnx', 'onnxscript', 'tensorboard'):
+    pytest.importorskip(module, reason=f"{module} of the extra 'train' is not installed; "
+                                       'the line of make test about it says why')
+
+import torch    # noqa: E402
+
+from beetle_omni_ros.robot.parameters import RobotParameters    # noqa: E402
+from beetle_omni_ros.train.command import read_parameters    # noqa: E402
+from beetle_omni_ros.train.environment import TiltableQuadrotorEnv    # noqa: E402
+
+torch.set_num_threads(1)    # the other threads would only disturb on so small batches
+ROBOT = RobotParameters.load()
+SMALL = {'ppo.robots': 16, 'ppo.steps': 6, 'ppo.epochs': 2, 'ppo.minibatches': 2,
+         'network.hidden': [16, 16], 'iterations': 4, 'log_every': 1, 'save_every': 2}
+# Neither noise nor bias nor disturbance, robots as the file says, latencies of one period.
+QUIET = {f'random.{name}': 0.0 for name in (
+    'mass_scale', 'inertia_scale', 'centre_of_mass', 'position_bias', 'position_noise',
+    'attitude_bias', 'attitude_noise', 'velocity_bias', 'velocity_noise', 'rate_bias',
+    'rate_noise', 'tilt_bias', 'tilt_noise', 'force_share', 'strong_share', 'payload_share',
+    'push_share')} | {f'estimate.{name}': 0.0 for name in (
+        'force_bias', 'force_noise', 'torque_bias', 'torque_noise')} | {
+    'random.velocity_latency': [0.0, 0.0], 'random.tilt_latency': [0.0, 0.0],
+    'random.command_latency': [0.01, 0.01], 'random.thrust_limit': [20.0, 20.0]}
+
+
+def small(changes=None, **more):
+    """Shipped parameters at a tiny size; dotted names -> values on top of them."""
+    return read_parameters(None, {**SMALL, **(changes or {}), **more})
+
+
+def environment(changes=None, robots=64, seed=0, robot=ROBOT, **more):
+    """Seeded small environment on the CPU."""
+    torch.manual_seed(seed)
+    return TiltableQuadrotorEnv(small(changes, **{'ppo.robots': robots, **more}), robot)
+
+
+def quiet(changes=None, **more):
+    """:func:`environment` in which everything is known."""
+    return environment({**QUIET, **(changes or {})}, **more)
+
+
+def only(stratum):
+    """Parameters with all robots in one stratum of initial states."""
+    names = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
+    return {f'start.{name}': float(name == stratum) for name in names}
+
+
+def uniform(generator, low, high, *shape):
+    """Random tensor in [low, high)."""
+    return low + (high - low) * torch.rand(*shape, generator=generator)

@@ -1,0 +1,180 @@
+"""The written-out functions are the CasADi functions."""
+
+import ast
+from dataclasses import replace
+import sys
+from types import ModuleType, SimpleNamespace
+
+import casadi as ca
+from learning import ROBOT, uniform
+import numpy as np
+import pytest
+import torch
+
+from beetle_omni_ros.robot.effects import CATALOGUE, validated
+from beetle_omni_ros.train import codegen, model, physics
+
+EFFECTS = validated({
+    'mass': {'mass': 3.3}, 'inertia': {'inertia': [0.08, 0.07, 0.11]},
+    'centre_of_mass': {'offset': [0.01, -0.015, 0.02]},
+    'module_reaction': {'module_inertia': 2e-4, 'mass_moment': 3e-3},
+    'thrust_coefficient': {'scale': 0.93},
+    'rotor_thrust_coefficient': {'scale': [1.0, 0.9, 1.05, 0.97]},
+    'torque_coefficient': {'torque_to_thrust_ratio': 0.021}, 'wind': {'force': [1.0, -2.0, 0.5]},
+    'body_drag': {'coefficient': 0.11}, 'rotor_drag': {'coefficient': 0.4}})
+EVERYTHING = replace(ROBOT, effects=EFFECTS)
+
+
+def states(count, seed=0, dtype=torch.float64):
+    """States, commands, wrenches and bodies, also at and beyond all limits."""
+    g = torch.Generator().manual_seed(seed)
+    limit, rate = ROBOT.joints.position_limit, ROBOT.joints.velocity_limit
+    quaternion = torch.nn.functional.normalize(torch.randn(count, 4, generator=g), dim=-1)
+    tilt, joint_rate = uniform(g, -limit, limit, count, 4), uniform(g, -rate, rate, count, 4)
+    tilt[::3] = limit * torch.sign(tilt[::3])
+    joint_rate[::4] = rate * torch.sign(joint_rate[::4])
+    thrust = uniform(g, 0, 20, count, 4)
+    thrust[::5] = 20 * torch.round(thrust[::5] / 20)
+    x = torch.cat((torch.randn(count, 6, generator=g), quaternion,
+                   torch.randn(count, 3, generator=g), tilt, joint_rate, thrust), -1)
+    u = torch.cat((uniform(g, -6, 6, count, 4), uniform(g, -5, 25, count, 4)), -1)
+    body = torch.tensor(model.nominal_body(EVERYTHING)) * uniform(g, 0.9, 1.1, count, 7)
+    return [value.to(dtype) for value in (x, u, torch.randn(count, 6, generator=g), body)]
+
+
+@pytest.mark.parametrize('robot', [ROBOT, EVERYTHING, replace(ROBOT, multibody=None)],
+                         ids=['shipped', 'every effect', 'one rigid body'])
+def test_torch_computes_what_casadi_computes(robot):
+    assert set(EFFECTS) == set(CATALOGUE)
+    function = model.substep(robot, 0.0025)
+    inputs = states(200)
+    ours = codegen.torch_function(function)(*inputs).numpy()
+    theirs = np.array(function.map(200)(*(value.numpy().T for value in inputs))).T
+    assert ours.dtype == np.float64
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-10)
+
+
+def test_the_precision_is_that_of_the_inputs():
+    step = codegen.torch_function(model.substep(ROBOT, 0.0025))
+    inputs = states(50)
+    inputs[0][:, 13:17] *= 0.95     # away from the stops, where rounding decides who is held
+    single = step(*(value.float() for value in inputs))
+    assert single.dtype == torch.float32
+    np.testing.assert_allclose(single.numpy(), step(*inputs).numpy(), atol=1e-5)
+
+
+def test_every_operation_of_the_tables_is_right_also_with_constants():
+    x, y = ca.SX.sym('x', 2), ca.SX.sym('y', 2)
+    a, b = x[0], y[1]
+    inside = ca.logic_and(a > -1, ca.logic_not(ca.logic_or(b <= 0.3, a != a)))
+    out = ca.vertcat(
+        a + b, a - b, a * b, a / b, -a, a * a, 2 * a, 1 / b, ca.sqrt(b), ca.sin(a), ca.cos(a),
+        ca.exp(a), ca.fabs(a), ca.fmin(a, b), ca.fmax(a, b), ca.fmin(a, 0.1), ca.fmax(0.1, a),
+        ca.if_else(a < 0.2, b, 3.0), ca.if_else(a == a, b, 0), inside, 7.0)
+    function = ca.Function('sample', [x, y], [out], ['x', 'y'], ['z'])
+    rng = np.random.default_rng(1)
+    x, y = rng.normal(size=(60, 2)), rng.uniform(0.1, 2, (60, 2))
+    ours = codegen.torch_function(function)(torch.tensor(x), torch.tensor(y)).numpy()
+    np.testing.assert_allclose(ours, np.array(function.map(60)(x.T, y.T)).T, atol=1e-14)
+
+
+def test_an_unknown_operation_is_refused_by_name():
+    x = ca.SX.sym('x', 2)
+    function = ca.Function('turning', [x], [ca.atan2(x[0], x[1])], ['x'], ['y'])
+    with pytest.raises(NotImplementedError, match='turning'):
+        codegen.torch_function(function)
+
+
+def test_the_kernel_loads_uses_and_stores_each_number():
+    source = physics._kernel_source(model.substep(EVERYTHING, 0.0025))
+    ast.parse(source)
+    for name, array, size in (('x', 'x_in', 25), ('wrench', 'wrench', 6), ('body', 'body', 7),
+                              ('newest', 'newest', 8), ('previous', 'previous', 8),
+                              ('oldest', 'oldest', 8)):
+        for k in range(size):
+            assert f'{name}_{k} = tl.load({array} + {size} * i + {k}, mask' in source
+    for k in range(25):
+        assert f'        x_{k} = x_next_{k}\n' in source
+        assert f'tl.store(x_out + 25 * i + {k}, x_{k}, mask=mask)' in source
+
+
+class Pointer:
+    """Address arithmetic of Triton on a flat tensor."""
+
+    def __init__(self, values, places=0):
+        self.values, self.places = values, places
+
+    def __add__(self, more):
+        return Pointer(self.values, self.places + more)
+
+
+class Program:
+    """A Triton function, run one program after the other with torch in place of the compiler."""
+
+    def __init__(self, function):
+        self.function = function
+
+    def __call__(self, *arguments):
+        return self.function(*arguments)
+
+    def __getitem__(self, grid):
+        def launch(*arguments, num_warps, **constants):
+            pointers = [Pointer(value.view(-1)) if torch.is_tensor(value) else value
+                        for value in arguments]
+            for Program.index in range(grid[0]):
+                self.function(*pointers, **constants)
+        return launch
+
+
+def load(pointer, mask, other):
+    """Read where the mask allows it; reading elsewhere would leave the tensor."""
+    out = torch.full(mask.shape, other, dtype=pointer.values.dtype)
+    out[mask] = pointer.values[pointer.places[mask]]
+    return out
+
+
+def store(pointer, value, mask):
+    """Write where the mask allows it."""
+    pointer.values[pointer.places[mask]] = value[mask]
+
+
+@pytest.fixture
+def triton(monkeypatch):
+    """Stand in for the package triton, with the few words that the kernel uses."""
+    language = SimpleNamespace(
+        constexpr=int, float32=torch.float32, program_id=lambda axis: Program.index,
+        arange=torch.arange, load=load, store=store, where=torch.where, sin=torch.sin,
+        cos=torch.cos, exp=torch.exp, abs=torch.abs,
+        sqrt=lambda a: torch.sqrt(torch.as_tensor(a)),
+        minimum=lambda a, b: torch.minimum(torch.as_tensor(a), torch.as_tensor(b)),
+        maximum=lambda a, b: torch.maximum(torch.as_tensor(a), torch.as_tensor(b)))
+    package, words = ModuleType('triton'), ModuleType('triton.language')
+    package.jit, package.language = Program, words
+    vars(words).update(vars(language))
+    monkeypatch.setitem(sys.modules, 'triton', package)
+    monkeypatch.setitem(sys.modules, 'triton.language', words)
+
+
+@pytest.mark.parametrize('count', [1, physics.BLOCK, 150])
+def test_the_kernel_does_what_torch_does(triton, count):
+    made = physics.Physics(EVERYTHING, 0.01, 4, 'cpu', kernel=True)
+    assert made.has_kernel
+    x, _, wrench, body = states(count, 3, torch.float32)
+    commands = [states(count, seed, torch.float32)[1] for seed in (4, 5, 6)]
+    delays = uniform(torch.Generator().manual_seed(7), 0.0, 0.02, count, 2)
+    ours = made.advance(x, commands, delays, wrench, body)
+    theirs = made.advance_torch(x, commands, delays, wrench, body)
+    np.testing.assert_allclose(ours.numpy(), theirs.numpy(), atol=1e-5)
+
+
+def test_triton_itself_agrees_where_there_is_one():
+    pytest.importorskip('triton', reason='triton is not installed')
+    if not torch.cuda.is_available():
+        pytest.skip('triton compiles for a GPU, and here is none')
+    made = physics.Physics(EVERYTHING, 0.01, 4, 'cuda', kernel=True)
+    x, _, wrench, body = (value.cuda() for value in states(1000, 3, torch.float32))
+    commands = [states(1000, seed, torch.float32)[1].cuda() for seed in (4, 5, 6)]
+    delays = uniform(torch.Generator().manual_seed(7), 0.0, 0.02, 1000, 2).cuda()
+    ours = made.advance(x, commands, delays, wrench, body)
+    theirs = made.advance_torch(x, commands, delays, wrench, body)
+    np.testing.assert_allclose(ours.cpu().numpy(), theirs.cpu().numpy(), atol=1e-3)

@@ -1,0 +1,228 @@
+"""One control period of the training's model, against finer integration and against MuJoCo."""
+
+from dataclasses import replace
+
+import casadi as ca
+from learning import ROBOT
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from sim_robots import plant, WORLD
+
+from beetle_omni_ros.robot import dynamics
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.train import model
+
+PERIOD, SUBSTEPS = 0.01, 4
+RIGID = replace(ROBOT, multibody=None)
+UNITS = {'position': slice(0, 3), 'velocity': slice(3, 6), 'quaternion': slice(6, 10),
+         'rate': slice(10, 13), 'tilt': slice(13, 17), 'tilt_rate': slice(17, 21),
+         'thrust': slice(21, 25)}
+
+
+def states(count, seed, *, tilt_step, joint_rate=0.0):
+    """Random flight states and commands: tilt targets within a step from the tilts."""
+    rng = np.random.default_rng(seed)
+    tilt = rng.uniform(-3.8, 3.8, (count, 4))
+    x = np.hstack([rng.normal(size=(count, 6)), Rotation.random(count, rng).as_quat(),
+                   rng.normal(size=(count, 3)), tilt,
+                   joint_rate * rng.uniform(-1, 1, (count, 4)), rng.uniform(1, 19, (count, 4))])
+    u = np.hstack([tilt + tilt_step * rng.uniform(-1, 1, (count, 4)),
+                   rng.uniform(-2, 22, (count, 4))])
+    return x, u
+
+
+def trained(robot, x, u, duration=PERIOD, wrench=None):
+    """As the environment steps it."""
+    step = model.substep(robot, PERIOD / SUBSTEPS).map(len(x))
+    wrench = np.zeros((len(x), 6)) if wrench is None else wrench
+    body = np.tile(model.nominal_body(robot), (len(x), 1))
+    for _ in range(round(duration / PERIOD * SUBSTEPS)):
+        x = np.array(step(x.T, u.T, wrench.T, body.T)).T
+    return x
+
+
+def finely(robot, x, u, step=1e-5):
+    """The equations of motion by tiny Euler steps, servos clamped at their limits."""
+    state, command, joints = ca.SX.sym('x', 25), ca.SX.sym('u', 8), robot.joints
+    tilt, rate, thrust = state[13:17], state[17:21], state[21:25]
+
+    def clip(value, limit):
+        return ca.fmin(ca.fmax(value, -limit), limit)
+
+    torque = clip(joints.kp * (clip(command[:4], joints.position_limit) - tilt)
+                  - joints.kd * rate, joints.effort_limit)
+    new_rate = clip(rate + step * torque / joints.inertia, joints.velocity_limit)
+    free = tilt + step * new_rate
+    target = ca.fmin(ca.fmax(command[4:], robot.rotors.thrust_min), robot.rotors.thrust_max)
+    effects = {**robot.effects, 'module_reaction': model.module_reaction(robot)} \
+        if robot.multibody else robot.effects
+    linear, angular = dynamics.rigid_body(
+        robot, state[3:6], state[6:10], state[10:13], tilt, thrust,
+        tilt_acceleration=(new_rate - rate) / step, effects=effects)
+    velocity, turning = state[3:6] + step * linear, state[10:13] + step * angular
+    quaternion = state[6:10] + step * dynamics.quaternion_rate(state[6:10], turning)
+    after = ca.Function('fine', [state, command], [ca.vertcat(
+        state[:3] + step * velocity, velocity, quaternion / ca.norm_2(quaternion), turning,
+        clip(free, joints.position_limit),
+        ca.if_else(ca.fabs(free) > joints.position_limit, 0, new_rate),
+        thrust + step / robot.rotors.time_constant * (target - thrust))]).map(len(x))
+    for _ in range(round(PERIOD / step)):
+        x = np.array(after(x.T, u.T)).T
+    return x
+
+
+def assert_close(ours, theirs, **tolerances):
+    for name, tolerance in tolerances.items():
+        difference = np.abs(ours[:, UNITS[name]] - theirs[:, UNITS[name]]).max()
+        assert difference <= tolerance, f'{name}: {difference:.2g}, more than {tolerance}'
+
+
+def test_a_period_is_that_of_the_robots_dynamics_away_from_servo_limits():
+    x, u = states(100, 0, tilt_step=0.05)
+    fine = np.array(dynamics.integrator(RIGID, 200).map(100)(
+        x.T, u.T, np.zeros((10, 100)), PERIOD)).T
+    assert np.abs(fine[:, UNITS['tilt_rate']]).max() < 0.5 * ROBOT.joints.velocity_limit
+    assert_close(trained(RIGID, x, u), fine, position=5e-6, velocity=1e-3, quaternion=1e-5,
+                 rate=4e-3, tilt=1e-3, tilt_rate=0.1, thrust=1e-9)
+
+
+@pytest.mark.parametrize('tilt_step', [0.05, 0.5, 8.0])
+def test_a_period_is_that_of_tiny_clamped_steps_with_the_modules_reaction(tilt_step):
+    x, u = states(60, 1, tilt_step=tilt_step, joint_rate=0 if tilt_step < 0.1 else 10)
+    fine = finely(ROBOT, x, u)
+    at_limit = np.abs(fine[:, UNITS['tilt_rate']]) > 0.99 * ROBOT.joints.velocity_limit
+    assert at_limit.any() == (tilt_step > 0.1)
+    assert_close(trained(ROBOT, x, u), fine, position=2e-5, velocity=3e-3, quaternion=1e-4,
+                 rate=0.03, tilt=0.01, tilt_rate=1.0, thrust=2e-4)
+
+
+def test_shorter_substeps_come_closer():
+    x, u = states(40, 2, tilt_step=0.05)
+    fine = finely(ROBOT, x, u)
+    coarse = np.abs(trained(ROBOT, x, u) - fine).max(0)
+    step = model.substep(ROBOT, PERIOD / 16).map(40)
+    y = x
+    for _ in range(16):
+        y = np.array(step(y.T, u.T, np.zeros((6, 40)),
+                          np.tile(model.nominal_body(ROBOT), (40, 1)).T)).T
+    better = np.abs(y - fine).max(0)
+    assert (better[3:6] < 0.5 * coarse[3:6]).all() and (better[10:21] < 0.5 * coarse[10:21]).all()
+
+
+def test_servos_keep_their_rate_limit_and_stops():
+    x, u = states(50, 3, tilt_step=20.0, joint_rate=10)
+    for _ in range(40):
+        x = trained(ROBOT, x, u)
+        assert np.abs(x[:, UNITS['tilt_rate']]).max() <= ROBOT.joints.velocity_limit * (1 + 1e-12)
+        assert np.abs(x[:, UNITS['tilt']]).max() <= ROBOT.joints.position_limit * (1 + 1e-12)
+    held = np.isclose(np.abs(x[:, UNITS['tilt']]), ROBOT.joints.position_limit)
+    assert held.any()
+
+
+def test_the_rotors_lag_is_exact():
+    x, u = states(30, 4, tilt_step=0.0)
+    low, high = ROBOT.rotors.thrust_min, ROBOT.rotors.thrust_max
+    target = np.clip(u[:, 4:], low, high)
+    assert (target != u[:, 4:]).any()
+    for duration in (0.01, 0.13):
+        expected = target + np.exp(-duration / ROBOT.rotors.time_constant) * (x[:, 21:] - target)
+        np.testing.assert_allclose(trained(ROBOT, x, u, duration)[:, 21:], expected, atol=1e-12)
+
+
+def test_a_wrench_and_another_mass_act_as_newton_says():
+    x, u = states(20, 5, tilt_step=0.0)
+    x[:, UNITS['rate']] = 0
+    step = model.substep(RIGID, 0.001).map(20)
+    body = np.tile(model.nominal_body(RIGID), (20, 1))
+    force, torque = np.array([3.0, -2.0, 1.0]), np.array([0.05, 0.02, -0.03])
+    wrench = np.tile(np.r_[force, torque], (20, 1))
+
+    def after(wrench, body):
+        return np.array(step(x.T, u.T, wrench.T, body.T)).T
+
+    change = after(wrench, body) - after(0 * wrench, body)
+    np.testing.assert_allclose(change[:, 3:6], np.tile(1e-3 * force / ROBOT.mass, (20, 1)),
+                               rtol=1e-9)
+    np.testing.assert_allclose(change[:, 10:13], np.tile(1e-3 * torque / ROBOT.inertia, (20, 1)),
+                               rtol=1e-6)
+    heavy = body.copy()
+    heavy[:, 0] *= 2
+    gravity = np.array([0, 0, -ROBOT.gravity])
+    np.testing.assert_allclose(
+        2 * (after(0 * wrench, heavy)[:, 3:6] - x[:, 3:6] - 1e-3 * gravity),
+        after(0 * wrench, body)[:, 3:6] - x[:, 3:6] - 1e-3 * gravity, atol=1e-12)
+
+
+def test_reaction_parameters_are_those_of_the_modules():
+    module = replace(ROBOT.multibody.module, mass=0.4, inertia=np.array([2e-4, 9.0, 9.0]),
+                     centre_of_mass=np.array([0.1, 0.0, -0.03]))
+    robot = replace(ROBOT, multibody=replace(ROBOT.multibody, module=module))
+    found = model.module_reaction(robot)
+    assert found['module_inertia'] == pytest.approx(2e-4 + 0.4 * 0.03 ** 2)    # Steiner
+    assert found['mass_moment'] == pytest.approx(0.4 * 0.03)
+
+
+def test_a_robot_files_effects_are_where_the_bodies_start():
+    robot = replace(ROBOT, effects={'mass': {'mass': 3.5}, 'centre_of_mass': {
+        'offset': (0.01, 0.0, -0.01)}})
+    assert model.nominal_body(ROBOT) == [ROBOT.mass, *ROBOT.inertia, 0.0, 0.0, 0.0]
+    assert model.nominal_body(robot) == [3.5, *ROBOT.inertia, 0.01, 0.0, -0.01]
+
+
+def hovering(count, seed, tilt_step, thrust_step):
+    """States near hover at random attitudes, and commands near those that hover."""
+    x, _ = states(count, seed, tilt_step=0.0)
+    rng = np.random.default_rng(seed)
+    pull = Rotation.from_quat(x[:, 6:10]).inv().apply([0, 0, ROBOT.mass * ROBOT.gravity])
+    parts = (pull @ Allocator(ROBOT).inverse[:, :3].T).reshape(count, 4, 2)
+    x[:, :3] = 0
+    x[:, 3:6] *= 0.3
+    x[:, 10:13] *= 0.3
+    x[:, 13:17] = np.arctan2(parts[:, :, 1], parts[:, :, 0])
+    x[:, 21:25] = np.linalg.norm(parts, axis=2)
+    u = np.hstack([x[:, 13:17] + tilt_step * rng.uniform(-1, 1, (count, 4)),
+                   np.clip(x[:, 21:25] + thrust_step * rng.uniform(-1, 1, (count, 4)), 0, 20)])
+    return x, u
+
+
+def flown(x, u, duration):
+    """MuJoCo's multibody plant from the same states under the same commands."""
+    height, made, after = np.array([0.0, 0.0, 20.0]), plant(), np.empty_like(x)
+    for k, (state, command) in enumerate(zip(x, u)):
+        made.reset(height, state[6:10])
+        data = made.data
+        data.qvel[:] = np.r_[state[3:6], state[10:13], state[17:21]]
+        data.qpos[7:], data.act[:] = state[13:17], state[21:25]
+        made.set_targets(command[:4], command[4:])
+        made._update()
+        for _ in range(round(duration / WORLD.plant.tick)):
+            made.step()
+        q, v = made.state
+        after[k] = np.r_[q[:3] - height, v[:3], q[[4, 5, 6, 3]], v[3:6], q[7:], v[6:],
+                         made.thrust]
+    return after
+
+
+def angle(a, b):
+    """Angle between quaternions."""
+    return (Rotation.from_quat(a).inv() * Rotation.from_quat(b)).magnitude()
+
+
+def rms(values):
+    return np.sqrt((values ** 2).mean())
+
+
+@pytest.mark.parametrize(('tilt_step', 'thrust_step'), [(0.0, 0.0), (0.3, 2.0)])
+def test_training_physics_are_those_of_the_multibody_plant(tilt_step, thrust_step):
+    x, u = hovering(40, 6, tilt_step, thrust_step)
+    true = flown(x, u, 0.05)
+    with_modules, without = (trained(robot, x, u, 0.05) for robot in (ROBOT, RIGID))
+    # In MuJoCo the body's motion also pulls at the servos, which costs the tilts a degree.
+    assert_close(with_modules, true, position=1e-3, velocity=0.01, rate=0.1, tilt=0.05,
+                 thrust=1e-6)
+    assert angle(with_modules[:, 6:10], true[:, 6:10]).max() < 0.01
+    rate = UNITS['rate']
+    assert rms(with_modules[:, rate] - true[:, rate]) < 0.5 * rms(without[:, rate] - true[:, rate])
+    ours, theirs = (rms(angle(x[:, 6:10], true[:, 6:10])) for x in (with_modules, without))
+    assert ours < theirs * (0.3 if tilt_step == 0 else 0.95)
