@@ -127,7 +127,7 @@ class TiltableQuadrotorEnv(VecEnv):
         x = self._push(s, x, draw)
         rotation, target = batch.matrix(x[:, model.QUATERNION]), batch.matrix(s['target_attitude'])
         moment = self._moment(s, x, asked, rotation, target)
-        terms = torch.stack([term(moment) for term in rewards.TERMS.values()], -1)
+        terms = rewards.terms(moment)
         broken = ~torch.isfinite(x).all(-1)
         died = broken | (moment.position_error > limits.position_limit) \
             | (moment.speed > limits.velocity_limit) | (moment.rate > limits.rate_limit)

@@ -187,6 +187,6 @@ TERMS = {term.__name__: term for term in (
     exact_pose, joint_winding, hover_tilt_rate, hover_thrust_rate, sinking)}
 
 
-def total(moment: Moment, weights: torch.Tensor) -> torch.Tensor:
-    """(N,) weighted sum; ``weights`` in the order of ``TERMS``."""
-    return torch.stack([term(moment) for term in TERMS.values()], -1) @ weights
+def terms(moment: Moment) -> torch.Tensor:
+    """(N, R) values without weights, columns in the order of ``TERMS``."""
+    return torch.stack([term(moment) for term in TERMS.values()], -1)

@@ -1,18 +1,13 @@
-"""Small trainings for the tests of train/; without the extra 'train' every user of this skips."""
+"""Small trainings for the tests of train/."""
 
-import pytest
+import extra_train  # noqa: F401
+import torch
 
-for module in ('torch', 'tensordict', 'rsl_rl', 'onnx', 'onnxscript', 'tensorboard'):
-    pytest.importorskip(module, reason=f"{module} of the extra 'train' is not installed; "
-                                       'the line of make test about it says why')
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.train.command import read_parameters
+from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 
-import torch    # noqa: E402
-
-from beetle_omni_ros.robot.parameters import RobotParameters    # noqa: E402
-from beetle_omni_ros.train.command import read_parameters    # noqa: E402
-from beetle_omni_ros.train.environment import TiltableQuadrotorEnv    # noqa: E402
-
-torch.set_num_threads(1)    # the other threads would only disturb on so small batches
+torch.set_num_threads(1)    # more would only disturb each other on so small batches
 ROBOT = RobotParameters.load()
 SMALL = {'ppo.robots': 16, 'ppo.steps': 6, 'ppo.epochs': 2, 'ppo.minibatches': 2,
          'network.hidden': [16, 16], 'iterations': 4, 'log_every': 1, 'save_every': 2}

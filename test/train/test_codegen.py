@@ -105,6 +105,7 @@ class Pointer:
         self.values, self.places = values, places
 
     def __add__(self, more):
+        """Shift by places."""
         return Pointer(self.values, self.places + more)
 
 
@@ -115,9 +116,11 @@ class Program:
         self.function = function
 
     def __call__(self, *arguments):
+        """Call from another Triton function."""
         return self.function(*arguments)
 
     def __getitem__(self, grid):
+        """Launch on a grid."""
         def launch(*arguments, num_warps, **constants):
             pointers = [Pointer(value.view(-1)) if torch.is_tensor(value) else value
                         for value in arguments]

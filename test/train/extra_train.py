@@ -1,0 +1,6 @@
+"""To be imported first: without the extra 'train' the importing test module skips."""
+
+import pytest
+
+for module in ('torch', 'tensordict', 'rsl_rl', 'onnx', 'onnxscript', 'tensorboard'):
+    pytest.importorskip(module, reason=f"the extra 'train' is not installed (no {module})")

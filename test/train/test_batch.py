@@ -1,0 +1,94 @@
+"""Batched rotations against scipy, and random numbers that are what they claim."""
+
+import extra_train  # noqa: F401
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
+import torch
+
+from beetle_omni_ros.train import batch
+
+
+def rotations(count, seed):
+    return Rotation.random(count, np.random.default_rng(seed))
+
+
+def single(values):
+    return torch.tensor(np.asarray(values), dtype=torch.float32)
+
+
+def test_matrices_products_and_exponentials_are_scipys():
+    a, b = rotations(200, 0), rotations(200, 1)
+    np.testing.assert_allclose(batch.matrix(single(a.as_quat())), a.as_matrix(), atol=1e-6)
+    np.testing.assert_allclose(
+        batch.matrix(batch.product(single(a.as_quat()), single(b.as_quat()))),
+        (a * b).as_matrix(), atol=1e-6)
+    vector = np.random.default_rng(2).normal(size=(200, 3))
+    vector[:3] = [0, 0, 0], [1e-9, 0, 0], [0, 0, 3.1415]
+    np.testing.assert_allclose(batch.matrix(batch.from_rotation_vector(single(vector))),
+                               Rotation.from_rotvec(vector).as_matrix(), atol=1e-6)
+
+
+def test_turning_back_is_the_transposed_matrix():
+    a, b = rotations(50, 3), rotations(50, 4)
+    vector = np.random.default_rng(5).normal(size=(50, 3))
+    np.testing.assert_allclose(batch.turned_back(single(a.as_matrix()), single(vector)),
+                               a.inv().apply(vector), atol=1e-6)
+    np.testing.assert_allclose(batch.turned_back(single(a.as_matrix()), single(b.as_matrix())),
+                               (a.inv() * b).as_matrix(), atol=1e-6)
+
+
+@pytest.mark.parametrize('angle', [0.0, 1e-4, 1e-3, 0.02, 1.0, np.pi / 2, 3.0, np.pi - 1e-3,
+                                   np.pi])
+def test_the_geodesic_is_exact_at_all_angles(angle):
+    a = rotations(100, 6)
+    axis = np.random.default_rng(7).normal(size=(100, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    b = a * Rotation.from_rotvec(angle * axis)
+    double = batch.geodesic(torch.tensor(a.as_matrix()), torch.tensor(b.as_matrix()))
+    np.testing.assert_allclose(double, angle, atol=1e-7)    # of pi: the root of the rounding
+    found = batch.geodesic(single(a.as_matrix()), single(b.as_matrix()))
+    # An arc cosine would lose half the digits: 1e-3 rad.
+    np.testing.assert_allclose(found, angle, atol=1e-6)
+
+
+def drawn(count, seed):
+    numbers = torch.rand(count, 8, generator=torch.Generator().manual_seed(seed))
+    return batch.Draw(numbers).attitude().double()
+
+
+def test_drawn_attitudes_are_half_uniform_and_half_axis_and_angle():
+    quaternion = drawn(100_000, 0)
+    np.testing.assert_allclose(quaternion.norm(dim=-1), 1, atol=1e-5)
+    found = Rotation.from_quat(quaternion.numpy())
+    axes = found.as_matrix()
+    # No direction is preferred by either half: means of one body axis' image...
+    angle = found.magnitude()
+    turned = found.as_rotvec() / angle[:, None]
+    assert np.abs(turned.mean(0)).max() < 0.01
+    np.testing.assert_allclose(turned.T @ turned / len(turned), np.eye(3) / 3, atol=0.01)
+
+    # ... and angles: uniform on SO(3) has density (1 - cos a) / pi, the other half 1 / pi.
+    def share(a):
+        return (0.5 * (a - np.sin(a)) + 0.5 * a) / np.pi
+    assert kstest(angle, share).statistic < 0.01
+    # The uniform half alone would leave no mean, the other one leaves E[(1 + 2 cos a) / 3] = 1/3.
+    np.testing.assert_allclose(axes.mean(0), np.eye(3) / 6, atol=0.01)
+
+
+def test_uniform_numbers_keep_their_range_and_order():
+    numbers = torch.rand(1000, 7, generator=torch.Generator().manual_seed(1))
+    draw = batch.Draw(numbers)
+    first = draw.uniform(2, -3.0, 5.0)
+    torch.testing.assert_close(first, 8 * numbers[:, :2] - 3)
+    second = draw.around(0.5, 4)
+    torch.testing.assert_close(second, numbers[:, 2:6] - 0.5)
+    assert abs(float(draw.chance(0.3).float().mean()) - 0.3) < 0.05
+
+
+def test_more_numbers_than_drawn_are_refused():
+    draw = batch.Draw(torch.rand(3, 5))
+    draw.uniform(4)
+    with pytest.raises(ValueError, match='6 random numbers'):
+        draw.uniform(2)

@@ -1,0 +1,194 @@
+"""Each reward term at moments made by hand; the published ones against the paper's table."""
+
+from dataclasses import fields
+import itertools
+
+import extra_train  # noqa: F401
+import numpy as np
+import pytest
+import torch
+
+from beetle_omni_ros.train import rewards
+from beetle_omni_ros.train.parameters import RewardWeights
+
+TILT_LIMIT, THRUST_LIMIT, HOVER = 3.96, 20.0, 7.2
+NOT_TERMS = {'termination', 'scale'}
+
+
+def moment(**changes):
+    """One robot at rest at its target, level, as a moment of arrays."""
+    four, up = np.zeros((1, 4)), np.array([[0.0, 0.0, 1.0]])
+    values = {
+        **dict.fromkeys(('position_error', 'attitude_error', 'speed', 'rate', 'depth'),
+                        np.zeros(1)),
+        **dict.fromkeys(('tilt', 'tilt_rate', 'previous_tilt_rate', 'tilt_command',
+                         'previous_tilt_command'), four),
+        **dict.fromkeys(('thrust', 'thrust_command', 'previous_thrust_command'), four + HOVER),
+        'z_axis': up, 'target_z_axis': up,
+        **{key: np.atleast_1d(np.asarray(value, dtype=float)) for key, value in changes.items()}}
+    rows = max(len(value) for value in values.values())
+    values = {key: torch.tensor(np.broadcast_to(value, (rows, *value.shape[1:])).copy())
+              for key, value in values.items()}
+    return rewards.Moment(**values, tilt_limit=TILT_LIMIT, thrust_limit=THRUST_LIMIT)
+
+
+def moments(count, seed):
+    """Random moments over the whole range, many of them close to the target."""
+    rng = np.random.default_rng(seed)
+    near = rng.choice([0.01, 0.05, 1.0], (count, 1))[:, 0]
+
+    def axis():
+        value = rng.normal(size=(count, 3))
+        return value / np.linalg.norm(value, axis=1, keepdims=True)
+
+    return moment(
+        position_error=near * rng.uniform(0, 6, count), attitude_error=near * rng.uniform(
+            0, np.pi, count), speed=near * rng.uniform(0, 6, count),
+        rate=near * rng.uniform(0, 10, count), tilt=rng.uniform(-4, 4, (count, 4)),
+        tilt_rate=rng.uniform(-10, 10, (count, 4)),
+        previous_tilt_rate=rng.uniform(-10, 10, (count, 4)),
+        thrust=rng.uniform(0, 20, (count, 4)), tilt_command=rng.uniform(-6, 6, (count, 4)),
+        thrust_command=rng.uniform(-5, 25, (count, 4)),
+        previous_tilt_command=rng.uniform(-4, 4, (count, 4)),
+        previous_thrust_command=rng.uniform(0, 20, (count, 4)), z_axis=axis(),
+        target_z_axis=axis(), depth=rng.uniform(0, 3, count))
+
+
+def published(m):
+    """The table of the publication, for one robot at a time; m: name -> numbers."""
+    p, th, v, w = m['position_error'], m['attitude_error'], m['speed'], m['rate']
+    q, f = m['tilt_command'], m['thrust_command']
+    at_position = p < 0.02 and v < 0.02
+    at_pose = at_position and th < 0.05 and w < 0.02
+    exceeding = [max(x - THRUST_LIMIT, 0, -x) for x in f]
+    return {
+        'position': np.tanh(p / 0.6),
+        'pose': (1 - np.tanh(th / 2)) * (1 - np.tanh(p / 2)),
+        'reach_position': at_position and np.exp(-p / 0.02) + np.exp(-v / 0.02),
+        'reach_pose': at_pose and np.exp(-p / 0.02) + np.exp(-v / 0.02)
+        + np.exp(-2 * th / 0.05) + np.exp(-2 * w / 0.02),
+        'linear_velocity': np.expm1(0.6 * min(v, 4.0)) ** 2,
+        'angular_velocity': np.expm1(0.4 * min(w, 6.0)) ** 2,
+        'joint_limit': sum((abs(x) - TILT_LIMIT) * (abs(x) > TILT_LIMIT) for x in q),
+        'thrust_limit': sum(x ** 2 for x in exceeding),
+        'joint_action_rate': sum((a - b) ** 2 for a, b in zip(q, m['previous_tilt_command'])),
+        'thrust_action_rate': sum((a - b) ** 2 for a, b in zip(f, m['previous_thrust_command'])),
+        'thrust_power': sum(x ** 2 for x in m['thrust']),
+        'joint_acceleration': sum((a - b) ** 2 for a, b in zip(m['tilt_rate'],
+                                                               m['previous_tilt_rate'])),
+        'z_axis_align': np.linalg.norm(m['z_axis'] - m['target_z_axis']) > 1.5,
+        'thrust_allocation': sum((x - sum(f) / 4) ** 2 for x in f) * m['z_axis'][2] ** 2,
+    }
+
+
+def test_the_published_terms_are_those_of_the_table():
+    made = moments(400, 0)
+    rows = [{key: value[k].numpy() for key, value in made._asdict().items()
+             if torch.is_tensor(value)} for k in range(400)]
+    expected = [published(row) for row in rows]
+    for name in expected[0]:
+        ours = rewards.TERMS[name](made).double().numpy()
+        theirs = np.array([float(row[name]) for row in expected])
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12, err_msg=name)
+        assert theirs.any() or name == 'reach_pose', f'{name}: never anything but zero'
+
+
+def test_reaching_the_pose_counts_all_four_errors():
+    inside = {'position_error': 0.01, 'attitude_error': 0.02, 'speed': 0.005, 'rate': 0.01}
+    expected = sum(np.exp([-0.01 / 0.02, -0.005 / 0.02, -2 * 0.02 / 0.05, -2 * 0.01 / 0.02]))
+    assert float(rewards.reach_pose(moment(**inside))) == pytest.approx(expected)
+    for name, outside in (('position_error', 0.021), ('attitude_error', 0.051),
+                          ('speed', 0.021), ('rate', 0.021)):
+        assert float(rewards.reach_pose(moment(**{**inside, name: outside}))) == 0
+
+
+def test_at_rest_at_the_target_nothing_is_punished_but_thrust():
+    at_target = moment()
+    costs = {name: float(term(at_target)) for name, term in rewards.TERMS.items()
+             if getattr(RewardWeights(), name) < 0}
+    assert costs.pop('thrust_power') == pytest.approx(4 * HOVER ** 2)
+    assert set(costs.values()) == {0.0}
+
+
+def test_at_rest_at_the_target_every_bonus_is_the_largest():
+    best = {'pose': 1, 'reach_position': 2, 'reach_pose': 4, 'near_position': 1,
+            'near_attitude': 1, 'near_pose': 1, 'exact_pose': 1}
+    assert {name: float(rewards.TERMS[name](moment())) for name in best} == best
+    assert set(best) == {name for name in rewards.TERMS if getattr(RewardWeights(), name) > 0}
+
+
+STEPS = np.linspace(0, 1, 30)
+GROWS = {
+    'position': {'position_error': 3 * STEPS}, 'attitude': {'attitude_error': np.pi * STEPS},
+    'linear_velocity': {'speed': 4 * STEPS}, 'angular_velocity': {'rate': 6 * STEPS},
+    'joint_limit': {'tilt_command': TILT_LIMIT + np.outer(STEPS, [1, -0, 0, 0])},
+    'thrust_limit': {'thrust_command': THRUST_LIMIT + np.outer(STEPS, [1, 0, 0, 0])},
+    'joint_action_rate': {'tilt_command': np.outer(STEPS, [1, 0, -1, 0])},
+    'thrust_action_rate': {'thrust_command': HOVER + np.outer(STEPS, [1, 0, -1, 0])},
+    'thrust_power': {'thrust': np.outer(STEPS, [1, 1, 0, 1])},
+    'joint_acceleration': {'tilt_rate': np.outer(STEPS, [1, 0, -1, 0])},
+    'thrust_allocation': {'thrust_command': HOVER + np.outer(STEPS, [1, 0, -1, 0])},
+    'joint_winding': {'tilt': np.pi + np.outer(STEPS, [1, 0, 0, 0])},
+    'hover_tilt_rate': {'tilt_command': np.outer(STEPS, [1, 0, -1, 0])},
+    'hover_thrust_rate': {'thrust_command': HOVER + np.outer(STEPS, [1, 0, -1, 0])},
+    'sinking': {'depth': 2 * STEPS},
+}
+FALLS = {
+    'pose': {'position_error': 3 * STEPS}, 'reach_position': {'position_error': 0.019 * STEPS},
+    'reach_pose': {'attitude_error': 0.049 * STEPS}, 'near_position': {'position_error': STEPS},
+    'near_attitude': {'attitude_error': STEPS}, 'near_pose': {'position_error': STEPS},
+    'exact_pose': {'attitude_error': STEPS},
+}
+
+
+def test_every_term_but_the_step_is_tried_for_its_direction():
+    assert {*GROWS, *FALLS, 'z_axis_align'} == set(rewards.TERMS)
+
+
+@pytest.mark.parametrize(('name', 'changes', 'sign'), [
+    *((name, changes, 1) for name, changes in GROWS.items()),
+    *((name, changes, -1) for name, changes in FALLS.items())])
+def test_a_term_is_monotone_in_what_it_judges(name, changes, sign):
+    values = rewards.TERMS[name](moment(**changes)).numpy()
+    assert (sign * np.diff(values) > 0).all()
+
+
+def test_restlessness_counts_at_the_target_alone():
+    for term in (rewards.hover_tilt_rate, rewards.hover_thrust_rate):
+        here, there = term(moment(position_error=[0.0, 1.0], tilt_command=np.full((2, 4), 0.1),
+                                  thrust_command=np.full((2, 4), 9.0)))
+        assert here > 0 and there < 1e-3 * here
+
+
+def test_limits_do_not_punish_what_is_within_them():
+    tilts = np.array(list(itertools.product([-TILT_LIMIT, 0, TILT_LIMIT], repeat=4)))
+    assert not rewards.joint_limit(moment(tilt_command=tilts)).any()
+    thrusts = np.array(list(itertools.product([0, THRUST_LIMIT], repeat=4)))
+    assert not rewards.thrust_limit(moment(thrust_command=thrusts)).any()
+    assert float(rewards.thrust_limit(moment(thrust_command=[[-2.0, 23.0, 5, 5]]))) == 13
+    assert not rewards.joint_winding(moment(tilt=[[np.pi, -np.pi, 0, 1]])).any()
+
+
+def test_saturating_penalties_stay_finite_far_beyond():
+    wild = moment(position_error=1e3, speed=1e3, rate=1e3, attitude_error=np.pi, depth=1e3)
+    values = rewards.terms(wild)
+    assert torch.isfinite(values).all() and float(values.abs().max()) < 500
+
+
+def test_upside_down_begins_at_a_distance_of_one_and_a_half():
+    angle = 2 * np.arcsin(0.75)
+    axes = [[np.sin(a), 0, np.cos(a)] for a in (angle - 0.01, angle + 0.01)]
+    assert rewards.z_axis_align(moment(z_axis=axes)).tolist() == [0, 1]
+
+
+def test_the_terms_stand_in_the_order_of_the_table():
+    made = moments(50, 1)
+    found = rewards.terms(made)
+    assert found.shape == (50, len(rewards.TERMS))
+    for column, (name, term) in zip(found.T, rewards.TERMS.items()):
+        assert term.__name__ == name
+        torch.testing.assert_close(column, term(made).to(column))
+
+
+def test_every_weight_has_a_term_and_every_term_a_weight():
+    assert {entry.name for entry in fields(RewardWeights)} - NOT_TERMS == set(rewards.TERMS)
