@@ -1,0 +1,268 @@
+"""What happens in a step: commands and their delays, targets, ends, resets, disturbances."""
+
+from learning import environment, only, quiet, ROBOT
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+import torch
+
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.train import rewards
+from beetle_omni_ros.train.physics import Physics
+
+PERIOD = 0.01
+
+
+def actions(env, seed, count, size=1.0):
+    g = torch.Generator().manual_seed(seed)
+    return [size * torch.randn(env.num_envs, 8, generator=g) for _ in range(count)]
+
+
+def command(env, action):
+    return torch.clamp(env.offset + env.scale * action, env._low, env._high)
+
+
+def held(env, command):
+    """State one period later with one command throughout."""
+    physics = Physics(env.robot, PERIOD, 4, 'cpu')
+    s = env.state
+    return physics.advance(s['x'], (command,) * 3, s['delays'][:, :2], s['wrench'], s['body'])
+
+
+# ---- commands
+
+@pytest.mark.parametrize(('delay', 'late'), [(0.0, 0), (0.01, 1), (0.02, 2)])
+def test_a_command_acts_after_its_delay(delay, late):
+    env = quiet({**only('hover'), 'random.command_latency': [delay, delay]})
+    given = [env.state['previous'].clone()] * 2
+    for action in actions(env, 0, 5):
+        given.append(command(env, action))
+        expected = held(env, given[-1 - late])
+        env.advance(action)
+        assert not env.done.any()
+        torch.testing.assert_close(env.state['x'], expected)
+        wrong = held(env, given[-1 if late else -2])
+        assert (wrong[:, model.THRUST] - env.state['x'][:, model.THRUST]).abs().max() > 1e-3
+
+
+def test_a_delay_of_half_a_period_splits_it():
+    env = quiet({**only('hover'), 'random.command_latency': [0.005, 0.005]})
+    first, (action,) = env.state['previous'].clone(), actions(env, 1, 1)
+    half = Physics(ROBOT, PERIOD / 2, 2, 'cpu')
+    s, now = env.state, command(env, action)
+    rest = torch.zeros(env.num_envs, 2), s['wrench'], s['body']
+    expected = half.advance(half.advance(s['x'], (first,) * 3, *rest), (now,) * 3, *rest)
+    env.advance(action)
+    torch.testing.assert_close(env.state['x'], expected)
+
+
+def test_the_command_in_force_and_the_one_before_are_remembered_apart():
+    env = quiet(only('hover'))
+    start, (first, second) = env.state['previous'].clone(), actions(env, 2, 2)
+    env.advance(first)
+    torch.testing.assert_close(env.state['previous'], command(env, first))
+    torch.testing.assert_close(env.state['older'], start)
+    env.advance(second)
+    torch.testing.assert_close(env.state['previous'], command(env, second))
+    torch.testing.assert_close(env.state['older'], command(env, first))
+    torch.testing.assert_close(env.observation[:, 25:33] * env.scale + env.offset,
+                               command(env, second))
+
+
+def test_no_two_entries_of_the_state_share_memory():
+    env = environment()
+    for _ in range(3):
+        places = [value.untyped_storage().data_ptr() for value in env.state.values()]
+        assert len(set(places)) == len(places)
+        env.state['age'][::2] = env.max_episode_length
+        env.advance(torch.zeros(env.num_envs, 8))
+        assert env.done.any()
+
+
+def test_the_thrust_limit_binds_the_rotors_and_is_not_seen():
+    env = quiet({**only('hover'), 'random.thrust_limit': [9.0, 9.0],
+                 'random.command_latency': [0.0, 0.0]})
+    action = torch.zeros(env.num_envs, 8)
+    action[:, 4:] = 12.0
+    asked = command(env, action)
+    capped = asked.clone()
+    capped[:, 4:] = 9.0
+    expected = held(env, capped)
+    env.advance(action)
+    torch.testing.assert_close(env.state['x'], expected)
+    torch.testing.assert_close(env.state['previous'], asked)
+    torch.testing.assert_close(env.observation[:, 29:33], action[:, 4:])
+
+
+def test_actions_beyond_the_actuators_act_and_are_seen_as_their_limits():
+    env = quiet(only('hover'))
+    env.advance(torch.full((env.num_envs, 8), 1e3))
+    limits = [ROBOT.joints.position_limit] * 4 + [ROBOT.rotors.thrust_max] * 4
+    torch.testing.assert_close(env.state['previous'],
+                               torch.tensor(limits).expand(env.num_envs, 8))
+
+
+# ---- ends
+
+def pair(changes=None, **more):
+    """Two equal environments, to change something in the second."""
+    return quiet(changes, **more), quiet(changes, **more)
+
+
+BROKEN = [('position', 'x', slice(0, 3), 30.0), ('velocity', 'x', slice(3, 6), 20.0),
+          ('rate', 'x', slice(10, 13), 60.0), ('nothing a number', 'x', slice(3, 4), torch.nan)]
+
+
+def step_both(one, other, seed=3):
+    action = actions(one, seed, 1)[0]
+    for env in (one, other):
+        torch.manual_seed(seed)
+        env.advance(action)
+
+
+@pytest.mark.parametrize(('name', 'entry', 'places', 'value'), BROKEN, ids=lambda v: str(v))
+def test_a_robot_out_of_bounds_starts_anew_and_no_other(name, entry, places, value):
+    one, other = pair()
+    other.state[entry][:8, places] = value
+    other.state['age'].fill_(50.0)
+    one.state['age'].fill_(50.0)
+    step_both(one, other)
+    assert other.done.tolist() == [True] * 8 + [False] * 56 and not one.done.any()
+    assert not other.timeout.any()
+    for key in one.state:
+        torch.testing.assert_close(one.state[key][8:], other.state[key][8:], rtol=0, atol=0)
+    torch.testing.assert_close(one.observation[8:], other.observation[8:], rtol=0, atol=0)
+    assert not other.state['age'][:8].any() and (other.state['age'][8:] == 51).all()
+    assert not other.state['x'][:8, :3].any()
+    assert torch.isfinite(other.observation).all() and torch.isfinite(other.critic).all()
+    assert torch.isfinite(other.reward).all()
+
+
+def test_only_a_lost_robot_pays_for_its_end():
+    one, other = pair()
+    cost = one.cfg.reward.termination * one.cfg.reward.scale
+    other.state['age'][:8] = other.max_episode_length - 1
+    other.state['x'][8:16, 3:6] = torch.nan
+    step_both(one, other)
+    assert other.timeout.tolist() == [True] * 8 + [False] * 56
+    assert other.done.tolist() == [True] * 16 + [False] * 48
+    torch.testing.assert_close(other.reward[8:16], torch.full((8,), cost))
+    torch.testing.assert_close(other.reward[:8], one.reward[:8])
+    assert not other.state['age'][:16].any()
+
+
+def test_the_reward_is_the_weighted_sum_of_the_terms():
+    env = quiet()
+    before = {name: value.clone() for name, value in env.state.items()}
+    action = actions(env, 4, 1)[0]
+    asked = env.offset + env.scale * action
+    x = env.physics.advance(before['x'], (command(env, action), before['previous'],
+                                          before['older']), before['delays'][:, :2],
+                            before['wrench'], before['body'])
+    env.advance(action)
+    assert not env.done.any()
+    body = Rotation.from_quat(x[:, 6:10].numpy())
+    goal = Rotation.from_quat(before['target_attitude'].numpy())
+    made = rewards.Moment(
+        position_error=(x[:, :3] - before['target_position']).norm(dim=-1),
+        attitude_error=torch.tensor((body.inv() * goal).magnitude(), dtype=torch.float32),
+        speed=x[:, 3:6].norm(dim=-1), rate=x[:, 10:13].norm(dim=-1), tilt=x[:, 13:17],
+        tilt_rate=x[:, 17:21], previous_tilt_rate=before['x'][:, 17:21], thrust=x[:, 21:25],
+        tilt_command=asked[:, :4], thrust_command=asked[:, 4:],
+        previous_tilt_command=before['previous'][:, :4],
+        previous_thrust_command=before['previous'][:, 4:],
+        z_axis=torch.tensor(body.as_matrix()[:, :, 2], dtype=torch.float32),
+        target_z_axis=torch.tensor(goal.as_matrix()[:, :, 2], dtype=torch.float32),
+        depth=(torch.minimum(before['x'][:, 2], before['target_position'][:, 2])
+               - x[:, 2]).clamp(min=0),
+        tilt_limit=ROBOT.joints.position_limit, thrust_limit=ROBOT.rotors.thrust_max)
+    expected = sum(getattr(env.cfg.reward, name) * term(made)
+                   for name, term in rewards.TERMS.items()) * env.cfg.reward.scale
+    torch.testing.assert_close(env.reward, expected, atol=1e-5, rtol=1e-4)
+
+
+# ---- disturbances
+
+DISTURBED = {'random.force_share': 1.0, 'random.strong_share': 1.0, 'random.payload_share': 1.0,
+             'random.push_share': 1.0, 'random.push_period': 0.1}
+
+
+@pytest.mark.parametrize('severity', [0.0, 1.0])
+def test_pushes_change_velocities_by_their_severity(severity):
+    env = quiet({**only('hover'), **DISTURBED, 'random.push_period': 0.1}, robots=400)
+    env.severity.fill_(severity)
+    (action,) = actions(env, 5, 1)
+    expected = env.physics.advance(
+        env.state['x'], (command(env, action), env.state['previous'], env.state['older']),
+        env.state['delays'][:, :2], env.state['wrench'], env.state['body'])
+    env.advance(action)
+    going = ~env.done
+    pushed = ((env.state['x'] - expected)[:, 3:6].abs().max(-1).values > 1e-5)[going]
+    assert float(pushed.float().mean()) == pytest.approx(0.1 * severity, abs=0.05)
+    assert bool(pushed.any()) == bool(severity)
+
+
+def test_the_estimate_approaches_the_disturbance():
+    env = quiet({**only('hold'), 'memory': True, 'random.force_share': 1.0, 'random.torque': 0.0,
+                 'random.force': 1.0, 'episode.target_time': [100, 100]}, robots=32)
+    assert not env.state['estimate'].any()
+    env.state['age'].zero_()
+    begin = env.state['x'][:, :13].clone()
+    for _ in range(200):
+        env.state['x'][:, :13] = begin
+        env.advance((env.state['previous'] - env.offset) / env.scale)
+    assert not env.done.any()
+    force = env.state['wrench'][:, :3]
+    assert force.abs().max() > 0.5
+    lag = 1 - (1 - env.cfg.estimate.force_bandwidth * PERIOD) ** 200
+    torch.testing.assert_close(env.state['estimate'][:, :3], lag * force, atol=1e-3, rtol=1e-3)
+
+
+# ---- all of it
+
+def test_the_same_seed_is_the_same_flight_and_another_is_not():
+    rollouts = []
+    for seed in (5, 5, 6):
+        env = environment(seed=seed)
+        for action in actions(env, 0, 30):
+            env.advance(action)
+        rollouts.append((env.state['x'].clone(), env.observation.clone(), env.reward.clone()))
+    for same, repeated, other in zip(*rollouts):
+        assert torch.equal(same, repeated)
+        assert not torch.equal(same, other)
+
+
+@pytest.mark.parametrize('memory', [False, True])
+def test_wild_actions_never_leave_a_number_behind_that_is_none(memory):
+    env = environment({'memory': memory, **DISTURBED}, robots=256)
+    for k, action in enumerate(actions(env, 7, 250, size=20.0)):
+        env.advance(action)
+        values = (*env.state.values(), env.observation, env.critic, env.reward)
+        assert all(torch.isfinite(value).all() for value in values), f'step {k}'
+    tally = env.read_tally()
+    assert tally['steps'] == 250 * 256 and tally['deaths'] > 0
+    assert all(np.isfinite(value) for value in tally.values())
+    assert env.read_tally()['deaths'] == 0     # it begins anew
+
+
+def test_the_tally_counts_targets_and_who_reached_them():
+    env = quiet({**only('hold'), 'episode.target_time': [1.0, 1.0]}, robots=10)
+    env.state['target_left'].fill_(1)
+    env.state['target_position'].copy_(env.state['x'][:, :3])
+    env.state['target_position'][:4, 0] += 0.5
+    env.state['target_attitude'].copy_(env.state['x'][:, 6:10])
+    env.state['age'].zero_()
+    env.advance((env.state['previous'] - env.offset) / env.scale)
+    tally = env.read_tally()
+    assert tally['targets'] == 10 and tally['success_rate'] == pytest.approx(0.6)
+    assert tally['position_error_m'] == pytest.approx(0.2, abs=0.01)
+    assert tally['reward'] == pytest.approx(float(env.reward.mean()), rel=1e-4)
+
+
+def test_the_interface_is_that_of_rsl_rl():
+    env = environment()
+    observations, reward, done, extras = env.step(torch.zeros(env.num_envs, 8))
+    assert observations['actor'].shape == (env.num_envs, 33)
+    assert observations['critic'].shape == (env.num_envs, 41)
+    assert reward.shape == done.shape == extras['time_outs'].shape == (env.num_envs,)
+    assert env.episode_length_buf.dtype == torch.long

@@ -1,0 +1,170 @@
+"""What actor and critic see of known states: on time and late, with and without noise."""
+
+from learning import environment, only, QUIET, quiet, ROBOT, uniform
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+import torch
+
+from beetle_omni_ros.control.base import Reference, State
+from beetle_omni_ros.control.observation import observation
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.train import batch
+from beetle_omni_ros.train.observations import late, Signals
+
+SEEN = {'velocity': slice(0, 3), 'rate': slice(3, 6), 'tilt': slice(21, 25)}
+
+
+def scattered(env, seed=0):
+    """Put the robots and their targets anywhere; returns the state."""
+    g, n, s = torch.Generator().manual_seed(seed), env.num_envs, env.state
+    s['x'].copy_(torch.cat((
+        torch.randn(n, 6, generator=g),
+        torch.nn.functional.normalize(torch.randn(n, 4, generator=g), dim=-1),
+        torch.randn(n, 3, generator=g), uniform(g, -3.9, 3.9, n, 4),
+        torch.randn(n, 4, generator=g), uniform(g, 0, 20, n, 4)), -1))
+    s['previous'].copy_(torch.cat((uniform(g, -3.9, 3.9, n, 4), uniform(g, 0, 20, n, 4)), -1))
+    s['target_position'].copy_(torch.randn(n, 3, generator=g))
+    s['target_attitude'].copy_(torch.nn.functional.normalize(
+        torch.randn(n, 4, generator=g), dim=-1))
+    s['estimate'].copy_(torch.randn(n, 6, generator=g))
+    return s
+
+
+def draw(env, seed=1):
+    return batch.Draw(torch.rand(env.num_envs, 40, generator=torch.Generator().manual_seed(seed)))
+
+
+def on_board(env, k):
+    """The observation that the controller makes of robot k."""
+    s = {name: value[k].double().numpy() for name, value in env.state.items()}
+    x = s['x']
+    state = State(0.0, x[model.POSITION], x[model.VELOCITY], x[model.QUATERNION], x[model.RATE],
+                  x[model.TILT], x[model.TILT_RATE], 0.0)
+    zero = np.zeros(3)
+    target = Reference(s['target_position'], s['target_attitude'], zero, zero)
+    action = (s['previous'] - env.offset.double().numpy()) / env.scale.double().numpy()
+    return observation(state, target, action, s['estimate'] if env.cfg.memory else None)
+
+
+@pytest.mark.parametrize('memory', [False, True])
+def test_without_noise_and_delay_the_batch_sees_what_the_controller_sees(memory):
+    env = quiet({'memory': memory})
+    scattered(env)
+    seen, _ = env._observe(env.state, draw(env))
+    assert seen.shape == (env.num_envs, 39 if memory else 33)
+    expected = np.stack([on_board(env, k) for k in range(env.num_envs)])
+    np.testing.assert_allclose(seen, expected, atol=2e-5)
+
+
+@pytest.mark.parametrize('memory', [False, True])
+def test_the_critic_sees_the_truth_with_the_rotors_torques_and_thrusts(memory):
+    env = environment({'memory': memory, 'random.noise_power': 0})
+    s = scattered(env)
+    _, seen = env._observe(s, draw(env))
+    assert seen.shape == (env.num_envs, 47 if memory else 41)
+    x, seen = s['x'].double().numpy(), seen.double().numpy()
+    body = Rotation.from_quat(x[:, 6:10])
+    goal = Rotation.from_quat(s['target_attitude'].numpy()).as_matrix()
+    back = body.inv()
+    torque = -np.array(ROBOT.rotors.spin) * ROBOT.rotors.torque_to_thrust_ratio * x[:, 21:25]
+    action = (s['previous'] - env.offset) / env.scale
+    columns = [back.apply(x[:, 3:6]), x[:, 10:13],
+               back.apply(s['target_position'].numpy() - x[:, :3]),
+               body.as_matrix()[:, :, 0], body.as_matrix()[:, :, 2], goal[:, :, 0], goal[:, :, 2],
+               x[:, 13:17], torque, x[:, 21:25], action]
+    if memory:
+        columns += [back.apply(s['estimate'][:, :3].numpy()), s['estimate'][:, 3:]]
+    np.testing.assert_allclose(seen, np.hstack(columns), atol=2e-5)
+
+
+def test_a_late_value_lies_on_the_line_between_two_entries():
+    history = torch.randn(7, 4, 5, generator=torch.Generator().manual_seed(0))
+    for back in (0.0, 0.25, 1.0, 1.7, 2.0, 3.0):
+        low = min(int(back), 2)
+        part = back - low
+        expected = (1 - part) * history[:, low] + part * history[:, low + 1]
+        torch.testing.assert_close(late(history, torch.full((7, 1), 0.01 * back)), expected,
+                                   atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(('delay', 'weights'), [(0.0, [1, 0, 0]), (0.01, [0, 1, 0]),
+                                                (0.015, [0, 0.5, 0.5]), (0.02, [0, 0, 1])])
+def test_a_delayed_robot_sees_its_past(delay, weights):
+    env = quiet({**only('moving'), 'random.velocity_latency': [delay, delay],
+                 'random.tilt_latency': [delay, delay]}, robots=16)
+    g, truth = torch.Generator().manual_seed(2), []
+    for _ in range(8):
+        env.advance(torch.randn(16, 8, generator=g))
+        x = env.state['x']
+        back = batch.turned_back(batch.matrix(x[:, model.QUATERNION]), x[:, model.VELOCITY])
+        truth.insert(0, {'velocity': back, 'rate': x[:, model.RATE].clone(),
+                         'tilt': x[:, model.TILT].clone()})
+    assert not env.done.any()
+    for name, places in SEEN.items():
+        expected = sum(w * moment[name] for w, moment in zip(weights, truth))
+        torch.testing.assert_close(env.observation[:, places], expected, atol=1e-5, rtol=1e-5)
+    assert (truth[0]['tilt'] - truth[1]['tilt']).abs().max() > 0.01
+
+
+def test_the_past_of_a_robot_begins_with_its_start():
+    env = quiet({**only('moving'), 'random.velocity_latency': [0.02, 0.02],
+                 'random.tilt_latency': [0.02, 0.02]})
+    fresh = {name: value.clone() for name, value in env.state.items()}
+    now = torch.cat((batch.turned_back(batch.matrix(fresh['x'][:, 6:10]), fresh['x'][:, 3:6]),
+                     fresh['x'][:, 10:13]), -1)
+    torch.testing.assert_close(env.observation[:, :6], now)
+    torch.testing.assert_close(env.observation[:, 21:25], fresh['x'][:, 13:17])
+
+
+def widths(env, random):
+    """Errors of the signals of many robots."""
+    s = env.state
+    seen = Signals(random, s, draw(env))
+    x = s['x']
+    rotation = Rotation.from_quat(x[:, 6:10].numpy())
+    wrong = rotation.inv() * Rotation.from_matrix(seen.rotation.double().numpy())
+    back = batch.turned_back(batch.matrix(x[:, 6:10]), x[:, 3:6])
+    return {'position': (seen.position - x[:, :3]).numpy(), 'attitude': wrong.as_rotvec(),
+            'velocity': (seen.velocity - back).numpy(), 'rate': (seen.rate - x[:, 10:13]).numpy(),
+            'tilt': (seen.tilt - x[:, 13:17]).numpy()}
+
+
+@pytest.mark.parametrize('kind', ['noise', 'bias'])
+@pytest.mark.parametrize('name', ['position', 'attitude', 'velocity', 'rate', 'tilt'])
+def test_noise_and_bias_fill_their_half_width_and_disturb_nothing_else(name, kind):
+    env = quiet({f'random.{name}_{kind}': 0.04, 'random.noise_power': 0.0}, robots=2000)
+    for other, error in widths(env, env.cfg.random).items():
+        if other == name:
+            assert 0.0396 < np.abs(error).max() < 0.0401
+            assert np.abs(error.mean(0)).max() < 0.002
+            assert error.std(0) == pytest.approx(0.04 / 3 ** 0.5, rel=0.06)
+        else:
+            assert np.abs(error).max() < 1e-5
+
+
+def test_a_bias_stays_and_noise_does_not():
+    env = quiet({'random.tilt_bias': 0.05, 'random.noise_power': 0.0}, robots=500)
+    first, second = (Signals(env.cfg.random, env.state, draw(env, seed)).tilt for seed in (1, 2))
+    torch.testing.assert_close(first, second)
+    env = quiet({'random.tilt_noise': 0.05, 'random.noise_power': 0.0}, robots=500)
+    first, second = (Signals(env.cfg.random, env.state, draw(env, seed)).tilt for seed in (1, 2))
+    assert abs(np.corrcoef((first - env.state['x'][:, 13:17]).flatten(),
+                           (second - env.state['x'][:, 13:17]).flatten())[0, 1]) < 0.1
+
+
+def test_a_robots_noise_scale_is_a_power_of_a_uniform_number():
+    scale = quiet(QUIET | {'random.noise_power': 2.0}, robots=4000).state['noise']
+    assert float(scale.mean()) == pytest.approx(1 / 3, abs=0.02)     # of u^2
+    assert float(scale.sqrt().mean()) == pytest.approx(1 / 2, abs=0.02)
+
+
+def test_the_estimate_is_seen_with_its_noise_and_bias():
+    env = quiet({'memory': True, 'random.noise_power': 0.0, 'estimate.force_noise': 0.3,
+                 'estimate.torque_bias': 0.2}, robots=2000)
+    scattered(env)
+    seen, _ = env._observe(env.state, draw(env))
+    s = env.state
+    force = batch.turned_back(batch.matrix(s['x'][:, 6:10]), s['estimate'][:, :3])
+    assert 0.295 < float((seen[:, 33:36] - force).abs().max()) < 0.3001
+    assert 0.195 < float((seen[:, 36:] - s['estimate'][:, 3:]).abs().max()) < 0.2001
