@@ -59,7 +59,9 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
         random: randomisation in place of the named one.
 
     Returns:
-        means U_*, L_*, share reached, share of robots lost, command change in the U windows.
+        means U_*, L_*, share reached, share of robots lost, command change in the U windows,
+        share of joints at a stop there, mean thrust, how far the worst hundredth of the moves
+        sank below start and target.
 
     """
     start = {entry.name: 0.0 for entry in fields(StartParameters)}
@@ -89,6 +91,7 @@ def _fly(mean, env, length, segments, period):
     change = torch.zeros(2, device=env.device)
     lost = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
     stopped = torch.zeros(1, device=env.device)
+    depth, thrust = torch.zeros(shape, device=env.device), torch.zeros(1, device=env.device)
     for segment in range(segments + 1):
         for step in range(length):
             before = env.state['previous'].clone()
@@ -102,6 +105,8 @@ def _fly(mean, env, length, segments, period):
                 if first <= step + 1 < end:
                     sums[f'{key}_position'][segment] += position / (end - first)
                     sums[f'{key}_attitude'][segment] += attitude / (end - first)
+            depth[segment] = torch.maximum(depth[segment], s['floor'][:, 0] - s['x'][:, 2])
+            thrust += s['x'][:, model.THRUST].mean() / (length * (segments + 1))
             if segment and windows['U'][0] <= step + 1 < windows['U'][1]:
                 delta = (s['previous'] - before) ** 2
                 change += torch.stack((delta[:, :4].mean(), delta[:, 4:].mean()))
@@ -112,7 +117,8 @@ def _fly(mean, env, length, segments, period):
     result = {'reached': float(reached.float().mean()), 'lost': float(lost.float().mean()),
               'tilt_change_rad': float((change[0] / count).sqrt()),
               'thrust_change_N': float((change[1] / count).sqrt()),
-              'at_stop': float(stopped / count)}
+              'at_stop': float(stopped / count), 'thrust_N': float(thrust),
+              'depth_p99_m': float(depth[1:].flatten().quantile(0.99))}
     for key, value in kept.items():
         angle = key.endswith('attitude')
         result[f'{key}_deg' if angle else f'{key}_m'] = float(
