@@ -236,8 +236,7 @@ def train(output: Annotated[Path, typer.Option(
               '--seed', min=0, max=2**31 - 1, help='Of everything random.')] = None,
           memory: Annotated[Optional[bool], typer.Option(
               '--memory', help='The policy also sees the estimated disturbance.')] = None,
-          device: Annotated[str, typer.Option(
-              '--device', help='auto, cpu, cuda or cuda:N.')] = 'auto',
+          device: Annotated[str, typer.Option('--device', help='auto, cpu, cuda[:N].')] = 'auto',
           resume: Annotated[Optional[Path], typer.Option(
               '--resume', metavar='DIR', help="Go on from a run's last checkpoint, or from a "
                                               'model_N.pt.')] = None,
@@ -251,16 +250,14 @@ def train(output: Annotated[Path, typer.Option(
 
     Several GPUs: torchrun --nproc-per-node N -m beetle_omni_ros.cli train --output DIR
     """
-    if output is None:
-        if resume is None:
-            raise ParameterError('--output DIR: where the training shall land')
-        output = resume if resume.is_dir() else resume.parent
-    from beetle_omni_ros.train.command import parse_changes, run_train
-    given = parse_changes(changes or [])
-    given.update({key: value for key, value in (('seed', seed), ('memory', memory))
-                  if value is not None})
-    run_train(output=output, config=config, robot=robot, changes=given, device=device,
-              resume=resume, smoke=smoke, stop_after=stop_after, json_path=json_path)
+    from beetle_omni_ros.train.command import run_train, TrainingError
+    from beetle_omni_ros.train.run_folder import parse_changes
+    try:
+        run_train(output=output, config=config, robot=robot, device=device, resume=resume,
+                  changes=parse_changes(changes or [], seed=seed, memory=memory),
+                  smoke=smoke, stop_after=stop_after, json_path=json_path)
+    except TrainingError as error:
+        raise typer.Exit(_fail(error, FAILED)) from None
 
 
 def _check(*, task, seed, conditions, bag, json_path, files):

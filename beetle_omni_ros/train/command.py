@@ -6,23 +6,25 @@ from contextlib import redirect_stdout
 import io
 import os
 from pathlib import Path
-import re
-import time
 
-import numpy as np
 from rich.console import Console
 import torch
-import yaml
 
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import bind, flatten, nest, ParameterError
-from beetle_omni_ros.runs.json_file import write_json
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.json_file import check_writable, write_json
 from beetle_omni_ros.train.assess import assess
-from beetle_omni_ros.train.export import export_policy
-from beetle_omni_ros.train.parameters import TrainParameters
-from beetle_omni_ros.train.runner import Runner
+from beetle_omni_ros.train.export import export_policy, ExportError
+from beetle_omni_ros.train.run_folder import (
+    last_checkpoint,
+    make_folder,
+    PARAMETER_FILE,
+    read_parameters,
+    write_parameters,
+)
+from beetle_omni_ros.train.runner import is_first, Runner
 
-PARAMETER_FILE, POLICY_FILE = 'train.yaml', 'policy.onnx'
+POLICY_FILE = 'policy.onnx'
 # A run that shows within a minute on a CPU that everything fits together; it learns nothing.
 SMOKE = {'iterations': 3, 'log_every': 1, 'save_every': 2, 'ppo.robots': 32, 'ppo.steps': 8,
          'ppo.epochs': 2, 'ppo.minibatches': 2, 'network.hidden': [32, 16, 16]}
@@ -33,6 +35,10 @@ COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}')
            ('attitude_error_deg', 'error deg', '{:.1f}'), ('deaths', 'lost', '{:.0f}'),
            ('tilt_std', 'std tilt', '{:.2f}'), ('thrust_std', 'std thrust', '{:.2f}'),
            ('learning_rate', 'rate', '{:.0e}'))
+
+
+class TrainingError(RuntimeError):
+    """The training cannot go on, or its policy not be written; one line."""
 
 
 def choose_device(name: str) -> str:
@@ -63,53 +69,7 @@ def choose_device(name: str) -> str:
     return 'cpu'
 
 
-def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
-    """
-    A parameter file with single values replaced.
-
-    Args:
-        file: YAML; None: the shipped one.
-        changes: dotted name -> value.
-
-    Raises:
-        ParameterError: file or value unusable.
-
-    """
-    parameters = TrainParameters.load(file)
-    flat = {name: value for name, _, _, value in flatten(parameters)}
-    for key, value in changes.items():
-        if key not in flat:
-            raise ParameterError(f'--set {key}: unknown; keys are those of params/train.yaml, '
-                                 'e.g. ppo.robots')
-        flat[key] = value
-    return bind(TrainParameters, nest(flat), '--set' if changes else str(file or ''))
-
-
-def write_parameters(parameters: TrainParameters, path: Path) -> None:
-    """Dump as YAML that ``--config`` reads."""
-    flat = {name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, _, _, value in flatten(parameters)}
-    path.write_text(yaml.safe_dump(nest(flat), sort_keys=False))
-
-
-def last_checkpoint(folder: Path) -> Path:
-    """
-    The newest checkpoint of a run.
-
-    Raises:
-        ParameterError: there is none.
-
-    """
-    if folder.is_file():
-        return folder
-    numbered = {int(match[1]): path for path in folder.glob('model_*.pt')
-                if (match := re.fullmatch(r'model_(\d+)\.pt', path.name))}
-    if not numbered:
-        raise ParameterError(f'--resume {folder}: no checkpoint model_N.pt there')
-    return numbered[max(numbered)]
-
-
-def run_train(*, output: Path, config: Path | None = None, robot: Path | None = None,
+def run_train(*, output: Path | None, config: Path | None = None, robot: Path | None = None,
               changes: dict | None = None, device: str = 'auto', resume: Path | None = None,
               smoke: bool = False, stop_after: float | None = None,
               json_path: Path | None = None, console: Console | None = None) -> dict:
@@ -117,7 +77,8 @@ def run_train(*, output: Path, config: Path | None = None, robot: Path | None = 
     Train, assess, export.
 
     Args:
-        output: folder for parameters, checkpoints, TensorBoard log and policy.onnx.
+        output: folder for parameters, checkpoints, TensorBoard log and policy.onnx; default
+            that of ``resume``.
         config: parameter file; default the shipped one, with ``resume`` that of the run.
         robot: robot file.
         changes: dotted parameter name -> value, over the file.
@@ -133,43 +94,51 @@ def run_train(*, output: Path, config: Path | None = None, robot: Path | None = 
 
     Raises:
         ParameterError: unusable input, one line.
+        TrainingError: the loss is not finite, or the exported file is wrong; one line.
         KeyboardInterrupt: after a checkpoint was written.
 
     """
-    console = console or Console()
+    console = console or Console(quiet=not is_first())
+    if json_path:
+        check_writable(json_path)
+    if output is None and resume is None:
+        raise ParameterError('--output DIR: where the training shall land')
     where = choose_device(device)
     checkpoint = last_checkpoint(resume) if resume else None
+    output = output or checkpoint.parent
     if checkpoint and config is None and (checkpoint.parent / PARAMETER_FILE).is_file():
         config = checkpoint.parent / PARAMETER_FILE
     changes = {**(SMOKE if smoke and not checkpoint else {}), **(changes or {})}
     parameters = read_parameters(config, changes)
     believed = RobotParameters.load(robot)
-    output.mkdir(parents=True, exist_ok=True)
+    if is_first():
+        make_folder(output, checkpoint)
     torch.set_float32_matmul_precision('high')
     with redirect_stdout(io.StringIO()):     # rsl-rl prints its models
         runner = Runner(parameters, believed, output, where)
     if checkpoint:
         runner.resume(checkpoint)
-    first = runner.is_distributed is False or runner.gpu_global_rank == 0
-    if first:
+    if is_first():
         write_parameters(parameters, output / PARAMETER_FILE)
-        console.print(f'{parameters.ppo.robots} robots on {where}, seed {parameters.seed}, '
-                      f'iterations {runner.current_learning_iteration} to '
-                      f'{parameters.iterations}; everything lands in {output}')
-    began = time.monotonic()
+    processes = f'{runner.gpu_world_size} x ' if runner.is_distributed else ''
+    console.print(f'{processes}{parameters.ppo.robots} robots on {where}, seed '
+                  f'{parameters.seed}, iterations {runner.current_learning_iteration} to '
+                  f'{parameters.iterations}; everything lands in {output}')
     try:
         runner.train(Rows(console), stop_after)
+        runner.close()
+        return _finish(runner, believed, output, where, smoke, json_path, console) \
+            if is_first() else {}
     except KeyboardInterrupt:
-        path = runner.checkpoint()
-        console.print(f'interrupted; go on with: beetle_omni train --resume {path.parent}')
+        if is_first():
+            path = runner.checkpoint()
+            console.print(f'interrupted; go on with: beetle_omni train --resume {path.parent}')
         raise
-    if not first:
-        return {}
-    return _finish(runner, believed, output, where, time.monotonic() - began, smoke, json_path,
-                   console)
+    except (FloatingPointError, ExportError) as error:
+        raise TrainingError(str(error)) from None
 
 
-def _finish(runner, robot, output, device, seconds, smoke, json_path, console):
+def _finish(runner, robot, output, device, smoke, json_path, console):
     """Assess, export, report."""
     parameters, actor = runner.parameters, runner.alg.actor
     robots, segments = (ROBOTS, 2) if device.startswith('cuda') else (CPU_ROBOTS, 1)
@@ -178,7 +147,9 @@ def _finish(runner, robot, output, device, seconds, smoke, json_path, console):
     path = output / POLICY_FILE
     training = {'iterations_done': runner.current_learning_iteration,
                 'samples': runner.current_learning_iteration * parameters.ppo.steps
-                * parameters.ppo.robots, 'seconds': round(seconds, 1), 'device': _model(device)}
+                * parameters.ppo.robots * runner.gpu_world_size,
+                'seconds': round(runner.trained_seconds, 1), 'processes': runner.gpu_world_size,
+                'device': _model(device)}
     difference = export_policy(actor, path, robot, parameters, training, metrics)
     for name, values in metrics.items():
         console.print(f'{name}, training environment: ' + ', '.join(
@@ -186,7 +157,7 @@ def _finish(runner, robot, output, device, seconds, smoke, json_path, console):
     console.print(f'{path}: agrees with torch to {difference:.1e}; fly it with beetle_omni '
                   f'evaluate --controllers rl --policy {path} --task random100')
     result = {'policy': str(path), 'iterations': runner.current_learning_iteration,
-              'seconds': seconds, 'metrics': metrics, 'onnx_difference': difference}
+              'seconds': runner.trained_seconds, 'metrics': metrics, 'onnx_difference': difference}
     if json_path:
         write_json(json_path, result)
     return result
@@ -214,25 +185,3 @@ class Rows:
         self._console.print(' '.join(pattern.format(row[key]).rjust(width)
                                      for (key, _, pattern), width in zip(COLUMNS, widths)),
                             soft_wrap=True, highlight=False)
-
-
-def parse_changes(texts: list[str]) -> dict:
-    """
-    ``key=value`` texts of the command line, values as YAML.
-
-    Raises:
-        ParameterError: no '=' or no YAML.
-
-    """
-    changes = {}
-    for text in texts:
-        key, sign, value = text.partition('=')
-        if not sign:
-            raise ParameterError(f"--set '{text}': expected key=value")
-        try:
-            changes[key.strip()] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise ParameterError(f"--set '{text}': the value is not valid YAML") from None
-    return changes
-
-

@@ -41,7 +41,8 @@ class GraphPpo(PPO):
             compiled: compile the loss.
 
         """
-        self.env, self._limits, self._graphs = env, tuple(learning_rate_limits), graphs
+        self.env, self._graphs = env, graphs
+        self._limits = tuple(float(limit) for limit in learning_rate_limits)
         self._capturable = graphs
         self.rate = torch.tensor(float(self.learning_rate), device=self.device)
         self.optimizer = torch.optim.Adam(
@@ -78,11 +79,22 @@ class GraphPpo(PPO):
         self._run('learn', self._learn)
 
     def update(self) -> dict[str, float]:
-        """rsl-rl's own update, with the knobs applied: the path of several GPUs."""
+        """rsl-rl's own update with the knobs applied, which averages over several processes."""
         self.desired_kl, self.entropy_coef = self.knobs[:2].tolist()
         losses = super().update()
         self.actor.distribution.bound(self.knobs[2:].repeat_interleave(4))
+        low, high = self._limits
+        self.set_rate(min(max(self.learning_rate, low), high))
+        # its divergence it keeps to itself
+        self.losses.copy_(torch.tensor([losses['value'], losses['surrogate'], losses['entropy'],
+                                        0.0]))
         return losses
+
+    def set_rate(self, rate: float) -> None:
+        """Go on with a learning rate."""
+        self.learning_rate = rate
+        self.rate.fill_(rate)
+        self.optimizer.param_groups[0]['lr'] = self.rate if self._capturable else rate
 
     def _run(self, name, function):
         if not self._graphs:

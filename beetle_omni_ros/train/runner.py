@@ -1,9 +1,11 @@
-"""The training loop: schedule, progress, TensorBoard, checkpoints, resume."""
+"""The training loop: schedule, progress, TensorBoard, checkpoints, resume, several processes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+import os
 from pathlib import Path
+import pickle
 import time
 
 import numpy as np
@@ -47,28 +49,41 @@ def rsl_rl_configuration(p: TrainParameters) -> dict:
                       'rnd_cfg': None, 'symmetry_cfg': None}}
 
 
+def is_first() -> bool:
+    """Whether this is the one process, or the first of those that torchrun started."""
+    return int(os.environ.get('RANK', '0')) == 0
+
+
 class Runner(OnPolicyRunner):
     """
     rsl-rl's runner with a loop that keeps the GPU busy.
 
+    Under torchrun each process flies its own robots on its own GPU, and rsl-rl's update averages
+    gradients and divergence over all of them; the first process reports and writes.
+
     Args:
-        parameters: of the training.
+        parameters: of the training; ``ppo.robots`` for each process.
         robot: nominal robot.
         folder: for checkpoints and the TensorBoard log; None: nothing is written.
         device: torch device.
         graphs: whether to capture CUDA graphs and compile; None: on one GPU.
 
+    Attributes:
+        trained_seconds: that the iterations so far took, those before a resume included.
+
     """
 
     def __init__(self, parameters: TrainParameters, robot: RobotParameters,
                  folder: Path | None = None, device: str = 'cpu', graphs: bool | None = None):
-        self.parameters, self.folder = parameters, folder
+        self.parameters, self.folder = parameters, folder if is_first() else None
+        self._robot_hash = robot.hash()
         torch.manual_seed(parameters.seed)
         env = TiltableQuadrotorEnv(parameters, robot, device,
                                    compiled=graphs if graphs is not None else None)
         super().__init__(env, rsl_rl_configuration(parameters),
-                         str(folder) if folder else None, device)
+                         str(self.folder) if self.folder else None, device)
         if self.is_distributed:
+            # equal networks were drawn in all processes, different flights follow
             torch.manual_seed(parameters.seed + 1000 * self.gpu_global_rank)
         if graphs is None:
             graphs = torch.device(device).type == 'cuda' and not self.is_distributed
@@ -114,29 +129,34 @@ class Runner(OnPolicyRunner):
             stop_after: stop early after so many seconds.
 
         """
-        p = self.parameters
-        writer = self._writer()
-        began, first = time.monotonic(), self.current_learning_iteration
+        p, writer = self.parameters, self._writer()
+        if self.is_distributed:
+            self.alg.broadcast_parameters()
+        before, began, first = self.trained_seconds, time.monotonic(), \
+            self.current_learning_iteration
         for iteration in range(first, p.iterations):
             if iteration % SCHEDULE_EVERY == 0 or iteration == first:
                 self.apply_schedule(iteration / p.iterations)
             self.alg.collect()
-            self.alg.learn_batch()
-            self.current_learning_iteration = iteration + 1
-            last = iteration + 1 == p.iterations
-            if last or (iteration + 1) % p.log_every == 0:
-                row = self._row(time.monotonic() - began, iteration + 1 - first)
-                if not np.isfinite(row['value_loss']):
-                    raise FloatingPointError(
-                        f'iteration {iteration + 1}: the value loss is not finite; the last '
-                        f'checkpoint in {self.folder} is the one to resume from')
+            if self.is_distributed:
+                self.alg.update()
+            else:
+                self.alg.learn_batch()
+            self.current_learning_iteration = done = iteration + 1
+            report = done == p.iterations or done % p.log_every == 0
+            save = done < p.iterations and done % p.save_every == 0
+            if report or save:
+                self._check_finite()    # waits for the device
+            elapsed = time.monotonic() - began
+            self.trained_seconds = before + elapsed
+            if save and self.folder:
+                self.checkpoint()
+            if report:
+                row = self._row(elapsed, done - first)
                 self._write(writer, row)
                 progress(row)
-                if stop_after is not None and row['seconds'] > stop_after:
+                if stop_after is not None and self._agree(elapsed > stop_after):
                     break
-            if self.folder and not last and (iteration + 1) % p.save_every == 0:
-                self.checkpoint()
-        self.trained_seconds += time.monotonic() - began
         if self.folder:
             self.checkpoint()
         if writer:
@@ -146,7 +166,7 @@ class Runner(OnPolicyRunner):
         """Write ``model_ITERATION.pt``, whole or not at all."""
         path = self.folder / f'model_{self.current_learning_iteration}.pt'
         part = path.with_suffix('.part')
-        self.save(str(part))
+        self.save(str(part), {'seconds': self.trained_seconds, 'robot_hash': self._robot_hash})
         part.replace(path)
         return path
 
@@ -155,25 +175,68 @@ class Runner(OnPolicyRunner):
         Continue from a checkpoint.
 
         Raises:
-            ParameterError: unreadable file, or one of another network.
+            ParameterError: unreadable file, or one of another network or robot.
 
         """
         try:
-            self.load(str(path), map_location=str(self.env.device))
-        except (OSError, RuntimeError, KeyError, ValueError, EOFError) as error:
-            text = ' '.join(str(error).split())
+            saved = torch.load(str(path), map_location=str(self.env.device), weights_only=True)
+            group, ours = (optimizer['param_groups'][0] for optimizer in (
+                saved['optimizer_state_dict'], self.alg.optimizer.state_dict()))
+            rate = float(group['lr'])
+            # what depends on the device, not on the training
+            group.update({key: ours[key] for key in ('capturable', 'fused', 'foreach')})
+            self.alg.load(saved, None, True)
+            self.current_learning_iteration, infos = int(saved['iter']), saved['infos'] or {}
+        except (OSError, RuntimeError, LookupError, ValueError, TypeError, EOFError,
+                pickle.UnpicklingError) as error:
+            text = ' '.join(str(error).split()) or type(error).__name__
             raise ParameterError(f'{path}: no checkpoint that fits this training '
                                  f'({text[:160]})') from None
-        rate = self.alg.optimizer.param_groups[0]['lr']
-        self.alg.rate.copy_(torch.as_tensor(float(rate)))
-        if self.alg._capturable:
-            self.alg.optimizer.param_groups[0]['lr'] = self.alg.rate
+        found = infos.get('robot_hash', self._robot_hash)
+        if found != self._robot_hash:
+            raise ParameterError(f'{path}: trained for another robot ({found}, this is '
+                                 f'{self._robot_hash}); give its file with --robot')
+        self.trained_seconds = float(infos.get('seconds', 0.0))
+        self.alg.set_rate(rate)
+
+    def _configure_multi_gpu(self):
+        """As rsl-rl, which knows GPUs alone; several processes on a CPU are for tests."""
+        world = int(os.environ.get('WORLD_SIZE', '1'))
+        if world == 1 or torch.device(self.device).type != 'cpu':
+            super()._configure_multi_gpu()
+            return
+        self.gpu_world_size, self.is_distributed = world, True
+        self.gpu_local_rank = int(os.environ.get('LOCAL_RANK', '0'))
+        self.gpu_global_rank = int(os.environ.get('RANK', '0'))
+        self.cfg['multi_gpu'] = {'global_rank': self.gpu_global_rank, 'world_size': world,
+                                 'local_rank': self.gpu_local_rank}
+        torch.distributed.init_process_group('gloo', rank=self.gpu_global_rank, world_size=world)
+
+    def close(self) -> None:
+        """Leave the group of processes."""
+        if self.is_distributed and torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+
+    def _agree(self, decision: bool) -> bool:
+        """What the first process decides; clocks differ, and who stops alone hangs the others."""
+        if not self.is_distributed:
+            return decision
+        flag = torch.tensor(float(decision), device=self.env.device)
+        torch.distributed.broadcast(flag, src=0)
+        return bool(flag)
+
+    def _check_finite(self):
+        if not torch.isfinite(self.alg.losses).all():
+            raise FloatingPointError(
+                f'iteration {self.current_learning_iteration}: the loss is not finite; lower '
+                'ppo.learning_rate perhaps, and resume from the last checkpoint'
+                + (f' in {self.folder}' if self.folder else ''))
 
     def _row(self, seconds, iterations):
         tally = self.env.read_tally()
         value, surrogate, entropy, divergence = self.alg.losses.tolist()
         std = self.alg.std.tolist()
-        samples = iterations * self.parameters.ppo.steps * self.env.num_envs
+        samples = iterations * self.parameters.ppo.steps * self.env.num_envs * self.gpu_world_size
         return {'iteration': self.current_learning_iteration, 'seconds': seconds,
                 'samples_per_second': samples / max(seconds, 1e-9), **tally,
                 'value_loss': value, 'surrogate_loss': surrogate, 'entropy': entropy,

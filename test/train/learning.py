@@ -4,8 +4,8 @@ import extra_train  # noqa: F401
 import torch
 
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.train.command import read_parameters
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
+from beetle_omni_ros.train.run_folder import read_parameters
 
 torch.set_num_threads(1)    # more would only disturb each other on so small batches
 ROBOT = RobotParameters.load()
