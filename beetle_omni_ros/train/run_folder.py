@@ -1,0 +1,103 @@
+"""A run's folder: its parameter file and its checkpoints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+
+import numpy as np
+import yaml
+
+from beetle_omni_ros.robot.schema import bind, flatten, nest, ParameterError
+from beetle_omni_ros.train.parameters import TrainParameters
+
+PARAMETER_FILE = 'train.yaml'
+
+
+def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
+    """
+    A parameter file with single values replaced.
+
+    Args:
+        file: YAML; None: the shipped one.
+        changes: dotted name -> value.
+
+    Raises:
+        ParameterError: file or value unusable.
+
+    """
+    parameters = TrainParameters.load(file)
+    flat = {name: value for name, _, _, value in flatten(parameters)}
+    for key, value in changes.items():
+        if key not in flat:
+            raise ParameterError(f'--set {key}: unknown; keys are those of params/train.yaml, '
+                                 'e.g. ppo.robots')
+        flat[key] = value
+    return bind(TrainParameters, nest(flat), '--set' if changes else str(file or ''))
+
+
+def write_parameters(parameters: TrainParameters, path: Path) -> None:
+    """Dump as YAML that ``--config`` reads."""
+    flat = {name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, _, _, value in flatten(parameters)}
+    path.write_text(yaml.safe_dump(nest(flat), sort_keys=False))
+
+
+def last_checkpoint(folder: Path) -> Path:
+    """
+    The newest checkpoint of a run.
+
+    Raises:
+        ParameterError: there is none.
+
+    """
+    if folder.is_file():
+        return folder
+    numbered = checkpoints(folder)
+    if not numbered:
+        raise ParameterError(f'--resume {folder}: no checkpoint model_N.pt there')
+    return numbered[max(numbered)]
+
+
+def checkpoints(folder: Path) -> dict[int, Path]:
+    """Iteration -> checkpoint of that iteration."""
+    return {int(match[1]): path for path in folder.glob('model_*.pt')
+            if (match := re.fullmatch(r'model_(\d+)\.pt', path.name))}
+
+
+def make_folder(output: Path, checkpoint: Path | None) -> None:
+    """
+    Make the folder of a run.
+
+    Raises:
+        ParameterError: it cannot be made, or holds another run, which would be overwritten.
+
+    """
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ParameterError(f'--output {output}: cannot be made ({error.strerror})') from None
+    goes_on = checkpoint is not None and output.resolve() == checkpoint.parent.resolve()
+    if checkpoints(output) and not goes_on:
+        raise ParameterError(f'--output {output}: holds the checkpoints of another run; '
+                             f'--resume {output} goes on with it')
+
+
+def parse_changes(texts: list[str], **others) -> dict:
+    """
+    ``key=value`` texts of the command line, values as YAML; and other keys that are not None.
+
+    Raises:
+        ParameterError: no '=' or no YAML.
+
+    """
+    changes = {}
+    for text in texts:
+        key, sign, value = text.partition('=')
+        if not sign:
+            raise ParameterError(f"--set '{text}': expected key=value")
+        try:
+            changes[key.strip()] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise ParameterError(f"--set '{text}': the value is not valid YAML") from None
+    return changes | {key: value for key, value in others.items() if value is not None}
