@@ -123,7 +123,7 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     processes = f'{runner.gpu_world_size} x ' if runner.is_distributed else ''
     console.print(f'{processes}{parameters.ppo.robots} robots on {where}, seed '
                   f'{parameters.seed}, iterations {runner.current_learning_iteration} to '
-                  f'{parameters.iterations}; everything lands in {output}')
+                  f'{parameters.iterations}; everything lands in {output}', soft_wrap=True)
     try:
         runner.train(Rows(console), stop_after)
         runner.close()
@@ -132,7 +132,8 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     except KeyboardInterrupt:
         if is_first():
             path = runner.checkpoint()
-            console.print(f'interrupted; go on with: beetle_omni train --resume {path.parent}')
+            console.print(f'interrupted; go on with: beetle_omni train --resume {path.parent}',
+                          soft_wrap=True)
         raise
     except (FloatingPointError, ExportError) as error:
         raise TrainingError(str(error)) from None
@@ -153,9 +154,9 @@ def _finish(runner, robot, output, device, smoke, json_path, console):
     difference = export_policy(actor, path, robot, parameters, training, metrics)
     for name, values in metrics.items():
         console.print(f'{name}, training environment: ' + ', '.join(
-            f'{key} {value:.4g}' for key, value in values.items()))
+            f'{key} {value:.4g}' for key, value in values.items()), soft_wrap=True)
     console.print(f'{path}: agrees with torch to {difference:.1e}; fly it with beetle_omni '
-                  f'evaluate --controllers rl --policy {path} --task random100')
+                  f'evaluate --controllers rl --policy {path} --task random100', soft_wrap=True)
     result = {'policy': str(path), 'iterations': runner.current_learning_iteration,
               'seconds': runner.trained_seconds, 'metrics': metrics, 'onnx_difference': difference}
     if json_path:

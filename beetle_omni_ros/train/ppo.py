@@ -85,6 +85,8 @@ class GraphPpo(PPO):
         self.actor.distribution.bound(self.knobs[2:].repeat_interleave(4))
         low, high = self._limits
         self.set_rate(min(max(self.learning_rate, low), high))
+        with torch.no_grad():    # let go of the last minibatch, whose graph cannot be copied
+            self.actor.distribution.update(torch.zeros_like(self.std))
         # its divergence it keeps to itself
         self.losses.copy_(torch.tensor([losses['value'], losses['surrogate'], losses['entropy'],
                                         0.0]))
