@@ -112,8 +112,8 @@ def test_densities_entropy_and_divergence_are_those_of_torch():
     divergence = kl_divergence(Normal(mean, old), new).sum(-1).mean()
     torch.testing.assert_close(parts[3], divergence.detach())
     assert float(parts[3]) > 0.05
-    torch.testing.assert_close(
-        float(loss.detach()), float(parts[1] + alg.value_loss_coef * parts[0] - alg.knobs[1] * parts[2]))
+    torch.testing.assert_close(loss.detach(), parts[1] + alg.value_loss_coef * parts[0]
+                               - alg.knobs[1] * parts[2])
 
 
 @pytest.mark.parametrize('schedule', ['adaptive', 'fixed'])

@@ -1,0 +1,259 @@
+"""The training loop: schedule, rows, checkpoints, resume, what stops it."""
+
+from dataclasses import replace
+
+from learning import environment, ROBOT, small
+import numpy as np
+import pytest
+import torch
+
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.train import rewards
+from beetle_omni_ros.train.runner import Runner
+
+
+def runner(folder=None, robot=ROBOT, **changes):
+    return Runner(small(changes), robot, folder)
+
+
+def parameters_of(made):
+    return {name: value.clone() for model in (made.alg.actor, made.alg.critic)
+            for name, value in model.state_dict(prefix=type(model).__name__ + '.').items()}
+
+
+def assert_same_state(one, other):
+    """Everything that an optimisation continues from."""
+    for name, value in parameters_of(one).items():
+        torch.testing.assert_close(value, parameters_of(other)[name], rtol=0, atol=0)
+    ours, theirs = one.alg.optimizer.state_dict(), other.alg.optimizer.state_dict()
+    assert ours['state'].keys() == theirs['state'].keys() and ours['state']
+    for key, entries in ours['state'].items():
+        for name, value in entries.items():
+            torch.testing.assert_close(value, theirs['state'][key][name], rtol=0, atol=0)
+    assert float(one.alg.rate) == float(other.alg.rate)
+    assert ours['param_groups'][0]['lr'] == pytest.approx(theirs['param_groups'][0]['lr'])
+
+
+def test_the_schedule_is_linear_between_its_ends():
+    made = runner(**{'schedule.begin': 0.25, 'schedule.end': 0.75, 'schedule.kl': [0.01, 0.005],
+                     'schedule.entropy': [4e-4, 0.0], 'schedule.tilt_std_limit': [0.8, 0.2],
+                     'schedule.thrust_std_limit': [3.0, 1.0], 'schedule.severity': [0.0, 1.0],
+                     'schedule.smooth': [0.1, 1.0], 'schedule.near': [0.5, 1.0]})
+    begin, middle, end = ([0.01, 4e-4, 0.8, 3.0, 0.0], [0.0075, 2e-4, 0.5, 2.0, 0.5],
+                          [0.005, 0.0, 0.2, 1.0, 1.0])
+    for part, knobs, smooth, near in ((0.0, begin, 0.1, 0.5), (0.25, begin, 0.1, 0.5),
+                                      (0.5, middle, 0.55, 0.75), (0.75, end, 1.0, 1.0),
+                                      (1.0, end, 1.0, 1.0)):
+        found, factors = made.knobs(part)
+        assert found == pytest.approx(knobs)
+        assert factors == pytest.approx({
+            **dict.fromkeys(('joint_action_rate', 'thrust_action_rate', 'hover_tilt_rate',
+                             'hover_thrust_rate'), smooth),
+            **dict.fromkeys(('near_position', 'near_attitude', 'near_pose'), near)})
+        made.apply_schedule(part)
+        np.testing.assert_allclose(made.alg.knobs, knobs[:4], rtol=1e-6)
+        assert float(made.env.severity) == pytest.approx(knobs[4])
+        for name, weight in zip(rewards.TERMS, made.env.weights.tolist()):
+            full = getattr(made.parameters.reward, name) * made.parameters.reward.scale
+            assert weight == pytest.approx(full * factors.get(name, 1.0), rel=1e-5), name
+
+
+def test_the_environment_of_the_runner_and_its_starts_share_the_severity():
+    env = environment()
+    env.severity.fill_(0.3)
+    assert float(env._starts.severity) == pytest.approx(0.3)
+
+
+def test_rows_come_when_they_are_due_and_hold_finite_numbers(tmp_path):
+    rows = []
+    runner(tmp_path, iterations=5, log_every=2).train(rows.append)
+    assert [row['iteration'] for row in rows] == [2, 4, 5]
+    for row in rows:
+        assert all(np.isfinite(value) for value in row.values())
+        assert {'reward', 'success_rate', 'value_loss', 'learning_rate'} <= set(row)
+        assert {f'reward/{name}' for name in rewards.TERMS} <= set(row)
+    assert rows[0]['steps'] == 2 * 16 * 6
+
+
+def test_checkpoints_come_when_they_are_due_and_at_the_end(tmp_path):
+    runner(tmp_path, iterations=5, save_every=2).train()
+    assert {path.name for path in tmp_path.glob('model_*')} == {'model_2.pt', 'model_4.pt',
+                                                                'model_5.pt'}
+
+
+def test_without_a_folder_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runner().train()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_training_stops_early_when_told_to(tmp_path):
+    made, rows = runner(tmp_path, iterations=1000), []
+    made.train(rows.append, stop_after=0.0)
+    assert len(rows) == 1 and (tmp_path / 'model_1.pt').is_file()
+
+
+def test_the_same_seed_trains_the_same_network():
+    trained = []
+    for seed in (3, 3, 4):
+        made = runner(seed=seed, iterations=2)
+        made.train()
+        trained.append(parameters_of(made))
+    first, second, other = trained
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert not all(torch.equal(first[name], other[name]) for name in first)
+
+
+def test_a_resumed_training_has_the_state_of_the_interrupted_one(tmp_path):
+    made = runner(tmp_path, iterations=4)
+    calls = []
+
+    def interrupt():
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return collect()
+
+    collect, made.alg.collect = made.alg.collect, interrupt
+    with pytest.raises(KeyboardInterrupt):
+        made.train()
+    path = made.checkpoint()
+    assert path.name == 'model_2.pt'
+    other = runner(tmp_path, iterations=4, seed=9)
+    other.resume(path)
+    assert other.current_learning_iteration == 2
+    assert other.trained_seconds == made.trained_seconds > 0
+    assert_same_state(made, other)
+    rows = []
+    other.train(rows.append)
+    assert [row['iteration'] for row in rows] == [3, 4]
+    assert other.trained_seconds > made.trained_seconds
+
+
+def test_a_resumed_training_takes_the_next_step_of_the_interrupted_one(tmp_path):
+    made = runner(tmp_path, iterations=1)
+    made.train()
+    other = runner(tmp_path, iterations=1)
+    other.resume(tmp_path / 'model_1.pt')
+    made.alg.collect()
+    for name in ('observations', 'actions', 'rewards', 'values', 'returns', 'advantages',
+                 'actions_log_prob'):
+        getattr(other.alg.storage, name).copy_(getattr(made.alg.storage, name))
+    for ours, theirs in zip(other.alg.storage.distribution_params,
+                            made.alg.storage.distribution_params):
+        ours.copy_(theirs)
+    for each in (made, other):
+        each.apply_schedule(1.0)
+        torch.manual_seed(0)
+        each.alg.learn_batch()
+    assert_same_state(made, other)
+
+
+def test_a_checkpoint_of_a_captured_training_continues_without_capture(tmp_path):
+    made = runner(tmp_path, iterations=1)
+    made.train()
+    path = tmp_path / 'model_1.pt'
+    saved = torch.load(path)
+    for group in saved['optimizer_state_dict']['param_groups']:
+        # as the optimiser of CUDA graphs keeps it
+        group.update(capturable=True, fused=True, lr=torch.tensor(float(group['lr'])))
+    torch.save(saved, path)
+    other = runner(iterations=2)
+    other.resume(path)
+    other.train()
+    assert other.current_learning_iteration == 2
+    assert isinstance(other.alg.optimizer.param_groups[0]['lr'], float)
+
+
+def broken(path, how):
+    """Damage a checkpoint."""
+    data = path.read_bytes()
+    if how == 'truncated':
+        path.write_bytes(data[:len(data) // 2])
+    elif how == 'empty':
+        path.write_bytes(b'')
+    elif how == 'text':
+        path.write_text('no checkpoint\n' * 40)
+    elif how == 'another file of torch':
+        torch.save({'weights': torch.zeros(3)}, path)
+    elif how == 'a list':
+        torch.save([1, 2], path)
+    else:
+        path.unlink()
+
+
+@pytest.mark.parametrize('how', ['truncated', 'empty', 'text', 'another file of torch', 'a list',
+                                 'missing'])
+def test_a_broken_checkpoint_is_refused_in_one_line(tmp_path, how):
+    made = runner(tmp_path, iterations=1)
+    path = made.checkpoint()
+    broken(path, how)
+    with pytest.raises(ParameterError) as raised:
+        made.resume(path)
+    assert str(raised.value).startswith(f'{path}: no checkpoint that fits')
+    assert '\n' not in str(raised.value)
+
+
+@pytest.mark.parametrize('changes', [{'network.hidden': [24, 16]}, {'network.hidden': [16]},
+                                     {'memory': True}])
+def test_a_checkpoint_of_another_network_is_refused(tmp_path, changes):
+    path = runner(tmp_path).checkpoint()
+    with pytest.raises(ParameterError, match='no checkpoint that fits this training'):
+        runner(**changes).resume(path)
+
+
+def test_a_checkpoint_of_another_robot_is_refused(tmp_path):
+    path = runner(tmp_path, robot=replace(ROBOT, mass=3.2)).checkpoint()
+    with pytest.raises(ParameterError, match='another robot .* --robot'):
+        runner().resume(path)
+
+
+def test_a_checkpoint_runs_no_code(tmp_path):
+    path = runner(tmp_path).checkpoint()
+    saved = torch.load(path)
+    saved['infos'] = Loud(tmp_path / 'touched')
+    torch.save(saved, path)
+    with pytest.raises(ParameterError, match='no checkpoint that fits'):
+        runner().resume(path)
+    assert not (tmp_path / 'touched').exists()
+
+
+class Loud:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        """Call when unpickled."""
+        return (type(self.path).touch, (self.path,))
+
+
+@pytest.mark.parametrize('log_every', [1, 1000])
+def test_a_loss_that_is_not_finite_stops_the_training_before_it_is_saved(tmp_path, log_every):
+    made = runner(tmp_path, iterations=2000, log_every=log_every, save_every=3)
+    learn = made.alg.learn_batch
+
+    def poisoned():
+        learn()
+        if made.current_learning_iteration == 4:
+            made.alg.losses.fill_(torch.nan)
+            made.alg.learn_batch = lambda: None
+
+    made.alg.learn_batch = poisoned
+    with pytest.raises(FloatingPointError, match=r'iteration \d: the loss is not finite'):
+        made.train()
+    assert {path.name for path in tmp_path.glob('model_*')} == {'model_3.pt'}
+
+
+def test_tensorboard_gets_every_number(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    rows = []
+    runner(tmp_path, iterations=3).train(rows.append)
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert {'train/reward', 'train/success_rate', 'train/value_loss', 'reward/position'} \
+        <= set(events.Tags()['scalars'])
+    written = events.Scalars('train/value_loss')
+    assert [event.step for event in written] == [1, 2, 3]
+    assert [event.value for event in written] == pytest.approx(
+        [row['value_loss'] for row in rows])
