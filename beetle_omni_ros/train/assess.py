@@ -59,9 +59,9 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
         random: randomisation in place of the named one.
 
     Returns:
-        means U_*, L_*, share reached, share of robots lost, command change in the U windows,
-        share of joints at a stop there, mean thrust, how far the worst hundredth of the moves
-        sank below start and target.
+        means U_*, L_* of robots never lost, share of poses reached, share of robots lost,
+        command change in the U windows, share of joints at a stop there, mean thrust, how far
+        the worst hundredth of the moves sank below start and target.
 
     """
     start = {entry.name: 0.0 for entry in fields(StartParameters)}
@@ -114,7 +114,8 @@ def _fly(mean, env, length, segments, period):
     kept = {key: value[1:][:, ~lost] for key, value in sums.items()}
     count = segments * (windows['U'][1] - windows['U'][0])
     reached = (kept['U_position'] < 0.10) & (kept['U_attitude'] < np.radians(10))
-    result = {'reached': float(reached.float().mean()), 'lost': float(lost.float().mean()),
+    result = {'reached': float(reached.sum() / (segments * env.num_envs)),
+              'lost': float(lost.float().mean()),
               'tilt_change_rad': float((change[0] / count).sqrt()),
               'thrust_change_N': float((change[1] / count).sqrt()),
               'at_stop': float(stopped / count), 'thrust_N': float(thrust),
@@ -123,4 +124,4 @@ def _fly(mean, env, length, segments, period):
         angle = key.endswith('attitude')
         result[f'{key}_deg' if angle else f'{key}_m'] = float(
             torch.rad2deg(value.mean()) if angle else value.mean())
-    return result
+    return {key: value for key, value in result.items() if np.isfinite(value)}

@@ -9,14 +9,24 @@ import numpy as np
 
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import group, parameter
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+
+
+def _check_ranges(parameters, *names):
+    """Refuse a range that ends before it begins."""
+    for name in names:
+        low, high = getattr(parameters, name)
+        if low > high:
+            raise ParameterError(f"key '{name}': expected [lowest, highest], found "
+                                 f'[{low:g}, {high:g}]')
 
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeParameters:
     """Time, targets and the end of an episode."""
 
-    period: float = parameter(0.01, doc='between two actions', unit='s', low=1e-3, high=0.1)
+    period: float = parameter(0.01, doc='between two actions, as the policy file promises',
+                              unit='s', low=0.01, high=0.01)
     substeps: int = parameter(4, doc='integration steps in a period', low=1, high=100)
     duration: float = parameter(16.0, doc='longest episode', unit='s', low=1, high=1000)
     target_time: np.ndarray = parameter(
@@ -31,6 +41,10 @@ class EpisodeParameters:
                                   high=200)
     hold_targets: float = parameter(0.1, doc='share of new targets that are near the present '
                                              'pose, so that holding is trained', low=0, high=1)
+
+    def __post_init__(self):
+        """Refuse ranges in the wrong order."""
+        _check_ranges(self, 'target_time')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +65,12 @@ class StartParameters:
                                 high=10)
     rate: float = parameter(3.0, doc='of moving starts, each axis up to', unit='rad/s', low=0,
                             high=20)
+
+    def __post_init__(self):
+        """Refuse shares that leave no robot."""
+        if not any((self.wound_back, self.level, self.wound, self.mixed, self.hover, self.hold,
+                    self.moving)):
+            raise ParameterError('all shares are zero')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +120,11 @@ class RandomParameters:
                                      unit='m/s', low=0, high=10)
     push_rate: float = parameter(4.5, doc='change of body rate, standard deviation of an axis',
                                  unit='rad/s', low=0, high=30)
+
+    def __post_init__(self):
+        """Refuse ranges in the wrong order."""
+        _check_ranges(self, 'velocity_latency', 'tilt_latency', 'command_latency',
+                      'thrust_limit')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,6 +187,13 @@ class NetworkParameters:
                                 high=10)
     thrust_std: float = parameter(2.0, doc='of the thrust actions', low=0, high=10)
 
+    def __post_init__(self):
+        """Refuse layers without neurons, and no layers."""
+        sizes = self.hidden
+        if sizes.ndim != 1 or not sizes.size or (sizes < 1).any() or (sizes % 1).any():
+            raise ParameterError("key 'hidden': expected the sizes of the hidden layers, found "
+                                 f'{sizes.tolist()}')
+
 
 @dataclass(frozen=True, kw_only=True)
 class PpoParameters:
@@ -178,6 +210,13 @@ class PpoParameters:
     value_weight: float = parameter(1.0, doc='of the value loss', low=0, high=100)
     learning_rate: float = parameter(1e-3, doc='at the start', low=0, high=1)
     learning_rate_limits: np.ndarray = parameter([3e-5, 1e-2], doc='of the adaptation', shape=(2,))
+
+    def __post_init__(self):
+        """Refuse empty minibatches."""
+        _check_ranges(self, 'learning_rate_limits')
+        if self.minibatches > self.robots * self.steps:
+            raise ParameterError(f"key 'minibatches': {self.minibatches} are more than the "
+                                 f'{self.robots * self.steps} samples of an iteration')
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -97,7 +97,15 @@ def parse_changes(texts: list[str], **others) -> dict:
         if not sign:
             raise ParameterError(f"--set '{text}': expected key=value")
         try:
-            changes[key.strip()] = yaml.safe_load(value)
+            changes[key.strip()] = _number(yaml.safe_load(value))
         except yaml.YAMLError:
             raise ParameterError(f"--set '{text}': the value is not valid YAML") from None
     return changes | {key: value for key, value in others.items() if value is not None}
+
+
+def _number(value):
+    """Number of a text such as 1e-3, which is none in YAML 1.1."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
