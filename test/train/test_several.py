@@ -1,0 +1,106 @@
+"""Training in several processes: here two on the CPU, which stand for two GPUs."""
+
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+from learning import ROBOT, small
+import pytest
+
+from beetle_omni_ros.train import command
+from beetle_omni_ros.train.runner import is_first, Runner
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+
+
+def together(*arguments):
+    """Run a program as two processes of torchrun."""
+    done = subprocess.run(
+        [sys.executable, '-m', 'torch.distributed.run', '--standalone', '--nproc-per-node', '2',
+         *map(str, arguments)], cwd=ROOT, timeout=120, capture_output=True, text=True, check=False,
+        env={**os.environ, 'OMP_NUM_THREADS': '1',
+             'PYTHONPATH': os.pathsep.join((str(ROOT), str(HERE)))})
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture(scope='module')
+def ranks(tmp_path_factory):
+    """What each of two processes tells after training together."""
+    folder = tmp_path_factory.mktemp('several')
+    together(HERE / 'several_processes.py', folder)
+    return folder, [json.loads((folder / f'rank{rank}.json').read_text()) for rank in (0, 1)]
+
+
+def test_all_processes_have_the_same_network_and_their_own_robots(ranks):
+    _, (first, second) = ranks
+    assert first['distributed'] and second['distributed']
+    assert first['begin'] == second['begin'] != first['weights']
+    assert first['weights'] == second['weights'] and first['rate'] == second['rate']
+    assert first['robots'] != second['robots']
+
+
+def test_the_update_is_not_that_of_one_process_alone(ranks):
+    alone = Runner(small(iterations=1), ROBOT)
+    alone.train()
+    weights = [value.detach().double().sum().item() for value in (
+        *alone.alg.actor.parameters(), *alone.alg.critic.parameters())]
+    assert weights != ranks[1][0]['weights']
+
+
+def test_the_first_process_alone_writes(ranks):
+    folder, (first, second) = ranks
+    assert first['folder'] == str(folder / 'run') and second['folder'] == 'None'
+    names = sorted(path.name for path in (folder / 'run').iterdir())
+    assert len(names) == 2 and names[1] == 'model_1.pt' and names[0].startswith('events')
+
+
+def test_they_stop_together_when_the_first_one_does(ranks):
+    assert [told['iterations'] for told in ranks[1]] == [1, 1]
+
+
+def test_the_samples_of_all_are_counted(ranks):
+    told, one = ranks[1][0], small()
+    assert told['samples_per_second'] * told['seconds'] == pytest.approx(
+        2 * one.ppo.robots * one.ppo.steps)
+
+
+def test_the_command_trains_and_exports_once(tmp_path):
+    told = together('-m', 'beetle_omni_ros.cli', 'train', '--smoke', '--device', 'cpu', '--output',
+                    tmp_path / 'run', '--set', 'iterations=1')
+    assert told.count('2 x 32 robots on cpu') == 1
+    assert told.count('agrees with torch') == 1
+    assert {'train.yaml', 'model_1.pt', 'policy.onnx'} <= {
+        path.name for path in (tmp_path / 'run').iterdir()}
+
+
+def test_one_process_of_torchrun_is_an_ordinary_training(monkeypatch):
+    for name in ('WORLD_SIZE', 'RANK', 'LOCAL_RANK'):
+        monkeypatch.setenv(name, '1' if name == 'WORLD_SIZE' else '0')
+    made = Runner(small(), ROBOT)
+    assert not made.is_distributed and is_first()
+
+
+def test_each_process_takes_the_gpu_of_its_rank(monkeypatch):
+    monkeypatch.setattr(command.torch.cuda, 'is_available', lambda: True)
+    monkeypatch.setattr(command.torch.cuda, 'device_count', lambda: 4)
+    assert command.choose_device('cuda:2') == 'cuda:2'
+    monkeypatch.setenv('LOCAL_RANK', '3')
+    assert command.choose_device('auto') == command.choose_device('cuda') == 'cuda:3'
+    monkeypatch.setenv('LOCAL_RANK', '4')
+    with pytest.raises(command.ParameterError, match='has 4 CUDA devices'):
+        command.choose_device('cuda')
+
+
+def test_several_gpus_are_set_up_by_rsl_rl(monkeypatch):
+    # rsl-rl insists on its device for each process, which tells that its own set-up runs.
+    monkeypatch.setenv('WORLD_SIZE', '2')
+    monkeypatch.setenv('RANK', '1')
+    monkeypatch.setenv('LOCAL_RANK', '1')
+    made = Runner.__new__(Runner)
+    made.device, made.cfg = 'cuda:0', {}
+    with pytest.raises(ValueError, match="'cuda:0' does not match .* '1'"):
+        made._configure_multi_gpu()
