@@ -163,10 +163,12 @@ def main():
         print(f'benchmarks/environment.py: error: {error}', file=sys.stderr)
         sys.exit(2)
     torch.set_float32_matmul_precision('high')
+    if not gpu:
+        torch.set_num_threads(1)    # several wait for each other on a computer that others use
     ppo = TrainParameters.load().ppo
     robots = ppo.robots if gpu else CPU_PPO_ROBOTS
-    results = {'device': torch.cuda.get_device_name(device) if gpu else
-               f'CPU, {torch.get_num_threads()} threads', 'torch': torch.__version__,
+    results = {'device': torch.cuda.get_device_name(device) if gpu else 'CPU, one thread',
+               'torch': torch.__version__,
                'kernel_difference': agreement(device),
                'environment': {size: environment_rate(size, device) for size in sizes},
                'robots': robots, 'steps': ppo.steps, 'ours': ours(robots, device),

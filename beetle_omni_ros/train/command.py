@@ -114,6 +114,8 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     if is_first():
         make_folder(output, checkpoint)
     torch.set_float32_matmul_precision('high')
+    if smoke:
+        torch.set_num_threads(1)    # several wait for each other where other programs run
     with redirect_stdout(io.StringIO()):     # rsl-rl prints its models
         runner = Runner(parameters, believed, output, where)
     if checkpoint:

@@ -7,10 +7,11 @@ written out from the same CasADi function (:mod:`codegen`).
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Callable
-import hashlib
 import importlib.util
 from pathlib import Path
+import shutil
 import tempfile
 
 import torch
@@ -79,14 +80,11 @@ def _kernel_source(function) -> str:
 
 def _load_kernel(source: str):
     """Import a Triton module; its compiler reads the source from a file."""
-    digest = hashlib.md5(source.encode()).hexdigest()
-    folder = Path(tempfile.gettempdir()) / f'beetle_omni_{digest}'
-    folder.mkdir(exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix='beetle_omni_'))    # other users cannot write there
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     path = folder / 'kernel.py'
-    with tempfile.NamedTemporaryFile('w', dir=folder, delete=False) as part:
-        part.write(source)
-    Path(part.name).replace(path)    # whole for others that read it at this moment
-    spec = importlib.util.spec_from_file_location(folder.name, path)
+    path.write_text(source)
+    spec = importlib.util.spec_from_file_location('beetle_omni_kernel', path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.advance
