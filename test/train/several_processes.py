@@ -5,9 +5,10 @@ import os
 from pathlib import Path
 import sys
 
-from learning import ROBOT, small
+import learning  # noqa: F401
 
-from beetle_omni_ros.train.runner import Runner
+from beetle_omni_ros import cli
+from beetle_omni_ros.train import command
 
 
 def checksum(tensors):
@@ -15,20 +16,39 @@ def checksum(tensors):
     return [value.detach().double().sum().item() for value in tensors]
 
 
+def networks(made):
+    """Every parameter."""
+    return checksum((*made.alg.actor.parameters(), *made.alg.critic.parameters()))
+
+
+class Runner(command.Runner):
+    """The training's, kept to be looked at."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        Runner.made, self.begin, self.rows = self, networks(self), []
+
+    def train(self, progress, stop_after):
+        """As it is, with the rows kept."""
+        def both(row):
+            self.rows.append(row)
+            progress(row)
+        super().train(both, stop_after)
+
+
 def main(folder):
-    """Train, tell what came out."""
-    rank = int(os.environ['RANK'])
-    made = Runner(small({'iterations': 1000}), ROBOT, folder / 'run')
-    begin = checksum((*made.alg.actor.parameters(), *made.alg.critic.parameters()))
-    rows = []
+    """Train by the command, tell what came out."""
+    rank = os.environ['RANK']
+    command.Runner = Runner
     # Only the first process has had enough after its first iteration.
-    made.train(rows.append, stop_after=0.0 if rank == 0 else 1e9)
-    result = {'begin': begin, 'distributed': made.is_distributed,
-              'weights': checksum((*made.alg.actor.parameters(), *made.alg.critic.parameters())),
-              'rate': float(made.alg.rate), 'robots': checksum([made.env.state['x']]),
-              'iterations': made.current_learning_iteration, 'folder': str(made.folder),
-              'samples_per_second': rows[0]['samples_per_second'], 'seconds': rows[0]['seconds']}
-    made.close()
+    status = cli.main(['train', '--smoke', '--device', 'cpu', '--output', str(folder / 'run'),
+                       '--set', 'iterations=1000', '--stop-after', '0' if rank == '0' else '1e9'])
+    made = Runner.made
+    result = {
+        'status': status, 'begin': made.begin, 'distributed': made.is_distributed,
+        'weights': networks(made), 'rate': float(made.alg.rate), 'folder': str(made.folder),
+        'robots': checksum([made.env.state['x']]), 'iterations': made.current_learning_iteration,
+        'samples': made.rows[0]['samples_per_second'] * made.rows[0]['seconds']}
     (folder / f'rank{rank}.json').write_text(json.dumps(result))
 
 

@@ -9,34 +9,31 @@ import sys
 from learning import ROBOT, small
 import pytest
 
+from beetle_omni_ros.control.policy_network import PolicyNetwork
 from beetle_omni_ros.train import command
+from beetle_omni_ros.train.run_folder import read_parameters
 from beetle_omni_ros.train.runner import is_first, Runner
 
 HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
-
-
-def together(*arguments):
-    """Run a program as two processes of torchrun."""
-    done = subprocess.run(
-        [sys.executable, '-m', 'torch.distributed.run', '--standalone', '--nproc-per-node', '2',
-         *map(str, arguments)], cwd=ROOT, timeout=120, capture_output=True, text=True, check=False,
-        env={**os.environ, 'OMP_NUM_THREADS': '1',
-             'PYTHONPATH': os.pathsep.join((str(ROOT), str(HERE)))})
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
 
 
 @pytest.fixture(scope='module')
 def ranks(tmp_path_factory):
-    """What each of two processes tells after training together."""
+    """Folder, output, and what each of two processes tells after training together."""
     folder = tmp_path_factory.mktemp('several')
-    together(HERE / 'several_processes.py', folder)
-    return folder, [json.loads((folder / f'rank{rank}.json').read_text()) for rank in (0, 1)]
+    done = subprocess.run(
+        [sys.executable, '-m', 'torch.distributed.run', '--standalone', '--nproc-per-node', '2',
+         str(HERE / 'several_processes.py'), str(folder)], timeout=120, capture_output=True,
+        text=True, check=False, env={**os.environ, 'OMP_NUM_THREADS': '1', 'PYTHONPATH':
+                                     os.pathsep.join((str(HERE.parents[1]), str(HERE)))})
+    assert done.returncode == 0, done.stderr[-3000:]
+    return folder, done.stdout, [json.loads((folder / f'rank{rank}.json').read_text())
+                                 for rank in (0, 1)]
 
 
 def test_all_processes_have_the_same_network_and_their_own_robots(ranks):
-    _, (first, second) = ranks
+    _, _, (first, second) = ranks
+    assert first['status'] == second['status'] == 0
     assert first['distributed'] and second['distributed']
     assert first['begin'] == second['begin'] != first['weights']
     assert first['weights'] == second['weights'] and first['rate'] == second['rate']
@@ -44,37 +41,30 @@ def test_all_processes_have_the_same_network_and_their_own_robots(ranks):
 
 
 def test_the_update_is_not_that_of_one_process_alone(ranks):
-    alone = Runner(small(iterations=1), ROBOT)
+    alone = Runner(read_parameters(None, {**command.SMOKE, 'iterations': 1}), ROBOT)
     alone.train()
     weights = [value.detach().double().sum().item() for value in (
         *alone.alg.actor.parameters(), *alone.alg.critic.parameters())]
-    assert weights != ranks[1][0]['weights']
+    assert weights != ranks[2][0]['weights']
 
 
 def test_the_first_process_alone_writes(ranks):
-    folder, (first, second) = ranks
+    folder, told, (first, second) = ranks
     assert first['folder'] == str(folder / 'run') and second['folder'] == 'None'
-    names = sorted(path.name for path in (folder / 'run').iterdir())
-    assert len(names) == 2 and names[1] == 'model_1.pt' and names[0].startswith('events')
+    names = {path.name for path in (folder / 'run').iterdir()}
+    assert {'train.yaml', 'model_1.pt', 'policy.onnx'} <= names and len(names) == 4
+    assert told.count('2 x 32 robots on cpu') == told.count('agrees with torch') == 1
 
 
 def test_they_stop_together_when_the_first_one_does(ranks):
-    assert [told['iterations'] for told in ranks[1]] == [1, 1]
+    assert [told['iterations'] for told in ranks[2]] == [1, 1]
 
 
 def test_the_samples_of_all_are_counted(ranks):
-    told, one = ranks[1][0], small()
-    assert told['samples_per_second'] * told['seconds'] == pytest.approx(
-        2 * one.ppo.robots * one.ppo.steps)
-
-
-def test_the_command_trains_and_exports_once(tmp_path):
-    told = together('-m', 'beetle_omni_ros.cli', 'train', '--smoke', '--device', 'cpu', '--output',
-                    tmp_path / 'run', '--set', 'iterations=1')
-    assert told.count('2 x 32 robots on cpu') == 1
-    assert told.count('agrees with torch') == 1
-    assert {'train.yaml', 'model_1.pt', 'policy.onnx'} <= {
-        path.name for path in (tmp_path / 'run').iterdir()}
+    each = command.SMOKE['ppo.robots'] * command.SMOKE['ppo.steps']
+    assert ranks[2][0]['samples'] == pytest.approx(2 * each)
+    contract = PolicyNetwork(ranks[0] / 'run' / 'policy.onnx', ROBOT).contract
+    assert contract.training['samples'] == 2 * each and contract.training['processes'] == 2
 
 
 def test_one_process_of_torchrun_is_an_ordinary_training(monkeypatch):
