@@ -151,6 +151,14 @@ def test_only_a_lost_robot_pays_for_its_end():
     assert not other.state['age'][:16].any()
 
 
+def test_who_is_lost_at_the_time_limit_is_lost():
+    env = quiet()
+    env.state['age'].fill_(env.max_episode_length - 1)
+    env.state['x'][:8, 3:6] = 50.0
+    env.advance(actions(env, 3, 1)[0])
+    assert env.done.all() and env.timeout.tolist() == [False] * 8 + [True] * 56
+
+
 def test_the_reward_is_the_weighted_sum_of_the_terms():
     env = quiet()
     before = {name: value.clone() for name, value in env.state.items()}

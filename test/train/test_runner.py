@@ -162,7 +162,8 @@ def test_a_checkpoint_of_a_captured_training_continues_without_capture(tmp_path)
     other.resume(path)
     other.train()
     assert other.current_learning_iteration == 2
-    assert isinstance(other.alg.optimizer.param_groups[0]['lr'], float)
+    group = other.alg.optimizer.param_groups[0]
+    assert isinstance(group['lr'], float) and not group['capturable'] and not group['fused']
 
 
 def broken(path, how):
