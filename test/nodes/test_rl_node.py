@@ -33,6 +33,7 @@ from hover_policy import write_hover_policy
 from policy_files import write
 
 SWITCHES = 20
+OWN_DOMAIN = 7      # of the flight by the command: far from those that the fixtures reserve
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -223,7 +224,8 @@ def test_one_call_flies_the_policy_and_the_bag_holds_both_controllers(tmp_path):
     task.write_text(HEADER + '0.3,0,1,20,0,0\n')
     done = subprocess.run(
         [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--controller', 'rl', '--policy',
-         str(policy), '--task', str(task), '--bag', str(bag), '--json', str(result)],
+         str(policy), '--task', str(task), '--bag', str(bag), '--json', str(result),
+         '--domain-id', str(OWN_DOMAIN)],
         capture_output=True, text=True, timeout=READY, check=False)
     assert done.returncode == 0, done.stderr
     results = json.loads(result.read_text())
