@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager
 import fcntl
+from itertools import count
 import os
 from pathlib import Path
 import socket
@@ -9,14 +10,19 @@ import tempfile
 
 # Linux keeps its ephemeral ports clear of domains up to 101; 0 is everybody's default.
 DOMAINS = range(101, 0, -1)
-# Ports of the RTPS standard: base + gain * domain + offset.
+# Ports of the RTPS standard: base + gain * domain + offset. All participants of a domain share the
+# first, for discovery; the second is the first participant's own.
 PORT_BASE, DOMAIN_GAIN, USER_UNICAST = 7400, 250, 11
+_turns = count(os.getpid())
 
 
 @contextmanager
 def reserved():
     """
     Reserve a free ROS domain while the context lasts.
+
+    Each call begins its search at another number: participants that are on their way out may
+    still tell the next ones in their domain what they know.
 
     Yields:
         Its number.
@@ -27,7 +33,8 @@ def reserved():
     """
     folder = Path(tempfile.gettempdir()) / f'beetle_omni_{os.getuid()}'
     folder.mkdir(mode=0o700, exist_ok=True)
-    for number in DOMAINS:
+    first = next(_turns) % len(DOMAINS)
+    for number in [*DOMAINS[first:], *DOMAINS[:first]]:
         with open(folder / f'domain{number}.lock', 'w') as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -40,10 +47,11 @@ def reserved():
 
 
 def _quiet(number):
-    """Whether no participant of another program has the domain's first unicast port."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(('', PORT_BASE + DOMAIN_GAIN * number + USER_UNICAST))
-        except OSError:
-            return False
+    """Whether no participant of another program holds a port of the domain."""
+    for offset in (0, USER_UNICAST):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(('', PORT_BASE + DOMAIN_GAIN * number + offset))
+            except OSError:
+                return False
     return True

@@ -33,7 +33,6 @@ from hover_policy import write_hover_policy
 from policy_files import write
 
 SWITCHES = 20
-OWN_DOMAIN = 7      # of the flight by the command: far from those that the fixtures reserve
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -72,8 +71,7 @@ def test_the_node_answers_as_the_controller_does(process):
     targets.publish(message)
     witness.spin(0.3)
 
-    sent = {}
-    for k in range(20):
+    def ask(k):
         now = time.time()
         state = convert.Odom(now, np.array([0.0, 0.1 * k, 1.0]), np.array([0.1, 0.2, -0.3]),
                              np.array([0.5, 0.5, 0.5, 0.5]), np.array([0.3, 0.0, -0.1]))
@@ -82,13 +80,21 @@ def test_the_node_answers_as_the_controller_does(process):
         odom.publish(convert.odometry_message(
             now, state.position, state.velocity, state.quaternion, state.angular_velocity))
         witness.spin(0.02)
-        sent[round(now, 4)] = controller.step(
+        expected = controller.step(
             convert.state(state, convert.Joints(now, tilt, np.zeros(4)), None), target)
-    assert len(answers) >= 10, graph.dead()
-    for answer in answers:
-        expected = sent[round(answer.stamp, 4)]
-        assert np.allclose(answer.tilt, expected.tilt, atol=1e-5)
-        assert np.allclose(answer.thrust, expected.thrust, atol=1e-5)
+        return round(now, 4), np.concatenate((expected.tilt, expected.thrust))
+
+    def answered(asked):
+        found = {round(a.stamp, 4): np.concatenate((a.tilt, a.thrust)) for a in answers}
+        return [(found[stamp], expected) for stamp, expected in asked.items() if stamp in found]
+
+    # A busy machine delivers the target when it likes; from then on every answer is the same.
+    assert witness.wait(
+        lambda: any(np.allclose(*pair, atol=1e-5) for pair in answered(dict([ask(0)]))), 30)
+    pairs = answered(dict(ask(k) for k in range(20)))
+    assert len(pairs) >= 10, graph.dead()
+    for answer, expected in pairs:
+        assert np.allclose(answer, expected, atol=1e-5)
     assert witness.wait(lambda: witness.values('rl_node: controller').get('steps'), 5)
     assert witness.values('rl_node: controller')['policy'] == 'rl'
     assert not graph.dead()
@@ -224,8 +230,7 @@ def test_one_call_flies_the_policy_and_the_bag_holds_both_controllers(tmp_path):
     task.write_text(HEADER + '0.3,0,1,20,0,0\n')
     done = subprocess.run(
         [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--controller', 'rl', '--policy',
-         str(policy), '--task', str(task), '--bag', str(bag), '--json', str(result),
-         '--domain-id', str(OWN_DOMAIN)],
+         str(policy), '--task', str(task), '--bag', str(bag), '--json', str(result)],
         capture_output=True, text=True, timeout=READY, check=False)
     assert done.returncode == 0, done.stderr
     results = json.loads(result.read_text())
