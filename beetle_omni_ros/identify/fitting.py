@@ -8,7 +8,7 @@ independent pieces of information, and clipped (Huber) so that a bad sample cann
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
@@ -218,6 +218,11 @@ class Fitter:
             busy[rows] = np.where(better, fall > TOLERANCE, damping[rows] < 1e4)
         return Fits(decode(points), chi2)
 
+    def cost(self, problems: Problems) -> np.ndarray:
+        """(B,) chi2 of parameter sets as they are, without the prior."""
+        return (self.residuals(encode(problems.sets), problems.joint,
+                               problems.weight)**2).sum(axis=1)
+
     def _normal(self, points, problems, base):
         slopes = self.jacobian(points, problems, base)
         normal = slopes @ slopes.transpose(0, 2, 1)
@@ -248,6 +253,3 @@ def _move(points, normal, slope, free, damping):
     wanted = points + np.clip(step, -LARGEST_MOVE, LARGEST_MOVE)
     return np.where(free, np.clip(wanted, LOW, HIGH), points)
 
-
-__all__ = ['decode', 'encode', 'Fits', 'Fitter', 'HIGH', 'LOW', 'Noise', 'Prior', 'Problems',
-           'replace']
