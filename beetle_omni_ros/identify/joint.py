@@ -1,0 +1,176 @@
+"""Identification of the tilt servos from one response log, judged on what was not fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.identify.fitting import encode, Fitter, Noise, Prior, Problems
+from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.selection import CANDIDATES, Choice, free_mask, LINEAR, Selector
+from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, published_set, simulate, TERMS
+from beetle_omni_ros.identify.uncertainty import (
+    Experiment,
+    separating_experiment,
+    traded,
+    uncertainties,
+    Uncertainty,
+)
+from beetle_omni_ros.robot.parameters import JointParameters
+
+FITTED_PART = 0.6       # of the log; the rest judges
+FIRST_NOISE = 0.002     # [rad] white, until the residuals tell
+# Belief beside the data, as standard deviations. The published frequency and damping are right
+# within a factor of 1.6; servos of one type and one bus differ by 10 % and 3 ms.
+PUBLISHED_DEVIATION = {'natural_frequency': 0.5, 'damping_ratio': 0.5}
+COMMON_DEVIATION = {'natural_frequency': 0.1, 'damping_ratio': 0.1, 'delay': 0.003}
+LEAST_COMMON = 3        # joints, below which nothing is called common
+CERTAIN = ('delay', 'coulomb_friction')   # in the model that estimates the noise
+
+
+@dataclass(frozen=True)
+class JointModel:
+    """
+    What one servo turned out to be.
+
+    Attributes:
+        joint: number, 1 to 4.
+        kept: candidates in the model.
+        values: (n,) parameter set that predicts; where the log says nothing, as published.
+        estimates: (n,) also of numbers that are not in the model.
+        uncertainty: of the estimates.
+        traded: pairs that the log cannot separate.
+        experiment: that would separate delay and bandwidth.
+        gain: candidate -> chi2 gained on unseen blocks.
+
+    """
+
+    joint: int
+    kept: tuple[str, ...]
+    values: np.ndarray
+    estimates: np.ndarray
+    uncertainty: Uncertainty
+    traded: list[list[str]]
+    experiment: Experiment
+    gain: dict[str, float]
+
+
+def identify_joints(log: JointLog, published: JointParameters,
+                    fitted: float = FITTED_PART) -> list[JointModel]:
+    """
+    Identify every joint of a log from its first part.
+
+    Args:
+        log: commands and positions.
+        published: the servo as the robot file has it.
+        fitted: part of the log that may be looked at.
+
+    """
+    end = int(round(fitted * len(log.t)))
+    start = published_set(published)
+    weight = np.zeros((len(log.joints), len(log.t)))
+    weight[:, :end] = 1.0
+    noise = _first_noise(log, start, weight, end)
+    belief = _prior(start, PUBLISHED_DEVIATION)
+    choices = Selector(Fitter(log, noise, belief), end).run(_unlimited(start))
+    problems = _problems(log, choices, weight)
+    fits = Fitter(log, noise, belief).solve(problems)
+    if len(log.joints) >= LEAST_COMMON:
+        common = np.median(fits.sets, axis=0)
+        prior = _prior(common, COMMON_DEVIATION)
+        if not problems.free[:, INDEX['delay']].any():
+            prior.precision[INDEX['delay']] = 0.0
+        problems = Problems(problems.joint, fits.sets, problems.free, weight)
+        fits = Fitter(log, noise, prior).solve(problems)
+    return _models(log, noise, choices, fits.sets, weight, end, start)
+
+
+def _unlimited(start):
+    return np.where(free_mask(()), start, OFF)
+
+
+def _prior(centre, deviations):
+    precision = np.zeros(len(NAMES))
+    for name, deviation in deviations.items():
+        precision[INDEX[name]] = (TERMS[name].scale / deviation)**2
+    return Prior(encode(centre), precision)
+
+
+def _problems(log, choices, weight):
+    free = np.array([free_mask(choice.kept) for choice in choices])
+    return Problems(np.arange(len(log.joints)), np.array([c.values for c in choices]), free,
+                    weight)
+
+
+def _first_noise(log, start, weight, end):
+    """Noise around the model whose terms are certain, fitted with equal weights."""
+    joints = np.arange(len(log.joints))
+    sets = np.tile(_unlimited(start), (len(joints), 1))
+    sets[:, INDEX['delay']], sets[:, INDEX['coulomb_friction']] = 0.01, 0.01
+    free = np.tile(free_mask((*CERTAIN, 'offset')), (len(joints), 1))
+    fits = Fitter(log, Noise.white(len(joints), FIRST_NOISE), _prior(
+        start, PUBLISHED_DEVIATION)).solve(Problems(joints, sets, free, weight))
+    error = simulate(log, joints, fits.sets) - log.measured
+    return Noise.of(error[:, :end], max(log.quantum, 1e-4) / np.sqrt(12))
+
+
+def _models(log, noise, choices: list[Choice], sets, weight, end, start):
+    """Intervals of the kept numbers together, and of each other one if it joined them."""
+    rows, owner = [], []
+    for j, choice in enumerate(choices):
+        for name in (None, *(n for n in CANDIDATES if n not in choice.kept)):
+            if name is not None and name not in choice.tried:
+                continue
+            kept = choice.kept if name is None else (*choice.kept, name)
+            values = sets[j].copy()
+            for member in CANDIDATES[name].members if name else ():
+                values[INDEX[member]] = choice.tried[name][INDEX[member]]
+            rows.append(Problems(np.array([j]), values[None], free_mask(kept)[None],
+                                 weight[j:j + 1]))
+            owner.append((j, name))
+    problems = Problems.join(rows)
+    judged = dict(zip(owner, uncertainties(log, noise, problems, end), strict=True))
+    models = []
+    for j, choice in enumerate(choices):
+        main, estimates = judged[j, None], sets[j].copy()
+        for name in CANDIDATES:
+            if (j, name) in judged:
+                for member in CANDIDATES[name].members:
+                    index = INDEX[member]
+                    estimates[index] = choice.tried[name][index]
+                    main.intervals[index] = judged[j, name].intervals[index]
+        values = _with_published_limits(log, j, choice, sets[j], start, estimates, main)
+        names = [n for n in NAMES if free_mask(choice.kept)[INDEX[n]]]
+        judge = judged.get((j, 'delay'), main)
+        pairs = traded(judge, names if 'delay' in names else [*names, 'delay'])
+        models.append(JointModel(
+            log.joints[j], choice.kept, values, estimates, main, pairs,
+            separating_experiment(sets[j], free_mask(choice.kept), noise, j, main.scatter),
+            choice.gain))
+    return models
+
+
+def _with_published_limits(log, j, choice: Choice, values, start, estimates, uncertainty):
+    """Limits that the log never reaches stay as published, unless the log went beyond them."""
+    values = values.copy()
+    seen = {'velocity_limit': log.speed()[j],
+            'torque_limit': np.abs(log.command[j] - log.measured[j]).max()}
+    for name, reached in seen.items():
+        index = INDEX[name]
+        if name in choice.kept:
+            continue
+        limit = max(start[index], 1.1 * reached)
+        values[index] = estimates[index] = limit
+        uncertainty.intervals[index] = reached, np.inf
+    return values
+
+
+def error_rms(log: JointLog, joint: int, values: np.ndarray, held: bool = True,
+              part: slice = slice(None)) -> float:
+    """RMS of prediction minus measurement [rad] of the joint with this index."""
+    error = simulate(log, joint, values[None], held)[0] - log.measured[joint]
+    return float(np.sqrt(np.mean(error[part]**2)))
+
+
+__all__ = ['error_rms', 'FITTED_PART', 'identify_joints', 'JointModel', 'LINEAR']
