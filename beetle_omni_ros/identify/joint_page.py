@@ -18,8 +18,8 @@ from beetle_omni_ros.runs.table import Grid
 MILLI = 1e3
 
 
-def grids(results: dict) -> list[Grid]:
-    """Errors and terms, a column for each joint."""
+def grids(results: dict, brief: bool = False) -> list[Grid]:
+    """Errors and terms, a column for each joint; ``brief``: only terms that some joint has."""
     joints = results['joints']
     header = ['', *(f'joint {joint["joint"]}' for joint in joints)]
     rows = [[text, *(_milli(joint[key]) for joint in joints)] for text, key in (
@@ -32,7 +32,8 @@ def grids(results: dict) -> list[Grid]:
                           ('identified', 'validation_rms_rad')):
             rows.append([f'{text}, {name}', *(_milli(joint[key][k]) for joint in joints)])
     errors = Grid('Prediction error, RMS [mrad]', header, rows)
-    names = list(joints[0]['terms'])
+    names = [name for name in joints[0]['terms'] if not brief
+             or any(joint['terms'][name]['kept'] for joint in joints)]
     rows = [[f'{name} [{_unit(joints[0]["terms"][name]["unit"])}]',
              *(_value(joint['terms'][name]) for joint in joints)] for name in names]
     unused = frozenset(k for k, name in enumerate(names)
@@ -53,15 +54,13 @@ def _value(term):
     factor = MILLI if term['unit'] in ('s', 'rad') else 1.0
     numbers = [None if v is None else factor * v for v in (term['value'], *term['interval'])]
     value, low, high = ('inf' if v is None else f'{v:.3g}' for v in numbers)
-    text = f'{value} ({low} to {high})'
+    text = f'{value} ({low}..{high})'
     return text if term['kept'] else f'[{text}]'
 
 
 def joint_page(log: JointLog, validations: list[JointLog], models: list[JointModel],
                published: JointParameters, results: dict) -> str:
     """HTML page with the tables, what cannot be told, and figures of every log."""
-    notes = [f'Joint {joint["joint"]}: {text}' for joint in results['joints']
-             for text in joint['text']]
     with matplotlib.rc_context(STYLE):
         sections = []
         for k, other in enumerate([log, *validations]):
@@ -75,7 +74,8 @@ def joint_page(log: JointLog, validations: list[JointLog], models: list[JointMod
         sections.append(section('Friction and lag', 'Position error over commanded speed: a '
                                 'straight line is lag, the gap between the branches a dead band.',
                                 svg(_loops(log, models), 'position error over speed')))
-    return page('Tilt servos', f'identified from {log.name}', grids(results), notes, sections)
+    return page('Tilt servos', f'identified from {log.name}', grids(results), results['text'],
+                sections)
 
 
 def _pairs(log, models):

@@ -17,7 +17,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 WORDS = {'natural_frequency': 'bandwidth', 'damping_ratio': 'damping', 'delay': 'delay',
          'coulomb_friction': 'friction', 'velocity_limit': 'speed limit',
-         'torque_limit': 'torque limit', 'stribeck_velocity': 'Stribeck velocity',
+         'torque_limit': 'torque limit (an error of position)', 'stribeck_velocity': 'Stribeck velocity',
          'load_sine': 'load (sine)', 'load_cosine': 'load (cosine)'}
 
 
@@ -33,10 +33,20 @@ def joint_results(log: JointLog, validations: list[JointLog], models: list[Joint
         published: the servo as the robot file has it.
 
     """
+    joints = [_joint(log, k, validations, model, published) for k, model in enumerate(models)]
     return {'meta': {'log': log.name, 'validate': [other.name for other in validations],
                      'fitted_part': FITTED_PART, 'version': __version__},
-            'joints': [_joint(log, k, validations, model, published)
-                       for k, model in enumerate(models)]}
+            'joints': joints, 'text': _merged(joints)}
+
+
+def _merged(joints):
+    """Sentences of all joints, each once, with the joints that it is about."""
+    about: dict[str, list[str]] = {}
+    for joint in joints:
+        for text in joint['text']:
+            about.setdefault(text, []).append(str(joint['joint']))
+    return [f'Joint{"s" if len(numbers) > 1 else ""} {", ".join(numbers)}: {text}'
+            for text, numbers in about.items()]
 
 
 def _joint(log, index, validations, model, published):
@@ -94,13 +104,12 @@ def sentences(model: JointModel) -> list[str]:
             f'{plan.amplitude:.2f} rad for {plan.duration:g} s (several reversals a second): it '
             f'would give the delay to +-{1e3 * plan.delay_width:.1f} ms and the natural frequency '
             f'to +-{plan.frequency_width:.1f} rad/s.')
-    for name, wanted in (('velocity_limit', 'speeds'), ('torque_limit', 'position errors')):
-        if name not in model.kept:
-            index = INDEX[name]
-            text.append(
-                f'The {WORDS[name]} was not met ({wanted} up to {intervals[index][0]:.2f} '
-                f'{TERMS[name].unit}); predictions use {model.values[index]:.3g} '
-                f'{TERMS[name].unit}, as published. A step of 1.5 rad would show it.')
+    unmet = [name for name in ('velocity_limit', 'torque_limit') if name not in model.kept]
+    if unmet:
+        used = ' and '.join(f'{model.values[INDEX[name]]:.3g} {TERMS[name].unit}'
+                            for name in unmet)
+        text.append(f'Not met in this log: {" and ".join(WORDS[name] for name in unmet)}; '
+                    f'predictions use {used} as published. Steps of 1.5 rad would show them.')
     return text
 
 
