@@ -6,11 +6,11 @@ from pathlib import Path
 
 from rich.console import Console
 
+from beetle_omni_ros.identify import joint_results as of_joints
+from beetle_omni_ros.identify import rotor_results as of_rotor
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import read_joint_log
 from beetle_omni_ros.identify.joint_page import grids, joint_page
-from beetle_omni_ros.identify import joint_results as of_joints
-from beetle_omni_ros.identify import rotor_results as of_rotor
 from beetle_omni_ros.identify.rotor import identify_rotor
 from beetle_omni_ros.identify.rotor_log import read_rotor_log
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -54,7 +54,8 @@ def run_identify_joint(path: Path, *, validate: list[Path] = (), robot: Path | N
     if json_path:
         write_json(json_path, results)
     if report:
-        of_joints.write_text(report, joint_page(log, validations, models, published, results), 'report')
+        of_joints.write_text(report, joint_page(log, validations, models, published, results),
+                             'report')
     if params:
         of_joints.write_robot_file(params, results, robot)
     return results

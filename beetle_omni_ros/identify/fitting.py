@@ -71,8 +71,12 @@ class Noise:
     @classmethod
     def of(cls, residual: np.ndarray, floor: float):
         """
-        Estimate from one residual for each joint (n, N); ``floor`` [rad] below which no
-        whitened residual of a quantised reading can be.
+        Estimate the noise.
+
+        Args:
+            residual: (n, N), one for each joint [rad].
+            floor: below which no whitened residual of a quantised reading can be [rad].
+
         """
         filters, sigmas = [], []
         for row in residual:

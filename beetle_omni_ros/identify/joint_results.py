@@ -17,8 +17,8 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 WORDS = {'natural_frequency': 'bandwidth', 'damping_ratio': 'damping', 'delay': 'delay',
          'coulomb_friction': 'friction', 'velocity_limit': 'speed limit',
-         'torque_limit': 'torque limit (an error of position)', 'stribeck_velocity': 'Stribeck velocity',
-         'load_sine': 'load (sine)', 'load_cosine': 'load (cosine)'}
+         'torque_limit': 'torque limit (an error of position)',
+         'stribeck_velocity': 'Stribeck velocity', 'load_sine': 'load (sine)', 'load_cosine': 'load (cosine)'}
 
 
 def joint_results(log: JointLog, validations: list[JointLog], models: list[JointModel],

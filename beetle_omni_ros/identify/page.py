@@ -15,7 +15,8 @@ def page(title: str, subtitle: str, grids: list[Grid], notes: list[str],
     Put a page together.
 
     Args:
-        title, subtitle: of the page.
+        title: of the page.
+        subtitle: below it.
         grids: tables.
         notes: sentences below the tables.
         sections: HTML made by :func:`beetle_omni_ros.runs.report_page.section`.

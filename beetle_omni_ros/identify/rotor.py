@@ -16,7 +16,7 @@ from beetle_omni_ros.identify.csv_table import LogError
 from beetle_omni_ros.identify.rotor_log import Plateau, RotorLog
 
 UNIT_THRUST = 10.0      # [N] of g
-IDLE = 0.3              # [N] below which the rotor hardly turns: not fitted
+STOP = 50.5             # [%] of duty up to which the rotor stands: not fitted
 LEAST_SLOPE = 1.0       # [% of duty for each g] of a map that can be inverted safely
 NORMAL_95 = 1.96
 GRID = 400
@@ -90,36 +90,31 @@ def fit_row(name: str, plateau: Plateau) -> MapRow:
         LogError: the sweep is too small, or thrust does not rise with duty.
 
     """
-    used = plateau.force > IDLE
+    used = plateau.duty > STOP
     duty, g = plateau.duty[used], plateau.force[used] / UNIT_THRUST
     if used.sum() < 12 or np.unique(np.round(duty, 1)).size < 5:
         raise LogError(f'{name}: at {plateau.voltage:.2f} V only {used.sum()} rows of '
-                       f'{np.unique(np.round(duty, 1)).size} duties give thrust; expected a sweep')
+                       f'{np.unique(np.round(duty, 1)).size} duties above stop; expected a sweep')
     if np.corrcoef(duty, g)[0, 1] < 0.8:
         raise LogError(f'{name}: at {plateau.voltage:.2f} V thrust does not rise with duty; '
                        'are the columns in the right units?')
-    top = 1.05 * g.max()
-    grid = np.linspace(0, top, 60)
-
-    def error(coefficients):
-        slope = np.polyval(np.polyder(coefficients[::-1]), grid)
-        fitted = inverse(coefficients, duty, UNIT_THRUST * 1.3 * g.max()) / UNIT_THRUST
-        return np.concatenate([fitted - g, 0.3 * np.minimum(slope - LEAST_SLOPE, 0)])
-
-    start = np.polyfit(g, duty, 3)[::-1]
-    if np.polyval(np.polyder(start[::-1]), grid).min() < LEAST_SLOPE:
-        start = np.array([*np.polyfit(g, duty, 1)[::-1], 0.0, 0.0])
-    scale = 3 * 1.4826 * np.median(np.abs(error(start)[:len(g)])) + 1e-4
-    fit = least_squares(error, start, loss='soft_l1', f_scale=scale, x_scale='jac')
-    coefficients = fit.x
+    top = 1.3 * g.max()
+    coefficients = _start(g, duty)
+    weight = np.ones(len(g))
+    for _ in range(3):
+        scale = 3 * 1.4826 * np.median(np.abs(_error(coefficients, g, duty, weight)[:len(g)]))
+        coefficients = least_squares(_error, coefficients, loss='soft_l1', x_scale='jac',
+                                     f_scale=scale + 1e-6, args=(g, duty, weight)).x
+        fitted = inverse(coefficients, duty, UNIT_THRUST * top) / UNIT_THRUST
+        weight = _weights(fitted, fitted - g)
     slopes = np.polyval(np.polyder(coefficients[::-1]), np.linspace(0, g.max(), GRID))
     if slopes.min() <= 0:
         raise LogError(f'{name}: at {plateau.voltage:.2f} V no rising map fits the data')
-    residual = error(coefficients)[:len(g)]
-    covariance = _covariance(coefficients, duty, residual, g.max())
+    residual = fitted - g
+    covariance = _covariance(coefficients, fitted, residual * weight, weight)
     size = NORMAL_95 * np.sqrt(np.diag(covariance))
     # The row ends where the data end: at the largest duty, not at the largest noisy force.
-    last = float(inverse(coefficients, duty.max(), UNIT_THRUST * 1.3 * g.max()))
+    last = float(UNIT_THRUST * fitted.max())
     thrust = np.linspace(min(1.0, last / 2), last, GRID)
     band = _band(coefficients, covariance, thrust / UNIT_THRUST)
     row = MapRow(plateau.voltage, last, coefficients,
@@ -131,15 +126,38 @@ def fit_row(name: str, plateau: Plateau) -> MapRow:
     return MapRow(**{**row.__dict__, 'inverse_error': float(np.abs(back / thrust - 1).max())})
 
 
+def _start(g, duty):
+    """Coefficients of a rising polynomial near the data."""
+    run = g > 0.02
+    start = np.polyfit(g[run], duty[run], 3)[::-1]
+    if np.polyval(np.polyder(start[::-1]), np.linspace(0, g.max(), 60)).min() < LEAST_SLOPE:
+        start = np.array([*np.polyfit(g[run], duty[run], 1)[::-1], 0.0, 0.0])
+    return start
+
+
+def _error(coefficients, g, duty, weight):
+    """Weighted error of thrust / 10 N, then what is missing of a rising slope."""
+    slope = np.polyval(np.polyder(coefficients[::-1]), np.linspace(0, 1.05 * g.max(), 60))
+    fitted = inverse(coefficients, duty, UNIT_THRUST * 1.3 * g.max()) / UNIT_THRUST
+    return np.concatenate([weight * (fitted - g), 0.3 * np.minimum(slope - LEAST_SLOPE, 0)])
+
+
+def _weights(g, residual):
+    """Weights for noise that may grow with thrust: its size as a line through the residuals."""
+    size = np.minimum(np.abs(residual), 4 * np.median(np.abs(residual)))
+    slope, level = np.polyfit(g, size, 1)
+    spread = np.maximum(level + slope * g, 0.15 * size.mean() + 1e-6)
+    return spread.mean() / spread
+
+
 def _slopes(coefficients, g):
     """(N, 4) change of g with each coefficient at a given duty."""
     slope = np.maximum(np.polyval(np.polyder(coefficients[::-1]), g), LEAST_SLOPE / 10)
     return -np.stack([g**k for k in range(4)], axis=1) / slope[:, None]
 
 
-def _covariance(coefficients, duty, residual, top):
-    g = inverse(coefficients, duty, UNIT_THRUST * 1.3 * top) / UNIT_THRUST
-    jacobian = _slopes(coefficients, g)
+def _covariance(coefficients, g, residual, weight):
+    jacobian = _slopes(coefficients, g) * (weight * (g > 0))[:, None]
     variance = residual @ residual / max(len(g) - 4, 1)
     return variance * np.linalg.pinv(jacobian.T @ jacobian)
 

@@ -139,7 +139,7 @@ def write_robot_file(path: Path, results: dict, base: Path | None) -> None:
                                   round(v, 6) for v in ratio['interval']],
                               'rms_N': [round(p['rms_N'], 4) for p in results['plateaus']]}}
     head = ('# Rotor map identified by `beetle_omni identify rotor`: duty [% of 2000 us] =\n'
-            '# c0 + c1 g + c2 g^2 + c3 g^3, g = thrust / 10 N, coefficients c0 to c3; voltage [V],\n'
-            '# thrust_max [N], torque_to_thrust_ratio [m].\n')
+            '# c0 + c1 g + c2 g^2 + c3 g^3, g = thrust / 10 N, coefficients c0 to c3;\n'
+            '# voltage [V], thrust_max [N], torque_to_thrust_ratio [m].\n')
     write_text(path, head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None),
                'parameter file')

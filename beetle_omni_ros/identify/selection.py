@@ -64,8 +64,8 @@ CANDIDATES = {
                       lambda log, joint: [(0.005, 0.005), (-0.005, -0.005)]),
 }
 
-# Offered in this order. A delay and friction or play are certain to be there in some size, and what
-# comes later imitates them on slow logs: stiction, above all, can stand in for a delay.
+# Offered in this order. A delay and friction or play are certain to be there in some size, and
+# what comes later imitates them on slow logs: stiction, above all, can stand in for a delay.
 TIERS = (('delay', 'coulomb_friction', 'backlash'), ('offset', 'stiction'),
          ('velocity_limit', 'torque_limit', 'load'))
 
@@ -129,7 +129,7 @@ class Selector:
 
         """
         joints = range(len(self.log.joints))
-        kept: dict[int, tuple] = {j: () for j in joints}
+        kept: dict[int, tuple] = dict.fromkeys(joints, ())
         values = {j: np.where(free_mask(()), start, OFF) for j in joints}
         tried: dict[int, dict] = {j: {} for j in joints}
         gains: dict[int, dict] = {j: {} for j in joints}
@@ -248,4 +248,5 @@ def _verdict(gains, numbers):
     """Gain over all blocks, and whether it is real: above its scatter, in most blocks."""
     total = float(gains.sum())
     error = float(gains.std(ddof=1) * np.sqrt(len(gains)))
-    return total, bool(total > max(LEAST_GAIN * numbers, error) and (gains > 0).sum() * 2 > len(gains))
+    real = total > max(LEAST_GAIN * numbers, error) and (gains > 0).sum() * 2 > len(gains)
+    return total, bool(real)

@@ -52,7 +52,7 @@ TERMS = {
     'coulomb_friction': Term('rad', 0.0, 0.0, 0.4, 0.002),    # dead band to each side
     'stiction': Term('rad', 0.0, 0.0, 0.4, 0.002),            # breakaway above that
     'stribeck_velocity': Term('rad/s', 0.1, 0.02, 3.0, 0.2, True),    # at which stiction fades
-    'backlash': Term('rad', 0.0, 0.0, 0.3, 0.002),            # play to each side, before the encoder
+    'backlash': Term('rad', 0.0, 0.0, 0.3, 0.002),    # play to each side, before the encoder
     'velocity_limit': Term('rad/s', NEVER, 0.2, NEVER, 0.05, True),
     'torque_limit': Term('rad', NEVER, 0.005, NEVER, 0.05, True),
     'load_sine': Term('rad', 0.0, -0.3, 0.3, 0.002),          # sag ~ sin(q): a weight on the joint
