@@ -16,7 +16,7 @@ from scipy.linalg import solve_toeplitz
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.servo_model import NAMES, simulate, TERMS
 
-ORDER = 6           # of the whitening filter
+ORDER = 12          # of the whitening filter
 HUBER = 3.0         # standard deviations from which a sample counts less
 DIFFERENCE = 0.05   # of a parameter's scale, for derivatives
 LARGEST_MOVE = 12.0  # of a parameter in one iteration, in scales

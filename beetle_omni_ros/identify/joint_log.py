@@ -61,6 +61,16 @@ class JointLog:
         """Command of the joint with this index [rad], interpolated; straight before the log."""
         return np.interp(times, self._command_t, self._command[joint])
 
+    def first(self, part: float) -> JointLog:
+        """Its beginning, alone."""
+        end = self.end_of(part)
+        return JointLog(self.name, self.t[:end], self.joints, self.measured[:, :end],
+                        self.command[:, :end])
+
+    def end_of(self, part: float) -> int:
+        """Count the samples in a part of it."""
+        return int(round(part * len(self.t)))
+
     @property
     def quantum(self) -> float:
         """The encoder's step [rad]: the smallest change of a reading that occurs."""

@@ -18,7 +18,8 @@ from beetle_omni_ros.robot.schema import ParameterError
 WORDS = {'natural_frequency': 'bandwidth', 'damping_ratio': 'damping', 'delay': 'delay',
          'coulomb_friction': 'friction', 'velocity_limit': 'speed limit',
          'torque_limit': 'torque limit (an error of position)',
-         'stribeck_velocity': 'Stribeck velocity', 'load_sine': 'load (sine)', 'load_cosine': 'load (cosine)'}
+         'stribeck_velocity': 'Stribeck velocity', 'load_sine': 'load (sine)',
+         'load_cosine': 'load (cosine)'}
 
 
 def joint_results(log: JointLog, validations: list[JointLog], models: list[JointModel],
@@ -50,7 +51,7 @@ def _merged(joints):
 
 
 def _joint(log, index, validations, model, published):
-    end = int(round(FITTED_PART * len(log.t)))
+    end = log.end_of(FITTED_PART)
     first, last = slice(0, end), slice(end, None)
     start, inertia = published_set(published), published.inertia
     wn, zeta = (model.values[INDEX[name]] for name in LINEAR)

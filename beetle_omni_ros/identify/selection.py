@@ -15,11 +15,13 @@ import numpy as np
 
 from beetle_omni_ros.identify.fitting import Fitter, Problems
 from beetle_omni_ros.identify.joint_log import JointLog
-from beetle_omni_ros.identify.servo_model import INDEX, NAMES, NEVER, OFF, TERMS
+from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, TERMS
 
 BLOCKS = 5
 LEAST_GAIN = 6.0        # of chi2 on unseen data for each number, all blocks together
 LEAST_DELAY = 0.001     # [s]
+BEYOND = 1.15           # a limit counts only if the command went so far beyond it
+MOST_PASSES = 3
 LINEAR = ('natural_frequency', 'damping_ratio')   # always there
 QUICK, THOROUGH = 6, 15  # iterations
 
@@ -68,6 +70,9 @@ CANDIDATES = {
 # what comes later imitates them on slow logs: stiction, above all, can stand in for a delay.
 TIERS = (('delay', 'coulomb_friction', 'backlash'), ('offset', 'stiction'),
          ('velocity_limit', 'torque_limit', 'load'))
+# What looks much alike: a dead band or play, a limit of speed or of torque.
+RIVALS = {'coulomb_friction': 'backlash', 'backlash': 'coulomb_friction',
+          'velocity_limit': 'torque_limit', 'torque_limit': 'velocity_limit'}
 
 
 @dataclass(frozen=True)
@@ -95,10 +100,11 @@ def free_mask(kept: tuple[str, ...]) -> np.ndarray:
     return np.array([name in names for name in NAMES])
 
 
-def block_masks(count: int, end: int, blocks: int = BLOCKS) -> np.ndarray:
-    """(blocks, count) 1 within each of the blocks of the first ``end`` samples."""
-    edges = np.linspace(0, end, blocks + 1).astype(int)
-    index = np.arange(count)
+def block_masks(weight: np.ndarray, blocks: int = BLOCKS) -> np.ndarray:
+    """(blocks, N) 1 within each of the blocks of the samples that have a weight (N,)."""
+    used = np.flatnonzero(weight)
+    edges = np.linspace(used[0], used[-1] + 1, blocks + 1).astype(int)
+    index = np.arange(len(weight))
     return np.array([(index >= a) & (index < b)
                      for a, b in zip(edges[:-1], edges[1:], strict=True)], dtype=float)
 
@@ -109,15 +115,16 @@ class Selector:
 
     Args:
         fitter: log, noise and prior.
-        end: samples from this one on are never looked at.
+        weight: (N,) 0 for samples that are never looked at.
         allowed: names of candidates; default all.
 
     """
 
-    def __init__(self, fitter: Fitter, end: int, allowed: tuple[str, ...] = tuple(CANDIDATES)):
+    def __init__(self, fitter: Fitter, weight: np.ndarray,
+                 allowed: tuple[str, ...] = tuple(CANDIDATES)):
         """Cut the blocks; see the class."""
         self.fitter, self.log, self.allowed = fitter, fitter.log, allowed
-        self.blocks = block_masks(len(self.log.t), end)
+        self.blocks = block_masks(weight)
         self.all = self.blocks.sum(axis=0)
 
     def run(self, start: np.ndarray) -> list[Choice]:
@@ -128,78 +135,112 @@ class Selector:
             start: (n,) parameter set to begin with.
 
         """
-        joints = range(len(self.log.joints))
-        kept: dict[int, tuple] = dict.fromkeys(joints, ())
-        values = {j: np.where(free_mask(()), start, OFF) for j in joints}
-        tried: dict[int, dict] = {j: {} for j in joints}
-        gains: dict[int, dict] = {j: {} for j in joints}
-        for tier in TIERS:
-            self._grow(tier, kept, values, tried, gains)
-            if 'delay' in tier:
-                self._share_delay(kept)
-        self._prune(kept, values, tried, gains)
-        return [Choice(kept[j], values[j], tried[j], gains[j]) for j in joints]
+        count = len(self.log.joints)
+        self.kept = [()] * count
+        self.values = [np.where(free_mask(()), start, OFF)] * count
+        self.tried: list[dict] = [{} for _ in range(count)]
+        self.gains: list[dict] = [{} for _ in range(count)]
+        for _ in range(MOST_PASSES):
+            self._grow(TIERS[0])
+            self._share_delay()
+            early = list(self.kept)
+            for tier in TIERS[1:]:
+                self._grow(tier)
+            # What comes late, a limit say, can have hidden what was offered early.
+            if not self._swap() and self.kept == early:
+                break
+        self._prune()
+        return [Choice(*each) for each in zip(self.kept, self.values, self.tried, self.gains,
+                                              strict=True)]
 
-    def _grow(self, tier, kept, values, tried, gains):
+    def _grow(self, tier):
         """Add candidates of one tier while any helps."""
-        open_joints = list(kept)
-        while open_joints:
-            asked = [(j, name) for j in open_joints
-                     for name in (None, *self._open(tier, kept[j]))]
-            answers = self._judge(asked, kept, values)
-            for j in list(open_joints):
-                mine = {name: answers[j, name] for k, name in asked if k == j}
-                values[j], without = mine.pop(None)
+        growing = list(range(len(self.kept)))
+        while growing:
+            asked = {(j, None): (self.kept[j], None) for j in growing}
+            asked |= {(j, name): ((*self.kept[j], name), name) for j in growing
+                      for name in self._open(tier, self.kept[j])}
+            answers = self._judge(asked)
+            for j in list(growing):
+                self.values[j], without = answers[j, None]
                 best, best_gain = None, 0.0
-                for name, (found, costs) in mine.items():
-                    gain, accepted = _verdict(without - costs, len(CANDIDATES[name].members))
-                    tried[j][name], gains[j][name] = found, gain
-                    if accepted and gain > best_gain and self._matters(j, name, found):
+                for name in self._open(tier, self.kept[j]):
+                    found, costs = answers[j, name]
+                    gain, real = _verdict(without - costs, len(CANDIDATES[name].members))
+                    self.tried[j][name], self.gains[j][name] = found, gain
+                    if real and gain > best_gain and self._matters(j, name, found):
                         best, best_gain = name, gain
                 if best is None:
-                    open_joints.remove(j)
+                    growing.remove(j)
                 else:
-                    kept[j], values[j] = (*kept[j], best), tried[j][best]
+                    self.kept[j] = (*self.kept[j], best)
+                    self.values[j] = self.tried[j][best]
 
-    @staticmethod
-    def _share_delay(kept):
+    def _share_delay(self):
         """One bus serves all joints: a delay that half of them show is there for all."""
-        if 2 * sum('delay' in names for names in kept.values()) >= len(kept) > 1:
-            for j, names in kept.items():
-                kept[j] = names if 'delay' in names else (*names, 'delay')
+        if 2 * sum('delay' in names for names in self.kept) >= len(self.kept) > 1:
+            self.kept = [names if 'delay' in names else (*names, 'delay') for names in self.kept]
 
     def _open(self, tier, kept):
         return [name for name in self.allowed if name in tier and name not in kept
                 and CANDIDATES[name].needs in (None, *kept)]
 
-    def _prune(self, kept, values, tried, gains):
+    def _swap(self):
+        """Exchange a term for its rival where that predicts better; tell whether any was."""
+        asked = {(j, None): (names, None) for j, names in enumerate(self.kept)}
+        for j, names in enumerate(self.kept):
+            for name in names:
+                rival = RIVALS.get(name)
+                if rival in self.allowed and rival not in names:
+                    asked[j, name] = (tuple(rival if n == name else n for n in names
+                                            if CANDIDATES[n].needs != name), rival)
+        answers, swapped = self._judge(asked), False
+        for j, name in asked:
+            if name is None:
+                continue
+            found, costs = answers[j, name]
+            gain = float((answers[j, None][1] - costs).sum())
+            rival = RIVALS[name]
+            if gain > LEAST_GAIN and self._matters(j, rival, found):
+                self.kept[j], self.values[j], swapped = asked[j, name][0], found, True
+                self.tried[j][rival] = found
+        return swapped
+
+    def _prune(self):
         """Drop what a later term has made superfluous, e.g. play once there is friction."""
-        asked = [(j, drop) for j in kept for drop in (None, *kept[j])]
-        reduced = {(j, drop): tuple(n for n in kept[j] if n != drop) for j, drop in asked}
-        answers = self._judge(asked, kept, values, reduced)
-        for j in kept:
-            values[j], full = answers[j, None]
-            for name in kept[j]:
-                gain, accepted = _verdict(answers[j, name][1] - full,
-                                          len(CANDIDATES[name].members))
-                tried[j][name] = values[j]
-                if name == 'delay':
+        asked = {(j, drop): (tuple(n for n in names if n != drop), None)
+                 for j, names in enumerate(self.kept) for drop in (None, *names)}
+        answers = self._judge(asked)
+        for j, names in enumerate(self.kept):
+            self.values[j], full = answers[j, None]
+            for name in names:
+                self.tried[j][name] = self.values[j]
+                if name == 'delay':     # shared: the other joints vouch for it
                     continue
-                gains[j][name] = gain
-                if not accepted:
-                    values[j] = answers[j, name][0]
-                    kept[j] = reduced[j, name]
+                self.gains[j][name], real = _verdict(answers[j, name][1] - full,
+                                                     len(CANDIDATES[name].members))
+                needed = any(CANDIDATES[n].needs == name for n in names)
+                if not real and not needed:
+                    self.values[j], self.kept[j] = answers[j, name][0], asked[j, name][0]
                     break
 
-    def _judge(self, asked, kept, values, models=None):
-        """(joint, name) -> fitted set and (blocks,) chi2 of each block left out."""
+    def _judge(self, asked):
+        """
+        Fit models and predict the blocks left out.
+
+        Args:
+            asked: (joint, any label) -> candidates in the model, and the one among them that is
+                new and needs start values, or None.
+
+        Returns:
+            (joint, label) -> fitted set, and (blocks,) chi2 of each block left out.
+
+        """
         parts, owner = [], []
-        for key in asked:
-            j, name = key
-            model = models[key] if models else kept[j] + ((name,) if name else ())
-            for start in self._starts(j, None if models else name, values[j]):
+        for key, (model, new) in asked.items():
+            for start in self._starts(key[0], new, self.values[key[0]]):
                 start = np.where(free_mask(model), start, OFF)
-                parts.append(Problems(np.array([j]), start[None], free_mask(model)[None],
+                parts.append(Problems(np.array([key[0]]), start[None], free_mask(model)[None],
                                       self.all[None]))
                 owner.append(key)
         problems = Problems.join(parts)
@@ -217,6 +258,7 @@ class Selector:
         return {key: (fits.sets[best[key]], cost[k]) for k, key in enumerate(asked)}
 
     def _starts(self, joint, name, values):
+        """Parameter sets to start from when a candidate is new."""
         if name is None:
             return [values]
         found = []
@@ -237,11 +279,18 @@ class Selector:
         if name == 'delay':
             return sizes['delay'] >= LEAST_DELAY
         if name == 'velocity_limit':
-            return sizes[name] <= 1.05 * self.log.speed()[joint]
+            return BEYOND * sizes[name] <= self._asked_speed(joint)
         if name == 'torque_limit':
-            return sizes[name] < 0.9 * NEVER
+            sent = self.log.t - values[INDEX['delay']] - self.log.period / 2
+            errors = np.abs(self.log.command_at(joint, sent) - self.log.measured[joint])
+            return BEYOND * sizes[name] <= np.quantile(errors[self.all > 0], 0.99)
         return max(size for member, size in sizes.items()
                    if member != 'stribeck_velocity') >= self.log.quantum
+
+
+    def _asked_speed(self, joint):
+        speed = np.abs(np.gradient(self.log.command[joint], self.log.t))
+        return np.quantile(speed[self.all > 0], 0.99)
 
 
 def _verdict(gains, numbers):

@@ -3,8 +3,8 @@ How well a log determines a servo model: intervals, trades, and the log that wou
 
 Intervals are profile likelihoods of the whitened residuals, without any prior: each number is
 moved and held while all others are refitted, until chi2 has risen by that of 95 %. The rise is
-scaled by how much the gradient of chi2 scatters over blocks of the log, which is 1 where the
-residuals are as independent as the whitening assumes.
+scaled by how much the gradient of chi2 scatters over blocks of the log, which would be
+1 if the residuals were as independent as the whitening assumes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ RISE = 3.84             # of chi2 with one degree of freedom, 95 %
 PROFILED = ('natural_frequency', 'damping_ratio', 'delay')
 LADDER = np.array([0.5, 1.2, 2.2, 3.6, 5.5, 8.0, 12.0, 18.0])  # in scales of a term
 DIFFERENT = 10          # blocks over which the gradient's scatter is taken
-LARGEST_SCATTER = 6.0
+SCATTER = 2.0, 6.0      # its range; below 2 made logs with slow drifts are covered too seldom
 TRADED = 0.6            # part of its interval through which another's interval drags a number
 LOOSE = 1.5             # half width of an interval, in scales, below which nothing is traded
 
@@ -61,7 +61,7 @@ class Uncertainty:
         return float((high - low) / 2 / term.scale)
 
 
-def uncertainties(log: JointLog, noise: Noise, problems: Problems, end: int) -> list[Uncertainty]:
+def uncertainties(log: JointLog, noise: Noise, problems: Problems) -> list[Uncertainty]:
     """
     Judge fitted parameter sets, one for each row of ``problems``.
 
@@ -69,7 +69,6 @@ def uncertainties(log: JointLog, noise: Noise, problems: Problems, end: int) -> 
         log: what they were fitted to.
         noise: its whitening.
         problems: with the fitted sets; only ``free`` numbers are judged.
-        end: samples fitted.
 
     """
     fitter = Fitter(log, noise, Prior.none())
@@ -81,7 +80,7 @@ def uncertainties(log: JointLog, noise: Noise, problems: Problems, end: int) -> 
         information = slopes[k] @ slopes[k].T
         covariance = _inverse(information, free)
         scatter = _scatter(slopes[k], base[k], free, covariance, block_masks(
-            len(log.t), end, DIFFERENT))
+            problems.weight[k], DIFFERENT))
         covariance *= scatter
         size = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
         width = np.sqrt(RISE) * np.where(free, size, np.nan)
@@ -105,7 +104,7 @@ def _scatter(slopes, residual, free, covariance, blocks):
     scores = np.array([(slopes[free] * block) @ residual for block in blocks])
     found = scores.T @ scores
     ratio = np.trace(covariance[np.ix_(free, free)] @ found) / free.sum()
-    return float(np.clip(ratio, 1.0, LARGEST_SCATTER))
+    return float(np.clip(ratio, *SCATTER))
 
 
 def _profile(fitter, problems, results):
@@ -211,7 +210,6 @@ class Experiment:
         duration: [s].
         delay_width: half of the 95 % interval that it would give [s].
         frequency_width: the same of the natural frequency [rad/s].
-        correlation: of the two, then.
 
     """
 
@@ -220,49 +218,59 @@ class Experiment:
     duration: float
     delay_width: float
     frequency_width: float
-    correlation: float
 
 
-def separating_experiment(values: np.ndarray, free: np.ndarray, noise: Noise, joint: int,
-                          scatter: float, wanted: float = 0.001) -> Experiment:
+def separating_experiments(sets: np.ndarray, free: np.ndarray, noise: Noise, scatter: np.ndarray,
+                           wanted: float = 0.001) -> list[Experiment]:
     """
-    The slowest sine that determines the delay to +-``wanted`` [s], from the model's sensitivities.
+    The slowest sine that determines every joint's delay, from the model's sensitivities.
 
     Args:
-        values: (n,) fitted parameter set.
-        free: (n,) its free numbers; the delay is added.
-        noise: of the log it was fitted to; the same is assumed again.
-        joint: index of the joint in ``noise``.
-        scatter: inflation of chi2, see :class:`Uncertainty`.
+        sets: (n, m) fitted parameter sets, one for each joint.
+        free: (n, m) their free numbers; the delay is added.
+        noise: of the log they were fitted to; the same is assumed again.
+        scatter: (n,) inflation of chi2, see :class:`Uncertainty`.
         wanted: half width of the delay's interval [s].
+
+    Returns:
+        what it would give, joint by joint; if no sine reaches ``wanted``, the best.
 
     """
     free = free.copy()
-    free[INDEX['delay']] = True
-    noise = Noise(noise.filter[joint:joint + 1], noise.sigma[joint:joint + 1])
-    t = np.arange(0.0, EXCITATION_TIME, EXCITATION_PERIOD)
-    best = None
+    free[:, INDEX['delay']] = True
+    best: list[Experiment] = []
     for frequency in FREQUENCIES:
-        omega = 2 * np.pi * frequency
-        amplitude = min(LARGEST_AMPLITUDE, LARGEST_SPEED / omega)
-        command = (amplitude * np.sin(omega * t))[None]
-        blank = JointLog('', t, (1,), np.zeros_like(command), command)
-        log = JointLog('', t, (1,), simulate(blank, 0, values[None]), command)
-        problem = Problems(np.zeros(1, dtype=int), values[None], free[None],
-                           np.ones((1, len(t))))
-        information = Fitter(log, noise, Prior.none()).information(problem)[0]
-        covariance = scatter * _inverse(information, free)
-        f, d = INDEX['natural_frequency'], INDEX['delay']
-        width = np.sqrt(RISE * np.diag(covariance)) * [term.scale for term in TERMS.values()]
-        correlation = covariance[f, d] / np.sqrt(covariance[f, f] * covariance[d, d])
-        found = Experiment(frequency, amplitude, EXCITATION_TIME, float(width[d]),
-                           float(width[f] * values[f]), float(correlation))
-        if best is None or found.delay_width < best.delay_width:
+        found = _widths(sets, free, noise, scatter, frequency)
+        worst = max(plan.delay_width for plan in found)
+        if not best or worst < max(plan.delay_width for plan in best):
             best = found
-        if found.delay_width <= wanted:
-            return found
+        if worst <= wanted:
+            break
     return best
 
 
-__all__ = ['Experiment', 'NAMES', 'separating_experiment', 'traded', 'uncertainties',
+def _widths(sets, free, noise, scatter, frequency):
+    """What a sine of this frequency would tell about each joint."""
+    t = np.arange(0.0, EXCITATION_TIME, EXCITATION_PERIOD)
+    omega = 2 * np.pi * frequency
+    amplitude = min(LARGEST_AMPLITUDE, LARGEST_SPEED / omega)
+    command = np.tile(amplitude * np.sin(omega * t), (len(sets), 1))
+    joints = np.arange(len(sets))
+    numbers = tuple(int(j) + 1 for j in joints)
+    blank = JointLog('', t, numbers, np.zeros_like(command), command)
+    log = JointLog('', t, numbers, simulate(blank, joints, sets), command)
+    weight = np.tile((t >= 1.0).astype(float), (len(sets), 1))
+    information = Fitter(log, noise, Prior.none()).information(
+        Problems(joints, sets, free, weight))
+    f, d = INDEX['natural_frequency'], INDEX['delay']
+    scale = np.array([term.scale for term in TERMS.values()])
+    found = []
+    for values, mask, matrix, factor in zip(sets, free, information, scatter, strict=True):
+        width = np.sqrt(RISE * factor * np.diag(_inverse(matrix, mask))) * scale
+        found.append(Experiment(frequency, amplitude, EXCITATION_TIME, float(width[d]),
+                                float(width[f] * values[f])))
+    return found
+
+
+__all__ = ['Experiment', 'NAMES', 'separating_experiments', 'traded', 'uncertainties',
            'Uncertainty']
