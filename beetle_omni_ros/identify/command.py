@@ -11,6 +11,7 @@ from beetle_omni_ros.identify import rotor_results as of_rotor
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import read_joint_log
 from beetle_omni_ros.identify.joint_page import grids, joint_page
+from beetle_omni_ros.identify.robot_file import check_not_base, write_text
 from beetle_omni_ros.identify.rotor import identify_rotor
 from beetle_omni_ros.identify.rotor_log import read_rotor_log
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -41,7 +42,7 @@ def run_identify_joint(path: Path, *, validate: list[Path] = (), robot: Path | N
 
     """
     console = console or Console()
-    _check_outputs(json_path, report, params)
+    _check_outputs(json_path, report, params, robot)
     published = RobotParameters.load(robot).joints
     log = read_joint_log(path)
     validations = [read_joint_log(other) for other in validate]
@@ -54,10 +55,10 @@ def run_identify_joint(path: Path, *, validate: list[Path] = (), robot: Path | N
     if json_path:
         write_json(json_path, results)
     if report:
-        of_joints.write_text(report, joint_page(log, validations, models, published, results),
+        write_text(report, joint_page(log, validations, models, published, results),
                              'report')
     if params:
-        of_joints.write_robot_file(params, results, robot)
+        of_joints.write_joint_file(params, results, robot)
     return results
 
 
@@ -83,7 +84,7 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
 
     """
     console = console or Console()
-    _check_outputs(json_path, report, params)
+    _check_outputs(json_path, report, params, robot)
     believed = RobotParameters.load(robot)
     log = read_rotor_log(path)
     rows, ratio = identify_rotor(log)
@@ -94,14 +95,16 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
     if json_path:
         write_json(json_path, results)
     if report:
-        of_joints.write_text(report, of_rotor.rotor_page(log, rows, ratio, believed, results),
+        write_text(report, of_rotor.rotor_page(log, rows, ratio, believed, results),
                              'report')
     if params:
-        of_rotor.write_robot_file(params, results, robot)
+        of_rotor.write_rotor_file(params, results, robot)
     return results
 
 
-def _check_outputs(json_path, report, params):
+def _check_outputs(json_path, report, params, robot):
+    if params:
+        check_not_base(params, robot)
     for path, what in ((json_path, 'result file'), (report, 'report'),
                        (params, 'parameter file')):
         if path:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.identify.fitting import encode, Fitter, Noise, Prior, Problems
+from beetle_omni_ros.identify.fitting import decode, encode, Fitter, Noise, Prior, Problems
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.selection import CANDIDATES, Choice, free_mask, LINEAR, Selector
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, published_set, simulate, TERMS
@@ -27,6 +27,7 @@ SETTLING = 0.25         # [s] of a log that are not fitted: its first velocity i
 # within a factor of 1.6; servos of one type and one bus differ by 10 % and 3 ms.
 PUBLISHED_DEVIATION = {'natural_frequency': 0.5, 'damping_ratio': 0.5}
 COMMON_DEVIATION = {'natural_frequency': 0.1, 'damping_ratio': 0.1, 'delay': 0.003}
+MOST_ROUNDS, RESTING = 10, 0.2    # of refits; change of the median, in scales, that ends them
 LEAST_COMMON = 3        # joints, below which nothing is called common
 CERTAIN = ('delay', 'coulomb_friction')   # in the model that estimates the noise
 
@@ -81,14 +82,27 @@ def identify_joints(log: JointLog, published: JointParameters,
         before, noise = noise, _noise(log, fits.sets, weight)
         if (noise.sigma > NEARLY * before.sigma).all():
             break       # else the terms found let see more than the first model did
-    if len(log.joints) >= LEAST_COMMON:
-        common = np.median(fits.sets, axis=0)
-        prior = _prior(common, COMMON_DEVIATION)
-        if not problems.free[:, INDEX['delay']].any():
-            prior.precision[INDEX['delay']] = 0.0
-        problems = Problems(problems.joint, fits.sets, problems.free, weight)
-        fits = Fitter(log, noise, prior).solve(problems)
-    return _models(log, noise, choices, fits.sets, weight, start)
+    sets = _alike(log, noise, problems, fits.sets)
+    return _models(log, noise, choices, sets, weight, start)
+
+
+def _alike(log, noise, problems, sets):
+    """
+    Fit again, each joint with the median of all as a prior, until the median rests.
+
+    A joint whose log decides stays where it is; one whose log does not, follows.
+    """
+    if len(sets) < LEAST_COMMON:
+        return sets
+    for _ in range(MOST_ROUNDS):
+        common = decode(np.median(encode(sets), axis=0))
+        fits = Fitter(log, noise, _prior(common, COMMON_DEVIATION)).solve(
+            Problems(problems.joint, sets, problems.free, problems.weight), 8)
+        change = np.median(encode(fits.sets), axis=0) - encode(common)
+        sets = fits.sets
+        if np.abs(change[[INDEX[name] for name in COMMON_DEVIATION]]).max() < RESTING:
+            break
+    return sets
 
 
 def _unlimited(start):

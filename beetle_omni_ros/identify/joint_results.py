@@ -5,15 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.joint import error_rms, FITTED_PART, JointModel
 from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.identify.selection import CANDIDATES, LINEAR
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, published_set, TERMS
 from beetle_omni_ros.robot.parameters import JointParameters
-from beetle_omni_ros.robot.schema import ParameterError
 
 WORDS = {'natural_frequency': 'bandwidth', 'damping_ratio': 'damping', 'delay': 'delay',
          'coulomb_friction': 'friction', 'velocity_limit': 'speed limit',
@@ -120,7 +119,7 @@ def _range(name, interval):
     return f'({interval[0]:.3g} to {interval[1]:.3g} {TERMS[name].unit})'.replace(' 1)', ')')
 
 
-def write_robot_file(path: Path, results: dict, base: Path | None) -> None:
+def write_joint_file(path: Path, results: dict, base: Path | None) -> None:
     """
     Write a robot file with the identified servo on top of the one that was believed.
 
@@ -139,41 +138,21 @@ def write_robot_file(path: Path, results: dict, base: Path | None) -> None:
     joints = results['joints']
     middle = {key: float(np.median([joint['derived'][key] for joint in joints]))
               for key in ('kp_N_m_per_rad', 'kd_N_m_s_per_rad')}
-    servo = {'kp': _rounded(middle['kp_N_m_per_rad']), 'kd': _rounded(middle['kd_N_m_s_per_rad'])}
+    servo = {'kp': rounded(middle['kp_N_m_per_rad']), 'kd': rounded(middle['kd_N_m_s_per_rad'])}
     limits = [joint['terms']['velocity_limit'] for joint in joints]
     if all(term['kept'] for term in limits):
-        servo['velocity_limit'] = _rounded(float(np.median([t['value'] for t in limits])))
+        servo['velocity_limit'] = rounded(float(np.median([t['value'] for t in limits])))
     torque = [joint['terms']['torque_limit'] for joint in joints]
     if all(term['kept'] for term in torque):
-        servo['effort_limit'] = _rounded(servo['kp'] * float(np.median(
+        servo['effort_limit'] = rounded(servo['kp'] * float(np.median(
             [term['value'] for term in torque])))
-    content = {'extends': str(base.resolve()) if base else 'robot.yaml', 'joints': servo,
+    content = {'joints': servo,
                'provenance': {'log': results['meta']['log'], 'version': __version__,
-                              'heldout_rms_rad': [_rounded(j['heldout_rms_rad']) for j in joints],
+                              'heldout_rms_rad': [rounded(j['heldout_rms_rad']) for j in joints],
                               'joint_terms': {f'gimbal{j["joint"]}': {
-                                  name: _rounded(term['value'])
+                                  name: rounded(term['value'])
                                   for name, term in j['terms'].items() if term['kept']}
                                   for j in joints}}}
     head = ('# Tilt servos identified by `beetle_omni identify joint`. SI units: kp [N m/rad],\n'
             '# kd [N m s/rad] for the inertia of the file below; angles [rad], delay [s].\n')
-    write_text(path, head + yaml.safe_dump(content, sort_keys=False), 'parameter file')
-
-
-def write_text(path: Path, text: str, what: str) -> None:
-    """
-    Replace a file at once.
-
-    Raises:
-        ParameterError: it cannot be written.
-
-    """
-    try:
-        temporary = path.with_name(path.name + '.tmp')
-        temporary.write_text(text, encoding='utf-8')
-        temporary.replace(path)
-    except OSError as error:
-        raise ParameterError(f'{path}: cannot write the {what} ({error.strerror})') from None
-
-
-def _rounded(value):
-    return float(f'{value:.5g}')
+    write_robot_file(path, head, content, base)

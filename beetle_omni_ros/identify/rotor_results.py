@@ -7,11 +7,10 @@ from pathlib import Path
 import matplotlib
 from matplotlib.figure import Figure
 import numpy as np
-import yaml
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.joint_results import write_text
 from beetle_omni_ros.identify.page import page
+from beetle_omni_ros.identify.robot_file import write_robot_file
 from beetle_omni_ros.identify.rotor import crossings, inverse, MapRow, Ratio
 from beetle_omni_ros.identify.rotor_log import RotorLog
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -120,7 +119,7 @@ def _torque(log, ratio) -> Figure:
     return figure
 
 
-def write_robot_file(path: Path, results: dict, base: Path | None) -> None:
+def write_rotor_file(path: Path, results: dict, base: Path | None) -> None:
     """
     Write a robot file with the identified map on top of the one that was believed.
 
@@ -132,8 +131,7 @@ def write_robot_file(path: Path, results: dict, base: Path | None) -> None:
              'coefficients': [round(p['coefficients'][f'c{k}']['value'], 8) for k in range(4)]}
             for p in results['plateaus']]
     ratio = results['torque_to_thrust_ratio']
-    content = {'extends': str(base.resolve()) if base else 'robot.yaml',
-               'rotors': {'torque_to_thrust_ratio': round(ratio['value'], 6), 'map': rows},
+    content = {'rotors': {'torque_to_thrust_ratio': round(ratio['value'], 6), 'map': rows},
                'provenance': {'log': results['meta']['log'], 'version': __version__,
                               'torque_to_thrust_ratio_interval': [
                                   round(v, 6) for v in ratio['interval']],
@@ -141,5 +139,4 @@ def write_robot_file(path: Path, results: dict, base: Path | None) -> None:
     head = ('# Rotor map identified by `beetle_omni identify rotor`: duty [% of 2000 us] =\n'
             '# c0 + c1 g + c2 g^2 + c3 g^3, g = thrust / 10 N, coefficients c0 to c3;\n'
             '# voltage [V], thrust_max [N], torque_to_thrust_ratio [m].\n')
-    write_text(path, head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None),
-               'parameter file')
+    write_robot_file(path, head, content, base)

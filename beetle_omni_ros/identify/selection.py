@@ -18,7 +18,7 @@ from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, TERMS
 
 BLOCKS = 5
-LEAST_GAIN = 6.0        # of chi2 on unseen data for each number, all blocks together
+LEAST_GAIN = 10.0       # of chi2 on unseen data for each number, all blocks together
 LEAST_DELAY = 0.001     # [s]
 BEYOND = 1.15           # a limit counts only if the command went so far beyond it
 MOST_PASSES = 3
@@ -177,9 +177,12 @@ class Selector:
                     self.values[j] = self.tried[j][best]
 
     def _share_delay(self):
-        """One bus serves all joints: a delay that half of them show is there for all."""
-        if 2 * sum('delay' in names for names in self.kept) >= len(self.kept) > 1:
-            self.kept = [names if 'delay' in names else (*names, 'delay') for names in self.kept]
+        """One bus serves all joints: a delay that one of them proves is there for all."""
+        if not any('delay' in names for names in self.kept):
+            return
+        for j, names in enumerate(self.kept):
+            if 'delay' not in names:
+                self.kept[j], self.values[j] = (*names, 'delay'), self.tried[j]['delay']
 
     def _open(self, tier, kept):
         return [name for name in self.allowed if name in tier and name not in kept
