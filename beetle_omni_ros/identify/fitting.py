@@ -16,7 +16,8 @@ from scipy.linalg import solve_toeplitz
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.servo_model import NAMES, simulate, TERMS
 
-ORDER = 12          # of the whitening filter
+MEMORY = 0.12       # [s] of the whitening filter
+ORDERS = 6, 40      # its range in samples
 HUBER = 3.0         # standard deviations from which a sample counts less
 DIFFERENCE = 0.05   # of a parameter's scale, for derivatives
 LARGEST_MOVE = 12.0  # of a parameter in one iteration, in scales
@@ -47,7 +48,7 @@ class Noise:
     What is left over, for each joint of a log.
 
     Attributes:
-        filter: (n, ORDER) autoregressive coefficients; zeros: white.
+        filter: (n, order) autoregressive coefficients; zeros: white.
         sigma: (n,) standard deviation of the whitened residual [rad].
 
     """
@@ -69,22 +70,24 @@ class Noise:
         return cls(np.zeros((joints, 1)), np.full(joints, sigma))
 
     @classmethod
-    def of(cls, residual: np.ndarray, floor: float):
+    def of(cls, residual: np.ndarray, floor: float, period: float):
         """
         Estimate the noise.
 
         Args:
             residual: (n, N), one for each joint [rad].
             floor: below which no whitened residual of a quantised reading can be [rad].
+            period: between samples [s].
 
         """
+        order = int(np.clip(round(MEMORY / period), *ORDERS))
         filters, sigmas = [], []
         for row in residual:
             row = np.clip(row, *(np.median(row) + 6 * 1.4826 * np.median(
                 np.abs(row - np.median(row))) * np.array([-1, 1]) + [-1e-9, 1e-9]))
             count = len(row)
             covariance = np.array([row[lag:] @ row[:count - lag]
-                                   for lag in range(ORDER + 1)]) / count
+                                   for lag in range(order + 1)]) / count
             covariance[0] = covariance[0] * (1 + 1e-6) + 1e-14
             filters.append(solve_toeplitz(covariance[:-1], covariance[1:]))
             sigmas.append(np.sqrt(max(covariance[0] - filters[-1] @ covariance[1:], floor**2)))

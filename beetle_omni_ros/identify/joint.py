@@ -8,7 +8,14 @@ import numpy as np
 
 from beetle_omni_ros.identify.fitting import decode, encode, Fitter, Noise, Prior, Problems
 from beetle_omni_ros.identify.joint_log import JointLog
-from beetle_omni_ros.identify.selection import CANDIDATES, Choice, free_mask, LINEAR, Selector
+from beetle_omni_ros.identify.selection import (
+    BEYOND,
+    CANDIDATES,
+    Choice,
+    free_mask,
+    LINEAR,
+    Selector,
+)
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, published_set, simulate, TERMS
 from beetle_omni_ros.identify.uncertainty import (
     Experiment,
@@ -123,11 +130,14 @@ def _problems(log, choices, weight):
 
 
 def _first_noise(log, start, weight):
-    """Noise around the model whose terms are certain, fitted with equal weights."""
+    """Noise around the model whose terms are certain, and a speed limit where one may be."""
     joints = np.arange(len(log.joints))
     sets = np.tile(_unlimited(start), (len(joints), 1))
     sets[:, INDEX['delay']], sets[:, INDEX['coulomb_friction']] = 0.01, 0.01
     free = np.tile(free_mask((*CERTAIN, 'offset')), (len(joints), 1))
+    beyond = log.asked_speed() > BEYOND * log.speed()
+    limit = INDEX['velocity_limit']
+    sets[beyond, limit], free[beyond, limit] = log.speed()[beyond], True
     fits = Fitter(log, Noise.white(len(joints), FIRST_NOISE), _prior(
         start, PUBLISHED_DEVIATION)).solve(Problems(joints, sets, free, weight))
     return _noise(log, fits.sets, weight)
@@ -135,7 +145,8 @@ def _first_noise(log, start, weight):
 
 def _noise(log, sets, weight):
     error = simulate(log, np.arange(len(sets)), sets) - log.measured
-    return Noise.of(error[:, weight[0] > 0], max(log.quantum, 1e-4) / np.sqrt(12))
+    return Noise.of(error[:, weight[0] > 0], max(log.quantum, 1e-4) / np.sqrt(12),
+                    log.period)
 
 
 def _models(log, noise, choices: list[Choice], sets, weight, start):

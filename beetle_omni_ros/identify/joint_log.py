@@ -51,15 +51,44 @@ class JointLog:
         slope = np.polyfit(self.t[:count] - self.t[0], self.command[:, :count].T, 1)[0]
         back = -period * np.arange(int(HISTORY / period) + 1, 0, -1)
         before = self.command[:, :1] + slope[:, None] * back
-        known = {'period': period, 'start': first[2], 'start_velocity': first[1],
-                 '_command_t': np.concatenate([self.t[0] + back, self.t]),
-                 '_command': np.concatenate([before, self.command], axis=1)}
+        command_t = np.concatenate([self.t[0] + back, self.t])
+        command = np.concatenate([before, self.command], axis=1)
+        # Integrals of the held command: once, and once more.
+        steps = np.diff(command_t)
+        once = np.cumsum(command[:, :-1] * steps, axis=1)
+        once = np.concatenate([np.zeros((len(command), 1)), once], axis=1)
+        twice = np.cumsum(once[:, :-1] * steps + command[:, :-1] * steps**2 / 2, axis=1)
+        twice = np.concatenate([np.zeros((len(command), 1)), twice], axis=1)
+        known = {'_once': once, '_twice': twice, 'period': period, 'start': first[2],
+                 'start_velocity': first[1],
+                 '_command_t': command_t, '_command': command}
         for name, value in known.items():
             object.__setattr__(self, name, value)
 
     def command_at(self, joint: int, times: np.ndarray) -> np.ndarray:
         """Command of the joint with this index [rad], interpolated; straight before the log."""
         return np.interp(times, self._command_t, self._command[joint])
+
+    def held_command(self, joint: int, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Command that is held from each row to the next, over equal steps.
+
+        Args:
+            joint: index of the joint.
+            edges: (K + 1,) times [s], evenly spaced.
+
+        Returns:
+            (K,) its mean over each step, and (K,) how far what comes before the middle of the
+            step outweighs the rest: the mean of (command - mean) (1/2 - place in the step) [rad].
+
+        """
+        row = np.maximum(np.searchsorted(self._command_t, edges, side='right') - 1, 0)
+        since, command = edges - self._command_t[row], self._command[joint, row]
+        once = self._once[joint, row] + command * since
+        twice = self._twice[joint, row] + self._once[joint, row] * since + command * since**2 / 2
+        step = edges[1] - edges[0]
+        mean = np.diff(once) / step
+        return mean, (np.diff(twice) - step * once[:-1]) / step**2 - mean / 2
 
     def first(self, part: float) -> JointLog:
         """Its beginning, alone."""
@@ -77,6 +106,10 @@ class JointLog:
         steps = np.abs(np.diff(self.measured, axis=1))
         steps = steps[steps > 1e-5]
         return float(np.quantile(steps, 0.01)) if steps.size else 0.0
+
+    def asked_speed(self) -> np.ndarray:
+        """(n,) Speed of each command [rad/s] that 1 % of the samples exceed."""
+        return np.quantile(np.abs(np.gradient(self.command, self.t, axis=1)), 0.99, axis=1)
 
     def speed(self) -> np.ndarray:
         """(n,) Largest speed of each joint [rad/s], over 50 ms so that steps do not count."""

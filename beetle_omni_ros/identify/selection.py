@@ -66,10 +66,11 @@ CANDIDATES = {
                       lambda log, joint: [(0.005, 0.005), (-0.005, -0.005)]),
 }
 
-# Offered in this order. A delay and friction or play are certain to be there in some size, and
-# what comes later imitates them on slow logs: stiction, above all, can stand in for a delay.
-TIERS = (('delay', 'coulomb_friction', 'backlash'), ('offset', 'stiction'),
-         ('velocity_limit', 'torque_limit', 'load'))
+# Offered in this order. A delay and friction or play are certain to be there in some size, a limit
+# that was met spoils all else, and what comes later imitates them on slow logs: stiction, above
+# all, can stand in for a delay.
+TIERS = (('delay', 'coulomb_friction', 'backlash', 'velocity_limit', 'torque_limit'),
+         ('offset', 'stiction'), ('load',))
 # What looks much alike: a dead band or play, a limit of speed or of torque.
 RIVALS = {'coulomb_friction': 'backlash', 'backlash': 'coulomb_friction',
           'velocity_limit': 'torque_limit', 'torque_limit': 'velocity_limit'}
@@ -159,12 +160,12 @@ class Selector:
         while growing:
             asked = {(j, None): (self.kept[j], None) for j in growing}
             asked |= {(j, name): ((*self.kept[j], name), name) for j in growing
-                      for name in self._open(tier, self.kept[j])}
+                      for name in self._open(tier, j)}
             answers = self._judge(asked)
             for j in list(growing):
                 self.values[j], without = answers[j, None]
                 best, best_gain = None, 0.0
-                for name in self._open(tier, self.kept[j]):
+                for name in self._open(tier, j):
                     found, costs = answers[j, name]
                     gain, real = _verdict(without - costs, len(CANDIDATES[name].members))
                     self.tried[j][name], self.gains[j][name] = found, gain
@@ -184,9 +185,13 @@ class Selector:
             if 'delay' not in names:
                 self.kept[j], self.values[j] = (*names, 'delay'), self.tried[j]['delay']
 
-    def _open(self, tier, kept):
+    def _open(self, tier, joint):
+        """Candidates of a tier that the joint can have and has not."""
+        kept = self.kept[joint]
+        slow = self.log.asked_speed()[joint] < BEYOND * 0.95 * self.log.speed()[joint]
         return [name for name in self.allowed if name in tier and name not in kept
-                and CANDIDATES[name].needs in (None, *kept)]
+                and CANDIDATES[name].needs in (None, *kept)
+                and not (name == 'velocity_limit' and slow)]
 
     def _swap(self):
         """Exchange a term for its rival where that predicts better; tell whether any was."""
@@ -282,18 +287,13 @@ class Selector:
         if name == 'delay':
             return sizes['delay'] >= LEAST_DELAY
         if name == 'velocity_limit':
-            return BEYOND * sizes[name] <= self._asked_speed(joint)
+            return BEYOND * sizes[name] <= self.log.asked_speed()[joint]
         if name == 'torque_limit':
             sent = self.log.t - values[INDEX['delay']] - self.log.period / 2
             errors = np.abs(self.log.command_at(joint, sent) - self.log.measured[joint])
             return BEYOND * sizes[name] <= np.quantile(errors[self.all > 0], 0.99)
         return max(size for member, size in sizes.items()
                    if member != 'stribeck_velocity') >= self.log.quantum
-
-
-    def _asked_speed(self, joint):
-        speed = np.abs(np.gradient(self.log.command[joint], self.log.t))
-        return np.quantile(speed[self.all > 0], 0.99)
 
 
 def _verdict(gains, numbers):

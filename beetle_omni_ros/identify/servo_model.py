@@ -85,8 +85,8 @@ def simulate(log: JointLog, joint: np.ndarray | int, sets: np.ndarray,
         log: gives commands, times and the first state.
         joint: (B,) index of the log's joint for each set, or one for all.
         sets: (B, len(NAMES)) parameter sets.
-        held: a command acts until the next sample, which on average delays it by half a period;
-            else the command is taken as the smooth curve through its samples.
+        held: a command acts until the next sample; else it is taken as the curve through its
+            samples.
 
     Returns:
         (B, N) positions at the log's times [rad].
@@ -97,23 +97,28 @@ def simulate(log: JointLog, joint: np.ndarray | int, sets: np.ndarray,
     step = log.period / max(1, int(np.ceil(log.period / LONGEST_STEP - 1e-9)))
     count = int(np.ceil((log.t[-1] - log.t[0]) / step - 1e-6))
     value = dict(zip(NAMES, sets.T, strict=True))
-    delay = value['delay'] + (log.period / 2 if held else 0.0)
-    command = _commands(log, joint, delay, log.t[0] + step * (np.arange(count) + 0.5))
+    command, early = _commands(log, joint, value['delay'], log.t[0] + step * np.arange(count + 1),
+                               held)
     command += value['offset']
-    positions = _integrate(value, command, log.start[joint].copy(),
+    positions = _integrate(value, command, early, log.start[joint].copy(),
                            log.start_velocity[joint].copy(), step)
     return _at_samples(positions, (log.t - log.t[0]) / step)
 
 
-def _commands(log, joint, delay, times):
-    """(K, B) delayed commands; sets with the same joint and delay share their interpolation."""
+def _commands(log, joint, delay, edges, held):
+    """Two (K, B): delayed commands and their moment, for which equal joints and delays share."""
     keys, which = np.unique(np.stack([joint, delay]), axis=1, return_inverse=True)
-    table = np.stack([log.command_at(int(j), times - d) for j, d in keys.T], axis=1)
-    return table[:, which.ravel()]
+    if held:
+        parts = [log.held_command(int(j), edges - d) for j, d in keys.T]
+    else:
+        middle = (edges[1:] + edges[:-1]) / 2
+        parts = [(log.command_at(int(j), middle - d), np.zeros(len(middle))) for j, d in keys.T]
+    mean, early = (np.stack(column, axis=1) for column in zip(*parts, strict=True))
+    return mean[:, which.ravel()], early[:, which.ravel()]
 
 
-def _integrate(value, command, q, v, step):
-    """(K + 1, B) positions."""
+def _integrate(value, command, early, q, v, step):
+    """(K + 1, B) positions; ``early``: where within a step the command changes."""
     wn, half = value['natural_frequency'], 0.5 * step
     damping = step * value['damping_ratio'] * wn
     keep, gain = (1 - damping) / (1 + damping), step * wn**2 / (1 + damping)
@@ -125,6 +130,7 @@ def _integrate(value, command, q, v, step):
     weak, slow = (torque < 0.9 * NEVER).any(), (speed < 0.9 * NEVER).any()
     positions, shown = np.empty((len(command) + 1, len(q))), q.copy()
     positions[0] = q
+    early = early * (gain * step)
     for k, target in enumerate(command):
         q += half * v
         error = target - q
@@ -137,7 +143,7 @@ def _integrate(value, command, q, v, step):
         v -= np.minimum(np.maximum(v, -friction), friction)
         if slow:
             v = np.minimum(np.maximum(v, -speed), speed)
-        q += half * v
+        q += half * v + early[k] * (v != 0)     # what friction holds does not move
         if play:
             shown = np.minimum(np.maximum(shown, q - gap), q + gap)
         positions[k + 1] = shown if play else q
