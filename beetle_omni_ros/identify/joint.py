@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.identify.fitting import decode, encode, Fitter, Noise, Prior, Problems
+from beetle_omni_ros.identify.fitting import decode, encode, Fits, Fitter, Noise, Prior, Problems
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.selection import (
     BEYOND,
@@ -35,6 +35,7 @@ SETTLING = 0.25         # [s] of a log that are not fitted: its first velocity i
 PUBLISHED_DEVIATION = {'natural_frequency': 0.5, 'damping_ratio': 0.5}
 COMMON_DEVIATION = {'natural_frequency': 0.1, 'damping_ratio': 0.1, 'delay': 0.003}
 MOST_ROUNDS, RESTING = 10, 0.2    # of refits; change of the median, in scales, that ends them
+RESTARTS = ((32.0, 0.003), (45.0, 0.015), (70.0, 0.025))    # [rad/s], [s]
 LEAST_COMMON = 3        # joints, below which nothing is called common
 CERTAIN = ('delay', 'coulomb_friction')   # in the model that estimates the noise
 
@@ -85,12 +86,25 @@ def identify_joints(log: JointLog, published: JointParameters,
     for _ in range(MOST_PASSES):
         choices = Selector(Fitter(log, noise, belief), weight[0]).run(_unlimited(start))
         problems = _problems(log, choices, weight)
-        fits = Fitter(log, noise, belief).solve(problems)
+        fits = _best(Fitter(log, noise, belief), problems)
         before, noise = noise, _noise(log, fits.sets, weight)
         if (noise.sigma > NEARLY * before.sigma).all():
             break       # else the terms found let see more than the first model did
     sets = _alike(log, noise, problems, fits.sets)
     return _models(log, noise, choices, sets, weight, start)
+
+
+def _best(fitter, problems):
+    """Fit each joint from several starts, for chi2 may have more than one valley."""
+    count, starts = len(problems.joint), [problems]
+    for frequency, delay in RESTARTS:
+        sets = problems.sets.copy()
+        sets[:, INDEX['natural_frequency']] = frequency
+        sets[:, INDEX['delay']] = np.where(problems.free[:, INDEX['delay']], delay, 0.0)
+        starts.append(Problems(problems.joint, sets, problems.free, problems.weight))
+    fits = fitter.solve(Problems.join(starts))
+    choice = fits.chi2.reshape(-1, count).argmin(axis=0) * count + np.arange(count)
+    return Fits(fits.sets[choice], fits.chi2[choice])
 
 
 def _alike(log, noise, problems, sets):

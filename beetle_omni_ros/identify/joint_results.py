@@ -109,7 +109,8 @@ def sentences(model: JointModel) -> list[str]:
         used = ' and '.join(f'{model.values[INDEX[name]]:.3g} {TERMS[name].unit}'
                             for name in unmet)
         text.append(f'Not met in this log: {" and ".join(WORDS[name] for name in unmet)}; '
-                    f'predictions use {used} as published. Steps of 1.5 rad would show them.')
+                    f'predictions use {used} as published. A sine of 1.5 rad, fast enough for '
+                    f'{1.2 * model.values[INDEX["velocity_limit"]]:.0f} rad/s, would show them.')
     return text
 
 

@@ -215,22 +215,28 @@ class Selector:
         return swapped
 
     def _prune(self):
-        """Drop what a later term has made superfluous, e.g. play once there is friction."""
-        asked = {(j, drop): (tuple(n for n in names if n != drop), None)
-                 for j, names in enumerate(self.kept) for drop in (None, *names)}
-        answers = self._judge(asked)
-        for j, names in enumerate(self.kept):
-            self.values[j], full = answers[j, None]
-            for name in names:
-                self.tried[j][name] = self.values[j]
-                if name == 'delay':     # shared: the other joints vouch for it
+        """Drop what a later term has made superfluous, the least useful first."""
+        open_joints = list(range(len(self.kept)))
+        while open_joints:
+            asked = {(j, drop): (tuple(n for n in self.kept[j] if n != drop), None)
+                     for j in open_joints for drop in (None, *self.kept[j])}
+            answers = self._judge(asked)
+            for j in list(open_joints):
+                self.values[j], full = answers[j, None]
+                least = {}
+                for name in self.kept[j]:
+                    self.tried[j][name] = self.values[j]
+                    if name == 'delay':     # shared: the other joints vouch for it
+                        continue
+                    self.gains[j][name], real = _verdict(answers[j, name][1] - full,
+                                                         len(CANDIDATES[name].members))
+                    if not real and not any(CANDIDATES[n].needs == name for n in self.kept[j]):
+                        least[name] = self.gains[j][name]
+                if not least:
+                    open_joints.remove(j)
                     continue
-                self.gains[j][name], real = _verdict(answers[j, name][1] - full,
-                                                     len(CANDIDATES[name].members))
-                needed = any(CANDIDATES[n].needs == name for n in names)
-                if not real and not needed:
-                    self.values[j], self.kept[j] = answers[j, name][0], asked[j, name][0]
-                    break
+                name = min(least, key=least.get)
+                self.values[j], self.kept[j] = answers[j, name][0], asked[j, name][0]
 
     def _judge(self, asked):
         """

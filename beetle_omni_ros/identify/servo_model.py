@@ -143,7 +143,8 @@ def _integrate(value, command, early, q, v, step):
         v -= np.minimum(np.maximum(v, -friction), friction)
         if slow:
             v = np.minimum(np.maximum(v, -speed), speed)
-        q += half * v + early[k] * (v != 0)     # what friction holds does not move
+        # A joint that friction or a limit holds does not feel when the command changed.
+        q += half * v + early[k] * ((v != 0) & (np.abs(v) < speed) & (np.abs(error) < torque))
         if play:
             shown = np.minimum(np.maximum(shown, q - gap), q + gap)
         positions[k + 1] = shown if play else q

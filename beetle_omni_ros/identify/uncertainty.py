@@ -130,6 +130,8 @@ def _profile(fitter, problems, results):
         rows = [k] + [len(problems.joint) + i for i, entry in enumerate(owner)
                       if entry[:3] == (k, index, side)]
         rise = np.maximum((fits.chi2[rows] - best[k]) / results[k].scatter, 0.0)
+        if (rise > RISE).all():     # a better fit lies elsewhere: the local width must do
+            continue
         place = _crossing(rise)
         centre = encode(problems.sets[k:k + 1])[0]
         ends = np.array([np.interp(place, np.arange(len(rows)), refitted[rows, n])
@@ -144,7 +146,8 @@ def _profile(fitter, problems, results):
 def _correlate(paths, results):
     """Correlation of profiled pairs: how far along its own interval one drags the other."""
     for k, result in enumerate(results):
-        profiled = [index for row, index, side in paths if row == k and side > 0]
+        profiled = [index for row, index, side in paths
+                    if row == k and side > 0 and (k, index, -1) in paths]
         reach = {index: paths[k, index, 1] - paths[k, index, -1] for index in profiled}
         for a in profiled:
             for b in profiled:
@@ -175,12 +178,10 @@ def _held(problem, index, move):
 
 def _crossing(rise):
     """Fractional index at which the rise reaches that of 95 %; the last where it never does."""
-    above = np.flatnonzero(rise > RISE)
-    if not above.size:
-        return len(rise) - 1.0
-    k = above[0]
-    if k == 0:
-        return 0.0
+    last = np.flatnonzero(rise <= RISE)[-1]
+    if last == len(rise) - 1:
+        return float(last)
+    k = last + 1
     # chi2 rises with the square of a move: straight in its root
     a, b = np.sqrt(rise[[k - 1, k]])
     return k - 1 + (np.sqrt(RISE) - a) / max(b - a, 1e-9)
