@@ -6,16 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beetle_omni_ros.identify.candidates import CANDIDATES, free_mask, LINEAR
 from beetle_omni_ros.identify.fitting import decode, encode, Fits, Fitter, Noise, Prior, Problems
 from beetle_omni_ros.identify.joint_log import JointLog
-from beetle_omni_ros.identify.selection import (
-    BEYOND,
-    CANDIDATES,
-    Choice,
-    free_mask,
-    LINEAR,
-    Selector,
-)
+from beetle_omni_ros.identify.selection import BEYOND, Choice, Selector
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, published_set, simulate, TERMS
 from beetle_omni_ros.identify.uncertainty import (
     Experiment,

@@ -8,72 +8,20 @@ blocks and by more than its scatter over them, and if the term is large enough t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from beetle_omni_ros.identify.candidates import CANDIDATES, free_mask, RIVALS, TIERS
 from beetle_omni_ros.identify.fitting import Fitter, Problems
-from beetle_omni_ros.identify.joint_log import JointLog
-from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, TERMS
+from beetle_omni_ros.identify.servo_model import INDEX, OFF, TERMS
 
 BLOCKS = 5
 LEAST_GAIN = 10.0       # of chi2 on unseen data for each number, all blocks together
 LEAST_DELAY = 0.001     # [s]
 BEYOND = 1.15           # a limit counts only if the command went so far beyond it
 MOST_PASSES = 3
-LINEAR = ('natural_frequency', 'damping_ratio')   # always there
 QUICK, THOROUGH = 6, 15  # iterations
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """
-    What may join the model.
-
-    Attributes:
-        members: names of its numbers in a parameter set.
-        starts: (log, joint index) -> values of the members to start from, several.
-        needs: a candidate that must be there before.
-
-    """
-
-    members: tuple[str, ...]
-    starts: Callable[[JointLog, int], list[tuple[float, ...]]]
-    needs: str | None = None
-
-
-def _speeds(log, joint):
-    return [(0.97 * log.speed()[joint],), (0.8 * log.speed()[joint],)]
-
-
-def _errors(log, joint):
-    largest = np.abs(log.command[joint] - log.measured[joint]).max()
-    return [(0.9 * largest,), (0.6 * largest,)]
-
-
-CANDIDATES = {
-    'delay': Candidate(('delay',), lambda log, joint: [(0.006,), (0.02,)]),
-    'coulomb_friction': Candidate(('coulomb_friction',), lambda log, joint: [(0.01,), (0.04,)]),
-    'backlash': Candidate(('backlash',), lambda log, joint: [(0.01,), (0.03,)]),
-    'offset': Candidate(('offset',), lambda log, joint: [(
-        float(np.mean(log.measured[joint] - log.command[joint])),)]),
-    'stiction': Candidate(('stiction', 'stribeck_velocity'),
-                          lambda log, joint: [(0.005, 0.1), (0.005, 1.0)], 'coulomb_friction'),
-    'velocity_limit': Candidate(('velocity_limit',), _speeds),
-    'torque_limit': Candidate(('torque_limit',), _errors),
-    'load': Candidate(('load_sine', 'load_cosine'),
-                      lambda log, joint: [(0.005, 0.005), (-0.005, -0.005)]),
-}
-
-# Offered in this order. A delay and friction or play are certain to be there in some size, a limit
-# that was met spoils all else, and what comes later imitates them on slow logs: stiction, above
-# all, can stand in for a delay.
-TIERS = (('delay', 'coulomb_friction', 'backlash', 'velocity_limit', 'torque_limit'),
-         ('offset', 'stiction'), ('load',))
-# What looks much alike: a dead band or play, a limit of speed or of torque.
-RIVALS = {'coulomb_friction': 'backlash', 'backlash': 'coulomb_friction',
-          'velocity_limit': 'torque_limit', 'torque_limit': 'velocity_limit'}
 
 
 @dataclass(frozen=True)
@@ -93,12 +41,6 @@ class Choice:
     values: np.ndarray
     tried: dict[str, np.ndarray]
     gain: dict[str, float]
-
-
-def free_mask(kept: tuple[str, ...]) -> np.ndarray:
-    """(n,) which numbers a model with these candidates fits."""
-    names = set(LINEAR).union(*(CANDIDATES[name].members for name in kept))
-    return np.array([name in names for name in NAMES])
 
 
 def block_masks(weight: np.ndarray, blocks: int = BLOCKS) -> np.ndarray:
@@ -167,7 +109,7 @@ class Selector:
                 best, best_gain = None, 0.0
                 for name in self._open(tier, j):
                     found, costs = answers[j, name]
-                    gain, real = _verdict(without - costs, len(CANDIDATES[name].members))
+                    gain, real = _verdict(without - costs, _weight(name, self.kept[j]))
                     self.tried[j][name], self.gains[j][name] = found, gain
                     if real and gain > best_gain and self._matters(j, name, found):
                         best, best_gain = name, gain
@@ -229,7 +171,7 @@ class Selector:
                     if name == 'delay':     # shared: the other joints vouch for it
                         continue
                     self.gains[j][name], real = _verdict(answers[j, name][1] - full,
-                                                         len(CANDIDATES[name].members))
+                                                         _weight(name, self.kept[j]))
                     if not real and not any(CANDIDATES[n].needs == name for n in self.kept[j]):
                         least[name] = self.gains[j][name]
                 if not least:
@@ -302,9 +244,14 @@ class Selector:
                    if member != 'stribeck_velocity') >= self.log.quantum
 
 
-def _verdict(gains, numbers):
+def _weight(name, kept):
+    """By how much a candidate must beat the least gain; twice where its rival is there too."""
+    return len(CANDIDATES[name].members) * (2 if RIVALS.get(name) in kept else 1)
+
+
+def _verdict(gains, weight):
     """Gain over all blocks, and whether it is real: above its scatter, in most blocks."""
     total = float(gains.sum())
     error = float(gains.std(ddof=1) * np.sqrt(len(gains)))
-    real = total > max(LEAST_GAIN * numbers, error) and (gains > 0).sum() * 2 > len(gains)
+    real = total > max(LEAST_GAIN * weight, error) and (gains > 0).sum() * 2 > len(gains)
     return total, bool(real)
