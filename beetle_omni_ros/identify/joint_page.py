@@ -53,7 +53,7 @@ def _unit(unit):
 def _value(term):
     factor = MILLI if term['unit'] in ('s', 'rad') else 1.0
     numbers = [None if v is None else factor * v for v in (term['value'], *term['interval'])]
-    value, low, high = ('inf' if v is None else f'{v:.{digits}g}'
+    value, low, high = ('inf' if v is None else f'{v:.{digits}g}' if abs(v) < 99.5 else f'{v:.0f}'
                         for v, digits in zip(numbers, (3, 2, 2), strict=True))
     text = f'{value} ({low}..{high})'
     return text if term['kept'] else f'[{text}]'
