@@ -20,10 +20,11 @@ ALLOWED = {
     'runs': ('robot', 'control.base'),
     'evaluation': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs'),
     'comparison': ('robot', 'runs', 'evaluation'),
+    'identify': ('robot', 'runs'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs'),
     'train': ('robot', 'control.observation', 'control.policy_file', 'runs.json_file'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
-            'nodes', 'train'),
+            'nodes', 'train', 'identify'),
 }
 
 # Library -> the only room that imports it.

@@ -222,10 +222,14 @@ def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
         return content
     name = content.pop('extends')
     base = path.parent / str(name)
-    if not base.is_file():
+    # `extends: robot.yaml` in somebody's robot.yaml means the shipped one
+    itself = base.resolve() == path.resolve()
+    if itself or not base.is_file():
         try:
             base = share_path(f'params/{name}')
         except FileNotFoundError:
+            if itself:
+                raise ParameterError(f"{path}: key 'extends': {name} extends itself") from None
             raise ParameterError(f"{path}: key 'extends': no file {name!r} beside it or among the "
                                  'shipped params') from None
     if base.resolve() in (*seen, path.resolve()):

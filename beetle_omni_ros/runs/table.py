@@ -226,12 +226,17 @@ def print_results(results: dict, console: Console | None = None) -> None:
              if meta.get(key) is not None]
     if known:
         console.print(', '.join(known), style='bold', highlight=False)
-    for grid in grids(results):
+    print_grids(grids(results), console)
+
+
+def print_grids(shown: list[Grid], console: Console) -> None:
+    """Print tables to the terminal."""
+    for grid in shown:
         console.print(_rich(grid))
 
 
 def _rich(grid):
-    table = Table(title=grid.title, title_justify='left', title_style='', box=None,
+    table = Table(title=Text(grid.title), title_justify='left', title_style='', box=None,
                   header_style='dim', padding=(0, 2, 0, 0))
     for k, name in enumerate(grid.header):
         table.add_column(Text(name), justify='left' if k == 0 else 'right', overflow='fold',

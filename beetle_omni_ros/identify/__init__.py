@@ -1,0 +1,1 @@
+"""Actuator models from measured data: servo response logs and rotor bench logs."""

@@ -1,0 +1,117 @@
+"""`beetle_omni identify`: measured logs in, numbers, a page and a robot file out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from beetle_omni_ros.identify import joint_results as of_joints
+from beetle_omni_ros.identify import rotor_results as of_rotor
+from beetle_omni_ros.identify.joint import identify_joints
+from beetle_omni_ros.identify.joint_log import read_joint_log
+from beetle_omni_ros.identify.joint_page import grids, joint_page
+from beetle_omni_ros.identify.robot_file import check_not_base, write_text
+from beetle_omni_ros.identify.rotor import identify_rotor
+from beetle_omni_ros.identify.rotor_log import read_rotor_log
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.json_file import check_writable, write_json
+from beetle_omni_ros.runs.table import print_grids
+
+
+def run_identify_joint(path: Path, *, validate: list[Path] = (), robot: Path | None = None,
+                       json_path: Path | None = None, report: Path | None = None,
+                       params: Path | None = None, console: Console | None = None) -> dict:
+    """
+    Identify the tilt servos from a response log.
+
+    Args:
+        path: log, see docs/identification.md.
+        validate: further logs, which only judge.
+        robot: file with the published servo and its inertia; default the shipped one.
+        json_path: file for the results.
+        report: HTML page to write.
+        params: robot file to write.
+        console: where to print.
+
+    Returns:
+        the results as in INTERFACES: ``joints``, and ``meta``.
+
+    Raises:
+        LogError, ParameterError: unusable input, in one line.
+
+    """
+    console = console or Console()
+    _check_outputs(json_path, report, params, robot)
+    published = RobotParameters.load(robot).joints
+    log = read_joint_log(path)
+    validations = [read_joint_log(other) for other in validate]
+    with console.status(f'identifying {len(log.joints)} joints'):
+        models = identify_joints(log, published)
+    results = of_joints.joint_results(log, validations, models, published)
+    if robot:
+        results['meta']['robot'] = str(robot)
+    _print(console, grids(results, brief=True), results['text'])
+    if json_path:
+        write_json(json_path, results)
+    if report:
+        write_text(report, joint_page(log, validations, models, published, results),
+                             'report')
+    if params:
+        of_joints.write_joint_file(params, results, robot)
+    return results
+
+
+def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path | None = None,
+                       report: Path | None = None, params: Path | None = None,
+                       console: Console | None = None) -> dict:
+    """
+    Identify a rotor's map and torque ratio from a bench log.
+
+    Args:
+        path: log, see docs/identification.md.
+        robot: file whose map is drawn beside and extended; default the shipped one.
+        json_path: file for the results.
+        report: HTML page to write.
+        params: robot file to write.
+        console: where to print.
+
+    Returns:
+        ``plateaus``, ``torque_to_thrust_ratio``, ``warnings`` and ``meta``.
+
+    Raises:
+        LogError, ParameterError: unusable input, in one line.
+
+    """
+    console = console or Console()
+    _check_outputs(json_path, report, params, robot)
+    believed = RobotParameters.load(robot)
+    log = read_rotor_log(path)
+    rows, ratio = identify_rotor(log)
+    results = of_rotor.rotor_results(log, rows, ratio)
+    if robot:
+        results['meta']['robot'] = str(robot)
+    _print(console, of_rotor.grids(results), [f'warning: {w}' for w in results['warnings']])
+    if json_path:
+        write_json(json_path, results)
+    if report:
+        write_text(report, of_rotor.rotor_page(log, rows, ratio, believed, results),
+                             'report')
+    if params:
+        of_rotor.write_rotor_file(params, results, robot)
+    return results
+
+
+def _check_outputs(json_path, report, params, robot):
+    if params:
+        check_not_base(params, robot)
+    for path, what in ((json_path, 'result file'), (report, 'report'),
+                       (params, 'parameter file')):
+        if path:
+            check_writable(path, what)
+
+
+def _print(console, tables, notes):
+    print_grids(tables, console)
+    for note in notes:
+        console.print(note, highlight=False, markup=False)

@@ -1,0 +1,219 @@
+"""Identification of the tilt servos from one response log, judged on what was not fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.identify.candidates import CANDIDATES, free_mask, LINEAR
+from beetle_omni_ros.identify.fitting import decode, encode, Fits, Fitter, Noise, Prior, Problems
+from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.selection import BEYOND, Choice, Selector
+from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, published_set, simulate, TERMS
+from beetle_omni_ros.identify.uncertainty import (
+    Experiment,
+    separating_experiments,
+    traded,
+    uncertainties,
+    Uncertainty,
+)
+from beetle_omni_ros.robot.parameters import JointParameters
+
+FITTED_PART = 0.6       # of the log; the rest judges
+FIRST_NOISE = 0.002     # [rad] white, until the residuals tell
+MOST_PASSES, NEARLY = 3, 0.8    # of selection, while the noise falls below this part of itself
+SETTLING = 0.25         # [s] of a log that are not fitted: its first velocity is only a guess
+# Belief beside the data, as standard deviations. The published frequency and damping are right
+# within a factor of 1.6; servos of one type and one bus differ by 10 % and 3 ms.
+PUBLISHED_DEVIATION = {'natural_frequency': 0.5, 'damping_ratio': 0.5}
+COMMON_DEVIATION = {'natural_frequency': 0.1, 'damping_ratio': 0.1, 'delay': 0.003}
+MOST_ROUNDS, RESTING = 10, 0.2    # of refits; change of the median, in scales, that ends them
+RESTARTS = ((32.0, 0.003), (45.0, 0.015), (70.0, 0.025))    # [rad/s], [s]
+LEAST_COMMON = 3        # joints, below which nothing is called common
+CERTAIN = ('delay', 'coulomb_friction')   # in the model that estimates the noise
+
+
+@dataclass(frozen=True)
+class JointModel:
+    """
+    What one servo turned out to be.
+
+    Attributes:
+        joint: number, 1 to 4.
+        kept: candidates in the model.
+        values: (n,) parameter set that predicts; where the log says nothing, as published.
+        estimates: (n,) also of numbers that are not in the model.
+        uncertainty: of the estimates.
+        traded: pairs that the log cannot separate.
+        experiment: that would separate delay and bandwidth.
+        gain: candidate -> chi2 gained on unseen blocks.
+
+    """
+
+    joint: int
+    kept: tuple[str, ...]
+    values: np.ndarray
+    estimates: np.ndarray
+    uncertainty: Uncertainty
+    traded: list[list[str]]
+    experiment: Experiment
+    gain: dict[str, float]
+
+
+def identify_joints(log: JointLog, published: JointParameters,
+                    fitted: float = FITTED_PART) -> list[JointModel]:
+    """
+    Identify every joint of a log from its first part.
+
+    Args:
+        log: commands and positions.
+        published: the servo as the robot file has it.
+        fitted: part of the log that may be looked at.
+
+    """
+    log = log.first(fitted)
+    start = published_set(published)
+    weight = np.tile((log.t >= log.t[0] + SETTLING).astype(float), (len(log.joints), 1))
+    noise = _first_noise(log, start, weight)
+    belief = _prior(start, PUBLISHED_DEVIATION)
+    for _ in range(MOST_PASSES):
+        choices = Selector(Fitter(log, noise, belief), weight[0]).run(_unlimited(start))
+        problems = _problems(log, choices, weight)
+        fits = _best(Fitter(log, noise, belief), problems)
+        before, noise = noise, _noise(log, fits.sets, weight)
+        if (noise.sigma > NEARLY * before.sigma).all():
+            break       # else the terms found let see more than the first model did
+    sets = _alike(log, noise, problems, fits.sets)
+    return _models(log, noise, choices, sets, weight, start)
+
+
+def _best(fitter, problems):
+    """Fit each joint from several starts, for chi2 may have more than one valley."""
+    count, starts = len(problems.joint), [problems]
+    for frequency, delay in RESTARTS:
+        sets = problems.sets.copy()
+        sets[:, INDEX['natural_frequency']] = frequency
+        sets[:, INDEX['delay']] = np.where(problems.free[:, INDEX['delay']], delay, 0.0)
+        starts.append(Problems(problems.joint, sets, problems.free, problems.weight))
+    fits = fitter.solve(Problems.join(starts))
+    choice = fits.chi2.reshape(-1, count).argmin(axis=0) * count + np.arange(count)
+    return Fits(fits.sets[choice], fits.chi2[choice])
+
+
+def _alike(log, noise, problems, sets):
+    """
+    Fit again, each joint with the median of all as a prior, until the median rests.
+
+    A joint whose log decides stays where it is; one whose log does not, follows.
+    """
+    if len(sets) < LEAST_COMMON:
+        return sets
+    for _ in range(MOST_ROUNDS):
+        common = decode(np.median(encode(sets), axis=0))
+        fits = Fitter(log, noise, _prior(common, COMMON_DEVIATION)).solve(
+            Problems(problems.joint, sets, problems.free, problems.weight), 8)
+        change = np.median(encode(fits.sets), axis=0) - encode(common)
+        sets = fits.sets
+        if np.abs(change[[INDEX[name] for name in COMMON_DEVIATION]]).max() < RESTING:
+            break
+    return sets
+
+
+def _unlimited(start):
+    return np.where(free_mask(()), start, OFF)
+
+
+def _prior(centre, deviations):
+    precision = np.zeros(len(NAMES))
+    for name, deviation in deviations.items():
+        precision[INDEX[name]] = (TERMS[name].scale / deviation)**2
+    return Prior(encode(centre), precision)
+
+
+def _problems(log, choices, weight):
+    free = np.array([free_mask(choice.kept) for choice in choices])
+    return Problems(np.arange(len(log.joints)), np.array([c.values for c in choices]), free,
+                    weight)
+
+
+def _first_noise(log, start, weight):
+    """Noise around the model whose terms are certain, and a speed limit where one may be."""
+    joints = np.arange(len(log.joints))
+    sets = np.tile(_unlimited(start), (len(joints), 1))
+    sets[:, INDEX['delay']], sets[:, INDEX['coulomb_friction']] = 0.01, 0.01
+    free = np.tile(free_mask((*CERTAIN, 'offset')), (len(joints), 1))
+    beyond = log.asked_speed() > BEYOND * log.speed()
+    limit = INDEX['velocity_limit']
+    sets[beyond, limit], free[beyond, limit] = log.speed()[beyond], True
+    fits = Fitter(log, Noise.white(len(joints), FIRST_NOISE), _prior(
+        start, PUBLISHED_DEVIATION)).solve(Problems(joints, sets, free, weight))
+    return _noise(log, fits.sets, weight)
+
+
+def _noise(log, sets, weight):
+    error = simulate(log, np.arange(len(sets)), sets) - log.measured
+    return Noise.of(error[:, weight[0] > 0], max(log.quantum, 1e-4) / np.sqrt(12),
+                    log.period)
+
+
+def _models(log, noise, choices: list[Choice], sets, weight, start):
+    """Intervals of the kept numbers together, and of each other one if it joined them."""
+    rows, owner = [], []
+    for j, choice in enumerate(choices):
+        for name in (None, *(n for n in CANDIDATES if n not in choice.kept)):
+            if name is not None and name not in choice.tried:
+                continue
+            kept = choice.kept if name is None else (*choice.kept, name)
+            values = sets[j].copy()
+            for member in CANDIDATES[name].members if name else ():
+                values[INDEX[member]] = choice.tried[name][INDEX[member]]
+            rows.append(Problems(np.array([j]), values[None], free_mask(kept)[None],
+                                 weight[j:j + 1]))
+            owner.append((j, name))
+    problems = Problems.join(rows)
+    judged = dict(zip(owner, uncertainties(log, noise, problems), strict=True))
+    plans = separating_experiments(
+        sets, np.array([free_mask(choice.kept) for choice in choices]), noise,
+        np.array([judged[j, None].scatter for j in range(len(choices))]))
+    models = []
+    for j, choice in enumerate(choices):
+        main, estimates = judged[j, None], sets[j].copy()
+        for name in CANDIDATES:
+            if (j, name) in judged:
+                for member in CANDIDATES[name].members:
+                    index = INDEX[member]
+                    estimates[index] = choice.tried[name][index]
+                    main.intervals[index] = judged[j, name].intervals[index]
+        values = _with_published_limits(log, j, choice, sets[j], start, estimates, main)
+        names = [n for n in NAMES if free_mask(choice.kept)[INDEX[n]]]
+        judge = judged.get((j, 'delay'), main)
+        pairs = traded(judge, names if 'delay' in names else [*names, 'delay'])
+        models.append(JointModel(
+            log.joints[j], choice.kept, values, estimates, main, pairs, plans[j], choice.gain))
+    return models
+
+
+def _with_published_limits(log, j, choice: Choice, values, start, estimates, uncertainty):
+    """Limits that the log never reaches stay as published, unless the log went beyond them."""
+    values = values.copy()
+    seen = {'velocity_limit': log.speed()[j],
+            'torque_limit': np.abs(log.command[j] - log.measured[j]).max()}
+    for name, reached in seen.items():
+        index = INDEX[name]
+        if name in choice.kept:
+            continue
+        limit = max(start[index], 1.1 * reached)
+        values[index] = estimates[index] = limit
+        uncertainty.intervals[index] = reached, np.inf
+    return values
+
+
+def error_rms(log: JointLog, joint: int, values: np.ndarray, held: bool = True,
+              part: slice = slice(None)) -> float:
+    """RMS of prediction minus measurement [rad] of the joint with this index."""
+    error = simulate(log, joint, values[None], held)[0] - log.measured[joint]
+    return float(np.sqrt(np.mean(error[part]**2)))
+
+
+__all__ = ['error_rms', 'FITTED_PART', 'identify_joints', 'JointModel', 'LINEAR']

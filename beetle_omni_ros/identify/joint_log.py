@@ -1,0 +1,198 @@
+"""Response logs of the tilt servos: what was commanded and what the encoders read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.identify.csv_table import LogError, missing, read_table
+
+HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
+JOINTS = (1, 2, 3, 4)
+LONGEST_PERIOD, SHORTEST_PERIOD = 0.1, 2e-4   # [s] between samples; slower cannot show a servo
+LONGEST_GAP = 0.25       # [s] within a log
+LEAST_DURATION = 2.0     # [s]
+LEAST_SAMPLES = 100
+LEAST_TRAVEL = 0.02      # [rad] of the command and of each joint
+LARGEST_ANGLE = 13.0     # [rad] two turns: a larger one is not an angle in radians
+HISTORY = 0.3            # [s] for which the command goes on backwards before the log
+
+
+@dataclass(frozen=True)
+class JointLog:
+    """
+    Commands and positions of several joints over time.
+
+    Attributes:
+        name: of the file.
+        t: (N,) [s], increasing.
+        joints: (n,) numbers of the joints, 1 to 4.
+        measured: (n, N) encoder positions [rad].
+        command: (n, N) commanded positions [rad].
+
+    """
+
+    name: str
+    t: np.ndarray
+    joints: tuple[int, ...]
+    measured: np.ndarray
+    command: np.ndarray
+    period: float = field(init=False)
+    start: np.ndarray = field(init=False)
+    start_velocity: np.ndarray = field(init=False)
+
+    def __post_init__(self):
+        """Derive sampling period [s], first positions [rad] and velocities [rad/s]."""
+        period = float(np.median(np.diff(self.t)))
+        count = max(4, int(round(0.04 / period)) + 1)
+        first = np.polyfit(self.t[:count] - self.t[0], self.measured[:, :count].T, 2)
+        slope = np.polyfit(self.t[:count] - self.t[0], self.command[:, :count].T, 1)[0]
+        back = -period * np.arange(int(HISTORY / period) + 1, 0, -1)
+        before = self.command[:, :1] + slope[:, None] * back
+        command_t = np.concatenate([self.t[0] + back, self.t])
+        command = np.concatenate([before, self.command], axis=1)
+        # Integrals of the held command: once, and once more.
+        steps = np.diff(command_t)
+        once = np.cumsum(command[:, :-1] * steps, axis=1)
+        once = np.concatenate([np.zeros((len(command), 1)), once], axis=1)
+        twice = np.cumsum(once[:, :-1] * steps + command[:, :-1] * steps**2 / 2, axis=1)
+        twice = np.concatenate([np.zeros((len(command), 1)), twice], axis=1)
+        known = {'_once': once, '_twice': twice, 'period': period, 'start': first[2],
+                 'start_velocity': first[1],
+                 '_command_t': command_t, '_command': command}
+        for name, value in known.items():
+            object.__setattr__(self, name, value)
+
+    def command_at(self, joint: int, times: np.ndarray) -> np.ndarray:
+        """Command of the joint with this index [rad], interpolated; straight before the log."""
+        return np.interp(times, self._command_t, self._command[joint])
+
+    def held_command(self, joint: int, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Command that is held from each row to the next, over equal steps.
+
+        Args:
+            joint: index of the joint.
+            edges: (K + 1,) times [s], evenly spaced.
+
+        Returns:
+            (K,) its mean over each step, and (K,) how far what comes before the middle of the
+            step outweighs the rest: the mean of (command - mean) (1/2 - place in the step) [rad].
+
+        """
+        row = np.maximum(np.searchsorted(self._command_t, edges, side='right') - 1, 0)
+        since, command = edges - self._command_t[row], self._command[joint, row]
+        once = self._once[joint, row] + command * since
+        twice = self._twice[joint, row] + self._once[joint, row] * since + command * since**2 / 2
+        step = edges[1] - edges[0]
+        mean = np.diff(once) / step
+        return mean, (np.diff(twice) - step * once[:-1]) / step**2 - mean / 2
+
+    def first(self, part: float) -> JointLog:
+        """Its beginning, alone."""
+        end = self.end_of(part)
+        return JointLog(self.name, self.t[:end], self.joints, self.measured[:, :end],
+                        self.command[:, :end])
+
+    def end_of(self, part: float) -> int:
+        """Count the samples in a part of it."""
+        return int(round(part * len(self.t)))
+
+    @property
+    def quantum(self) -> float:
+        """The encoder's step [rad]: the smallest change of a reading that occurs."""
+        steps = np.abs(np.diff(self.measured, axis=1))
+        steps = steps[steps > 1e-5]
+        return float(np.quantile(steps, 0.01)) if steps.size else 0.0
+
+    def asked_speed(self) -> np.ndarray:
+        """(n,) Speed of each command [rad/s] that 1 % of the samples exceed."""
+        return np.quantile(np.abs(np.gradient(self.command, self.t, axis=1)), 0.99, axis=1)
+
+    def speed(self) -> np.ndarray:
+        """(n,) Largest speed of each joint [rad/s], over 50 ms so that steps do not count."""
+        span = max(1, int(round(0.05 / self.period)))
+        travel = np.abs(self.measured[:, span:] - self.measured[:, :-span])
+        return (travel / (self.t[span:] - self.t[:-span])).max(axis=1)
+
+
+def read_joint_log(path: str | Path) -> JointLog:
+    """
+    Read a response log and refuse what cannot be identified from.
+
+    Raises:
+        LogError: naming the file, the row or column, and what was expected.
+
+    """
+    table = read_table(path, _wanted, HEADER)
+    t = table.columns['t_s']
+    _check_times(table, t)
+    joints = tuple(k for k in JOINTS if f'q{k}_rad' in table.columns)
+    measured = np.stack([table.columns[f'q{k}_rad'] for k in joints])
+    command = np.stack([table.columns.get(f'command{k}_rad', table.columns.get('command_rad'))
+                        for k in joints])
+    for k, position, wanted in zip(joints, measured, command, strict=True):
+        _check_angles(table.path, k, position, wanted)
+    return JointLog(table.path.name, t, joints, measured, command)
+
+
+def _wanted(header):
+    if 't_s' not in header:
+        raise missing('t_s', header)
+    joints = [k for k in JOINTS if f'q{k}_rad' in header]
+    if not joints:
+        raise missing('q1_rad', header)
+    odd = [cell for cell in header if cell[:1] == 'q' and cell[1:2].isdigit()
+           and cell not in [f'q{k}_rad' for k in JOINTS]]
+    if odd:
+        raise LogError(f"column '{odd[0]}' is not one of q1_rad to q4_rad")
+    names = ['t_s', *(f'q{k}_rad' for k in joints)]
+    if 'command_rad' in header:
+        return [*names, 'command_rad']
+    if not any(f'command{k}_rad' in header for k in joints):
+        raise missing('command_rad', header)
+    for k in joints:
+        if f'command{k}_rad' not in header:
+            raise missing(f'command{k}_rad', header)
+    return names + [f'command{k}_rad' for k in joints]
+
+
+def _check_times(table, t):
+    path = table.path
+    if len(t) < LEAST_SAMPLES:
+        raise LogError(f'{path}: {len(t)} rows are too few; expected at least {LEAST_SAMPLES}')
+    steps = np.diff(t)
+    if (steps <= 0).any():
+        k = int(np.argmax(steps <= 0)) + 1
+        raise LogError(f'{path}: row {table.rows[k]}, column t_s: {t[k]:g} s does not come after '
+                       f'{t[k - 1]:g} s; expected increasing times')
+    period = float(np.median(steps))
+    if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
+        raise LogError(f'{path}: column t_s: samples are {period:g} s apart; expected '
+                       f'{SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g} s (is the time in seconds?)')
+    if t[-1] - t[0] < LEAST_DURATION:
+        raise LogError(f'{path}: {t[-1] - t[0]:.2f} s are too short; expected at least '
+                       f'{LEAST_DURATION:g} s')
+    if steps.max() > LONGEST_GAP:
+        k = int(np.argmax(steps)) + 1
+        raise LogError(f'{path}: row {table.rows[k]}: {steps.max():.2f} s without a sample; '
+                       f'expected gaps below {LONGEST_GAP:g} s (split the log there)')
+
+
+def _check_angles(path, joint, position, command):
+    for name, values in (('the command', command), (f'q{joint}_rad', position)):
+        if np.abs(values).max() > LARGEST_ANGLE:
+            raise LogError(f'{path}: {name} reaches {np.abs(values).max():g}; expected radians '
+                           f'within +-{LARGEST_ANGLE:g} (degrees or encoder counts?)')
+        if np.ptp(values) < LEAST_TRAVEL:
+            raise LogError(f'{path}: {name} moves by {np.ptp(values):.4f} rad only; expected at '
+                           f'least {LEAST_TRAVEL:g} rad (a constant says nothing about a servo)')
+    ratio = np.ptp(position) / np.ptp(command)
+    if not 0.1 < ratio < 10:
+        raise LogError(f'{path}: q{joint}_rad travels {ratio:.3g} times as far as its command; '
+                       'expected the same unit, radians, in both')
+    if np.corrcoef(position, command)[0, 1] < 0:
+        raise LogError(f'{path}: q{joint}_rad moves against its command; expected both with the '
+                       'same sign')

@@ -1,0 +1,257 @@
+"""
+Which terms a servo model needs: each must improve the prediction of data it was not fitted to.
+
+The fitted part of a log is cut into blocks. A candidate joins the model only if the model fitted
+without a block predicts that block better with the candidate than without it, summed over the
+blocks and by more than its scatter over them, and if the term is large enough to matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.identify.candidates import CANDIDATES, free_mask, RIVALS, TIERS
+from beetle_omni_ros.identify.fitting import Fitter, Problems
+from beetle_omni_ros.identify.servo_model import INDEX, OFF, TERMS
+
+BLOCKS = 5
+LEAST_GAIN = 10.0       # of chi2 on unseen data for each number, all blocks together
+LEAST_DELAY = 0.001     # [s]
+BEYOND = 1.15           # a limit counts only if the command went so far beyond it
+MOST_PASSES = 3
+QUICK, THOROUGH = 6, 15  # iterations
+
+
+@dataclass(frozen=True)
+class Choice:
+    """
+    The model of one joint.
+
+    Attributes:
+        kept: names of candidates in it.
+        values: (n,) parameter set, fitted to the whole fitted part.
+        tried: candidate -> parameter set with it in the model, those kept too.
+        gain: candidate -> chi2 gained on unseen blocks when it was last judged.
+
+    """
+
+    kept: tuple[str, ...]
+    values: np.ndarray
+    tried: dict[str, np.ndarray]
+    gain: dict[str, float]
+
+
+def block_masks(weight: np.ndarray, blocks: int = BLOCKS) -> np.ndarray:
+    """(blocks, N) 1 within each of the blocks of the samples that have a weight (N,)."""
+    used = np.flatnonzero(weight)
+    edges = np.linspace(used[0], used[-1] + 1, blocks + 1).astype(int)
+    index = np.arange(len(weight))
+    return np.array([(index >= a) & (index < b)
+                     for a, b in zip(edges[:-1], edges[1:], strict=True)], dtype=float)
+
+
+class Selector:
+    """
+    Forward selection, all joints side by side.
+
+    Args:
+        fitter: log, noise and prior.
+        weight: (N,) 0 for samples that are never looked at.
+        allowed: names of candidates; default all.
+
+    """
+
+    def __init__(self, fitter: Fitter, weight: np.ndarray,
+                 allowed: tuple[str, ...] = tuple(CANDIDATES)):
+        """Cut the blocks; see the class."""
+        self.fitter, self.log, self.allowed = fitter, fitter.log, allowed
+        self.blocks = block_masks(weight)
+        self.all = self.blocks.sum(axis=0)
+
+    def run(self, start: np.ndarray) -> list[Choice]:
+        """
+        Select from the linear model on.
+
+        Args:
+            start: (n,) parameter set to begin with.
+
+        """
+        count = len(self.log.joints)
+        self.kept = [()] * count
+        self.values = [np.where(free_mask(()), start, OFF)] * count
+        self.tried: list[dict] = [{} for _ in range(count)]
+        self.gains: list[dict] = [{} for _ in range(count)]
+        for _ in range(MOST_PASSES):
+            self._grow(TIERS[0])
+            self._share_delay()
+            early = list(self.kept)
+            for tier in TIERS[1:]:
+                self._grow(tier)
+            # What comes late, a limit say, can have hidden what was offered early.
+            if not self._swap() and self.kept == early:
+                break
+        self._prune()
+        return [Choice(*each) for each in zip(self.kept, self.values, self.tried, self.gains,
+                                              strict=True)]
+
+    def _grow(self, tier):
+        """Add candidates of one tier while any helps."""
+        growing = list(range(len(self.kept)))
+        while growing:
+            asked = {(j, None): (self.kept[j], None) for j in growing}
+            asked |= {(j, name): ((*self.kept[j], name), name) for j in growing
+                      for name in self._open(tier, j)}
+            answers = self._judge(asked)
+            for j in list(growing):
+                self.values[j], without = answers[j, None]
+                best, best_gain = None, 0.0
+                for name in self._open(tier, j):
+                    found, costs = answers[j, name]
+                    gain, real = _verdict(without - costs, _weight(name, self.kept[j]))
+                    self.tried[j][name], self.gains[j][name] = found, gain
+                    if real and gain > best_gain and self._matters(j, name, found):
+                        best, best_gain = name, gain
+                if best is None:
+                    growing.remove(j)
+                else:
+                    self.kept[j] = (*self.kept[j], best)
+                    self.values[j] = self.tried[j][best]
+
+    def _share_delay(self):
+        """One bus serves all joints: a delay that one of them proves is there for all."""
+        if not any('delay' in names for names in self.kept):
+            return
+        for j, names in enumerate(self.kept):
+            if 'delay' not in names:
+                self.kept[j], self.values[j] = (*names, 'delay'), self.tried[j]['delay']
+
+    def _open(self, tier, joint):
+        """Candidates of a tier that the joint can have and has not."""
+        kept = self.kept[joint]
+        slow = self.log.asked_speed()[joint] < BEYOND * 0.95 * self.log.speed()[joint]
+        return [name for name in self.allowed if name in tier and name not in kept
+                and CANDIDATES[name].needs in (None, *kept)
+                and not (name == 'velocity_limit' and slow)]
+
+    def _swap(self):
+        """Exchange a term for its rival where that predicts better; tell whether any was."""
+        asked = {(j, None): (names, None) for j, names in enumerate(self.kept)}
+        for j, names in enumerate(self.kept):
+            for name in names:
+                rival = RIVALS.get(name)
+                if rival in self.allowed and rival not in names:
+                    asked[j, name] = (tuple(rival if n == name else n for n in names
+                                            if CANDIDATES[n].needs != name), rival)
+        answers, swapped = self._judge(asked), False
+        for j, name in asked:
+            if name is None:
+                continue
+            found, costs = answers[j, name]
+            gain = float((answers[j, None][1] - costs).sum())
+            rival = RIVALS[name]
+            if gain > LEAST_GAIN and self._matters(j, rival, found):
+                self.kept[j], self.values[j], swapped = asked[j, name][0], found, True
+                self.tried[j][rival] = found
+        return swapped
+
+    def _prune(self):
+        """Drop what a later term has made superfluous, the least useful first."""
+        open_joints = list(range(len(self.kept)))
+        while open_joints:
+            asked = {(j, drop): (tuple(n for n in self.kept[j] if n != drop), None)
+                     for j in open_joints for drop in (None, *self.kept[j])}
+            answers = self._judge(asked)
+            for j in list(open_joints):
+                self.values[j], full = answers[j, None]
+                least = {}
+                for name in self.kept[j]:
+                    self.tried[j][name] = self.values[j]
+                    if name == 'delay':     # shared: the other joints vouch for it
+                        continue
+                    self.gains[j][name], real = _verdict(answers[j, name][1] - full,
+                                                         _weight(name, self.kept[j]))
+                    if not real and not any(CANDIDATES[n].needs == name for n in self.kept[j]):
+                        least[name] = self.gains[j][name]
+                if not least:
+                    open_joints.remove(j)
+                    continue
+                name = min(least, key=least.get)
+                self.values[j], self.kept[j] = answers[j, name][0], asked[j, name][0]
+
+    def _judge(self, asked):
+        """
+        Fit models and predict the blocks left out.
+
+        Args:
+            asked: (joint, any label) -> candidates in the model, and the one among them that is
+                new and needs start values, or None.
+
+        Returns:
+            (joint, label) -> fitted set, and (blocks,) chi2 of each block left out.
+
+        """
+        parts, owner = [], []
+        for key, (model, new) in asked.items():
+            for start in self._starts(key[0], new, self.values[key[0]]):
+                start = np.where(free_mask(model), start, OFF)
+                parts.append(Problems(np.array([key[0]]), start[None], free_mask(model)[None],
+                                      self.all[None]))
+                owner.append(key)
+        problems = Problems.join(parts)
+        fits = self.fitter.solve(problems, THOROUGH)
+        best: dict = {}
+        for k, key in enumerate(owner):
+            if key not in best or fits.chi2[k] < fits.chi2[best[key]]:
+                best[key] = k
+        rows = np.repeat([best[key] for key in asked], len(self.blocks))
+        held = np.tile(self.blocks, (len(asked), 1))
+        folds = Problems(problems.joint[rows], fits.sets[rows], problems.free[rows],
+                         self.all - held)
+        folds = Problems(folds.joint, self.fitter.solve(folds, QUICK).sets, folds.free, held)
+        cost = self.fitter.cost(folds).reshape(len(asked), len(self.blocks))
+        return {key: (fits.sets[best[key]], cost[k]) for k, key in enumerate(asked)}
+
+    def _starts(self, joint, name, values):
+        """Parameter sets to start from when a candidate is new."""
+        if name is None:
+            return [values]
+        found = []
+        for start in CANDIDATES[name].starts(self.log, joint):
+            changed = values.copy()
+            for member, value in zip(CANDIDATES[name].members, start, strict=True):
+                term = TERMS[member]
+                changed[INDEX[member]] = np.clip(value, term.low, term.high)
+            if name == 'delay':     # what the delay takes over, the servo need not lag
+                lag = 2 * values[INDEX['damping_ratio']] / values[INDEX['natural_frequency']]
+                changed[INDEX['natural_frequency']] *= lag / max(lag - start[0], 0.2 * lag)
+            found.append(changed)
+        return found
+
+    def _matters(self, joint, name, values):
+        """A term below the encoder's step, or a limit that is never met, is no finding."""
+        sizes = {member: abs(values[INDEX[member]]) for member in CANDIDATES[name].members}
+        if name == 'delay':
+            return sizes['delay'] >= LEAST_DELAY
+        if name == 'velocity_limit':
+            return BEYOND * sizes[name] <= self.log.asked_speed()[joint]
+        if name == 'torque_limit':
+            sent = self.log.t - values[INDEX['delay']] - self.log.period / 2
+            errors = np.abs(self.log.command_at(joint, sent) - self.log.measured[joint])
+            return BEYOND * sizes[name] <= np.quantile(errors[self.all > 0], 0.99)
+        return max(size for member, size in sizes.items()
+                   if member != 'stribeck_velocity') >= self.log.quantum
+
+
+def _weight(name, kept):
+    """By how much a candidate must beat the least gain; twice where its rival is there too."""
+    return len(CANDIDATES[name].members) * (2 if RIVALS.get(name) in kept else 1)
+
+
+def _verdict(gains, weight):
+    """Gain over all blocks, and whether it is real: above its scatter, in most blocks."""
+    total = float(gains.sum())
+    error = float(gains.std(ddof=1) * np.sqrt(len(gains)))
+    real = total > max(LEAST_GAIN * weight, error) and (gains > 0).sum() * 2 > len(gains)
+    return total, bool(real)

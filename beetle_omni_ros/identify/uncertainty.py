@@ -1,0 +1,277 @@
+"""
+How well a log determines a servo model: intervals, trades, and the log that would separate them.
+
+Intervals are profile likelihoods of the whitened residuals, without any prior: each number is
+moved and held while all others are refitted, until chi2 has risen by that of 95 %. The rise is
+scaled by how much the gradient of chi2 scatters over blocks of the log, which would be
+1 if the residuals were as independent as the whitening assumes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.identify.fitting import (
+    decode,
+    encode,
+    Fitter,
+    HIGH,
+    LOW,
+    Noise,
+    Prior,
+    Problems,
+)
+from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.selection import block_masks
+from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
+
+RISE = 3.84             # of chi2 with one degree of freedom, 95 %
+PROFILED = ('natural_frequency', 'damping_ratio', 'delay')
+LADDER = np.array([0.5, 1.2, 2.2, 3.6, 5.5, 8.0, 12.0, 18.0])  # in scales of a term
+DIFFERENT = 10          # blocks over which the gradient's scatter is taken
+SCATTER = 2.0, 6.0      # its range; below 2 made logs with slow drifts are covered too seldom
+TRADED = 0.6            # part of its interval through which another's interval drags a number
+LOOSE = 1.5             # half width of an interval, in scales, below which nothing is traded
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """
+    For one joint.
+
+    Attributes:
+        intervals: (n, 2) of each number, 95 %; NaN where it was not free.
+        correlation: (n, n) of the numbers that were free, in fitted units.
+        scatter: by which chi2 was divided.
+
+    """
+
+    intervals: np.ndarray
+    correlation: np.ndarray
+    scatter: float
+
+    def half_width(self, name: str) -> float:
+        """Half of an interval, in the number's scale."""
+        index, term = INDEX[name], TERMS[name]
+        low, high = self.intervals[index]
+        if term.logarithmic:
+            low, high = np.log(low), np.log(high)
+        return float((high - low) / 2 / term.scale)
+
+
+def uncertainties(log: JointLog, noise: Noise, problems: Problems) -> list[Uncertainty]:
+    """
+    Judge fitted parameter sets, one for each row of ``problems``.
+
+    Args:
+        log: what they were fitted to.
+        noise: its whitening.
+        problems: with the fitted sets; only ``free`` numbers are judged.
+
+    """
+    fitter = Fitter(log, noise, Prior.none())
+    points = encode(problems.sets)
+    base = fitter.residuals(points, problems.joint, problems.weight)
+    slopes = fitter.jacobian(points, problems, base)
+    results = []
+    for k, free in enumerate(problems.free):
+        information = slopes[k] @ slopes[k].T
+        covariance = _inverse(information, free)
+        scatter = _scatter(slopes[k], base[k], free, covariance, block_masks(
+            problems.weight[k], DIFFERENT))
+        covariance *= scatter
+        size = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+        width = np.sqrt(RISE) * np.where(free, size, np.nan)
+        intervals = np.stack([decode(np.clip(points[k] + side * width, LOW, HIGH))
+                              for side in (-1, 1)], axis=1)
+        results.append(Uncertainty(intervals, covariance / np.outer(size, size), scatter))
+    _profile(fitter, problems, results)
+    return results
+
+
+def _inverse(information, free):
+    covariance = np.zeros_like(information)
+    chosen = np.ix_(free, free)
+    # a direction that the data do not see at all gets a width of thousands of scales, not inf
+    covariance[chosen] = np.linalg.inv(information[chosen] + 1e-7 * np.eye(free.sum()))
+    return covariance
+
+
+def _scatter(slopes, residual, free, covariance, blocks):
+    """Mean variance of the gradient over blocks, relative to what white residuals give."""
+    scores = np.array([(slopes[free] * block) @ residual for block in blocks])
+    found = scores.T @ scores
+    ratio = np.trace(covariance[np.ix_(free, free)] @ found) / free.sum()
+    return float(np.clip(ratio, *SCATTER))
+
+
+def _profile(fitter, problems, results):
+    """Replace the intervals of curved numbers by where the refitted chi2 has risen."""
+    parts, owner = [], []
+    for k in range(len(problems.joint)):
+        for name in PROFILED:
+            index = INDEX[name]
+            if not problems.free[k, index]:
+                continue
+            for side in (-1, 1):
+                for move in LADDER:
+                    parts.append(_held(problems.pick([k]), index, side * move))
+                    owner.append((k, index, side, move))
+    fits = fitter.solve(Problems.join([problems, *parts]), 10)
+    best = fits.chi2[:len(problems.joint)].copy()
+    chi2 = fits.chi2[len(problems.joint):]
+    for (k, *_), value in zip(owner, chi2, strict=True):
+        best[k] = min(best[k], value)
+    refitted = encode(fits.sets)
+    paths: dict = {}
+    for k, index, side in dict.fromkeys(entry[:3] for entry in owner):
+        rows = [k] + [len(problems.joint) + i for i, entry in enumerate(owner)
+                      if entry[:3] == (k, index, side)]
+        rise = np.maximum((fits.chi2[rows] - best[k]) / results[k].scatter, 0.0)
+        if (rise > RISE).all():     # a better fit lies elsewhere: the local width must do
+            continue
+        place = _crossing(rise)
+        centre = encode(problems.sets[k:k + 1])[0]
+        ends = np.array([np.interp(place, np.arange(len(rows)), refitted[rows, n])
+                         for n in range(len(NAMES))])
+        ends[index] = np.clip(centre[index] + side * np.interp(
+            place, np.arange(len(rows)), [0.0, *LADDER]), LOW[index], HIGH[index])
+        paths[k, index, side] = ends
+        results[k].intervals[index, (side + 1) // 2] = decode(ends)[index]
+    _correlate(paths, results)
+
+
+def _correlate(paths, results):
+    """Correlation of profiled pairs: how far along its own interval one drags the other."""
+    for k, result in enumerate(results):
+        profiled = [index for row, index, side in paths
+                    if row == k and side > 0 and (k, index, -1) in paths]
+        reach = {index: paths[k, index, 1] - paths[k, index, -1] for index in profiled}
+        for a in profiled:
+            for b in profiled:
+                if a != b:
+                    drawn = [reach[a][b] / max(reach[b][b], 1e-9),
+                             reach[b][a] / max(reach[a][a], 1e-9)]
+                    result.correlation[a, b] = np.clip(max(drawn, key=abs), -1, 1)
+
+
+def _held(problem, index, move):
+    """The problem with one number moved and held, the delay giving way to the servo's lag."""
+    point = encode(problem.sets)
+    low, high = (encode(np.array([getattr(term, side) for term in TERMS.values()]))
+                 for side in ('low', 'high'))
+    point[0, index] = np.clip(point[0, index] + move, low[index], high[index])
+    free = problem.free.copy()
+    free[0, index] = False
+    sets = decode(point)
+    frequency, damping, delay = (INDEX[name] for name in PROFILED)
+    lag = [2 * s[0, damping] / s[0, frequency] for s in (problem.sets, sets)]
+    if index == delay:
+        change = sets[0, delay] - problem.sets[0, delay]
+        sets[0, frequency] *= lag[0] / max(lag[0] - change, 0.1 * lag[0])
+    elif problem.free[0, delay]:
+        sets[0, delay] = max(0.0, sets[0, delay] + lag[0] - lag[1])
+    return Problems(problem.joint, sets, free, problem.weight)
+
+
+def _crossing(rise):
+    """Fractional index at which the rise reaches that of 95 %; the last where it never does."""
+    last = np.flatnonzero(rise <= RISE)[-1]
+    if last == len(rise) - 1:
+        return float(last)
+    k = last + 1
+    # chi2 rises with the square of a move: straight in its root
+    a, b = np.sqrt(rise[[k - 1, k]])
+    return k - 1 + (np.sqrt(RISE) - a) / max(b - a, 1e-9)
+
+
+def traded(result: Uncertainty, names: list[str]) -> list[list[str]]:
+    """Pairs of these numbers that the log cannot separate, the closest first."""
+    loose = [name for name in names if result.half_width(name) > LOOSE]
+    pairs = [(abs(result.correlation[INDEX[a], INDEX[b]]), a, b)
+             for k, a in enumerate(loose) for b in loose[:k]]
+    return [sorted([a, b]) for r, a, b in sorted(pairs, reverse=True) if r >= TRADED]
+
+
+FREQUENCIES = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0)    # [Hz] of excitations that are weighed
+EXCITATION_TIME, EXCITATION_PERIOD = 10.0, 0.01           # [s] length, between samples
+LARGEST_AMPLITUDE, LARGEST_SPEED = 0.5, 6.0               # [rad], [rad/s] below the servo's limit
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """
+    A log that would tell the delay from the bandwidth.
+
+    Attributes:
+        frequency: of a sine [Hz].
+        amplitude: of the sine [rad].
+        duration: [s].
+        delay_width: half of the 95 % interval that it would give [s].
+        frequency_width: the same of the natural frequency [rad/s].
+
+    """
+
+    frequency: float
+    amplitude: float
+    duration: float
+    delay_width: float
+    frequency_width: float
+
+
+def separating_experiments(sets: np.ndarray, free: np.ndarray, noise: Noise, scatter: np.ndarray,
+                           wanted: float = 0.001) -> list[Experiment]:
+    """
+    The slowest sine that determines every joint's delay, from the model's sensitivities.
+
+    Args:
+        sets: (n, m) fitted parameter sets, one for each joint.
+        free: (n, m) their free numbers; the delay is added.
+        noise: of the log they were fitted to; the same is assumed again.
+        scatter: (n,) inflation of chi2, see :class:`Uncertainty`.
+        wanted: half width of the delay's interval [s].
+
+    Returns:
+        what it would give, joint by joint; if no sine reaches ``wanted``, the best.
+
+    """
+    free = free.copy()
+    free[:, INDEX['delay']] = True
+    best: list[Experiment] = []
+    for frequency in FREQUENCIES:
+        found = _widths(sets, free, noise, scatter, frequency)
+        worst = max(plan.delay_width for plan in found)
+        if not best or worst < max(plan.delay_width for plan in best):
+            best = found
+        if worst <= wanted:
+            break
+    return best
+
+
+def _widths(sets, free, noise, scatter, frequency):
+    """What a sine of this frequency would tell about each joint."""
+    t = np.arange(0.0, EXCITATION_TIME, EXCITATION_PERIOD)
+    omega = 2 * np.pi * frequency
+    amplitude = min(LARGEST_AMPLITUDE, LARGEST_SPEED / omega)
+    command = np.tile(amplitude * np.sin(omega * t), (len(sets), 1))
+    joints = np.arange(len(sets))
+    numbers = tuple(int(j) + 1 for j in joints)
+    blank = JointLog('', t, numbers, np.zeros_like(command), command)
+    log = JointLog('', t, numbers, simulate(blank, joints, sets), command)
+    weight = np.tile((t >= 1.0).astype(float), (len(sets), 1))
+    information = Fitter(log, noise, Prior.none()).information(
+        Problems(joints, sets, free, weight))
+    f, d = INDEX['natural_frequency'], INDEX['delay']
+    scale = np.array([term.scale for term in TERMS.values()])
+    found = []
+    for values, mask, matrix, factor in zip(sets, free, information, scatter, strict=True):
+        width = np.sqrt(RISE * factor * np.diag(_inverse(matrix, mask))) * scale
+        found.append(Experiment(frequency, amplitude, EXCITATION_TIME, float(width[d]),
+                                float(width[f] * values[f])))
+    return found
+
+
+__all__ = ['Experiment', 'NAMES', 'separating_experiments', 'traded', 'uncertainties',
+           'Uncertainty']

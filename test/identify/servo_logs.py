@@ -1,0 +1,77 @@
+"""Made response logs: an independent simulation of a servo, sampled as a real log is."""
+
+import csv
+
+import numpy as np
+
+from beetle_omni_ros.identify.joint_log import JointLog
+
+STEP = 1e-4                        # [s] of the simulation, plain semi-implicit Euler
+COUNT = 2 * np.pi / 4096           # [rad] of the encoder
+
+
+def sweep(duration=10.0, periods=(1.8, 2.6), amplitudes=(1.0, 1.7), rate=100.0):
+    """Times (N,) [s] and a sine whose period and amplitude vary slowly (N,) [rad]."""
+    t = np.arange(0.0, duration, 1 / rate)
+    part = t / duration
+    period = periods[0] + (periods[1] - periods[0]) * part
+    amplitude = amplitudes[0] + (amplitudes[1] - amplitudes[0]) * part
+    phase = np.cumsum(2 * np.pi / period) / rate
+    return t, amplitude * np.sin(phase)
+
+
+def servo(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0, stiction=0.0,
+          stribeck=0.1, backlash=0.0, velocity_limit=np.inf, torque_limit=np.inf, offset=0.0):
+    """Positions (N,) [rad] of a servo that gets each command when it is logged and holds it."""
+    # It has been moving before the log: a straight run-up of a second.
+    lead = np.arange(-1.0, 0.0, t[1] - t[0])
+    first = command[0] + (command[1] - command[0]) / (t[1] - t[0]) * lead
+    count, t = len(t), np.concatenate([t[0] + lead, t])
+    command = np.concatenate([first, command])
+    fine = np.arange(t[0], t[-1] + STEP, STEP)
+    index = np.searchsorted(t, fine - delay + 1e-9, side='right') - 1
+    slope = (command[1] - command[0]) / (t[1] - t[0])
+    held = np.where(index >= 0, command[np.maximum(index, 0)],
+                    command[0] + slope * (np.floor((fine - delay - t[0]) / (t[1] - t[0]))
+                                          * (t[1] - t[0])))
+    q, v, shown = held[0] + offset, slope, held[0] + offset
+    positions = np.empty(len(fine))
+    for k, wanted in enumerate(held.tolist()):
+        positions[k] = shown
+        error = min(max(wanted + offset - q, -torque_limit), torque_limit)
+        v += STEP * (frequency**2 * error - 2 * damping * frequency * v)
+        grip = STEP * frequency**2 * (coulomb + stiction * np.exp(-abs(v) / stribeck)
+                                      if stiction else coulomb)
+        v = 0.0 if abs(v) <= grip else v - grip * (1 if v > 0 else -1)
+        v = min(max(v, -velocity_limit), velocity_limit)
+        q += STEP * v
+        shown = min(max(shown, q - backlash), q + backlash)
+    return np.interp(t[-count:], fine, positions)
+
+
+def noisy(positions, rng, sigma=0.0012, slow=0.001):
+    """Readings: jitter, a slow error as of a rough gear, whole counts."""
+    drift = np.zeros(len(positions))
+    kicks = rng.normal(size=len(positions)) * slow * np.sqrt(1 - 0.95**2)
+    for k in range(1, len(drift)):
+        drift[k] = 0.95 * drift[k - 1] + kicks[k]
+    read = positions + drift + rng.normal(size=len(positions)) * sigma
+    return np.round(read / COUNT) * COUNT
+
+
+def log_of(t, command, servos, seed=0, name='made.csv'):
+    """JointLog of several servos (keyword dicts) behind one command."""
+    rng = np.random.default_rng(seed)
+    measured = np.array([noisy(servo(t, command, **values), rng) for values in servos])
+    return JointLog(name, t, tuple(range(1, len(servos) + 1)), measured,
+                    np.tile(command, (len(servos), 1)))
+
+
+def write(path, log):
+    """Write it as a CSV file with one command column."""
+    with open(path, 'w', newline='', encoding='utf-8') as file:
+        writer = csv.writer(file)
+        writer.writerow(['t_s', *(f'q{k}_rad' for k in log.joints), 'command_rad'])
+        for row in zip(log.t, *log.measured, log.command[0], strict=True):
+            writer.writerow([f'{value:.6f}' for value in row])
+    return path

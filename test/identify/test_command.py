@@ -1,0 +1,91 @@
+"""`beetle_omni identify` from the command line."""
+
+import json
+
+import numpy as np
+import pytest
+from rotor_logs import bench
+from rotor_logs import write as write_bench
+from servo_logs import log_of, sweep, write
+
+from beetle_omni_ros import cli
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+SERVOS = [{'coulomb': 0.012}, {'coulomb': 0.02}]
+
+
+@pytest.fixture(scope='module')
+def logs(tmp_path_factory):
+    """Paths of a slow log and of two fast ones."""
+    folder = tmp_path_factory.mktemp('logs')
+    fast = sweep(3.0, periods=(0.4, 0.6), amplitudes=(0.3, 0.5))
+    return [write(folder / 'slow.csv', log_of(*sweep(duration=6.0), SERVOS, seed=1)),
+            write(folder / 'fast.csv', log_of(*fast, SERVOS, seed=2)),
+            write(folder / 'first.csv', log_of(*fast, SERVOS[:1], seed=3))]
+
+
+def refused(capsys, *arguments):
+    """Run the command, expect status 2 and one line on standard error; return the line."""
+    assert cli.main([str(a) for a in arguments]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+def test_joint_writes_all_its_files(logs, tmp_path, capsys):
+    slow, fast, first = logs
+    json_path, page, params = (tmp_path / name for name in ('r.json', 'r.html', 'robot.yaml'))
+    assert cli.main([str(a) for a in (
+        'identify', 'joint', slow, '--validate', fast, first, '--json', json_path, '--report',
+        page, '--params', params)]) == 0
+    shown = capsys.readouterr().out
+    assert 'held-out' in shown and 'coulomb_friction' in shown
+    joints = json.loads(json_path.read_text())['joints']
+    assert [joint['joint'] for joint in joints] == [1, 2]
+    for joint in joints:
+        assert joint['heldout_rms_rad'] < joint['published_rms_rad'] / 5
+        assert len(joint['validation_rms_rad']) == 2
+        for term in joint['terms'].values():
+            assert set(term) == {'value', 'unit', 'interval', 'kept'}
+            assert len(term['interval']) == 2
+    assert joints[1]['validation_rms_rad'][1] is None       # the other log has only joint 1
+    assert page.read_text().count('<img') == 7
+    written = RobotParameters.load(params).joints
+    assert written.natural_frequency == pytest.approx(
+        np.median([joint['terms']['natural_frequency']['value'] for joint in joints]), rel=0.05)
+
+
+def test_rotor_writes_all_its_files(tmp_path, capsys):
+    log = write_bench(tmp_path / 'bench.csv', bench(np.random.default_rng(0)))
+    json_path, page, params = (tmp_path / name for name in ('r.json', 'r.html', 'robot.yaml'))
+    assert cli.main([str(a) for a in ('identify', 'rotor', log, '--json', json_path, '--report',
+                                      page, '--params', params)]) == 0
+    assert 'torque to thrust ratio' in capsys.readouterr().out
+    results = json.loads(json_path.read_text())
+    assert len(results['plateaus']) == 5
+    assert page.read_text().count('<img') == 3
+    assert len(RobotParameters.load(params).rotors.map) == 5
+
+
+@pytest.mark.parametrize('what', ['joint', 'rotor'])
+def test_unusable_input_ends_with_status_2_and_one_line(tmp_path, capsys, what):
+    assert 'no such file' in refused(capsys, 'identify', what, tmp_path / 'absent.csv')
+    bad = tmp_path / 'bad.csv'
+    bad.write_text('t_s,x\n1,2\n')
+    assert 'is missing' in refused(capsys, 'identify', what, bad)
+    assert 'cannot write' in refused(capsys, 'identify', what, bad, '--json', '/nowhere/r.json')
+    assert 'cannot write' in refused(capsys, 'identify', what, bad, '--report', '/nowhere/r.html')
+    assert refused(capsys, 'identify', what, bad, '--robot', tmp_path / 'absent.yaml')
+
+
+def test_a_bad_log_to_validate_is_refused_before_the_work(logs, tmp_path, capsys):
+    bad = tmp_path / 'bad.csv'
+    bad.write_text('t_s,x\n1,2\n')
+    assert 'bad.csv' in refused(capsys, 'identify', 'joint', logs[0], '--validate', bad)
+    assert 'follow --validate' in refused(capsys, 'identify', 'joint', logs[0], logs[1])
+
+
+def test_help_tells_what_there_is(capsys):
+    for command in (['identify'], ['identify', 'joint'], ['identify', 'rotor']):
+        assert cli.main([*command, '--help']) == 0
+        assert 'Usage' in capsys.readouterr().out

@@ -1,0 +1,99 @@
+"""The servo model agrees with closed forms and with a plain simulation of its own."""
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+from servo_logs import servo, sweep
+
+from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.servo_model import INDEX, OFF, published_set, simulate
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+
+def log_for(t, command, start=None):
+    measured = np.full((1, len(t)), command[0]) if start is None else start[None]
+    return JointLog('made.csv', t, (1,), measured, command[None])
+
+
+def parameter_set(**values):
+    made = OFF.copy()
+    made[INDEX['natural_frequency']], made[INDEX['damping_ratio']] = 50.0, 0.7
+    for name, value in values.items():
+        made[INDEX[name]] = value
+    return made[None]
+
+
+def step_command(size=0.3, at=0.2, duration=1.0):
+    t = np.arange(0, duration, 0.005)
+    return t, np.where(t >= at - 1e-9, size, 0.0)
+
+
+def test_a_step_answers_as_the_second_order_system_does():
+    t, command = step_command()
+    wn, zeta = 50.0, 0.7
+    fine = np.arange(0, t[-1] + 1e-4, 1e-4)
+    wanted = np.interp(fine, t, command)      # a smooth curve through the samples
+    numerator, denominator, _ = cont2discrete(
+        ([wn**2], [1, 2 * zeta * wn, wn**2]), 1e-4, method='foh')
+    exact = np.interp(t, fine, lfilter(numerator.ravel(), denominator, wanted))
+    assert np.abs(simulate(log_for(t, command), 0, parameter_set(), held=False)[0]
+                  - exact).max() < 1e-3 * 0.3
+
+
+def test_held_steps_agree_with_a_plain_simulation():
+    t = np.arange(0, 4, 0.01)
+    command = 0.75 * np.sign(np.sin(2 * np.pi * 0.7 * t + 0.3))
+    positions = servo(t, command, frequency=50.0, damping=0.7, delay=0.0137, coulomb=0.01)
+    model = parameter_set(delay=0.0137, coulomb_friction=0.01)
+    error = simulate(log_for(t, command, positions), 0, model)[0] - positions
+    assert np.abs(error[25:]).max() < 5e-3      # of 1.5 rad, within 3 ms of a step
+    assert np.sqrt(np.mean(error[25:]**2)) < 1.2e-3
+
+
+@pytest.mark.parametrize('values', [
+    {'delay': 0.0173}, {'coulomb': 0.013, 'delay': 0.01}, {'backlash': 0.02},
+    {'stiction': 0.01, 'coulomb': 0.01, 'stribeck': 0.2}, {'velocity_limit': 3.0},
+    {'torque_limit': 0.12}, {'offset': -0.03}])
+def test_every_term_agrees_with_a_plain_simulation(values):
+    t, command = sweep(duration=4.0)
+    positions = servo(t, command, frequency=50.0, damping=0.7, **{'delay': 0.0, **values})
+    names = {'coulomb': 'coulomb_friction', 'stribeck': 'stribeck_velocity'}
+    model = parameter_set(**{names.get(name, name): value for name, value in values.items()})
+    error = simulate(log_for(t, command, positions), 0, model)[0] - positions
+    assert np.sqrt(np.mean(error[25:]**2)) < 3e-4 and np.abs(error[25:]).max() < 1e-3
+
+
+def test_friction_holds_the_joint_exactly_still():
+    t, command = step_command(size=0.01)
+    held = simulate(log_for(t, command), 0, parameter_set(coulomb_friction=0.011))
+    assert np.all(held == held[0, 0])
+    moved = simulate(log_for(t, command), 0, parameter_set(coulomb_friction=0.009))
+    assert 0 < moved[0, -1] < 0.01
+
+
+def test_sets_in_a_batch_do_not_see_each_other():
+    t, command = sweep(duration=3.0)
+    log = log_for(t, command)
+    sets = np.concatenate([parameter_set(), parameter_set(delay=0.02, coulomb_friction=0.02),
+                           parameter_set(backlash=0.05, velocity_limit=2.0)])
+    together = simulate(log, 0, sets)
+    for k, alone in enumerate(sets):
+        assert np.allclose(together[k], simulate(log, 0, alone[None])[0], atol=1e-12)
+
+
+def test_uneven_sampling_gives_the_same_motion():
+    t, command = sweep(duration=3.0)
+    keep = np.ones(len(t), dtype=bool)
+    keep[50::7] = False
+    model = parameter_set(delay=0.013, coulomb_friction=0.01)
+    even = simulate(log_for(t, command), 0, model, held=False)[0]
+    uneven = simulate(log_for(t[keep], command[keep]), 0, model, held=False)[0]
+    assert np.abs(even[keep] - uneven)[20:].max() < 2e-3
+
+
+def test_the_published_set_has_the_frequency_of_the_robot_file():
+    joint = RobotParameters.load().joints
+    values = published_set(joint)
+    frequency, damping = values[INDEX['natural_frequency']], values[INDEX['damping_ratio']]
+    assert joint.inertia * frequency**2 == pytest.approx(joint.kp)
+    assert 2 * damping * frequency * joint.inertia == pytest.approx(joint.kd)
