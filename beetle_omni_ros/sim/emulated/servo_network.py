@@ -7,7 +7,14 @@ from dataclasses import dataclass
 
 from beetle_omni_ros.sim.emulated import servo_table as table
 from beetle_omni_ros.sim.emulated.dynamixel import (
-    BROADCAST, Error, fast_status, Instruction, LENGTH_LIMIT, Packet, status)
+    BROADCAST,
+    Error,
+    fast_status,
+    Instruction,
+    LENGTH_LIMIT,
+    Packet,
+    status,
+)
 from beetle_omni_ros.sim.emulated.servo import EmulatedServo
 
 CLEAR_KEY = b'\x01\x44\x58\x4c\x22'  # Clear: "multi-turn information", with its safety bytes
