@@ -16,6 +16,8 @@ from beetle_omni_ros.drivers.servo_port import PortLost
 from beetle_omni_ros.drivers.servo_setup import (
     configure,
     examine,
+    locate,
+    power,
     ServoFinding,
 )
 from beetle_omni_ros.drivers.servo_state import (

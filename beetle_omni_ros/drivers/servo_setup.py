@@ -160,7 +160,7 @@ def _apply(link, parameters, identifier, firmware):
 
 
 def locate(link: ServoLink, parameters: ServoBusParameters, servos):
-    """Read where the servos are; those that have restarted get their settings, lose their turns."""
+    """Read where the servos are; restarted ones get their settings and lose their turns."""
     for servo in servos:
         if not is_marked(link, servo.identifier):
             servo.turns_known = False
