@@ -36,7 +36,7 @@ class ServoBus:
     """
     Four tilt servos. For one thread; between :meth:`open` and :meth:`close`.
 
-    A loop of 200 Hz calls :meth:`write_goals`, :meth:`read` and :meth:`poll_health` once in a tick.
+    A loop of 200 Hz calls :meth:`write_goals`, :meth:`read` and :meth:`poll_health` in each tick.
     None of them raises when the cable is out or servos are silent: they say so in what they
     return, take at most one reply time together, and go on by themselves when things are back.
 

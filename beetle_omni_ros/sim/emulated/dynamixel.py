@@ -179,10 +179,14 @@ class Receiver:
             if len(self._buffer) < end:
                 return
             raw = bytes(self._buffer[:end])
-            del self._buffer[:end]
+            valid = crc16(raw[:-2]) == int.from_bytes(raw[-2:], 'little')
+            if valid:
+                del self._buffer[:end]
+            else:
+                # The start of the next packet may have been taken for its end.
+                self._drop(len(HEADER))
             body = unstuffed(raw[HEAD_SIZE:-2])
-            yield Packet(raw[4], body[0], body[1:],
-                         crc16(raw[:-2]) == int.from_bytes(raw[-2:], 'little'))
+            yield Packet(raw[4], body[0], body[1:], valid)
 
     def _align(self) -> bool:
         """Drop bytes before a header; tell whether a whole header stands in front."""
