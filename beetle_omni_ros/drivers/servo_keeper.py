@@ -14,9 +14,10 @@ from beetle_omni_ros.drivers.servo_setup import watchdog_counts
 from beetle_omni_ros.drivers.servo_state import Servo, ServoHealth
 
 # Read in turn, each from all servos at once: first register and number of bytes. No gaps: a
-# servo may refuse to read across addresses that do not exist.
-HEALTH = ((registers.TORQUE_ENABLE, 1), (registers.HARDWARE_ERROR, 1), (registers.WATCHDOG, 1),
-          (registers.INPUT_VOLTAGE, 3))
+# servo may refuse to read across addresses that do not exist. All of another length: an answer
+# does not say to what, and a late one must not be taken for another register.
+HEALTH = ((registers.TORQUE_ENABLE, 2), (registers.STATUS_LEVEL, 3), (registers.WATCHDOG, 1),
+          (registers.INPUT_VOLTAGE, 4))
 WATCHDOG_MARGIN = 0.8   # a longer pause than this share of the watchdog's time may have been seen
 REPEAT_AFTER = 1.0      # [s] until the same line is said again
 
@@ -113,7 +114,7 @@ class ServoKeeper:
         servo.misses += 1
         timing = self._parameters.timing
         if servo.misses >= timing.silent_after and not servo.silent:
-            servo.silent = True
+            servo.silent, servo.torque = True, None
             servo.probe_wait = timing.probe_first
             servo.next_probe = time.monotonic() + servo.probe_wait
             self.say(f'{self._place(servo)}: silent; check its cable and power')
@@ -130,6 +131,7 @@ class ServoKeeper:
     def recover(self, servo: Servo, forced: bool = False):
         """Look what is the matter with a servo and bring it back, or restart it in any case."""
         if forced or servo.identifier not in self._recoveries:
+            servo.torque = None  # unknown until it has been read
             self._recoveries[servo.identifier] = (servo, forced, None)
 
     def drop_recoveries(self):
@@ -225,8 +227,8 @@ class ServoKeeper:
             servo.torque = bool(data[0])
             if enabled and not servo.torque and not servo.resting:
                 self.recover(servo)
-        elif register is registers.HARDWARE_ERROR:
-            servo.error = data[0]
+        elif register is registers.STATUS_LEVEL:
+            servo.error = data[2]  # Hardware Error Status is the third
         elif register is registers.WATCHDOG:
             servo.watchdog_expired = data[0] == registers.WATCHDOG_EXPIRED
             if servo.watchdog_expired and enabled:

@@ -191,22 +191,24 @@ class ServoLink:
         return answers
 
     def _fast_answers(self, port, length, identifiers):
+        step = length + 4
+        expected = 1 + step * len(identifiers)
         while True:
             packet, result = self._handler.rxPacket(port, True)
+            ours = len(packet) >= FIRST_BLOCK and packet[4] == BROADCAST \
+                and packet[5] | packet[6] << 8 == expected
             # A late answer to something else may come first.
-            if result != COMM_SUCCESS or packet[4] == BROADCAST:
+            if ours or result != COMM_SUCCESS:
                 break
         self._count(result)
-        step = length + 4
-        complete = len(packet) == FIRST_BLOCK + step * len(identifiers)
-        if len(packet) < FIRST_BLOCK or packet[4] != BROADCAST:
+        if not ours:
             return {}
         answers, checked, crc = {}, 0, 0
         for count, identifier in enumerate(identifiers, 1):
             end = FIRST_BLOCK + step * count
             if end > len(packet) or packet[end - step + 1] != identifier:
                 break
-            if result != COMM_SUCCESS or not complete:
+            if result != COMM_SUCCESS:
                 # Each block ends with the CRC of all before: the sound part can be used.
                 crc = self._handler.updateCRC(crc, packet[checked:end - 2], end - 2 - checked)
                 if crc != packet[end - 2] | packet[end - 1] << 8:

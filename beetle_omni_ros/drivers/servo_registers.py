@@ -35,6 +35,7 @@ class Register:
 
 
 MODEL_NUMBER = Register('Model Number', 0, 2)
+MODEL_INFORMATION = Register('Model Information', 2, 4)
 FIRMWARE = Register('Firmware Version', 6, 1)
 ID = Register('ID', 7, 1)
 BAUD_RATE = Register('Baud Rate', 8, 1)
