@@ -11,6 +11,7 @@ from beetle_omni_ros.drivers.servo_port import PortLost, ServoPort
 from beetle_omni_ros.drivers.servo_registers import Register
 
 BROADCAST = 0xFE
+STATUS_SIZE = 11    # [B] an answer without data
 FIRST_BLOCK = 8     # [B] before the first servo's error byte in the answer to a fast sync read
 
 
@@ -108,19 +109,25 @@ class ServoLink:
 
     def read(self, identifier: int, register: Register) -> int:
         """Value of a register."""
-        data, result, error = self._handler.readTxRx(
-            self._open_port(), identifier, register.address, register.size)
-        self._judge(identifier, result, error, f'read {register.name}({register.address})',
-                    len(data) == register.size)
+        port = self._open_port()
+        result = self._handler.readTx(port, identifier, register.address, register.size)
+        error, data = 0, b''
+        if result == COMM_SUCCESS:
+            error, data, result = self._status(port, identifier, register.size)
+        self._judge(identifier, result, error, f'read {register.name}({register.address})')
         return register.decoded(data)
 
     def write(self, identifier: int, register: Register, value: int, attempts: int = 3):
         """Write a register; repeated where the answer is missing, as writing twice is harmless."""
         what = f'write {value} to {register.name}({register.address})'
         for attempt in range(attempts):
-            result, error = self._handler.writeTxRx(
-                self._open_port(), identifier, register.address, register.size,
-                register.encoded(value))
+            port = self._open_port()
+            result = self._handler.writeTxOnly(port, identifier, register.address,
+                                               register.size, register.encoded(value))
+            error = 0
+            if result == COMM_SUCCESS:
+                port.setPacketTimeout(STATUS_SIZE)
+                error, _, result = self._status(port, identifier, 0)
             try:
                 return self._judge(identifier, result, error, what)
             except NoAnswer:
@@ -184,11 +191,26 @@ class ServoLink:
     def _answers(self, port, length, identifiers):
         answers = {}
         for identifier in identifiers:
-            data, result, error = self._handler.readRx(port, identifier, length)
+            error, data, result = self._status(port, identifier, length)
             self._count(result)
-            if result == COMM_SUCCESS and (len(data) == length or error & 0x7F):
-                answers[identifier] = (error, bytes(data))
+            if result == COMM_SUCCESS:
+                answers[identifier] = (error, data)
         return answers
+
+    def _status(self, port, identifier, length):
+        """
+        Receive the answer of one servo: error byte, data, the SDK's result.
+
+        An answer does not say to what; one of another length is a late one to something else.
+        The SDK's own readRx would take its CRC for data.
+        """
+        while True:
+            packet, result = self._handler.rxPacket(port, False)
+            if result != COMM_SUCCESS:
+                return 0, b'', result
+            size = (packet[5] | packet[6] << 8) - 4
+            if packet[4] == identifier and (size == length or (size == 0 and packet[8] & 0x7F)):
+                return packet[8], bytes(packet[9:9 + size]), result
 
     def _fast_answers(self, port, length, identifiers):
         step = length + 4
@@ -238,7 +260,7 @@ class ServoLink:
         else:
             self.alerts.discard(identifier)
 
-    def _judge(self, identifier, result, error, what, sound=True):
+    def _judge(self, identifier, result, error, what):
         self.statistics.transactions += 1
         self.late = False
         self._count(result)
@@ -251,6 +273,3 @@ class ServoLink:
             self.statistics.refused += 1
             text = registers.PACKET_ERRORS.get(number, f'error {number}')
             raise Refused(f'{self.where(identifier)}: {what}: refused, {text}')
-        if not sound:
-            self.statistics.corrupt += 1
-            raise NoAnswer(f'{self.where(identifier)}: {what}: answer of the wrong length')

@@ -3,7 +3,8 @@
 from dataclasses import replace
 from math import pi
 
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from servo_bench import arrived, bench, COUNT, JOINTS, running, until

@@ -1,6 +1,7 @@
 """Packets against the bytes printed in the protocol's document, and the stream they come in."""
 
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import pytest
 
 from beetle_omni_ros.sim.emulated import dynamixel

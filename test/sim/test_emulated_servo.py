@@ -1,6 +1,7 @@
 """What an emulated servo refuses, and how it protects itself, as the manual has it."""
 
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
