@@ -91,7 +91,8 @@ class ServoBus:
     def check(self) -> list[ServoFinding]:
         """Look at each servo without changing anything."""
         try:
-            return [examine(self._link, servo) for servo in self._servos]
+            with self._link.patient():
+                return [examine(self._link, servo) for servo in self._servos]
         except PortLost as error:
             self._keeper.lost()
             return [ServoFinding(servo.name, servo.identifier, problem=f'{self._link.where()}: '
@@ -157,17 +158,9 @@ class ServoBus:
         self._keeper.drop_recoveries()
         if not self._link.is_open:
             return not was_enabled
-        confirmed = True
         try:
-            self._link.sync_write(registers.TORQUE_ENABLE,
-                                  {servo.identifier: 0 for servo in self._servos})
-            for servo in self._servos:
-                try:
-                    self._link.write(servo.identifier, registers.TORQUE_ENABLE, 0)
-                    servo.torque = False
-                except ServoBusError as error:
-                    confirmed = False
-                    self._keeper.say(f'torque off is not confirmed: {error}')
+            with self._link.patient():
+                confirmed = self._cut()
         except PortLost as error:
             self._keeper.lost(error)
             return False
@@ -272,9 +265,24 @@ class ServoBus:
 
     # --- inside -------------------------------------------------------------------------------
 
+    def _cut(self):
+        """Take the torque off: all at once, then each with its confirmation."""
+        self._link.sync_write(registers.TORQUE_ENABLE,
+                              {servo.identifier: 0 for servo in self._servos})
+        confirmed = True
+        for servo in self._servos:
+            try:
+                self._link.write(servo.identifier, registers.TORQUE_ENABLE, 0)
+                servo.torque = False
+            except ServoBusError as error:
+                confirmed = False
+                self._keeper.say(f'torque off is not confirmed: {error}')
+        return confirmed
+
     def _call(self, function, *arguments):
         try:
-            return function(*arguments)
+            with self._link.patient():
+                return function(*arguments)
         except PortLost as error:
             self._keeper.lost(error)
             raise ServoBusError(f'{self._link.where()}: {error}') from None

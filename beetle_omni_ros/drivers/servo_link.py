@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
@@ -11,6 +12,7 @@ from beetle_omni_ros.drivers.servo_port import PortLost, ServoPort
 from beetle_omni_ros.drivers.servo_registers import Register
 
 BROADCAST = 0xFE
+PATIENCE = 0.02     # [s] for an answer, outside the loop
 STATUS_SIZE = 11    # [B] an answer without data
 FIRST_BLOCK = 8     # [B] before the first servo's error byte in the answer to a fast sync read
 
@@ -88,6 +90,21 @@ class ServoLink:
         port.openPort()
         self._port = port
         self.statistics.connections += 1
+
+    @contextmanager
+    def patient(self):
+        """Wait longer for answers, where no loop is kept waiting."""
+        self.reply_time, brisk = max(self.reply_time, PATIENCE), self.reply_time
+        self._set_reply_time()
+        try:
+            yield
+        finally:
+            self.reply_time = brisk
+            self._set_reply_time()
+
+    def _set_reply_time(self):
+        if self._port is not None:
+            self._port.reply_time = self.reply_time
 
     def close(self):
         """Close the port, if it is open."""

@@ -34,6 +34,7 @@ class ServoPort(port_handler.PortHandler):
         super().__init__(path)
         self.baudrate = baud_rate
         self.reply_time = reply_time
+        self.unsent = 0
 
     def setupPort(self, cflag_baud):
         """Open for this process alone; ask the kernel's driver for low latency."""
@@ -86,6 +87,7 @@ class ServoPort(port_handler.PortHandler):
 
     def writePort(self, packet):
         """Write at once or not at all: a full buffer means that nobody takes the bytes."""
+        self.unsent = len(packet)
         try:
             return os.write(self.ser.fd, bytes(packet))
         except BlockingIOError:
@@ -98,9 +100,10 @@ class ServoPort(port_handler.PortHandler):
         return time.monotonic() * 1000
 
     def setPacketTimeout(self, packet_length):
-        """Allow for the packet's time on the wire and one reply time."""
+        """Allow for both packets' time on the wire and one reply time."""
         self.packet_start_time = self.getCurrentTime()
-        self.packet_timeout = self.tx_time_per_byte * packet_length + self.reply_time * 1000
+        self.packet_timeout = self.tx_time_per_byte * (self.unsent + packet_length) \
+            + self.reply_time * 1000
 
 
 def reason(error: Exception) -> str:

@@ -160,11 +160,12 @@ def test_configuring_an_incomplete_bus_fails_in_one_line_for_all():
         assert 'gimbal2 (id 2)' in text and 'gimbal4 (id 4)' in text and 'gimbal1' not in text
 
 
-def test_scanning_finds_servos_at_another_baud_rate():
-    with bench(servos={'baud_rate': 57600}) as (bus, emulated):
+@pytest.mark.parametrize('baud_rate', [9600, 57600, 3_000_000])
+def test_scanning_finds_servos_at_another_baud_rate(baud_rate):
+    with bench(servos={'baud_rate': baud_rate, 'timing': True}) as (bus, emulated):
         assert not any(finding.ok for finding in bus.check())
         bus.close()
-        assert scan(bus.parameters) == [(57600, name, 1210) for name in (1, 2, 3, 4)]
+        assert scan(bus.parameters) == [(baud_rate, name, 1210) for name in (1, 2, 3, 4)]
 
 
 def test_a_port_is_refused_in_one_line(tmp_path):

@@ -24,6 +24,7 @@ class Wire(ServoPort):
 
     def writePort(self, data):
         self.sent.append(bytes(data))
+        self.unsent = len(data)
         self.waiting = self.answers.pop(0) if self.answers else b''
         return len(data)
 

@@ -15,6 +15,12 @@ sdk = pytest.importorskip('dynamixel_sdk')
 ALL = (1, 2, 3, 4)
 
 
+@pytest.fixture(autouse=True)
+def patience(monkeypatch):
+    """Let the SDK wait as long as it does out of the box; the driver shortens it globally."""
+    monkeypatch.setattr(sdk.port_handler, 'LATENCY_TIMER', 16)
+
+
 @pytest.fixture
 def bus():
     with EmulatedServoBus(reboot_time=0.05) as made:

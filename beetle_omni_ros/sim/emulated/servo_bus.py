@@ -190,14 +190,15 @@ class EmulatedServoBus:
                     (self._terminal.plug if self._plugged else self._terminal.unplug)()
                     self._receiver.forget()
                     self._late.clear()
-                if now - watched >= WATCH:
-                    watched = now
-                    self._watch(now)
                 if data:
                     if now - last > PAUSE:
                         self._receiver.forget()
                     last = now
                     self._take(data, now)
+                # After the data: a late thread must not take waiting packets for silence.
+                if now - watched >= WATCH:
+                    watched = now
+                    self._watch(now)
                 while self._late and self._late[0][0] <= now:
                     self._terminal.send(heapq.heappop(self._late)[2])
 
