@@ -1,11 +1,13 @@
 """Answers on the wire against what is made of them: late, cut off, damaged."""
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import pytest
 
 from beetle_omni_ros.drivers.servo_link import NoAnswer, Refused, ServoLink
 from beetle_omni_ros.drivers.servo_port import PortLost, ServoPort
 from beetle_omni_ros.drivers.servo_registers import GOAL_POSITION, HARDWARE_ERROR, TORQUE_ENABLE
-from beetle_omni_ros.sim.emulated.dynamixel import fast_status, packet, status
+from beetle_omni_ros.sim.emulated.dynamixel import crc16, fast_status, packet, status
 
 IDS = [1, 2, 3]
 DATA = {name: bytes(range(name, name + 10)) for name in IDS}
@@ -142,3 +144,27 @@ def test_a_write_whose_answer_is_lost_is_repeated():
 def test_a_closed_link_says_so():
     with pytest.raises(PortLost):
         ServoLink('wire', 1_000_000, 0.001).ping(1)
+
+
+def sealed(name, length, rest):
+    """Bytes with a header and a CRC that fits, though little else may."""
+    raw = b'\xff\xff\xfd\0' + bytes((name,)) + length.to_bytes(2, 'little') + b'\x55' + rest
+    return raw + crc16(raw).to_bytes(2, 'little')
+
+
+noise = st.binary(max_size=60) | st.builds(
+    sealed, st.sampled_from((1, 2, 0xFC, 0xFE)), st.integers(0, 60), st.binary(max_size=60)) \
+    | st.builds(status, st.sampled_from((1, 2, 9)), st.integers(0, 255), st.binary(max_size=12))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(noise, max_size=4).map(b''.join), st.booleans())
+def test_no_bytes_from_the_wire_break_or_hang_the_link(data, fast):
+    for error, part in linked(data, fast=fast).sync_read(126, 10, IDS).values():
+        assert len(part) == 10 or error
+    for ask in (lambda link: link.ping(1), lambda link: link.read(1, GOAL_POSITION),
+                lambda link: link.write(1, GOAL_POSITION, 5)):
+        try:
+            ask(linked(data, fast=fast))
+        except (NoAnswer, Refused):
+            pass
