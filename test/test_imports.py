@@ -16,6 +16,7 @@ ALLOWED = {
     'control': ('robot',),
     'estimation': ('robot',),
     'sim': ('robot',),
+    'drivers': ('robot',),
     'safety': ('robot', 'control.base'),
     'runs': ('robot', 'control.base'),
     'evaluation': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs'),

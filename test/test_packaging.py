@@ -15,6 +15,7 @@ import beetle_omni_ros
 from beetle_omni_ros.control.hover import HoverParameters
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.policy import PolicyParameters
+from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
@@ -35,6 +36,7 @@ PARAMETER_CLASSES = {
     'ekf.yaml': EkfParameters, 'hover.yaml': HoverParameters, 'nmpc.yaml': NmpcParameters,
     'nmpc_published.yaml': NmpcParameters, 'rl.yaml': PolicyParameters,
     'robot.yaml': RobotParameters, 'robot_weak_and_heavy.yaml': RobotParameters,
+    'servo_bus.yaml': ServoBusParameters,
     'simulator.yaml': SimulatorParameters, 'supervisor.yaml': SupervisorParameters,
     'train.yaml': TrainParameters}
 

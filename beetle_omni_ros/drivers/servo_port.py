@@ -1,0 +1,120 @@
+"""The SDK's port, without its busy waiting, wall clock and endless writes."""
+
+from __future__ import annotations
+
+import os
+import select
+import termios
+import time
+
+from dynamixel_sdk import port_handler
+import serial
+
+# [ms] The SDK's default of 16 makes one missing answer cost 34 ms. The adapter must agree:
+# docs/hardware.md.
+port_handler.LATENCY_TIMER = 1
+
+
+class PortLost(OSError):
+    """The serial port does not exist, cannot be opened, or went away."""
+
+
+class ServoPort(port_handler.PortHandler):
+    """
+    A serial port for the SDK's packet handler.
+
+    Args:
+        path: of the device.
+        baud_rate: [bit/s].
+        reply_time: wait for an answer beside its time on the wire [s].
+
+    """
+
+    def __init__(self, path: str, baud_rate: int, reply_time: float):
+        super().__init__(path)
+        self.baudrate = baud_rate
+        self.reply_time = reply_time
+        self.unsent = 0
+
+    def setupPort(self, cflag_baud):
+        """Open for this process alone; ask the kernel's driver for low latency."""
+        if self.is_open:
+            self.closePort()
+        try:
+            self.ser = serial.Serial(self.port_name, self.baudrate, timeout=0, exclusive=True)
+        except (OSError, ValueError, termios.error) as error:
+            raise PortLost(reason(error)) from None
+        try:
+            self.ser.set_low_latency_mode(True)
+        except (OSError, ValueError):  # not an FTDI adapter, or a pseudo-terminal
+            pass
+        self.is_open = True
+        self.tx_time_per_byte = 10_000.0 / self.baudrate
+        return True
+
+    def closePort(self):
+        """Close; never fails."""
+        if self.ser is not None:
+            try:
+                self.ser.close()
+            except (OSError, termios.error):
+                pass
+        self.is_open = False
+
+    def clearPort(self):
+        """Drop what has arrived."""
+        try:
+            termios.tcflush(self.ser.fd, termios.TCIFLUSH)
+        except (OSError, termios.error, TypeError) as error:
+            raise PortLost(reason(error)) from None
+
+    def readPort(self, length):
+        """Wait for bytes, at most until the packet's time is up."""
+        patience = (self.packet_timeout - self.getTimeSinceStart()) / 1000
+        try:
+            if patience <= 0:
+                ready, _, _ = select.select([self.ser.fd], [], [], 0)
+            else:
+                ready, _, _ = select.select([self.ser.fd], [], [], patience)
+            data = os.read(self.ser.fd, length) if ready else b''
+        except BlockingIOError:
+            return b''
+        except (OSError, TypeError, ValueError) as error:
+            raise PortLost(reason(error)) from None
+        if ready and not data:
+            raise PortLost('unplugged')
+        return data
+
+    def writePort(self, packet):
+        """Write at once or not at all: a full buffer means that nobody takes the bytes."""
+        self.unsent = len(packet)
+        try:
+            return os.write(self.ser.fd, bytes(packet))
+        except BlockingIOError:
+            return 0
+        except (OSError, TypeError) as error:
+            raise PortLost(reason(error)) from None
+
+    def getCurrentTime(self):
+        """Milliseconds of a clock that nobody sets."""
+        return time.monotonic() * 1000
+
+    def setPacketTimeout(self, packet_length):
+        """Allow for both packets' time on the wire and one reply time."""
+        self.packet_start_time = self.getCurrentTime()
+        self.packet_timeout = self.tx_time_per_byte * (self.unsent + packet_length) \
+            + self.reply_time * 1000
+
+
+def reason(error: Exception) -> str:
+    """Say in a few words what is wrong with a port and what helps."""
+    number = getattr(error, 'errno', None)
+    if number is None and error.args and isinstance(error.args[0], int):
+        number = error.args[0]
+    if isinstance(error, serial.SerialException) and 'exclusively lock' in str(error):
+        return 'used by another process; stop that one'
+    hints = {2: 'no such port; is the adapter plugged in, is the udev rule installed?',
+             13: 'no permission; add the user to group dialout and log in again',
+             16: 'used by another process; stop that one',
+             5: 'unplugged', 6: 'unplugged', 19: 'unplugged'}
+    return hints.get(number, str(error).splitlines()[0] if str(error) else 'unplugged')

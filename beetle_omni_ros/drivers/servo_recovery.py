@@ -1,0 +1,111 @@
+"""
+How a servo is brought back while the others go on: one transaction for each step.
+
+A restarted servo has lost gains, watchdog, torque and turn count. :func:`recovery` is a generator;
+the bus lets it do one step in a tick, so that none is missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from beetle_omni_ros.drivers import servo_registers as registers
+from beetle_omni_ros.drivers.servo_link import NoAnswer, ServoLink
+from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.servo_setup import volatile_settings, watchdog_counts
+from beetle_omni_ros.drivers.servo_state import Servo
+from beetle_omni_ros.drivers.servo_turns import nearest_turns
+
+FIRST_LOOK = 0.2    # [s] a servo does not answer earlier after a reboot
+NEXT_LOOK = 0.02    # [s]
+
+
+def recovery(link: ServoLink, parameters: ServoBusParameters, servo: Servo, enabled: bool,
+             forced: bool, clock: Callable[[], float], say: Callable[[str], None]
+             ) -> Iterator[None]:
+    """
+    Find out what happened to a servo and bring it back.
+
+    Args:
+        link: the bus.
+        parameters: the settings to restore.
+        servo: the driver's memory of it; turns and torque are updated.
+        enabled: whether it should have torque in the end.
+        forced: restart it in any case.
+        clock: steady time [s].
+        say: takes a line for the log.
+
+    Yields:
+        after each transaction, or while waiting.
+
+    Raises:
+        ServoBusError, PortLost: given up; the bus may start anew.
+
+    """
+    where = f'{servo.name} ({link.where(servo.identifier)})'
+    servo.error = link.read(servo.identifier, registers.HARDWARE_ERROR)
+    yield
+    servo.torque = bool(link.read(servo.identifier, registers.TORQUE_ENABLE))
+    yield
+    if servo.torque and not forced:
+        return
+    if (servo.error and not servo.torque) or forced:
+        if not forced and not _may_restart(parameters, servo, enabled):
+            causes = ', '.join(registers.hardware_errors(servo.error))
+            say(f'{where}: shut down ({causes}); it stays off until it is rebooted')
+            servo.resting = True
+            return
+        servo.recoveries += 1
+        servo.resting = False
+        say(f'{where}: restarting it')
+        link.reboot(servo.identifier)
+        servo.silent = True  # the others need not wait for it
+        yield from _boot(link, parameters, servo, clock)
+        servo.error = link.read(servo.identifier, registers.HARDWARE_ERROR)
+        yield
+    for register, value in volatile_settings(parameters):
+        link.write(servo.identifier, register, value, attempts=1)
+        yield
+    counts = link.read(servo.identifier, registers.PRESENT_POSITION)
+    angle = servo.angle(counts)
+    if servo.position == servo.position:
+        servo.turns = nearest_turns(angle, servo.position)
+    yield
+    servo.torque = False
+    if not enabled:
+        servo.turns_known = False
+        say(f'{where}: is back, without torque')
+        return
+    # The goals of the running loop reach it too, in the frame of the new turn count.
+    link.write(servo.identifier, registers.GOAL_POSITION, counts, attempts=1)
+    yield
+    link.write(servo.identifier, registers.WATCHDOG, watchdog_counts(parameters), attempts=1)
+    yield
+    link.write(servo.identifier, registers.TORQUE_ENABLE, 1, attempts=1)
+    servo.torque = True
+    servo.watchdog_expired = False
+    say(f'{where}: had restarted, is back at {servo.position:+.2f} rad')
+
+
+def _may_restart(parameters, servo, enabled):
+    return (enabled and parameters.reboot_after_overload
+            and not servo.error & registers.OVERHEATING
+            and servo.recoveries < parameters.recoveries)
+
+
+def _boot(link, parameters, servo, clock):
+    """Wait until it answers again."""
+    start = last = clock()
+    while clock() - start < FIRST_LOOK:
+        yield
+    while True:
+        if clock() - last >= NEXT_LOOK:
+            last = clock()
+            try:
+                link.ping(servo.identifier)
+                servo.silent, servo.misses = False, 0
+                return
+            except NoAnswer:
+                if clock() - start > parameters.timing.reboot:
+                    raise
+        yield

@@ -1,0 +1,1 @@
+"""Emulated devices on pseudo-terminals; they speak the real protocols byte by byte."""

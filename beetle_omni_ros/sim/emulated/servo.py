@@ -1,0 +1,251 @@
+"""
+One XC330-T181-T: its control table, what it refuses, and how it protects itself.
+
+The shaft is moved from outside (:meth:`EmulatedServo.move`); angles are those of the robot's
+joint, [rad], which ``sign`` and ``zero`` tie to the servo's counts. Where the manual leaves open
+what happens, the servo here does what is worse for a driver; comments name these places.
+"""
+
+from __future__ import annotations
+
+from math import floor, inf
+
+from beetle_omni_ros.sim.emulated import servo_table as table
+from beetle_omni_ros.sim.emulated.dynamixel import Error
+
+
+class EmulatedServo:
+    """Registers, watchdog, shutdown and turn count of one servo."""
+
+    def __init__(self, identifier: int, *, firmware: int = table.FIRMWARE,
+                 baud_rate: int = 1_000_000, sign: int = 1, zero: int = table.ZERO,
+                 reboot_time: float = 0.3):
+        self.sign, self.zero, self.reboot_time = sign, zero, reboot_time
+        self.angle = self.velocity = self.effort = 0.0
+        self.temperature = self.voltage = None
+        self._memory = bytearray(table.SIZE)
+        self._turns = 0
+        self._registered = None
+        self._heard = 0.0
+        self._boots_at = -inf
+        for register in table.REGISTERS:
+            self[register.name] = register.initial
+        self['ID'], self['Firmware Version'] = identifier, firmware
+        self['Baud Rate'] = table.BAUD_RATES.index(baud_rate)
+        self['Return Delay Time'] = 250
+        self._to_one_turn()
+
+    def __getitem__(self, name: str) -> int:
+        """Value of a register."""
+        register = table.BY_NAME[name]
+        raw = self._memory[register.address:register.address + register.size]
+        return int.from_bytes(raw, 'little', signed=register.signed)
+
+    def __setitem__(self, name: str, value: int):
+        """Set a register from inside, unchecked."""
+        register = table.BY_NAME[name]
+        self._memory[register.address:register.address + register.size] = \
+            value.to_bytes(register.size, 'little', signed=register.signed)
+
+    @property
+    def torque(self) -> bool:
+        """Whether the motor is powered."""
+        return bool(self['Torque Enable'])
+
+    @property
+    def expired(self) -> bool:
+        """Whether the bus watchdog has stopped it."""
+        return self['Bus Watchdog'] == 255
+
+    @property
+    def baud_rate(self) -> int:
+        """Speed at which it listens [bit/s]."""
+        return table.BAUD_RATES[self['Baud Rate']]
+
+    @property
+    def goal(self) -> float:
+        """Joint angle that it drives to [rad]; the present one where it does not drive."""
+        if self['Operating Mode'] not in (table.POSITION_MODE, table.EXTENDED_MODE,
+                                          table.CURRENT_POSITION_MODE):
+            return self.angle
+        counts = self['Goal Position'] - self['Homing Offset'] \
+            + table.COUNTS_PER_TURN * self._turns
+        return self.sign * (counts - self.zero) * table.POSITION_UNIT
+
+    @property
+    def alert(self) -> int:
+        """Bit 7 of its error bytes."""
+        return Error.ALERT if self['Hardware Error Status'] else 0
+
+    def listens(self, now: float) -> bool:
+        """Whether it has booted."""
+        return now >= self._boots_at
+
+    def move(self, angle: float, velocity: float, effort: float):
+        """Set the shaft's state: [rad], [rad/s], [N m]."""
+        self.angle, self.velocity, self.effort = float(angle), float(velocity), float(effort)
+
+    # --- what instructions do ---------------------------------------------------------------
+
+    def hear(self, now: float):
+        """Note that an instruction packet went over the bus; that resets the watchdog."""
+        self._heard = now
+
+    def read(self, address: int, length: int, now: float) -> tuple[Error, bytes]:
+        """Bytes of the control table; the error is ACCESS where it has a gap."""
+        end = address + length
+        if not length or not all(place in table.DEFINED for place in range(address, end)):
+            return Error.ACCESS, b''
+        if end > 120:
+            self._measure(now)
+        return Error.NONE, bytes(self._memory[address:end])
+
+    def write(self, address: int, data: bytes) -> Error:
+        """Write whole registers, all or none of them."""
+        error, values = self._understood(address, data)
+        if error is Error.NONE:
+            for register, value in values:
+                self._apply(register.name, value)
+        return error
+
+    def register(self, address: int, data: bytes) -> Error:
+        """Keep a write until :meth:`action`."""
+        error, _ = self._understood(address, data)
+        if error is Error.NONE:
+            self._registered = (address, data)
+            self['Registered Instruction'] = 1
+        return error
+
+    def action(self) -> Error:
+        """Execute the kept write."""
+        if self._registered is None:
+            return Error.INSTRUCTION
+        kept, self._registered = self._registered, None
+        self['Registered Instruction'] = 0
+        return self.write(*kept)
+
+    def clear_turns(self) -> Error:
+        """Instruction Clear: forget the turn count, at rest only."""
+        if abs(self.velocity) > self['Moving Threshold'] * table.VELOCITY_UNIT:
+            return Error.RESULT_FAIL
+        self._to_one_turn()
+        return Error.NONE
+
+    def reboot(self, now: float):
+        """Restart: RAM as after power-up, torque off, position within one turn, silent a while."""
+        for register in table.REGISTERS:
+            if register.address >= table.EEPROM_END:
+                self[register.name] = register.initial
+        self._registered = None
+        self._boots_at = now + self.reboot_time
+        self._to_one_turn()
+        if self['Startup Configuration'] & 1:
+            self['Torque Enable'] = 1
+
+    # --- protection ---------------------------------------------------------------------------
+
+    def advance(self, now: float):
+        """Look at the watchdog, temperature and voltage."""
+        limit = self['Bus Watchdog']
+        if self.torque and 0 < limit < 255 and now - self._heard > limit * table.WATCHDOG_UNIT:
+            self.expire()
+        self['Present Temperature'] = round(35 if self.temperature is None else self.temperature)
+        if self['Present Temperature'] > self['Temperature Limit']:
+            self.trip(table.OVERHEATING)
+        self['Present Input Voltage'] = \
+            round((12.0 if self.voltage is None else self.voltage) / table.VOLTAGE_UNIT)
+        if not self['Min Voltage Limit'] <= self['Present Input Voltage'] \
+                <= self['Max Voltage Limit']:
+            self.trip(table.VOLTAGE_ERROR)
+
+    def expire(self):
+        """Stop where it is: the bus was silent. The manual says no more than "stop"."""
+        self['Bus Watchdog'] = 255
+        self['Goal Position'] = self._present()
+        self['Profile Acceleration'] = self['Profile Velocity'] = 0
+
+    def trip(self, error: int):
+        """Note a hardware error; those that Shutdown (63) names take the torque away."""
+        self['Hardware Error Status'] |= error
+        if error & self['Shutdown']:
+            self['Torque Enable'] = 0
+
+    # --- inside -------------------------------------------------------------------------------
+
+    def _understood(self, address, data):
+        """Cut a write into registers and values, or say why it is refused."""
+        values, place, end = [], address, address + len(data)
+        if not data:
+            return Error.DATA_LENGTH, ()
+        while place < end:
+            register = table.BY_ADDRESS.get(place)
+            if register is None:
+                return (Error.DATA_LENGTH if place in table.DEFINED else Error.ACCESS), ()
+            if not register.writable or (place < table.EEPROM_END and self.torque):
+                return Error.ACCESS, ()
+            place += register.size
+            if place > end:
+                return Error.DATA_LENGTH, ()
+            raw = data[register.address - address:place - address]
+            value = int.from_bytes(raw, 'little', signed=register.signed)
+            error = self._verdict(register, value)
+            if error is not Error.NONE:
+                return error, ()
+            values.append((register, value))
+        return Error.NONE, values
+
+    def _verdict(self, register, value):
+        """Judge one value."""
+        name = register.name
+        if not register.low <= value <= register.high \
+                or (register.choices and value not in register.choices):
+            return Error.DATA_RANGE
+        if self.expired and (name in table.GOALS or (name == 'Bus Watchdog' and value)):
+            return Error.DATA_RANGE
+        # Refused it is for sure, with which error the manual leaves open.
+        if name == 'Torque Enable' and value \
+                and self['Hardware Error Status'] & self['Shutdown']:
+            return Error.RESULT_FAIL
+        limit = {'Goal PWM': 'PWM Limit', 'Goal Current': 'Current Limit',
+                 'Goal Velocity': 'Velocity Limit'}.get(name)
+        if limit and abs(value) > self[limit]:
+            return Error.DATA_LIMIT
+        if name == 'Goal Position' and self['Operating Mode'] == table.POSITION_MODE \
+                and not self['Min Position Limit'] <= value <= self['Max Position Limit']:
+            return Error.DATA_LIMIT
+        return Error.NONE
+
+    def _apply(self, name, value):
+        changed = self[name] != value
+        self[name] = value
+        if name == 'Operating Mode' and changed:
+            for gain in table.RESET_BY_MODE:
+                self[gain] = table.BY_NAME[gain].initial
+            self['Goal PWM'], self['Goal Current'] = self['PWM Limit'], self['Current Limit']
+            if value == table.POSITION_MODE:
+                self._to_one_turn()
+        elif name == 'Torque Enable' and value and changed:
+            # A goal from before stays: a driver that forgot it would see a jump.
+            if self['Operating Mode'] == table.POSITION_MODE:
+                self._to_one_turn()
+        elif name in table.GOALS and self['Drive Mode'] & 8:
+            self['Torque Enable'] = 1
+
+    def _counts(self):
+        return round(self.zero + self.sign * self.angle / table.POSITION_UNIT)
+
+    def _present(self):
+        return self._counts() - table.COUNTS_PER_TURN * self._turns + self['Homing Offset']
+
+    def _to_one_turn(self):
+        self._turns = floor(self._counts() / table.COUNTS_PER_TURN)
+
+    def _measure(self, now):
+        speed = round(self.sign * self.velocity / table.VELOCITY_UNIT)
+        current = round(self.sign * self.effort / table.TORQUE_UNIT)
+        self['Realtime Tick'] = int(now * 1000) % 32768
+        self['Moving'] = int(abs(speed) > self['Moving Threshold'])
+        self['Present Current'] = max(-32768, min(32767, current))
+        self['Present Velocity'] = speed
+        self['Present Position'] = self._present()
+        self['Position Trajectory'] = self['Goal Position']

@@ -1,0 +1,214 @@
+"""Servos that share one line: who answers which packet with which bytes. No input or output."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from beetle_omni_ros.sim.emulated import servo_table as table
+from beetle_omni_ros.sim.emulated.dynamixel import (
+    BROADCAST,
+    Error,
+    fast_status,
+    Instruction,
+    LENGTH_LIMIT,
+    Packet,
+    status,
+)
+from beetle_omni_ros.sim.emulated.servo import EmulatedServo
+
+CLEAR_KEY = b'\x01\x44\x58\x4c\x22'  # Clear: "multi-turn information", with its safety bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """An instruction that a servo refused; broadcast ones are refused without an answer."""
+
+    identifier: int
+    instruction: int
+    error: int
+    address: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """Bytes that a servo puts on the line ``delay`` seconds after its turn has come."""
+
+    data: bytes
+    delay: float = 0.0
+
+
+class ServoNetwork:
+    """
+    The servos of one line.
+
+    Attributes:
+        servos: in the order of the robot's joints.
+        silent: IDs that neither hear nor answer.
+        refused: the last refusals, for tests and diagnosis.
+
+    """
+
+    def __init__(self, servos: list[EmulatedServo]):
+        self.servos = servos
+        self.silent: set[int] = set()
+        self.refused: deque[Refusal] = deque(maxlen=1000)
+
+    def handle(self, packet: Packet, baud_rate: int, now: float) -> list[Reply]:
+        """
+        Let every servo that hears this packet act on it.
+
+        Args:
+            packet: as received.
+            baud_rate: of the line; servos at another one hear noise.
+            now: [s] of any steady clock.
+
+        Returns:
+            the answers in the order in which they are sent.
+
+        """
+        hearing = {}
+        for servo in self.servos:
+            if servo['ID'] not in self.silent and servo.listens(now) \
+                    and servo.baud_rate == baud_rate:
+                hearing[servo['ID']] = servo
+        if not packet.valid:
+            # Nobody knows whom a broken broadcast was for.
+            servo = hearing.get(packet.identifier)
+            return [self._answer(servo, Error.CRC, packet)] if servo else []
+        for servo in hearing.values():
+            servo.hear(now)
+        group = {
+            Instruction.SYNC_READ: self._sync_read, Instruction.SYNC_WRITE: self._sync_write,
+            Instruction.FAST_SYNC_READ: self._sync_read, Instruction.BULK_READ: self._bulk_read,
+            Instruction.FAST_BULK_READ: self._bulk_read,
+            Instruction.BULK_WRITE: self._bulk_write}.get(packet.instruction)
+        if group:
+            return group(packet, hearing, now) if packet.identifier == BROADCAST else []
+        if packet.identifier == BROADCAST:
+            replies = [self._single(servo, packet, now) for _, servo in sorted(hearing.items())]
+            return replies if packet.instruction == Instruction.PING else []
+        servo = hearing.get(packet.identifier)
+        if servo is None or packet.instruction == Instruction.STATUS:
+            return []
+        level = servo['Status Return Level']
+        reply = self._single(servo, packet, now)
+        needed = {Instruction.PING: 0, Instruction.READ: 1}.get(packet.instruction, 2)
+        return [reply] if level >= needed else []
+
+    # --- one servo ----------------------------------------------------------------------------
+
+    def _single(self, servo, packet, now):
+        """Execute an instruction for one servo; its answer, sent or not."""
+        code, given = packet.instruction, packet.parameters
+        address = int.from_bytes(given[:2], 'little') if len(given) >= 2 else None
+        data = b''
+        if code == Instruction.PING:
+            error, data = servo.read(0, 2, now)
+            data += bytes((servo['Firmware Version'],))
+        elif code == Instruction.READ:
+            error = Error.DATA_LENGTH
+            if len(given) == 4:
+                error, data = servo.read(address, int.from_bytes(given[2:], 'little'), now)
+        elif code in (Instruction.WRITE, Instruction.REG_WRITE):
+            act = servo.write if code == Instruction.WRITE else servo.register
+            delay = servo['Return Delay Time']
+            error = Error.DATA_LENGTH if address is None else act(address, given[2:])
+            return self._answer(servo, error, packet, address=address, delay=delay)
+        elif code == Instruction.ACTION:
+            error = servo.action()
+        elif code == Instruction.REBOOT:
+            reply = self._answer(servo, Error.NONE, packet)
+            servo.reboot(now)
+            return reply
+        elif code == Instruction.CLEAR and given == CLEAR_KEY:
+            error = servo.clear_turns()
+        elif code == Instruction.FACTORY_RESET:
+            # The real one would lose ID and baud rate; nothing here may ask for that.
+            error = Error.RESULT_FAIL
+        else:
+            error = Error.INSTRUCTION
+        return self._answer(servo, error, packet, data, address)
+
+    def _answer(self, servo, error, packet, data=b'', address=None, delay=None):
+        self._note(servo, error, packet, address)
+        # The ID may just have changed: the servo answers under the one that was called.
+        name = servo['ID'] if packet.identifier == BROADCAST else packet.identifier
+        wait = servo['Return Delay Time'] if delay is None else delay
+        return Reply(status(name, error | servo.alert, data), wait * table.DELAY_UNIT)
+
+    def _note(self, servo, error, packet, address=None):
+        if error:
+            self.refused.append(Refusal(servo['ID'], int(packet.instruction), int(error),
+                                        address))
+
+    # --- several servos -----------------------------------------------------------------------
+
+    def _sync_read(self, packet, hearing, now):
+        given = packet.parameters
+        address, length = (int.from_bytes(given[k:k + 2], 'little') for k in (0, 2))
+        asked = [(name, address, length) for name in given[4:]]
+        return self._chain(packet, asked, hearing, now)
+
+    def _bulk_read(self, packet, hearing, now):
+        given = packet.parameters
+        if len(given) % 5:
+            return []
+        asked = [(given[k], int.from_bytes(given[k + 1:k + 3], 'little'),
+                  int.from_bytes(given[k + 3:k + 5], 'little')) for k in range(0, len(given), 5)]
+        return self._chain(packet, asked, hearing, now)
+
+    def _chain(self, packet, asked, hearing, now):
+        """Answer one after another; each waits for the one before, so a silent one ends it."""
+        names = [name for name, _, _ in asked]
+        total = sum(4 + length for _, _, length in asked)
+        if not asked or len(set(names)) != len(names) or total > LENGTH_LIMIT:
+            return []
+        fast = packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
+        blocks, delays = [], []
+        for name, address, length in asked:
+            servo = hearing.get(name)
+            if servo is None or servo['Status Return Level'] < 1 \
+                    or (fast and servo['Firmware Version'] < table.FIRST_FAST_FIRMWARE):
+                break
+            error, data = servo.read(address, length, now)
+            self._note(servo, error, packet, address)
+            if fast:
+                data = data.ljust(length, b'\0')
+            blocks.append((name, error | servo.alert, data))
+            delays.append(servo['Return Delay Time'] * table.DELAY_UNIT)
+        if not fast:
+            return [Reply(status(*block), delay)
+                    for block, delay in zip(blocks, delays, strict=True)]
+        if not blocks:
+            return []
+        pieces = fast_status(blocks, total)
+        # They join one packet without a pause; only the first waits.
+        return [Reply(b''.join(pieces), delays[0])]
+
+    def _sync_write(self, packet, hearing, now):
+        given = packet.parameters
+        address, length = (int.from_bytes(given[k:k + 2], 'little') for k in (0, 2))
+        rest = given[4:]
+        if not length or len(rest) % (length + 1):
+            return []
+        for k in range(0, len(rest), length + 1):
+            self._silent_write(packet, hearing, rest[k], address, rest[k + 1:k + 1 + length])
+        return []
+
+    def _bulk_write(self, packet, hearing, now):
+        given, place, writes = packet.parameters, 0, []
+        while place + 5 <= len(given):
+            address, length = (int.from_bytes(given[k:k + 2], 'little')
+                               for k in (place + 1, place + 3))
+            writes.append((given[place], address, given[place + 5:place + 5 + length]))
+            place += 5 + length
+        if place == len(given):
+            for name, address, data in writes:
+                self._silent_write(packet, hearing, name, address, data)
+        return []
+
+    def _silent_write(self, packet, hearing, name, address, data):
+        servo = hearing.get(name)
+        if servo is not None:
+            self._note(servo, servo.write(address, data), packet, address)

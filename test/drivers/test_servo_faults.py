@@ -1,0 +1,244 @@
+"""Every fault of the bus, switched on while the loop runs, has its outcome."""
+
+import time
+
+import numpy as np
+import pytest
+from servo_bench import arrived, bench, COUNT, PATIENT, running, tick, until
+
+from beetle_omni_ros.drivers import servo_registers as registers
+from beetle_omni_ros.drivers.servo_guard import Guard
+from beetle_omni_ros.drivers.servo_link import ServoBusError
+
+GOAL = np.array([0.5, -1.0, 3.5, -3.5])
+HOME = np.zeros(4)
+# One fault costs one tick here; the others keep the bench's patience.
+BRISK = {'timing': PATIENT.__class__(**{**{name: getattr(PATIENT, name)
+                                           for name in PATIENT.__dataclass_fields__},
+                                        'reply': 0.01})}
+
+
+def powered(readings, reports):
+    """All answer, have torque, and nothing is wrong."""
+    return readings.valid.all() and all(
+        one.torque and one.responding and not one.recovering and not one.message
+        for one in reports)
+
+
+@pytest.mark.parametrize('fault', ['bad_crc', 'dropped', 'delayed'])
+@pytest.mark.parametrize('firmware', [52, 45])
+def test_a_bad_line_costs_readings_but_never_gives_a_wrong_one(fault, firmware):
+    with running(servos={'motion': None, 'firmware': firmware}, **BRISK) as (bus, emulated):
+        emulated.set_state(GOAL / 2, HOME, HOME)
+        while not np.allclose(bus.read().position, GOAL / 2, atol=COUNT):
+            pass
+        setattr(emulated.faults, fault, 0.2)
+        emulated.faults.delay = 0.012
+        count = np.zeros(4)
+        for _ in range(150):
+            readings, _ = tick(bus, GOAL)
+            assert readings.position == pytest.approx(GOAL / 2, abs=COUNT)
+            count += readings.valid
+        assert (count > 40).all()
+        assert (count < 150).any(), 'the fault did show'
+        assert bus.statistics.unanswered + bus.statistics.corrupt > 5
+        setattr(emulated.faults, fault, 0.0)
+        until(lambda *now: powered(*now) and np.allclose(emulated.goals, GOAL, atol=COUNT),
+              bus, GOAL)
+
+
+@pytest.mark.parametrize('silent', [{1}, {3}, {4}, {1, 2}])
+@pytest.mark.parametrize('firmware', [52, 45])
+def test_silent_servos_are_left_out_and_the_others_fly_on(silent, firmware):
+    with running(servos={'firmware': firmware}) as (bus, emulated):
+        others = np.array([name not in silent for name in (1, 2, 3, 4)])
+        emulated.faults.silent = set(silent)
+        time.sleep(0.02)
+        unheard = missing = 0
+        for _ in range(30):
+            readings, reports = tick(bus, GOAL)
+            unheard += not (readings.valid == others).all()
+            missing += not readings.valid[others].all()
+        assert (readings.valid == others).all()
+        # The suspect is asked last: it costs the others one reading.
+        assert missing <= len(silent)
+        assert unheard <= PATIENT.silent_after * len(silent)
+        for one, other in zip(reports, others, strict=True):
+            assert one.responding == other
+            assert ('silent; check its cable and power' in one.message) != other
+        until(lambda readings, _: np.allclose(readings.position[others], GOAL[others],
+                                              atol=2 * COUNT), bus, GOAL)
+        emulated.faults.silent = set()
+        until(lambda *now: arrived(GOAL)(*now) and powered(*now), bus, GOAL)
+        lines = bus.take_events()
+        assert sum('answers again' in line for line in lines) == len(silent)
+
+
+def test_all_servos_silent_is_said_and_survived():
+    with running() as (bus, emulated):
+        emulated.faults.silent = {1, 2, 3, 4}
+        until(lambda _, reports: not any(one.responding for one in reports), bus, GOAL)
+        assert not bus.read().valid.any()
+        emulated.faults.silent = set()
+        until(lambda *now: arrived(GOAL)(*now) and powered(*now), bus, GOAL)
+
+
+def test_a_brief_overload_ends_in_a_restart_with_torque():
+    with running() as (bus, emulated):
+        until(arrived(GOAL), bus, GOAL)
+        emulated.faults.overload = {3}
+        until(lambda _, reports: not emulated.torque_enabled[2], bus, GOAL)
+        emulated.faults.overload = set()
+        readings, _ = until(powered, bus, GOAL)
+        assert emulated.torque_enabled.all()
+        # It stood beyond half a turn: the turn count survived the restart.
+        assert readings.position[2] == pytest.approx(GOAL[2], abs=0.05)
+        assert any('restarting it' in line for line in bus.take_events())
+
+
+def test_a_lasting_overload_leaves_the_servo_off_with_a_reason_and_the_service_brings_it_back():
+    with running(recoveries=2) as (bus, emulated):
+        emulated.faults.overload = {2}
+        _, reports = until(lambda _, reports: not reports[1].recovering
+                           and 'shut down (overload)' in reports[1].message
+                           and bus._servos[1].resting, bus, GOAL)
+        assert 'reboot' in reports[1].message
+        assert bus._servos[1].recoveries == 2
+        assert not emulated.torque_enabled[1] and emulated.torque_enabled[[0, 2, 3]].all()
+        until(lambda readings, _: readings.valid.all(), bus, GOAL)
+        emulated.faults.overload = set()
+        for _ in range(50):
+            tick(bus, GOAL)
+        assert not emulated.torque_enabled[1], 'nobody asked for it'
+        bus.reboot(2)
+        until(lambda *now: powered(*now) and arrived(GOAL)(*now), bus, GOAL)
+
+
+def test_an_overheated_servo_is_left_off():
+    with running() as (bus, emulated):
+        emulated.faults.overheated = {4}
+        _, reports = until(lambda _, reports: 'overheated' in reports[3].message
+                           and reports[3].temperature > 70, bus, GOAL)
+        for _ in range(50):
+            tick(bus, GOAL)
+        assert bus._servos[3].recoveries == 0
+        assert emulated.torque_enabled.tolist() == [True, True, True, False]
+        assert any('shut down (overheated)' in line for line in bus.take_events())
+
+
+def test_low_voltage_is_reported_and_flown_with():
+    with running() as (bus, emulated):
+        emulated.faults.supply_voltage = 5.0
+        _, reports = until(lambda _, reports: all('voltage' in one.message for one in reports),
+                           bus, GOAL)
+        assert emulated.torque_enabled.all()
+        until(arrived(GOAL), bus, GOAL)
+
+
+def test_an_expired_watchdog_is_cleared_and_goals_are_followed_again():
+    with running() as (bus, emulated):
+        until(arrived(GOAL), bus, GOAL)
+        emulated.expire_watchdog(1)
+        assert emulated.stopped[1]
+        until(lambda *_: not emulated.stopped[1], bus, HOME)
+        until(arrived(HOME), bus, HOME)
+        assert any('stopped by its watchdog' in line for line in bus.take_events())
+
+
+def test_after_a_pause_of_the_driver_the_very_next_goals_count():
+    with running() as (bus, emulated):
+        until(arrived(GOAL), bus, GOAL)
+        time.sleep(0.15)
+        assert emulated.stopped.all()
+        assert bus.write_goals(HOME)
+        bus.read()  # answered after the goals
+        assert emulated.goals == pytest.approx(HOME, abs=COUNT)
+        assert not emulated.stopped.any()
+
+
+def test_an_unplugged_cable_is_survived_and_flight_goes_on_when_it_is_back():
+    with running() as (bus, emulated):
+        until(arrived(GOAL), bus, GOAL)
+        for _ in range(3):
+            emulated.unplug()
+            for _ in range(5):
+                readings, reports = tick(bus, GOAL)
+                assert not readings.valid.any()
+                assert readings.position == pytest.approx(GOAL, abs=2 * COUNT), 'the last known'
+            assert not bus.write_goals(GOAL) and not bus.connected
+            emulated.replug()
+            until(lambda *now: powered(*now) and arrived(GOAL)(*now), bus, GOAL)
+        lines = bus.take_events()
+        assert any('unplugged' in line for line in lines)
+        assert any('connected again' in line for line in lines)
+        assert bus.statistics.connections == 4
+
+
+def test_servos_that_lost_power_with_the_cable_come_back_with_settings_and_turns():
+    with running() as (bus, emulated):
+        until(arrived(GOAL), bus, GOAL)
+        emulated.unplug()
+        tick(bus, GOAL)
+        for index in range(4):
+            emulated.reboot(index)
+        emulated.replug()
+        until(lambda *now: powered(*now) and arrived(GOAL)(*now), bus, GOAL)
+        assert np.allclose(emulated._motion.position, GOAL, atol=2 * COUNT)
+        assert [servo['Bus Watchdog'] for servo in emulated.servos] == [5] * 4
+
+
+def test_torque_that_could_not_be_taken_off_is_taken_off_when_the_cable_is_back():
+    with running() as (bus, emulated):
+        emulated.unplug()
+        assert not bus.disable()
+        emulated.replug()
+        until(lambda *_: not emulated.torque_enabled.any(), bus, GOAL)
+
+
+def test_disabling_confirms_on_a_bad_line_or_says_that_it_did_not():
+    with running(**BRISK) as (bus, emulated):
+        emulated.faults.dropped = 0.3
+        bus.disable()
+        assert not emulated.torque_enabled.any()
+        emulated.faults.dropped = 0.0
+        bus.enable()
+        bus.take_events()
+        emulated.faults.silent = {3}
+        assert not bus.disable()
+        assert any('torque off is not confirmed' in line and 'id 3' in line
+                   for line in bus.take_events())
+        emulated.faults.silent = set()
+
+
+def test_enabling_with_a_servo_that_refuses_leaves_none_with_torque():
+    with bench() as (bus, emulated):
+        bus.configure()
+        emulated.servos[2].trip(registers.OVERLOAD)
+        with pytest.raises(ServoBusError, match='id 3: write 1 to Torque Enable'):
+            bus.enable()
+        assert not emulated.torque_enabled.any() and not bus.enabled
+
+
+def test_a_reboot_without_torque_leaves_it_configured_and_off():
+    with bench() as (bus, emulated):
+        bus.configure()
+        bus.reboot(2)
+        until(lambda *_: any('is back, without torque' in line for line in bus.take_events()),
+              bus, GOAL)
+        assert not emulated.torque_enabled.any()
+        assert emulated.servos[1]['Velocity I Gain'] == 1201
+        bus.enable()
+        assert emulated.torque_enabled.all()
+        with pytest.raises(ServoBusError, match='id 9: no such servo'):
+            bus.reboot(9)
+
+
+def test_the_guard_is_dismissed_with_the_torque():
+    with bench(guard=True) as (bus, emulated):
+        bus.configure()
+        assert bus._guard is None
+        bus.enable()
+        process = bus._guard._process
+        assert isinstance(bus._guard, Guard) and process.poll() is None
+        bus.disable()
+        assert process.returncode == 0 and bus._guard is None
