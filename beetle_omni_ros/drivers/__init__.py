@@ -1,0 +1,1 @@
+"""Bytes to hardware: the servo bus and the motor board."""
