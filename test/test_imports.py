@@ -15,6 +15,7 @@ ALLOWED = {
     'robot': (),
     'control': ('robot',),
     'estimation': ('robot',),
+    'drivers': ('robot',),
     'sim': ('robot',),
     'safety': ('robot', 'control.base'),
     'runs': ('robot', 'control.base'),

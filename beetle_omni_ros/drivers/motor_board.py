@@ -20,12 +20,14 @@ from beetle_omni_ros.drivers.motor_board_messages import (
     CONTRACT_VERSION,
     heartbeat,
     LinkStatistics,
+    UNHEARD,
 )
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.motor_board_watch import BoardWatch, restarted
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 
+CORRECTION = 50_000     # [us] a larger step back of the board's clock is a restart
 GOODBYES = 3            # disarm commands written at once on closing, besides those with an answer
 
 
@@ -81,6 +83,7 @@ class MotorBoard:
                                self._on_connection, restarted)
         self._command: ArmCommand | None = None
         self._next_heartbeat = self._next_timesync = 0.0
+        self._last_stamp = (math.nan, 0)
 
     def open(self) -> None:
         """
@@ -125,6 +128,8 @@ class MotorBoard:
         if status.contract != CONTRACT_VERSION:
             return (f'firmware follows contract {status.contract}, '
                     f'this driver {CONTRACT_VERSION}')
+        if UNHEARD in status.conditions:
+            return 'the board does not hear our heartbeat'
         if self._watch.voltage is None:
             return 'battery voltage unknown'
         if not self._watch.clock.known:
@@ -168,7 +173,7 @@ class MotorBoard:
 
     def send(self, thrust: np.ndarray, stamp: float) -> Sent:
         """
-        Send thrust targets; returns at once.
+        Send thrust targets; returns at once. From one thread only.
 
         Args:
             thrust: (4,) [N]; negative counts as zero, zero stops the rotor.
@@ -191,10 +196,8 @@ class MotorBoard:
         # Without a measurement the highest voltage: it gives the least duty.
         voltage = self._watch.voltage or self.thrust_map.voltages[-1]
         command = self.thrust_map.command(thrust, voltage)
-        # By age: a step of the host's clock then spoils no more than this one stamp.
-        board_time = time.monotonic() - max(age, 0.0) + self._watch.clock.offset()
         message = common.MAVLink_set_actuator_control_target_message(
-            max(0, round(1e6 * board_time)), 0, self.parameters.board_system,
+            self._board_stamp(stamp, max(age, 0.0)), 0, self.parameters.board_system,
             self.parameters.board_component, [*command.tolist(), 0.0, 0.0, 0.0, 0.0])
         sent = self._link.send(message)
         reason = '' if sent else 'buffer full' if self._link.connected else 'port is away'
@@ -211,6 +214,21 @@ class MotorBoard:
         return BoardUpdate(**news, status=self._watch.status, link=counts,
                            clock_offset=clock.offset(),
                            clock_uncertainty=clock.uncertainty(time.monotonic()))
+
+    def _board_stamp(self, stamp, age):
+        """
+        Board's clock [us] at a stamp; it rises as the stamps do, and repeats as they do.
+
+        It is found by the age, so that a step of the host's clock spoils no more than one.
+        """
+        last_stamp, last = self._last_stamp
+        if stamp == last_stamp:
+            return last
+        micros = max(0, round(1e6 * (time.monotonic() - age + self._watch.clock.offset())))
+        if stamp > last_stamp and last - CORRECTION < micros <= last:
+            micros = last + 1       # the offset was corrected by more than the stamps are apart
+        self._last_stamp = stamp, micros
+        return micros
 
     def _start(self, arm):
         now = time.monotonic()
@@ -233,6 +251,8 @@ class MotorBoard:
                     self._command.acknowledge(message, now)
             else:
                 self._watch.message(message, now)
+                if restarted(message):
+                    self._next_heartbeat = self._next_timesync = now
 
     def _on_connection(self, connected, text):
         with self._lock:

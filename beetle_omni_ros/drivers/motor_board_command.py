@@ -44,7 +44,8 @@ class ArmCommand:
         self._next = now + self._parameters.acknowledge_timeout
         self._send(common.MAVLink_command_long_message(
             self._parameters.board_system, self._parameters.board_component,
-            common.MAV_CMD_COMPONENT_ARM_DISARM, self._attempts, float(self.arm), 0, 0, 0, 0, 0, 0))
+            common.MAV_CMD_COMPONENT_ARM_DISARM, self._attempts,
+            float(self.arm), 0, 0, 0, 0, 0, 0))
         self._attempts += 1
 
     def acknowledge(self, message, now: float) -> None:

@@ -14,8 +14,8 @@ from beetle_omni_ros.drivers.motor_board_messages import (
     battery_of,
     BoardReception,
     BoardStatus,
-    RotorStates,
     rotors_of,
+    RotorStates,
     status_of,
 )
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
