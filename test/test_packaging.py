@@ -15,8 +15,8 @@ import beetle_omni_ros
 from beetle_omni_ros.control.hover import HoverParameters
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.policy import PolicyParameters
-from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 from beetle_omni_ros.safety.parameters import SupervisorParameters
