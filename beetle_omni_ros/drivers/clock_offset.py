@@ -53,7 +53,8 @@ class ClockOffset:
         if received < sent:
             return False
         self.exchanges += 1
-        low, high = remote - received, remote - sent
+        within = self._drift * (received - sent)
+        low, high = remote - received - within, remote - sent + within
         known_low, known_high, at = self._bounds
         widening = self._drift * max(0.0, received - at)
         new_low, new_high = max(low, known_low - widening), min(high, known_high + widening)

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip('serial')
 
-from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError  # noqa: E402
+from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 
 
 @pytest.fixture

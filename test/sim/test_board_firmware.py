@@ -30,8 +30,11 @@ class Bench:
     def beat(self):
         self.send(mavlink.HEARTBEAT, 0, 18, 8, 0, 4, 3)
 
-    def target(self, *commands, age=0.0, group=0, to=(1, 1)):
-        stamp = round(1e6 * (self.board.clock(self.now) - age))
+    def stamp(self, age=0.0):
+        return round(1e6 * (self.board.clock(self.now) - age))
+
+    def target(self, *commands, age=0.0, stamp=None, group=0, to=(1, 1)):
+        stamp = self.stamp(age) if stamp is None else stamp
         controls = [*commands, *[0.0] * (8 - len(commands))]
         self.send(mavlink.ACTUATOR_TARGET, stamp, *controls, group, *to)
 
@@ -138,12 +141,12 @@ def test_rotors_stop_100_ms_after_the_last_target_and_start_again_with_the_next(
 
 def test_repeating_an_old_target_does_not_keep_the_rotors_alive():
     bench = Bench().arm()
-    begin = bench.now
+    stamp = bench.stamp()
     for _ in range(20):
-        bench.target(0.5, age=bench.now - begin)
-        bench.wait(0.0045)
-        bench.now = round(bench.now, 6)
-    bench.wait(0.011)
+        bench.target(0.5, stamp=stamp)
+        assert bench.outputs[0] == 0.5
+        bench.wait(0.0049)
+    bench.wait(0.003)
     assert bench.outputs == firmware.STOP
 
 
