@@ -247,8 +247,8 @@ class MotorBoard:
     def _on_message(self, message, now):
         with self._lock:
             if message.get_msgId() == common.MAVLINK_MSG_ID_COMMAND_ACK:
-                if self._command:
-                    self._command.acknowledge(message, now)
+                if self._command and self._command.acknowledge(message, now):
+                    self._watch.acknowledged(self._command.arm)
             else:
                 self._watch.message(message, now)
                 if restarted(message):

@@ -48,17 +48,18 @@ class ArmCommand:
             float(self.arm), 0, 0, 0, 0, 0, 0))
         self._attempts += 1
 
-    def acknowledge(self, message, now: float) -> None:
-        """Take a COMMAND_ACK; one that answers another question is ignored."""
+    def acknowledge(self, message, now: float) -> bool:
+        """Take a COMMAND_ACK, or ignore one to another question; tell whether it is done."""
         if message.command != common.MAV_CMD_COMPONENT_ARM_DISARM \
                 or bool(message.result_param2 & 1) != self.arm:
-            return
+            return False
         if message.result == common.MAV_RESULT_ACCEPTED:
             self.end(now, True)
-            return
+            return True
         text = RESULTS.get(message.result, f'result {message.result}')
         why = ', '.join(conditions_of(message.result_param2 >> 8 & 0xFF))
         self.end(now, False, f'{text} by the board: {why or "no reason given"}')
+        return False
 
     def end(self, now: float, accepted: bool, reason: str = '') -> None:
         """End with a result, unless it has one."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 import math
 import time
 
@@ -49,7 +50,7 @@ class BoardWatch:
         self._battery: Battery | None = None
         self._rotors: RotorStates | None = None
         self._events: deque = deque(maxlen=EVENTS_KEPT)
-        self._heard = -math.inf
+        self._heard = self._opened = -math.inf
         self._battery_at = -math.inf
         self._was_silent = self._was_uncertain = self._was_implausible = False
         self._handlers = {
@@ -72,7 +73,9 @@ class BoardWatch:
 
     def tick(self, now: float, connected: bool) -> None:
         """Notice silence and a poor clock."""
-        silent = connected and self.silent(now) and math.isfinite(self._heard)
+        # A port that has just come back is given the same time to be heard.
+        silent = math.isfinite(self._heard) and \
+            now - max(self._heard, self._opened) > self._parameters.silence
         if silent != self._was_silent and connected:
             self._was_silent = silent
             self._say('error' if silent else 'info',
@@ -85,8 +88,16 @@ class BoardWatch:
             self._say('warning' if uncertain else 'info',
                       f'offset of its clock known to {1e3 * uncertainty:.1f} ms')
 
+    def acknowledged(self, arm: bool) -> None:
+        """Note that the board has armed or disarmed as asked, before its heartbeat says so."""
+        if self.status is not None and self.status.armed != arm:
+            self.status = replace(self.status, stamp=self._host_clock(),
+                                  state='armed' if arm else 'disarmed')
+            self._say('info', self.status.state)
+
     def connection(self, connected: bool, text: str) -> None:
         """Note that the port came or went."""
+        self._opened = time.monotonic()
         self._say('info' if connected else 'error',
                   'port opened again' if connected else text)
 
