@@ -93,6 +93,8 @@ class MotorBoard:
             SerialPortError: the port cannot be opened; the text says what to do.
 
         """
+        if self._link.opened:
+            return
         self._link.open()
         atexit.register(self.close)
 
