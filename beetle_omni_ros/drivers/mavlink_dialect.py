@@ -2,7 +2,7 @@
 The MAVLink 2 dialect of the motor board: pymavlink's ``common`` and the ESC messages it lacks.
 
 ESC_INFO and ESC_STATUS stand in MAVLink's common.xml and in the C headers that firmware is built
-with, but not in the dialects that pymavlink is released with (2.4.50 looked at). They
+with, but not in the dialects that pymavlink is released with (2.4.41 and 2.4.50 looked at). They
 are declared here as common.xml declares them; a release that has them is left as it is.
 """
 
@@ -74,6 +74,7 @@ def message_class(number: int, name: str, fields) -> type:
 for _number, (_name, _fields) in ESC_MESSAGES.items():
     common.mavlink_map.setdefault(_number, message_class(_number, _name, _fields))
 MESSAGES = common.mavlink_map
+common.MAVLINK_IGNORE_CRC = 0   # no setting in the environment may let broken packets through
 EscInfo, EscStatus = MESSAGES[290], MESSAGES[291]
 
 __all__ = ['common', 'crc_extra', 'EscInfo', 'EscStatus', 'MESSAGES', 'message_class']

@@ -271,7 +271,7 @@ class MotorBoard:
         if now >= self._next_timesync:
             hurry = 1 if self._watch.clock.known else 4
             self._next_timesync = now + 1 / (hurry * self.parameters.timesync_rate)
-            self._link.send(common.MAVLink_timesync_message(0, round(1e9 * time.monotonic())))
+            self._link.send(self._watch.time_question())
 
 
 def _not_sent(reason):

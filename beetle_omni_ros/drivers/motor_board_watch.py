@@ -23,6 +23,7 @@ from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 EVENTS_KEPT = 200
+QUESTIONS_KEPT = 50     # of TIMESYNC; an answer later than these is of no use
 SEVERE = ('ESC failure', 'targets timed out')
 
 
@@ -50,6 +51,7 @@ class BoardWatch:
         self._battery: Battery | None = None
         self._rotors: RotorStates | None = None
         self._events: deque = deque(maxlen=EVENTS_KEPT)
+        self._asked: deque = deque(maxlen=QUESTIONS_KEPT)
         self._heard = self._opened = -math.inf
         self._battery_at = -math.inf
         self._was_silent = self._was_uncertain = self._was_implausible = False
@@ -59,6 +61,11 @@ class BoardWatch:
             common.MAVLINK_MSG_ID_BATTERY_STATUS: self._on_battery,
             common.MAVLINK_MSG_ID_SYS_STATUS: self._on_reception,
             EscInfo.id: self._on_info, EscStatus.id: self._on_rotors}
+
+    def time_question(self) -> common.MAVLink_message:
+        """TIMESYNC that asks for the board's clock; to be sent at once."""
+        self._asked.append(time.monotonic_ns())
+        return common.MAVLink_timesync_message(0, self._asked[-1])
 
     def message(self, message, now: float) -> None:
         """Take a message of the board that arrived at ``now`` [s, monotonic]."""
@@ -140,8 +147,10 @@ class BoardWatch:
                 self._say('error' if condition in SEVERE else 'warning', condition)
 
     def _on_timesync(self, message, now):
-        if message.tc1 and self.clock.add(message.ts1 / 1e9, message.tc1 / 1e9, now) \
-                and self.status is not None:
+        if not message.tc1 or message.ts1 not in self._asked:
+            return
+        self._asked.remove(message.ts1)
+        if self.clock.add(message.ts1 / 1e9, message.tc1 / 1e9, now) and self.status is not None:
             self._say('warning', 'its clock was set anew: restarted?')
 
     def _on_battery(self, message, now):

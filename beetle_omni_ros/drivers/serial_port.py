@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import select
+import termios
 
 import serial
 
@@ -46,7 +47,7 @@ class SerialPort:
         self.dropped = 0
         try:
             self._serial = serial.Serial(name, baud, timeout=0, exclusive=True)
-        except (serial.SerialException, OSError, ValueError) as error:
+        except (serial.SerialException, OSError, ValueError, termios.error) as error:
             number = getattr(error, 'errno', None)
             text = ADVICE.get(number) or str(error).splitlines()[0]
             raise SerialPortError(f'{name}: cannot be opened ({text})') from None
@@ -124,8 +125,12 @@ class SerialPort:
         return SerialPortError(f'{self.name}: device is gone ({text})')
 
     def close(self) -> None:
-        """Give the port back."""
+        """Give the port back; what is still unsent is dropped, or closing would wait for it."""
+        try:
+            self._serial.reset_output_buffer()
+        except (OSError, termios.error):
+            pass        # of a device that is gone
         try:
             self._serial.close()
         except OSError:
-            pass        # of a device that is gone
+            pass

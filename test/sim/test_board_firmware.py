@@ -292,3 +292,23 @@ def test_no_sequence_of_events_turns_rotors_without_arming_or_a_fresh_target(eve
             assert bench.now - last_thrust < limit + 1e-9
         if hung is not None and bench.now - hung >= PARAMETERS.watchdog_time:
             disarmed, hung = True, None
+
+
+PAYLOADS = strategies.sampled_from(sorted(mavlink.MESSAGES)).flatmap(
+    lambda number: strategies.tuples(strategies.just(number), strategies.binary(
+        min_size=mavlink.MESSAGES[number][1].size, max_size=mavlink.MESSAGES[number][1].size)))
+
+
+@settings(max_examples=300, deadline=None)
+@given(strategies.lists(PAYLOADS, max_size=10), strategies.booleans())
+def test_good_frames_with_any_content_do_no_harm(payloads, armed):
+    """Outputs stay within their range, and every answer can be packed."""
+    bench = Bench()
+    if armed:
+        bench.arm()
+    for number, payload in payloads:
+        answers = bench.send(number, *mavlink.MESSAGES[number][1].unpack(payload))
+        for answer in [*answers, *bench.board.due(bench.now, mavlink.Parser())]:
+            mavlink.pack(*answer, 0, 1, 1)
+        assert all(0 <= output <= 1 for output in bench.outputs)
+        bench.wait(0.01)
