@@ -128,20 +128,6 @@ def test_the_offset_of_the_boards_clock_is_within_its_bound():
         assert update.clock_uncertainty < 0.02
 
 
-def test_a_step_of_our_clock_does_not_stop_the_rotors():
-    """Stamps and clock step together; the board's clock is told by the stamps' age."""
-    shift = [0.0]
-    with connected() as (emulated, board):
-        board._clock = lambda: time.time() + shift[0]
-        assert board.arm().accepted
-        for k in range(60):
-            shift[0] = 3600.0 * (k > 20) - 7200.0 * (k > 40)
-            assert board.send(HOVER, time.time() + shift[0]).sent
-            time.sleep(0.005)
-            assert k < 10 or emulated.commands.all()
-        assert sum(emulated.refused.values()) <= 2
-
-
 def test_everything_the_driver_writes_passes_an_independent_parser():
     """Sequence numbers without gaps, from the right sender, all of the contract's messages."""
     device, other = pty.openpty()
