@@ -95,7 +95,8 @@ def measure(seconds):
         **quantiles('send', [end - start for start, end, *_ in sent]),
         **quantiles('rotor target', delays),
         'CPU driver [%]': 100 * share, 'CPU emulated board [%]': 100 * board_share,
-        'packets lost to us': link.received.lost, 'refused by the board': sum(refused.values())}
+        'packets lost to us': link.received.lost, 'refused by the board': sum(refused.values()),
+        **{f'refused: {reason}': count for reason, count in refused.items()}}
 
 
 def sweep():

@@ -59,7 +59,7 @@ class EmulatedMotorBoard:
         self._thrust: np.ndarray | None = None
         self._parser = mavlink.Parser()
         self._incoming, self._outgoing = Line(seed), Line(seed + 1)
-        self._sequence = 0
+        self._sequence, self._executes = 0, True
         self._port = PluggablePort('motor_board')
         self._wake_read, self._wake_write = os.pipe()
         self._stop = False
@@ -100,13 +100,19 @@ class EmulatedMotorBoard:
     def commands(self) -> np.ndarray:
         """(4,) normalised PWM commands at this moment, 0 (stop) to 1, also of failed ESCs."""
         with self._lock:
-            return np.array(self._firmware.outputs(time.monotonic()))
+            # What has arrived counts, also where the thread had no turn on a busy computer.
+            now = time.monotonic()
+            self._step(now)
+            return np.array(self._firmware.outputs(now))
 
     @property
     def thrust_targets(self) -> np.ndarray:
         """(4,) thrusts [N] to which the rotors strive: the PWM at the true voltage."""
         with self._lock:
-            thrust = self._map.thrust(duty_of_command(self.commands), self.voltage)
+            return self._thrusts(self.commands)
+
+    def _thrusts(self, commands):
+        thrust = self._map.thrust(duty_of_command(commands), self.voltage)
         for rotor in self.faults.failed_escs:
             thrust[rotor - 1] = 0.0
         return thrust
@@ -159,19 +165,13 @@ class EmulatedMotorBoard:
         self._parser, self._sequence = mavlink.Parser(), 0
 
     def _run(self):
-        running = True
         while not self._stop:
             try:
                 self._sleep()
-                with self._lock:
-                    now = time.monotonic()
-                    executes = self._firmware.runs(now)
-                    if running and not executes:
-                        self._forget()
-                    running = executes
-                    self._step(now, executes)
             except (OSError, ValueError):
                 continue        # the cable was pulled while waiting for it
+            with self._lock:
+                self._step(time.monotonic())
 
     def _sleep(self):
         now = time.monotonic()
@@ -183,13 +183,17 @@ class EmulatedMotorBoard:
         if self._wake_read in readable:
             os.read(self._wake_read, 16)
 
-    def _step(self, now, executes):
-        faults = self.faults
+    def _step(self, now):
+        """Do all that is due: receive, execute, send."""
+        faults, executed = self.faults, self._executes
+        self._executes = executes = self._firmware.runs(now)
+        if executed and not executes:
+            self._forget()
         for frame in frames(self._port.read()) if self._port.plugged else ():
             self._incoming.put(frame, now, faults.corrupt_in, faults.drop_in, faults.delay_in)
         data = self._incoming.take(now)
         if executes:
-            self._measure()
+            self._measure(now)
             for message in self._parser.feed(data):
                 self._send(self._firmware.receive(message, now), now)
                 if self.on_target and message.number == mavlink.ACTUATOR_TARGET:
@@ -209,12 +213,14 @@ class EmulatedMotorBoard:
             self._outgoing.put(frame, now, faults.corrupt_out, 1.0 if faults.mute
                                else faults.drop_out, faults.delay_out)
 
-    def _measure(self):
+    def _measure(self, now):
         """Write into the sensors what the world is like."""
         telemetry = self._firmware.telemetry
         telemetry.voltage, telemetry.current = self.voltage, self._current
         telemetry.failed = frozenset(rotor - 1 for rotor in self.faults.failed_escs)
-        thrust = self.thrust_targets if self._thrust is None else self._thrust
+        thrust = self._thrust
+        if thrust is None:
+            thrust = self._thrusts(np.array(self._firmware.outputs(now)))
         powers = [max(0.0, f) ** 1.5 for f in thrust.tolist()]
         total = sum(powers)
         telemetry.rpm = [self._parameters.rpm_at_1_newton * math.sqrt(max(0.0, f))
