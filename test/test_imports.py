@@ -15,6 +15,7 @@ ALLOWED = {
     'robot': (),
     'control': ('robot',),
     'estimation': ('robot',),
+    'drivers': ('robot',),
     'sim': ('robot',),
     'drivers': ('robot',),
     'safety': ('robot', 'control.base'),

@@ -15,11 +15,13 @@ import beetle_omni_ros
 from beetle_omni_ros.control.hover import HoverParameters
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.policy import PolicyParameters
+from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.train.parameters import TrainParameters
 
@@ -33,7 +35,9 @@ DISTRIBUTION = {'yaml': 'pyyaml', 'mcap_ros2': 'mcap-ros2-support', 'serial': 'p
 KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-ros2-support',
        'casadi': 'casadi-pip', 'serial': 'python3-serial', 'PIL': 'python3-pil'}
 PARAMETER_CLASSES = {
-    'ekf.yaml': EkfParameters, 'hover.yaml': HoverParameters, 'nmpc.yaml': NmpcParameters,
+    'ekf.yaml': EkfParameters, 'emulated_board.yaml': EmulatedBoardParameters,
+    'hover.yaml': HoverParameters, 'motor_board.yaml': MotorBoardParameters,
+    'nmpc.yaml': NmpcParameters,
     'nmpc_published.yaml': NmpcParameters, 'rl.yaml': PolicyParameters,
     'robot.yaml': RobotParameters, 'robot_weak_and_heavy.yaml': RobotParameters,
     'servo_bus.yaml': ServoBusParameters,

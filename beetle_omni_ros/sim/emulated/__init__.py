@@ -1,1 +1,1 @@
-"""Emulated devices on pseudo-terminals; they speak the real protocols byte by byte."""
+"""Emulated devices on pseudo-terminals, to the byte; written without the drivers they judge."""

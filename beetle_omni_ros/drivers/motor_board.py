@@ -1,0 +1,278 @@
+"""The motor board: thrusts out, battery and rotor states in, arming, link health."""
+
+from __future__ import annotations
+
+import atexit
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+import math
+import threading
+import time
+
+import numpy as np
+
+from beetle_omni_ros.drivers.mavlink_dialect import common
+from beetle_omni_ros.drivers.motor_board_command import ArmCommand
+from beetle_omni_ros.drivers.motor_board_link import BoardLink
+from beetle_omni_ros.drivers.motor_board_messages import (
+    BoardUpdate,
+    CommandResult,
+    CONTRACT_VERSION,
+    heartbeat,
+    LinkStatistics,
+    UNHEARD,
+)
+from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.motor_board_watch import BoardWatch, restarted
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.thrust_map import ThrustMap
+
+CORRECTION = 50_000     # [us] a larger step back of the board's clock is a restart
+GOODBYES = 3            # disarm commands written at once on closing, besides those with an answer
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """
+    What became of one set of thrusts.
+
+    Attributes:
+        sent: whether the target is on its way.
+        reason: why not, or ''.
+        saturated: (4,) thrusts that the battery cannot give; the largest possible were sent.
+        command: (4,) normalised commands, 0 to 1.
+
+    """
+
+    sent: bool
+    reason: str
+    saturated: np.ndarray
+    command: np.ndarray
+
+
+NOTHING = np.zeros(4)
+NOT_SATURATED = np.zeros(4, dtype=bool)
+
+
+class MotorBoard:
+    """
+    Driver of the motor board on a serial port; docs/firmware.md describes the other end.
+
+    A thread reads, sends heartbeats and reconnects. :meth:`send` and :meth:`poll` never wait.
+    Rotors stop 100 ms after the last target whatever happens to this process.
+    """
+
+    def __init__(self, parameters: MotorBoardParameters | None = None,
+                 robot: RobotParameters | None = None, clock: Callable[[], float] = time.time):
+        """
+        Prepare; nothing is opened.
+
+        Args:
+            parameters: by default params/motor_board.yaml.
+            robot: whose rotor map and battery to use; by default params/robot.yaml.
+            clock: the clock [s] of the stamps given to :meth:`send` and found in what is told.
+
+        """
+        self.parameters = parameters or MotorBoardParameters.load()
+        robot = robot or RobotParameters.load()
+        self.thrust_map = ThrustMap(robot.rotors)
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._watch = BoardWatch(self.parameters, robot, clock)
+        self._link = BoardLink(self.parameters, self._on_message, self._on_tick,
+                               self._on_connection, restarted)
+        self._command: ArmCommand | None = None
+        self._next_heartbeat = self._next_timesync = 0.0
+        self._last_stamp = (math.nan, 0)
+
+    def open(self) -> None:
+        """
+        Open the port and begin to talk; :meth:`wait_ready` waits for the board.
+
+        Raises:
+            SerialPortError: the port cannot be opened; the text says what to do.
+
+        """
+        if self._link.opened:
+            return
+        self._link.open()
+        atexit.register(self.close)
+
+    def close(self) -> None:
+        """Disarm, wait shortly for the acknowledgement, give the port back."""
+        atexit.unregister(self.close)
+        if not self._link.opened:
+            return
+        for _ in range(GOODBYES):
+            command = self._start(False)
+        command.wait(self.parameters.acknowledge_timeout * self.parameters.acknowledge_attempts)
+        self._link.close()
+
+    def __enter__(self) -> MotorBoard:
+        """Open."""
+        self.open()
+        return self
+
+    def __exit__(self, *_) -> None:
+        """Close."""
+        self.close()
+
+    @property
+    def ready(self) -> str:
+        """What is missing for arming on this side; '' when nothing is."""
+        status, now = self._watch.status, time.monotonic()
+        if not self._link.connected:
+            return f'{self.parameters.port}: port is away'
+        if self._watch.silent(now):
+            return 'nothing heard of the board'
+        if status is None:
+            return 'no heartbeat of the board'
+        if status.contract != CONTRACT_VERSION:
+            return (f'firmware follows contract {status.contract}, '
+                    f'this driver {CONTRACT_VERSION}')
+        if UNHEARD in status.conditions:
+            return 'the board does not hear our heartbeat'
+        if self._watch.voltage is None:
+            return 'battery voltage unknown'
+        if not self._watch.clock.known:
+            return "offset of the board's clock unknown"
+        return ''
+
+    def wait_ready(self, timeout: float) -> str:
+        """Wait at most ``timeout`` [s] until :attr:`ready` is ''; return it."""
+        end = time.monotonic() + timeout
+        while (missing := self.ready) and time.monotonic() < end:
+            time.sleep(0.01)
+        return missing
+
+    def start_arm(self) -> ArmCommand:
+        """Begin to arm without waiting; the returned command gets a result."""
+        missing = self.ready
+        if missing:
+            command = ArmCommand(True, self.parameters, lambda _: None, time.monotonic())
+            command.end(time.monotonic(), False, missing)
+            command.result = replace(command.result, attempts=0)
+            return command
+        return self._start(True)
+
+    def start_disarm(self) -> ArmCommand:
+        """Begin to disarm without waiting; the returned command gets a result."""
+        return self._start(False)
+
+    def arm(self) -> CommandResult:
+        """Arm and wait for the answer, half a second at most; refused unless all is well."""
+        return self._finished(self.start_arm())
+
+    def disarm(self) -> CommandResult:
+        """Disarm and wait for the answer, half a second at most."""
+        return self._finished(self.start_disarm())
+
+    @property
+    def armed(self) -> bool:
+        """Whether the board said so in its last heartbeat, and is heard."""
+        status = self._watch.status
+        return bool(status and status.armed and not self._watch.silent(time.monotonic()))
+
+    def send(self, thrust: np.ndarray, stamp: float) -> Sent:
+        """
+        Send thrust targets; returns at once. From one thread only.
+
+        Args:
+            thrust: (4,) [N]; negative counts as zero, zero stops the rotor.
+            stamp: time of the state that they answer [s, the clock of the constructor].
+
+        """
+        try:
+            thrust = np.asarray(thrust, dtype=float)
+        except (TypeError, ValueError):
+            return _not_sent('not numbers')
+        if thrust.shape != (4,):
+            return _not_sent(f'expected 4 thrusts, found shape {thrust.shape}')
+        age = self._clock() - stamp
+        if not (np.isfinite(thrust).all() and math.isfinite(age)):
+            return _not_sent('not finite')
+        if abs(age) > self.parameters.stamp_age_limit:
+            return _not_sent('stale stamp' if age > 0 else 'stamp in the future')
+        if not self._watch.clock.known:
+            return _not_sent("offset of the board's clock unknown")
+        # Without a measurement the highest voltage: it gives the least duty.
+        voltage = self._watch.voltage or self.thrust_map.voltages[-1]
+        command = self.thrust_map.command(thrust, voltage)
+        message = common.MAVLink_set_actuator_control_target_message(
+            self._board_stamp(stamp, max(age, 0.0)), 0, self.parameters.board_system,
+            self.parameters.board_component, [*command.tolist(), 0.0, 0.0, 0.0, 0.0])
+        sent = self._link.send(message)
+        reason = '' if sent else 'buffer full' if self._link.connected else 'port is away'
+        return Sent(sent, reason, self.thrust_map.saturated(thrust, voltage), command)
+
+    def poll(self) -> BoardUpdate:
+        """Return what is new since the last call."""
+        with self._lock:
+            news = self._watch.take()
+        link = self._link
+        counts = LinkStatistics(replace(link.receiver.counts), self._watch.reception, link.sent,
+                                link.dropped, link.connections)
+        clock = self._watch.clock
+        return BoardUpdate(**news, status=self._watch.status, link=counts,
+                           clock_offset=clock.offset(),
+                           clock_uncertainty=clock.uncertainty(time.monotonic()))
+
+    def _board_stamp(self, stamp, age):
+        """
+        Board's clock [us] at a stamp; it rises as the stamps do, and repeats as they do.
+
+        It is found by the age, so that a step of the host's clock spoils no more than one.
+        """
+        last_stamp, last = self._last_stamp
+        if stamp == last_stamp:
+            return last
+        micros = max(0, round(1e6 * (time.monotonic() - age + self._watch.clock.offset())))
+        if stamp > last_stamp and last - CORRECTION < micros <= last:
+            micros = last + 1       # the offset was corrected by more than the stamps are apart
+        self._last_stamp = stamp, micros
+        return micros
+
+    def _start(self, arm):
+        now = time.monotonic()
+        with self._lock:
+            if self._command:
+                self._command.end(now, False, 'replaced by another command')
+            self._command = ArmCommand(arm, self.parameters, self._link.send, now)
+            return self._command
+
+    def _finished(self, command):
+        patience = self.parameters.acknowledge_timeout * (self.parameters.acknowledge_attempts + 2)
+        if not command.wait(patience):
+            command.end(time.monotonic(), False, 'the thread of the link does not run')
+        return command.result
+
+    def _on_message(self, message, now):
+        with self._lock:
+            if message.get_msgId() == common.MAVLINK_MSG_ID_COMMAND_ACK:
+                if self._command and self._command.acknowledge(message, now):
+                    self._watch.acknowledged(self._command.arm)
+            else:
+                self._watch.message(message, now)
+                if restarted(message):
+                    self._next_heartbeat = self._next_timesync = now
+
+    def _on_connection(self, connected, text):
+        with self._lock:
+            self._watch.connection(connected, text)
+
+    def _on_tick(self, now):
+        with self._lock:
+            self._watch.tick(now, self._link.connected)
+            if self._command:
+                self._command.tick(now)
+        if now >= self._next_heartbeat:
+            self._next_heartbeat = now + 1 / self.parameters.heartbeat_rate
+            self._link.send(heartbeat())
+        if now >= self._next_timesync:
+            hurry = 1 if self._watch.clock.known else 4
+            self._next_timesync = now + 1 / (hurry * self.parameters.timesync_rate)
+            self._link.send(self._watch.time_question())
+
+
+def _not_sent(reason):
+    return Sent(False, reason, NOT_SATURATED, NOTHING)

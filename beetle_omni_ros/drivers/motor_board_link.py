@@ -1,0 +1,173 @@
+"""The thread that serves the motor board's port: reads, keeps time, reconnects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import os
+import select
+import threading
+import time
+
+from beetle_omni_ros.drivers.mavlink_dialect import common
+from beetle_omni_ros.drivers.mavlink_receiver import MavlinkReceiver
+from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
+
+TICK = 0.01             # [s] longest sleep of the thread; what it times is ten times slower
+
+
+class BoardLink:
+    """
+    One serial port with MAVLink on it.
+
+    The callbacks run in the thread of the link, one after the other.
+
+    Attributes:
+        receiver: counts what arrives.
+        sent: frames handed to the port.
+        dropped: frames that found its buffer full.
+        connections: times the port was opened.
+
+    """
+
+    def __init__(self, parameters: MotorBoardParameters, on_message: Callable,
+                 on_tick: Callable, on_connection: Callable, restarts: Callable):
+        """
+        Prepare; :meth:`open` starts.
+
+        Args:
+            parameters: of the link.
+            on_message: called with (message, arrival [s, monotonic]).
+            on_tick: called with the monotonic time [s], at least each :data:`TICK`.
+            on_connection: called with True, or False and a text, when the port comes or goes.
+            restarts: tells of a message whether the board has just restarted.
+
+        """
+        self._parameters = parameters
+        self._on_message, self._on_tick = on_message, on_tick
+        self._on_connection = on_connection
+        self._packer = common.MAVLink(None, parameters.host_system, parameters.host_component)
+        self.receiver = MavlinkReceiver(parameters.board_system, parameters.board_component,
+                                        restarts)
+        self._port: SerialPort | None = None
+        self._write_lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self.sent = self.dropped = self.connections = 0
+
+    def open(self) -> None:
+        """
+        Open the port and start the thread.
+
+        Raises:
+            SerialPortError: the port cannot be opened.
+
+        """
+        self._connect()
+        self._stop.clear()
+        self._wake_read, self._wake_write = os.pipe()
+        self._thread = threading.Thread(target=self._run, name='motor_board', daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop the thread and give the port back."""
+        if self._thread is None:
+            return
+        self._stop.set()
+        os.write(self._wake_write, b'x')
+        if self._thread is not threading.current_thread():
+            self._thread.join(2.0)
+        self._thread = None
+        with self._write_lock:
+            port, self._port = self._port, None
+        if port:
+            port.close()
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the port is open."""
+        return self._port is not None
+
+    @property
+    def opened(self) -> bool:
+        """Whether there is something to close."""
+        return self._thread is not None
+
+    def send(self, message) -> bool:
+        """
+        Pack and write a message without waiting.
+
+        Returns:
+            whether all or the beginning of it is on its way; False if the port is away or full.
+
+        """
+        with self._write_lock:
+            if self._port is None:
+                return False
+            frame = message.pack(self._packer)
+            try:
+                taken = self._port.write(frame)
+            except SerialPortError:
+                return False            # the thread finds out by itself and reconnects
+            if taken:
+                # A frame that was never sent must not look like a lost one.
+                self._packer.seq = (self._packer.seq + 1) % 256
+                self.sent += 1
+            else:
+                self.dropped += 1
+            return taken
+
+    def _connect(self):
+        port = SerialPort(self._parameters.port, self._parameters.baud)
+        self.receiver.restart()
+        with self._write_lock:
+            self._port = port
+        self.connections += 1
+
+    def _disconnect(self):
+        with self._write_lock:
+            port, self._port = self._port, None
+        if port:
+            port.close()
+
+    def _run(self):
+        retry = 0.0
+        while not self._stop.is_set():
+            try:
+                if self._port is None:
+                    retry = self._reconnect(retry)
+                else:
+                    self._serve()
+            except SerialPortError as error:
+                self._disconnect()
+                self._on_connection(False, str(error))
+            self._on_tick(time.monotonic())
+
+    def _reconnect(self, retry):
+        """Try to open the port once in a while; return when to try next."""
+        now = time.monotonic()
+        if now < retry:
+            select.select([self._wake_read], [], [], min(TICK, retry - now))
+            return retry
+        try:
+            self._connect()
+        except SerialPortError:
+            return now + self._parameters.reconnect_period
+        self._on_connection(True, '')
+        return 0.0
+
+    def _serve(self):
+        """Wait for bytes, at most one tick, and handle them."""
+        port = self._port
+        writers = [port] if port.waiting else []
+        readable, writable, _ = select.select([port, self._wake_read], writers, [], TICK)
+        if writable:
+            with self._write_lock:
+                port.flush()
+        if port in readable:
+            data = port.read()
+            now = time.monotonic()
+            for message in self.receiver.feed(data):
+                self._on_message(message, now)

@@ -1,0 +1,190 @@
+"""What the motor board tells, as dataclasses, and how it stands in MAVLink's fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+
+from beetle_omni_ros.drivers.mavlink_dialect import common
+from beetle_omni_ros.drivers.mavlink_receiver import ReceiveCounts
+
+# docs/firmware.md: the bytes of HEARTBEAT.custom_mode and COMMAND_ACK.result_param2.
+CONTRACT_VERSION = 1
+STATES = {0: 'boot', 1: 'disarmed', 2: 'armed', 3: 'running'}
+STOP_REASONS = {0: 'none', 1: 'asked by the host', 2: 'heartbeat of the host lost',
+                3: 'no target for too long', 4: 'watchdog reset'}
+UNHEARD = 'no heartbeat of the host'
+CONDITIONS = {1: 'booting', 2: UNHEARD, 4: 'throttle not low',
+              8: 'battery low', 16: 'ESC failure', 32: 'targets timed out', 64: 'saturated'}
+RESULTS = {0: 'accepted', 1: 'refused', 2: 'denied', 3: 'unsupported', 4: 'failed'}
+ESC_FAILURES = {1: 'over-current', 2: 'over-voltage', 4: 'overheated', 8: 'over-rpm',
+                16: 'inconsistent command', 32: 'stuck', 64: 'generic'}
+UNKNOWN_TEMPERATURE, UNKNOWN_CELL, UNKNOWN_CURRENT = 32767, 65535, -1
+
+
+@dataclass(frozen=True, slots=True)
+class BoardStatus:
+    """A heartbeat of the board: its state, why it last disarmed, what holds at present."""
+
+    stamp: float
+    state: str
+    stop_reason: str
+    conditions: tuple[str, ...]
+    contract: int
+
+    @property
+    def armed(self) -> bool:
+        """Whether the rotors may turn."""
+        return self.state in ('armed', 'running')
+
+
+@dataclass(frozen=True, slots=True)
+class Battery:
+    """Pack voltage [V] and current [A, negative while discharging; nan unknown], host time [s]."""
+
+    stamp: float
+    voltage: float
+    current: float
+
+
+@dataclass(frozen=True, slots=True)
+class RotorStates:
+    """
+    Telemetry of the four ESCs.
+
+    Attributes:
+        stamp: host time of the measurement [s].
+        rpm: (4,) [1/min]; nan where the ESC is offline, as in all of these.
+        voltage: (4,) [V].
+        current: (4,) [A].
+        temperature: (4,) [C], of the last ESC_INFO; nan unknown.
+        failures: four tuples of what the ESC reports.
+        error_count: (4,) since the board's start.
+
+    """
+
+    stamp: float
+    rpm: np.ndarray
+    voltage: np.ndarray
+    current: np.ndarray
+    temperature: np.ndarray
+    failures: tuple[tuple[str, ...], ...]
+    error_count: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class BoardReception:
+    """What the board says of the packets that it got, since its start."""
+
+    lost: int
+    bad_crc: int
+    refused: int
+    timeouts: int
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStatistics:
+    """Both directions of the link; ``board`` is None until the board has told."""
+
+    received: ReceiveCounts
+    board: BoardReception | None
+    sent: int
+    dropped: int            # frames that found the output buffer full
+    connections: int        # times the port was opened
+
+
+@dataclass(frozen=True, slots=True)
+class CommandResult:
+    """
+    How an arm or disarm command ended.
+
+    Attributes:
+        accepted: whether the board acknowledged it.
+        reason: '' or one line that says why not.
+        attempts: times it was sent.
+        duration: until the acknowledgement or the end of patience [s].
+
+    """
+
+    accepted: bool
+    reason: str = ''
+    attempts: int = 0
+    duration: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class BoardUpdate:
+    """
+    What is new since the last poll, and the state of the link.
+
+    Attributes:
+        battery: the newest, or None.
+        rotors: the newest, or None.
+        status: the newest of all time, or None.
+        events: (level, text) with level 'info', 'warning' or 'error', in order.
+        link: counts.
+        clock_offset: board's clock minus monotonic clock [s], nan unknown.
+        clock_uncertainty: bound of its error [s], inf unknown.
+
+    """
+
+    battery: Battery | None
+    rotors: RotorStates | None
+    status: BoardStatus | None
+    events: tuple[tuple[str, str], ...] = field(repr=False)
+    link: LinkStatistics
+    clock_offset: float
+    clock_uncertainty: float
+
+
+def status_of(message, stamp: float) -> BoardStatus:
+    """HEARTBEAT to :class:`BoardStatus`."""
+    mode = message.custom_mode
+    state, reason = mode & 0xFF, mode >> 8 & 0xFF
+    return BoardStatus(stamp, STATES.get(state, f'state {state}'),
+                       STOP_REASONS.get(reason, f'reason {reason}'),
+                       conditions_of(mode >> 16 & 0xFF), mode >> 24 & 0xFF)
+
+
+def conditions_of(bits: int) -> tuple[str, ...]:
+    """Names of the set bits of a condition byte."""
+    return tuple(text for bit, text in CONDITIONS.items() if bits & bit)
+
+
+def battery_of(message, stamp: float) -> Battery | None:
+    """BATTERY_STATUS to :class:`Battery`; None if it holds no voltage."""
+    cells = [cell for cell in message.voltages if cell != UNKNOWN_CELL]
+    if not cells:
+        return None
+    current = message.current_battery
+    return Battery(stamp, sum(cells) / 1000,
+                   math.nan if current == UNKNOWN_CURRENT else -current / 100)
+
+
+def rotors_of(message, info, stamp: float) -> RotorStates:
+    """ESC_STATUS with the last ESC_INFO (None: none yet) to :class:`RotorStates`."""
+    if info is None:
+        online, temperature = np.ones(4, dtype=bool), np.full(4, np.nan)
+        failures, errors = ((),) * 4, np.zeros(4, dtype=int)
+    else:
+        online = np.array([bool(info.info >> k & 1) for k in range(4)])
+        temperature = np.array([math.nan if value == UNKNOWN_TEMPERATURE else value / 100
+                                for value in info.temperature])
+        failures = tuple(tuple(text for bit, text in ESC_FAILURES.items() if flags & bit)
+                         for flags in info.failure_flags)
+        errors = np.array(info.error_count)
+
+    def known(values):
+        return np.where(online, np.array(values, dtype=float), np.nan)
+
+    return RotorStates(stamp, known(message.rpm), known(message.voltage), known(message.current),
+                       temperature, failures, errors)
+
+
+def heartbeat() -> common.MAVLink_message:
+    """Our heartbeat."""
+    return common.MAVLink_heartbeat_message(
+        common.MAV_TYPE_ONBOARD_CONTROLLER, common.MAV_AUTOPILOT_INVALID, 0, 0,
+        common.MAV_STATE_ACTIVE, 3)

@@ -1,0 +1,160 @@
+"""
+Thrust and PWM duty of a rotor at any pack voltage, each from the other.
+
+The robot file gives the duty as a cubic in thrust at a few voltages. Between two voltages the
+duty is interpolated at equal fractions of the largest thrust, because the measurements end at
+the same duty whatever the voltage; so no cubic is used beyond the thrusts it was fitted to.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.robot.parameters import RotorParameters
+from beetle_omni_ros.robot.schema import ParameterError
+
+STOP_DUTY, FULL_DUTY = 50.0, 100.0  # [% of 2000 us] the unit of the map: 1000 us and 2000 us
+CELLS = 2048                        # linear pieces of a cubic; 1e-5 of 0.5 N at most
+SLOPE_MIN = 1e-3                    # [% of duty / whole thrust range] keeps flat parts invertible
+
+
+class ThrustMap:
+    """
+    The measured map of one kind of rotor.
+
+    Thrust 0 stops the rotor; any more starts at the duty of the map's zero thrust.
+
+    Attributes:
+        voltages: (rows,) rising [V].
+        thrust_limits: (rows,) largest measured thrust there [N].
+        repaired: voltages at which the cubic falls somewhere and was replaced by its running
+            maximum.
+
+    """
+
+    def __init__(self, rotors: RotorParameters):
+        """
+        Tabulate the cubics.
+
+        Raises:
+            ParameterError: no row, two rows at one voltage, a duty outside stop to full.
+
+        """
+        rows = sorted(rotors.map, key=lambda row: row.voltage)
+        if not rows:
+            raise ParameterError('rotors.map: expected at least one row, found none')
+        self.voltages = np.array([row.voltage for row in rows])
+        if np.any(np.diff(self.voltages) <= 0):
+            raise ParameterError(f'rotors.map: two rows at one voltage, {self.voltages} V')
+        self.thrust_limits = np.array([row.thrust_max for row in rows])
+        self._torque_ratio = rotors.torque_to_thrust_ratio
+        self._duty = np.empty((len(rows), CELLS + 1))
+        repaired = []
+        for duty, row in zip(self._duty, rows):
+            duty[:] = np.polynomial.polynomial.polyval(
+                np.linspace(0, row.thrust_max, CELLS + 1) / 10, row.coefficients)
+            if duty.min() < STOP_DUTY or duty.max() > FULL_DUTY:
+                raise ParameterError(
+                    f'rotors.map at {row.voltage:g} V: duty {duty.min():.1f} to {duty.max():.1f} '
+                    f'% over 0 to {row.thrust_max:g} N, expected {STOP_DUTY:g} to {FULL_DUTY:g} %')
+            if np.any(np.diff(duty) < SLOPE_MIN / CELLS):
+                repaired.append(row.voltage)
+                duty[:] = _rising(duty)
+        self.repaired = tuple(repaired)
+        self._blend_voltage, self._blend = None, None
+
+    def thrust_limit(self, voltage):
+        """Largest thrust [N] at ``voltage`` [V], of its shape; as at the ends beyond the rows."""
+        return np.interp(voltage, self.voltages, self.thrust_limits)
+
+    def saturated(self, thrust, voltage) -> np.ndarray:
+        """Whether ``thrust`` [N] cannot be given at ``voltage`` [V]; shapes broadcast."""
+        return np.asarray(thrust) > self.thrust_limit(voltage)
+
+    def duty(self, thrust, voltage) -> np.ndarray:
+        """
+        Duty [% of 2000 us] that gives ``thrust`` [N] at ``voltage`` [V]; shapes broadcast.
+
+        Thrust is limited to what the voltage allows; zero or less stops the rotor.
+        """
+        thrust = np.asarray(thrust, dtype=float)
+        low, weight = self._rows(voltage)
+        position = np.clip(thrust / self.thrust_limit(voltage), 0, 1) * CELLS
+        cell = np.minimum(position.astype(int), CELLS - 1)
+        table, high = self._duty, np.minimum(low + 1, len(self.voltages) - 1)
+        left = (1 - weight) * table[low, cell] + weight * table[high, cell]
+        right = (1 - weight) * table[low, cell + 1] + weight * table[high, cell + 1]
+        return np.where(thrust > 0, left + (position - cell) * (right - left), STOP_DUTY)
+
+    def thrust(self, duty, voltage) -> np.ndarray:
+        """
+        Thrust [N] at ``duty`` [% of 2000 us] and ``voltage`` [V]; shapes broadcast.
+
+        The exact inverse of :meth:`duty`; no thrust below the duty where it begins, the limit
+        beyond the largest measured duty.
+        """
+        if np.ndim(voltage) == 0:
+            if voltage != self._blend_voltage:
+                low, weight = self._rows(voltage)
+                high = min(low + 1, len(self.voltages) - 1)
+                blend = (1 - weight) * self._duty[low] + weight * self._duty[high]
+                self._blend_voltage, self._blend = voltage, blend
+            fraction = np.interp(duty, self._blend, _FRACTIONS)
+            return fraction * self.thrust_limit(voltage)
+        duty, voltage = np.broadcast_arrays(np.asarray(duty, dtype=float), voltage)
+        return self._fractions(duty, voltage) * self.thrust_limit(voltage)
+
+    def command(self, thrust, voltage) -> np.ndarray:
+        """Normalised command, 0 (stop) to 1 (2000 us), for ``thrust`` [N] at ``voltage`` [V]."""
+        return command_of_duty(self.duty(thrust, voltage))
+
+    def torque(self, thrust) -> np.ndarray:
+        """Size of the reaction torque [N m] about the rotor's axis at ``thrust`` [N]."""
+        return self._torque_ratio * np.asarray(thrust)
+
+    def _rows(self, voltage):
+        """Row below ``voltage`` and weight of the next one."""
+        rows = len(self.voltages)
+        if rows == 1:
+            return np.zeros(np.shape(voltage), dtype=int)[()], np.zeros(np.shape(voltage))[()]
+        place = np.interp(voltage, self.voltages, np.arange(rows))
+        low = np.minimum(np.asarray(place).astype(int), rows - 2)[()]
+        return low, place - low
+
+    def _fractions(self, duty, voltage):
+        """Fraction of the thrust limit, by bisection in the blend of each element's rows."""
+        low, weight = self._rows(voltage)
+        high = np.minimum(low + 1, len(self.voltages) - 1)
+
+        def blend(cell):
+            return (1 - weight) * self._duty[low, cell] + weight * self._duty[high, cell]
+
+        cell, step = np.zeros(duty.shape, dtype=int), CELLS // 2
+        while step:
+            cell = np.where(blend(cell + step) <= duty, cell + step, cell)
+            step //= 2
+        left, right = blend(cell), blend(cell + 1)
+        return (cell + np.clip((duty - left) / (right - left), 0, 1)) / CELLS
+
+
+_FRACTIONS = np.linspace(0, 1, CELLS + 1)
+
+
+def command_of_duty(duty) -> np.ndarray:
+    """Normalised command, 0 to 1, of ``duty`` [% of 2000 us]."""
+    return (np.asarray(duty) - STOP_DUTY) / (FULL_DUTY - STOP_DUTY)
+
+
+def duty_of_command(command) -> np.ndarray:
+    """Duty [% of 2000 us] of a normalised ``command``, 0 to 1."""
+    return STOP_DUTY + (FULL_DUTY - STOP_DUTY) * np.asarray(command)
+
+
+def _rising(duty):
+    """
+    Least change upwards that makes samples rise; a falling end is cut off at its peak.
+
+    The slope added to flat parts is taken from the whole, so that the peak stays.
+    """
+    ramp = SLOPE_MIN * np.linspace(-1, 0, len(duty))
+    return np.maximum(np.maximum.accumulate(duty) + ramp, STOP_DUTY + SLOPE_MIN + ramp)

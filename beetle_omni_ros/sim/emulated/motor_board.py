@@ -1,0 +1,230 @@
+"""The emulated motor board: firmware, sensors and faults behind a pseudo-terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import math
+import os
+import select
+import threading
+import time
+
+import numpy as np
+
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.thrust_map import duty_of_command, ThrustMap
+from beetle_omni_ros.sim.emulated import mavlink
+from beetle_omni_ros.sim.emulated.board_faults import BoardFaults, frames, Line
+from beetle_omni_ros.sim.emulated.board_firmware import BoardFirmware
+from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.board_port import PluggablePort
+
+TICK = 0.01             # [s] longest sleep of the thread
+
+
+class EmulatedMotorBoard:
+    """
+    A motor board that a driver can open by :attr:`port`.
+
+    A thread serves the port in real time. The world asks :attr:`commands` or
+    :attr:`thrust_targets` and tells what the sensors measure; both from any thread.
+    Until the world tells a battery it is full and the rotors follow at once.
+
+    Attributes:
+        faults: what is wrong; set its attributes at any time.
+        on_target: called in the board's thread after each target that arrives, with its
+            arrival [s, monotonic] and its wire values; for measurements.
+
+    """
+
+    def __init__(self, robot: RobotParameters | None = None,
+                 parameters: EmulatedBoardParameters | None = None, seed: int = 0):
+        """
+        Power on.
+
+        Args:
+            robot: the true one: its rotor map turns PWM into thrust.
+            parameters: by default params/emulated_board.yaml.
+            seed: of random faults.
+
+        """
+        robot = robot or RobotParameters.load()
+        self._parameters = parameters or EmulatedBoardParameters.load()
+        self._map = ThrustMap(robot.rotors)
+        self.faults = BoardFaults()
+        self.on_target: Callable[[float, tuple], None] | None = None
+        self._lock = threading.RLock()
+        self._firmware = BoardFirmware(self._parameters, robot.battery.cells, time.monotonic())
+        self._voltage, self._current = robot.battery.full_voltage, 0.0
+        self._thrust: np.ndarray | None = None
+        self._parser = mavlink.Parser()
+        self._incoming, self._outgoing = Line(seed), Line(seed + 1)
+        self._sequence, self._executes = 0, True
+        self._port = PluggablePort('motor_board')
+        self._wake_read, self._wake_write = os.pipe()
+        self._stop = False
+        self._thread = threading.Thread(target=self._run, name='emulated_motor_board', daemon=True)
+        self._thread.start()
+
+    @property
+    def port(self) -> str:
+        """Path of the serial port to open; the same after unplugging and plugging in."""
+        return self._port.path
+
+    def close(self) -> None:
+        """Power off."""
+        if self._stop:
+            return
+        self._stop = True
+        os.write(self._wake_write, b'x')
+        self._thread.join(2.0)
+        self._port.close()
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+
+    def __enter__(self) -> EmulatedMotorBoard:
+        """Already on."""
+        return self
+
+    def __exit__(self, *_) -> None:
+        """Power off."""
+        self.close()
+
+    @property
+    def armed(self) -> bool:
+        """Whether rotors may turn at present."""
+        with self._lock:
+            return self._firmware.state(time.monotonic()) >= 2
+
+    @property
+    def commands(self) -> np.ndarray:
+        """(4,) normalised PWM commands at this moment, 0 (stop) to 1, also of failed ESCs."""
+        with self._lock:
+            # What has arrived counts, also where the thread had no turn on a busy computer.
+            now = time.monotonic()
+            self._step(now)
+            return np.array(self._firmware.outputs(now))
+
+    @property
+    def thrust_targets(self) -> np.ndarray:
+        """(4,) thrusts [N] to which the rotors strive: the PWM at the true voltage."""
+        with self._lock:
+            return self._thrusts(self.commands)
+
+    def _thrusts(self, commands):
+        thrust = self._map.thrust(duty_of_command(commands), self.voltage)
+        for rotor in self.faults.failed_escs:
+            thrust[rotor - 1] = 0.0
+        return thrust
+
+    @property
+    def voltage(self) -> float:
+        """True pack voltage [V], the sag fault included."""
+        return self._voltage - self.faults.voltage_sag
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Reason -> targets not followed since the board's start."""
+        return dict(self._firmware.refused)
+
+    def set_battery(self, voltage: float, current: float) -> None:
+        """Tell the pack's voltage under load [V] and the current drawn [A, positive]."""
+        self._voltage, self._current = float(voltage), float(current)
+
+    def set_rotors(self, thrust: np.ndarray, temperature: np.ndarray | None = None) -> None:
+        """Tell the rotors' present thrusts (4,) [N] and, if known, ESC temperatures (4,) [C]."""
+        self._thrust = np.array(thrust, dtype=float)
+        if temperature is not None:
+            self._firmware.telemetry.temperature = [float(value) for value in temperature]
+
+    def reboot(self) -> None:
+        """Reset the board now, as a brown-out does."""
+        with self._lock:
+            self._firmware.reboot(time.monotonic())
+            self._forget()
+
+    def hang(self) -> None:
+        """Hang the firmware; its watchdog resets it."""
+        with self._lock:
+            self._firmware.hang(time.monotonic())
+
+    def unplug(self) -> None:
+        """Pull the cable."""
+        with self._lock:
+            self._port.unplug()
+            self._incoming.clear()
+            self._outgoing.clear()
+
+    def plug(self) -> None:
+        """Put the cable back in; the port has its old name."""
+        with self._lock:
+            self._port.plug()
+        os.write(self._wake_write, b'x')
+
+    def _forget(self):
+        self._parser, self._sequence = mavlink.Parser(), 0
+
+    def _run(self):
+        while not self._stop:
+            try:
+                self._sleep()
+            except (OSError, ValueError):
+                continue        # the cable was pulled while waiting for it
+            with self._lock:
+                self._step(time.monotonic())
+
+    def _sleep(self):
+        now = time.monotonic()
+        telemetry = self._firmware.telemetry.next()
+        due = min(telemetry if telemetry > now else now + TICK, self._incoming.next(),
+                  self._outgoing.next(), now + TICK)
+        ports = [self._wake_read] + ([self._port.fileno()] if self._port.plugged else [])
+        readable = select.select(ports, [], [], max(0.0, due - now))[0]
+        if self._wake_read in readable:
+            os.read(self._wake_read, 16)
+
+    def _step(self, now):
+        """Do all that is due: receive, execute, send."""
+        faults, executed = self.faults, self._executes
+        self._executes = executes = self._firmware.runs(now)
+        if executed and not executes:
+            self._forget()
+        for frame in frames(self._port.read()) if self._port.plugged else ():
+            self._incoming.put(frame, now, faults.corrupt_in, faults.drop_in, faults.delay_in)
+        data = self._incoming.take(now)
+        if executes:
+            self._measure(now)
+            for message in self._parser.feed(data):
+                self._send(self._firmware.receive(message, now), now)
+                if self.on_target and message.number == mavlink.ACTUATOR_TARGET:
+                    self.on_target(now, message.values)
+            self._send(self._firmware.due(now, self._parser), now)
+        if self._port.plugged:
+            out = self._outgoing.take(now)
+            if out:
+                self._port.write(out)
+
+    def _send(self, messages, now):
+        faults = self.faults
+        for number, values in messages:
+            frame = mavlink.pack(number, values, self._sequence, self._parameters.system,
+                                 self._parameters.component)
+            self._sequence = (self._sequence + 1) % 256
+            self._outgoing.put(frame, now, faults.corrupt_out, 1.0 if faults.mute
+                               else faults.drop_out, faults.delay_out)
+
+    def _measure(self, now):
+        """Write into the sensors what the world is like."""
+        telemetry = self._firmware.telemetry
+        telemetry.voltage, telemetry.current = self.voltage, self._current
+        telemetry.failed = frozenset(rotor - 1 for rotor in self.faults.failed_escs)
+        thrust = self._thrust
+        if thrust is None:
+            thrust = self._thrusts(np.array(self._firmware.outputs(now)))
+        powers = [max(0.0, f) ** 1.5 for f in thrust.tolist()]
+        total = sum(powers)
+        telemetry.rpm = [self._parameters.rpm_at_1_newton * math.sqrt(max(0.0, f))
+                         for f in thrust.tolist()]
+        # Each rotor's part of the pack's current, by its aerodynamic power.
+        telemetry.rotor_current = [self._current * power / total if total else 0.0
+                                   for power in powers]

@@ -1,0 +1,84 @@
+"""An emulated motor board, a driver on it, and a loop that flies."""
+
+from contextlib import contextmanager
+from dataclasses import replace
+import threading
+import time
+
+import numpy as np
+
+from beetle_omni_ros.drivers.motor_board import MotorBoard
+from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
+
+QUICK = replace(EmulatedBoardParameters.load(), boot_time=0.05, heartbeat_timeout=0.5,
+                idle_timeout=1.0, throttle_low_time=0.3, reception_rate=10.0)
+HOVER = np.array([7.0, 7.5, 8.0, 8.5])
+
+
+def driver(port, **changes):
+    """Driver for a port, quick to reconnect."""
+    return MotorBoard(replace(MotorBoardParameters.load(), port=port, reconnect_period=0.05,
+                              **changes))
+
+
+def until(condition, timeout=3.0):
+    """Wait for a condition; tell whether it came."""
+    end = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.002)
+    return True
+
+
+class Pilot:
+    """Sends thrusts at 200 Hz from a thread of its own, as a bridge does."""
+
+    def __init__(self, board):
+        self.board, self.thrust, self.results, self.events = board, HOVER, [], []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self):
+        due = time.monotonic()
+        while not self._stop.is_set():
+            self.results.append(self.board.send(self.thrust, time.time()))
+            due += 0.005
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def heard(self, text):
+        """Whether an event with this text has come."""
+        self.events += self.board.poll().events
+        return any(text in event for _, event in self.events)
+
+    def __enter__(self):
+        """Begin."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        """Stop sending."""
+        self._stop.set()
+        self._thread.join()
+
+
+@contextmanager
+def connected(**changes):
+    """Emulated board and driver, ready to arm."""
+    with EmulatedMotorBoard(parameters=QUICK) as emulated, \
+            driver(emulated.port, **changes) as board:
+        assert board.wait_ready(3.0) == ''
+        yield emulated, board
+
+
+@contextmanager
+def flying(**changes):
+    """Emulated board, driver and pilot, rotors following."""
+    with connected(**changes) as (emulated, board):
+        result = board.arm()
+        assert result.accepted, result
+        with Pilot(board) as pilot:
+            assert until(lambda: emulated.commands.all() and pilot.results)
+            yield emulated, board, pilot

@@ -1,0 +1,38 @@
+"""docs/firmware.md shows the packets that are tested and the numbers that are emulated."""
+
+from pathlib import Path
+import re
+
+import pytest
+import reference_packets as reference
+
+from beetle_omni_ros.sim.emulated import board_firmware, mavlink
+from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+
+DOCUMENT = (Path(__file__).resolve().parents[2] / 'docs' / 'firmware.md').read_text()
+
+
+def test_the_packets_shown_are_the_packets_tested():
+    blocks = re.findall(r'```\n((?:[0-9a-f]{2}\s+)+)```', DOCUMENT)
+    shown = [bytes.fromhex(''.join(block.split())) for block in blocks]
+    assert shown == [*reference.BY_HOST, *reference.BY_BOARD]
+
+
+def test_the_numbers_shown_are_the_numbers_emulated():
+    rows = re.findall(r'^\| `(\w+)` \| ([\d.]+) (?:s|V|Hz) \|', DOCUMENT, re.MULTILINE)
+    assert len(rows) == 14
+    parameters = EmulatedBoardParameters.load()
+    for name, value in rows:
+        assert getattr(parameters, name) == float(value), name
+
+
+@pytest.mark.parametrize('number', mavlink.MESSAGES)
+def test_the_message_tables_are_right(number):
+    seed, layout = mavlink.MESSAGES[number]
+    name = reference.DEFINITIONS[number][0]
+    assert re.search(rf'^\| {name} \| {number} \| {seed} \| {layout.size} \|', DOCUMENT,
+                     re.MULTILINE), f'{name}: {number}, {seed}, {layout.size}'
+
+
+def test_the_version_shown_is_the_one_told():
+    assert f'**Contract version {board_firmware.CONTRACT_VERSION}.**' in DOCUMENT

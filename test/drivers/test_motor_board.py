@@ -1,0 +1,286 @@
+"""The driver against the emulated board, over a pseudo-terminal."""
+
+import math
+import os
+from pathlib import Path
+import pty
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+import reference_packets as reference
+
+pytest.importorskip('pymavlink')
+pytest.importorskip('serial')
+
+from board_bench import connected, driver, flying, HOVER, QUICK, until
+
+from beetle_omni_ros.drivers.mavlink_dialect import common
+from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
+
+
+def test_thrusts_arrive_as_asked_at_the_measured_voltage():
+    with connected() as (emulated, board):
+        emulated.set_battery(22.9, 20.0)
+        time.sleep(0.6)         # twelve time constants of the voltage filter
+        assert board.arm().accepted
+        assert board.send(HOVER, time.time()).sent
+        assert until(lambda: emulated.commands.all())
+        np.testing.assert_allclose(emulated.thrust_targets, HOVER, rtol=1e-3)
+
+
+def test_saturation_is_reported_and_the_most_is_given():
+    with flying() as (emulated, board, pilot):
+        emulated.set_battery(21.4, 40.0)
+        pilot.thrust = np.array([5.0, 19.5, 5.0, 30.0])
+        assert until(lambda: pilot.results[-1].saturated.tolist() == [False, True, False, True])
+        assert until(lambda: abs(emulated.thrust_targets[3] - 18.7075) < 1e-3)
+
+
+@pytest.mark.parametrize(('thrust', 'age', 'reason'), [
+    ([1, 2, 3], 0, 'expected 4 thrusts'), ('rubbish', 0, 'not numbers'),
+    ([1, 2, 3, math.nan], 0, 'not finite'), ([1, 2, 3, math.inf], 0, 'not finite'),
+    ([1, 2, 3, 4], math.nan, 'not finite'), ([1, 2, 3, 4], 0.2, 'stale stamp'),
+    ([1, 2, 3, 4], -0.2, 'stamp in the future')])
+def test_bad_thrusts_are_not_sent(thrust, age, reason):
+    with connected() as (emulated, board):
+        board.arm()
+        result = board.send(thrust, time.time() - age)
+        assert not result.sent and reason in result.reason
+        time.sleep(0.05)
+        assert not emulated.commands.any()
+
+
+def test_refused_arming_says_why():
+    with connected() as (emulated, board):
+        emulated.set_battery(20.0, 0.0)
+        assert until(lambda: 'battery low' in board.poll().status.conditions)
+        assert board.arm().reason == 'refused by the board: battery low'
+        emulated.set_battery(25.0, 0.0)
+        for _ in range(20):
+            board.send(HOVER, time.time())
+            time.sleep(0.005)
+        result = board.arm()
+        assert not result.accepted and result.reason.endswith('throttle not low')
+        time.sleep(QUICK.throttle_low_time)
+        assert board.arm().accepted and emulated.armed
+
+
+def test_disarming_is_acknowledged_and_stops_the_rotors():
+    with flying() as (emulated, board, _):
+        result = board.disarm()
+        assert result.accepted and result.attempts >= 1
+        assert not emulated.armed and not emulated.commands.any()
+        assert until(lambda: not board.armed)
+
+
+def test_an_answer_to_another_question_is_not_taken_for_this_one():
+    """The late acknowledgement of an arm command must not confirm a disarm command."""
+    with connected() as (_, board):
+        command = board.start_disarm()
+        late = common.MAVLink(None).decode(bytearray(reference.ACCEPTED))
+        other = type(command)(False, board.parameters, lambda _: None, 0.0)
+        other.acknowledge(late, 0.1)
+        assert other.result is None
+        assert command.wait(1.0) and command.result.accepted
+
+
+def test_battery_and_rotor_states_arrive_in_our_units_with_stamps_of_our_clock():
+    with connected() as (emulated, board):
+        emulated.set_battery(23.456, 12.34)
+        emulated.set_rotors(np.array([1.0, 4.0, 9.0, 0.0]), np.array([30.0, 40.0, 50.0, 60.0]))
+        time.sleep(0.6)         # one ESC_INFO
+        before = time.time()
+        board.poll()
+        time.sleep(0.1)
+        update = board.poll()
+        assert (update.battery.voltage, update.battery.current) == (23.456, -12.34)
+        rotors = update.rotors
+        assert rotors.rpm.tolist() == [2700, 5400, 8100, 0]
+        assert rotors.temperature.tolist() == [30, 40, 50, 60]
+        assert rotors.current.sum() == pytest.approx(12.34, rel=1e-5)
+        assert before - 0.02 < rotors.stamp <= time.time()
+
+
+def test_only_news_is_polled():
+    with connected() as (emulated, board):
+        emulated.faults.mute = True
+        time.sleep(0.05)
+        board.poll()
+        update = board.poll()
+        assert update.battery is None and update.rotors is None
+        assert update.status is not None
+
+
+def test_the_offset_of_the_boards_clock_is_within_its_bound():
+    with connected() as (emulated, board):
+        time.sleep(0.5)
+        update = board.poll()
+        now = time.monotonic()
+        truth = emulated._firmware.clock(now) - now
+        assert abs(update.clock_offset - truth) <= update.clock_uncertainty
+        assert update.clock_uncertainty < 0.02
+
+
+def test_everything_the_driver_writes_passes_an_independent_parser():
+    """Sequence numbers without gaps, from the right sender, all of the contract's messages."""
+    device, other = pty.openpty()
+    received = bytearray()
+    board = driver(os.ttyname(other))
+    board.open()
+    threading.Thread(target=board.disarm, daemon=True).start()
+    board._watch.clock.add(time.monotonic(), 1.0, time.monotonic())
+    for _ in range(100):
+        board.send(HOVER, time.time())
+        time.sleep(0.005)
+        received += os.read(device, 4096)
+    closing = threading.Thread(target=board.close)
+    closing.start()
+    os.set_blocking(device, False)
+    while closing.is_alive():
+        try:
+            received += os.read(device, 4096)
+        except BlockingIOError:
+            time.sleep(0.005)
+    messages = [reference.parse(frame) for frame in reference.split(bytes(received))]
+    assert {number for number, *_ in messages} == {0, 76, 111, 139}
+    assert all(sender == (1, 191) for _, _, sender, _ in messages)
+    assert [sequence for _, sequence, _, _ in messages] \
+        == [k % 256 for k in range(len(messages))]
+    stamps = [values[0] for number, _, _, values in messages if number == 139]
+    assert len(stamps) == 100 and np.all(np.diff(stamps) > 0)
+    assert messages[-1][0] in (0, 76, 111)
+    os.close(device)
+    os.close(other)
+
+
+def test_everything_the_emulated_board_writes_passes_pymavlinks_own_parser():
+    """Its strict parser raises at the first wrong byte."""
+    with EmulatedMotorBoard(parameters=QUICK) as emulated:
+        port = SerialPort(emulated.port, 921600)
+        parser, names, sequence = common.MAVLink(None), set(), None
+        packer = common.MAVLink(None, 1, 191)
+        end = time.monotonic() + 1.2
+        while time.monotonic() < end:
+            port.write(common.MAVLink_timesync_message(0, 5).pack(packer))
+            port.write(reference.ARM)
+            time.sleep(0.02)
+            for message in parser.parse_buffer(port.read()) or []:
+                names.add(message.get_type())
+                assert sequence is None or message.get_seq() == (sequence + 1) % 256
+                sequence = message.get_seq()
+        port.close()
+    assert names == {'HEARTBEAT', 'SYS_STATUS', 'COMMAND_ACK', 'TIMESYNC', 'BATTERY_STATUS',
+                     'ESC_INFO', 'ESC_STATUS'}
+    assert parser.total_receive_errors == 0
+
+
+def test_without_a_board_nothing_waits_long_and_all_says_so():
+    device, other = pty.openpty()
+    with driver(os.ttyname(other), acknowledge_timeout=0.02) as board:
+        assert board.wait_ready(0.1) == 'nothing heard of the board'
+        assert board.arm().reason == 'nothing heard of the board'
+        assert board.disarm().reason == 'no acknowledgement to 5 attempts'
+        assert not board.send(HOVER, time.time()).sent
+        assert not board.armed
+    os.close(device)
+    os.close(other)
+
+
+def test_another_firmware_is_refused():
+    with connected() as (emulated, board):
+        emulated._firmware._heartbeat = lambda state, now: (0, (1 | 9 << 24, 2, 0, 1, 3, 3))
+        assert until(lambda: board.poll().status.contract == 9)
+        assert board.arm().reason == 'firmware follows contract 9, this driver 1'
+
+
+def test_a_port_that_cannot_be_opened_is_one_line(tmp_path):
+    with pytest.raises(SerialPortError, match='board: cannot be opened .no such device'):
+        driver(str(tmp_path / 'board')).open()
+
+
+def test_closing_disarms():
+    with EmulatedMotorBoard(parameters=QUICK) as emulated:
+        board = driver(emulated.port)
+        board.open()
+        assert board.wait_ready(3) == '' and board.arm().accepted
+        board.send(HOVER, time.time())
+        board.close()
+        assert not emulated.armed
+        board.close()
+        assert emulated._firmware._stop_reason == 1
+
+
+CHILD = """
+import sys, time
+sys.path.insert(0, sys.argv[2])
+from board_bench import driver, HOVER
+board = driver(sys.argv[1])
+board.open()
+assert board.wait_ready(5) == '' and board.arm().accepted
+print('flying', flush=True)
+end = time.monotonic() + float(sys.argv[3])
+while time.monotonic() < end:
+    board.send(HOVER, time.time())
+    time.sleep(0.005)
+if sys.argv[4] == 'fail':
+    raise RuntimeError('a bug in the bridge')
+"""
+
+
+def process(emulated, seconds=60, end=''):
+    """A process that flies for some seconds and leaves without closing."""
+    folder = Path(__file__).parent
+    child = subprocess.Popen(
+        [sys.executable, '-c', CHILD, emulated.port, str(folder), str(seconds), end],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join([str(folder.parents[1]), *sys.path])})
+    assert child.stdout.readline() == 'flying\n'
+    return child
+
+
+@pytest.mark.parametrize('end', ['', 'fail'])
+def test_a_process_that_ends_disarms_at_exit_also_after_an_exception(end):
+    with EmulatedMotorBoard(parameters=QUICK) as emulated:
+        child = process(emulated, 0.2, end)
+        child.wait(20)
+        assert not emulated.armed
+        assert emulated._firmware._stop_reason == 1         # asked by the host
+
+
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP])
+def test_no_rotor_turns_100_ms_after_the_process_is_gone(number):
+    with EmulatedMotorBoard(parameters=QUICK) as emulated:
+        arrivals = []
+        emulated.on_target = lambda now, values: arrivals.append(now)
+        child = process(emulated)
+        assert until(lambda: emulated.commands.all())
+        try:
+            os.kill(child.pid, number)
+            killed = time.monotonic()
+            assert until(lambda: not emulated.commands.any())
+            stopped = time.monotonic()
+            assert arrivals[-1] - killed < 0.05
+            # The board's rule is exact; the rest is this test's own polling.
+            assert stopped - arrivals[-1] < QUICK.target_timeout + 0.05
+            assert until(lambda: not emulated.armed, 2.0)
+            if number == signal.SIGSTOP:
+                os.kill(child.pid, signal.SIGCONT)
+                time.sleep(0.3)
+                assert not emulated.commands.any() and not emulated.armed
+        finally:
+            child.kill()
+            child.wait(10)
+        assert emulated._firmware._stop_reason in (2, 3)
+
+
+def test_thrust_map_of_another_robot_is_used():
+    robot = RobotParameters.load()
+    with connected() as (_, board):
+        assert board.thrust_map.thrust_limits[-1] == robot.rotors.map[0].thrust_max

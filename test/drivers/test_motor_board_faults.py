@@ -1,0 +1,195 @@
+"""Every fault of the motor board in flight: its outcome and what is said about it."""
+
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('pymavlink')
+pytest.importorskip('serial')
+
+from board_bench import flying, HOVER, QUICK, until
+
+
+def keeps_flying(emulated, seconds=0.6):
+    """Whether the rotors never stop for this long."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if not emulated.commands.all():
+            return False
+        time.sleep(0.002)
+    return emulated.armed
+
+
+def stays_stopped(emulated, seconds=0.5):
+    """Whether no rotor turns for this long, though the pilot goes on sending."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if emulated.commands.any():
+            return False
+        time.sleep(0.002)
+    return True
+
+
+def test_bad_checksums_from_the_board_are_counted_and_flown_through():
+    with flying() as (emulated, board, _):
+        emulated.faults.corrupt_out = 0.3
+        assert keeps_flying(emulated)
+        counts = board.poll().link.received
+        assert counts.bad_crc > 10 and counts.lost > 10 and counts.messages > 30
+        assert board.armed
+
+
+def test_bad_checksums_to_the_board_are_counted_there_and_flown_through():
+    with flying() as (emulated, board, _):
+        emulated.faults.corrupt_in = 0.3
+        assert keeps_flying(emulated)
+        assert until(lambda: board.poll().link.board.bad_crc > 10)
+        assert until(lambda: board.poll().link.board.lost > 10)
+
+
+def test_lost_packets_both_ways_are_counted_and_flown_through():
+    with flying() as (emulated, board, _):
+        emulated.faults.drop_in = emulated.faults.drop_out = 0.3
+        assert keeps_flying(emulated)
+        assert until(lambda: board.poll().link.board.lost > 10)
+        link = board.poll().link
+        assert link.received.lost > 10 and link.received.bad_crc == 0
+
+
+def test_commands_get_through_where_half_of_all_packets_are_lost():
+    with flying() as (emulated, board, _):
+        emulated.faults.drop_in = emulated.faults.drop_out = 0.5
+        results = [board.disarm() for _ in range(3)]
+        assert not emulated.armed
+        assert any(result.accepted for result in results)
+
+
+def test_short_delays_are_flown_through():
+    with flying() as (emulated, board, pilot):
+        emulated.faults.delay_in = emulated.faults.delay_out = 0.03
+        assert keeps_flying(emulated)
+        assert not board.poll().link.board.timeouts
+
+
+def test_targets_too_long_under_way_are_refused_and_the_rotors_stop():
+    with flying() as (emulated, board, pilot):
+        emulated.faults.delay_in = 0.2
+        assert until(lambda: not emulated.commands.any())
+        assert stays_stopped(emulated)
+        assert emulated.refused['stale stamp'] > 10
+        assert pilot.heard('targets timed out')
+        assert until(lambda: not emulated.armed)
+        assert until(lambda: pilot.heard('disarmed (no target for too long)'))
+
+
+def test_a_mute_board_is_noticed_and_goes_on_following():
+    with flying() as (emulated, board, pilot):
+        emulated.faults.mute = True
+        assert until(lambda: pilot.heard('nothing heard for 0.3 s'))
+        assert keeps_flying(emulated, 0.3)
+        assert not board.armed and board.ready == 'nothing heard of the board'
+        emulated.faults.mute = False
+        assert until(lambda: pilot.heard('heard again'))
+        assert board.armed
+
+
+def test_voltage_sag_is_made_up_for_and_reported_where_it_cannot_be():
+    with flying() as (emulated, board, pilot):
+        emulated.set_battery(25.0, 30.0)
+        time.sleep(0.3)
+        before = emulated.commands
+        emulated.faults.voltage_sag = 3.0
+        assert until(lambda: np.allclose(emulated.thrust_targets, HOVER, rtol=2e-3))
+        assert np.all(emulated.commands > before)
+        pilot.thrust = np.full(4, 20.0)
+        assert until(lambda: pilot.results[-1].saturated.all())
+        emulated.faults.voltage_sag = 5.0
+        assert until(lambda: pilot.heard('battery low'))
+        assert keeps_flying(emulated, 0.2)
+
+
+def test_an_impossible_voltage_is_not_believed():
+    with flying() as (emulated, board, pilot):
+        before = emulated.commands
+        emulated.set_battery(3.0, 0.0)
+        assert until(lambda: pilot.heard('3.0 V not believed'))
+        np.testing.assert_array_equal(emulated.commands, before)
+
+
+def test_a_cable_out_for_a_moment_is_flown_through_after_a_short_stop():
+    with flying() as (emulated, board, pilot):
+        emulated.unplug()
+        assert until(lambda: pilot.heard('device is gone'))
+        assert until(lambda: pilot.results[-1].reason == 'port is away')
+        assert until(lambda: not emulated.commands.any())
+        emulated.plug()
+        assert until(lambda: emulated.commands.all(), 0.4)
+        assert pilot.heard('port opened again') and board.poll().link.connections == 2
+
+
+def test_a_cable_out_for_long_disarms_and_coming_back_does_not_arm():
+    with flying() as (emulated, board, pilot):
+        emulated.unplug()
+        assert until(lambda: not emulated.armed)
+        emulated.plug()
+        assert until(lambda: pilot.heard('port opened again'))
+        assert stays_stopped(emulated)
+        assert until(lambda: pilot.heard('disarmed (heartbeat of the host lost)'))
+        pilot.thrust = np.zeros(4)
+        time.sleep(QUICK.throttle_low_time)
+        assert until(lambda: board.arm().accepted)
+
+
+def test_a_hung_board_is_reset_by_its_watchdog_and_stays_disarmed():
+    with flying() as (emulated, board, pilot):
+        emulated.hang()
+        assert until(lambda: not emulated.commands.any(), 0.15)
+        assert until(lambda: pilot.heard('restarted (watchdog reset)'))
+        assert stays_stopped(emulated) and not board.armed
+
+
+def test_a_reboot_in_flight_stops_and_needs_arming_again():
+    with flying() as (emulated, board, pilot):
+        emulated.reboot()
+        assert not emulated.commands.any()
+        assert until(lambda: pilot.heard('restarted'))
+        assert stays_stopped(emulated)
+        assert board.poll().link.received.lost == 0
+        pilot.thrust = np.zeros(4)
+        time.sleep(QUICK.throttle_low_time)
+        assert until(lambda: board.arm().accepted)
+        pilot.thrust = HOVER
+        assert until(lambda: emulated.commands.all())
+
+
+def test_a_failed_esc_is_named_and_the_other_rotors_go_on():
+    with flying() as (emulated, board, pilot):
+        emulated.faults.failed_escs = (3,)
+        assert until(lambda: pilot.heard('ESC of rotor 3 offline'))
+        assert until(lambda: pilot.heard('ESC failure'))
+        assert emulated.thrust_targets[2] == 0
+        assert np.all(emulated.thrust_targets[[0, 1, 3]] > 5)
+        rotors = None
+        while rotors is None:
+            rotors = board.poll().rotors
+        assert np.isnan(rotors.rpm[2]) and rotors.failures[2] == ('generic',)
+        assert np.all(rotors.rpm[[0, 1, 3]] > 1000)
+        board.disarm()
+        pilot.thrust = np.zeros(4)
+        time.sleep(QUICK.throttle_low_time + 0.05)
+        assert board.arm().reason == 'refused by the board: ESC failure'
+
+
+def test_several_faults_at_once_leave_no_rotor_spinning():
+    with flying() as (emulated, board, pilot):
+        emulated.faults.corrupt_in = emulated.faults.corrupt_out = 0.5
+        emulated.faults.drop_in = emulated.faults.drop_out = 0.5
+        emulated.faults.delay_out = 0.05
+        time.sleep(0.3)
+        emulated.unplug()
+        assert until(lambda: not emulated.commands.any(), 0.2)
+        emulated.plug()
+        board.close()
+        assert until(lambda: not emulated.armed)
+        assert stays_stopped(emulated, 0.2)

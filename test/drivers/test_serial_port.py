@@ -1,0 +1,85 @@
+"""The serial port never blocks, and says what is wrong with it."""
+
+import os
+import pty
+import time
+import tty
+
+import pytest
+
+pytest.importorskip('serial')
+
+from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
+
+
+@pytest.fixture
+def ends():
+    """A port's other end, and the port's name."""
+    device, other = pty.openpty()
+    tty.setraw(other)
+    yield device, os.ttyname(other)
+    for descriptor in (device, other):
+        try:
+            os.close(descriptor)
+        except OSError:
+            pass
+
+
+def test_bytes_arrive_unchanged_both_ways(ends):
+    device, name = ends
+    data = bytes(range(256))
+    port = SerialPort(name, 921600)
+    assert port.write(data)
+    assert os.read(device, 1000) == data
+    os.write(device, data)
+    time.sleep(0.05)
+    assert port.read() == data
+    assert port.read() == b''
+    port.close()
+
+
+def test_a_full_buffer_drops_whole_frames_without_waiting(ends):
+    """Nobody reads at the other end; pyserial's own write would never return."""
+    device, name = ends
+    port = SerialPort(name, 921600)
+    frames = [bytes([k % 256]) * 55 for k in range(2000)]
+    taken = [k for k, frame in enumerate(frames) if port.write(frame)]
+    assert 10 < len(taken) < 2000
+    assert port.dropped == 2000 - len(taken)
+    received = b''
+    while True:
+        port.flush()
+        try:
+            os.set_blocking(device, False)
+            received += os.read(device, 65536)
+        except BlockingIOError:
+            if not port.waiting:
+                break
+    assert received == b''.join(frames[k] for k in taken)
+    port.close()
+
+
+def test_an_unplugged_device_is_an_error_of_one_line(ends):
+    device, name = ends
+    port = SerialPort(name, 921600)
+    os.close(device)
+    for use in (port.read, lambda: port.write(b'x')):
+        with pytest.raises(SerialPortError, match='device is gone') as caught:
+            use()
+        assert '\n' not in str(caught.value) and name in str(caught.value)
+    port.close()
+
+
+def test_a_port_in_use_is_refused(ends):
+    port = SerialPort(ends[1], 921600)
+    with pytest.raises(SerialPortError, match='in use by another process'):
+        SerialPort(ends[1], 921600)
+    port.close()
+
+
+def test_what_cannot_be_opened_says_what_to_do(tmp_path):
+    with pytest.raises(SerialPortError, match='nowhere: cannot be opened .no such device'):
+        SerialPort(str(tmp_path / 'nowhere'), 921600)
+    (tmp_path / 'file').write_text('x')
+    with pytest.raises(SerialPortError, match='file: cannot be opened'):
+        SerialPort(str(tmp_path / 'file'), 921600)
