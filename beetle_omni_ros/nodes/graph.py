@@ -12,8 +12,9 @@ import time
 import yaml
 
 import beetle_omni_ros
+from beetle_omni_ros.nodes.actuators import BRIDGES
 
-COMPOSED = 'composed'
+COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'
 STOP_TIMEOUT = 8.0      # s for a process to stop by itself before it is killed
 
 
@@ -25,7 +26,8 @@ class Graph:
         parameters: node name -> parameters that differ from the shipped ones.
         folder: for the parameter file and what the processes print; must exist.
         domain: ROS domain.
-        composed: one process for all, or one for each.
+        composed: one process for all but the bridges, which share another: they wait for their
+            serial ports; or one for each.
 
     """
 
@@ -39,8 +41,12 @@ class Graph:
             {f'/**/{node}': {'ros__parameters': values}
              for node, values in parameters.items() if values}) if any(parameters.values())
             else '/**: {ros__parameters: {}}\n')
-        self._commands = {COMPOSED: [COMPOSED, *self.nodes]} if composed \
-            else {node: [node] for node in self.nodes}
+        self._commands = {node: [node] for node in self.nodes}
+        if composed:
+            bridges = [node for node in self.nodes if node in BRIDGES]
+            others = [node for node in self.nodes if node not in BRIDGES]
+            self._commands = {name: [COMPOSED, *nodes] for name, nodes in
+                              ((COMPOSED, others), (BRIDGES_COMPOSED, bridges)) if nodes}
         self.processes: dict[str, subprocess.Popen] = {}
 
     def start(self) -> None:
@@ -73,9 +79,10 @@ class Graph:
         return {name: _ending(process.returncode, self.log(name))
                 for name, process in self.processes.items() if process.poll() is not None}
 
-    def cpu_seconds(self) -> float:
-        """CPU time that the living processes have used."""
-        return sum(_cpu_seconds(p.pid) for p in self.processes.values() if p.poll() is None)
+    def cpu_seconds(self, bridges: bool = False) -> float:
+        """CPU time that the living processes have used, or those of the bridges alone."""
+        return sum(_cpu_seconds(p.pid) for name, p in self.processes.items() if p.poll() is None
+                   and (not bridges or name in (BRIDGES_COMPOSED, *BRIDGES)))
 
     def kill(self, name: str) -> None:
         """End one process as a crash would."""
@@ -84,14 +91,18 @@ class Graph:
 
     def stop(self) -> list[str]:
         """
-        Stop everything, the recorder last so that the bag has the end.
+        Stop everything: bridges first, which switch the actuators off while these are there.
+
+        The recorder comes last, so that the bag has the end.
 
         Returns:
             Names of the processes that had to be killed.
 
         """
+        first = [name for name in self.processes if name in (BRIDGES_COMPOSED, *BRIDGES)]
         last = [name for name in self.processes if name == 'recorder_node']
-        return self._end([n for n in self.processes if n not in last]) + self._end(last)
+        others = [name for name in self.processes if name not in (*first, *last)]
+        return self._end(first) + self._end(others) + self._end(last)
 
     def _end(self, names):
         """Interrupt, again each second: a process that still imports may swallow the first."""
