@@ -101,9 +101,9 @@ def test_a_joint_without_torque_ignores_its_target_and_only_its_damping_slows_it
         tilt, rate = made.state[0][7:], made.state[1][6:]
         turned, left = damped(k * TICK, np.array([8.0, 30.0]))
         np.testing.assert_allclose(tilt[1:3], turned, atol=1e-4)
-        np.testing.assert_allclose(rate[1:3], left, rtol=1e-2, atol=1e-6)
+        np.testing.assert_allclose(rate[1:3], left, rtol=1e-2, atol=1e-3)
         expected, _ = second_order(k * TICK, 0.1)
-        np.testing.assert_allclose(tilt[[0, 3]], expected, atol=2e-5)
+        np.testing.assert_allclose(tilt[[0, 3]], expected, atol=1e-4)
 
 
 def test_a_joint_without_torque_is_not_stiffened_by_a_weak_motors_limits():

@@ -60,6 +60,7 @@ class EmulatedMotorBoard:
         self._lock = threading.RLock()
         self._firmware = BoardFirmware(self._parameters, robot.battery.cells, time.monotonic())
         self._voltage, self._current = robot.battery.full_voltage, 0.0
+        self._error = 0.0, 0.0
         self._thrust: np.ndarray | None = None
         self._parser = mavlink.Parser()
         self._incoming, self._outgoing = Line(seed), Line(seed + 1)
@@ -128,9 +129,18 @@ class EmulatedMotorBoard:
         """Reason -> targets not followed since the board's start."""
         return dict(self._firmware.refused)
 
-    def set_battery(self, voltage: float, current: float) -> None:
-        """Tell the pack's voltage under load [V] and the current drawn [A, positive]."""
-        self._voltage, self._current = float(voltage), float(current)
+    def set_battery(self, voltage: float, current: float,
+                    error: tuple[float, float] = (0.0, 0.0)) -> None:
+        """
+        Tell the pack's state.
+
+        Args:
+            voltage: true one under load [V].
+            current: true one drawn [A, positive].
+            error: what the board measures more than these [V, A].
+
+        """
+        self._voltage, self._current, self._error = float(voltage), float(current), error
 
     def set_rotors(self, thrust: np.ndarray, temperature: np.ndarray | None = None) -> None:
         """Tell the rotors' present thrusts (4,) [N] and, if known, ESC temperatures (4,) [C]."""
@@ -209,7 +219,8 @@ class EmulatedMotorBoard:
     def _measure(self, now):
         """Write into the sensors what the world is like."""
         telemetry = self._firmware.telemetry
-        telemetry.voltage, telemetry.current = self.voltage, self._current
+        telemetry.voltage = self.voltage + self._error[0]
+        telemetry.current = self._current + self._error[1]
         telemetry.failed = frozenset(rotor - 1 for rotor in self.faults.failed_escs)
         thrust = self._thrust
         if thrust is None:

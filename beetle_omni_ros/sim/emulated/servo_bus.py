@@ -117,6 +117,21 @@ class EmulatedServoBus:
 
     # --- the plant's side ---------------------------------------------------------------------
 
+    def drive(self) -> tuple[list[float], list[bool], list[bool]]:
+        """
+        All that a plant needs to know, of one moment.
+
+        Returns:
+            what :attr:`goals`, :attr:`torque_enabled` and :attr:`stopped` tell.
+
+        """
+        with self._lock:
+            # What has arrived counts, also where the thread had no turn on a busy computer.
+            self._serve(time.monotonic())
+            servos = self.servos
+            return ([servo.goal for servo in servos], [servo.torque for servo in servos],
+                    [servo.expired for servo in servos])
+
     @property
     def goals(self) -> np.ndarray:
         """(n,) joint angles that the servos drive to [rad]."""
