@@ -7,6 +7,7 @@ from math import ceil
 
 import numpy as np
 
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.command_link import ROUNDING
 from beetle_omni_ros.sim.emulated import fault_switches
 from beetle_omni_ros.sim.emulated.fault_switches import BoardFaultSwitches, ServoFaultSwitches
@@ -110,13 +111,17 @@ class EmulatedActuators:
         Switch faults on and off; events that are set happen now.
 
         Raises:
-            ParameterError: a servo or rotor that is none; nothing is changed then.
+            ParameterError: a servo or rotor that is none, and nothing is changed then; or a port
+                whose path is taken when it is plugged in again.
 
         """
         fault_switches.check_servo_faults(servo, self.bus)
         fault_switches.check_board_faults(board)
-        fault_switches.set_servo_faults(servo, self.bus)
-        fault_switches.set_board_faults(board, self.board)
+        try:
+            fault_switches.set_servo_faults(servo, self.bus)
+            fault_switches.set_board_faults(board, self.board)
+        except OSError as error:
+            raise ParameterError(str(error)) from None
         self._servo_faults, self._board_faults = servo, board
 
     @property
@@ -125,6 +130,15 @@ class EmulatedActuators:
         return [f'{device} {text}' for device, faults in
                 (('servo', self._servo_faults), ('board', self._board_faults))
                 for text in fault_switches.switched_on(faults)]
+
+    def status(self) -> dict[str, object]:
+        """What the devices are doing and have refused, for diagnostics."""
+        bus, board = self.bus, self.board
+        return {'servo_port': bus.port, 'board_port': board.port, 'armed': board.armed,
+                'torque': [bool(on) for on in bus.torque_enabled],
+                'stopped': [bool(on) for on in bus.stopped],
+                'servo refused': bus.network.refusals,
+                **{f'board refused: {reason}': count for reason, count in board.refused.items()}}
 
 
 def _line(delay, tick, make):

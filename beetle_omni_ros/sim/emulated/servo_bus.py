@@ -20,7 +20,7 @@ from beetle_omni_ros.sim.emulated.servo import EmulatedServo
 from beetle_omni_ros.sim.emulated.servo_motion import SecondOrderMotion
 from beetle_omni_ros.sim.emulated.servo_network import ServoNetwork
 
-WATCH = 0.005      # [s] how often watchdogs and temperatures are looked at
+WATCH = 0.01       # [s] how often watchdogs and temperatures are looked at
 PAUSE = 0.05       # [s] silence after which an unfinished packet is forgotten
 BITS_PER_BYTE = 10  # start, eight data, stop
 
@@ -181,8 +181,9 @@ class EmulatedServoBus:
     def replug(self):
         """Put the cable back."""
         with self._lock:
-            self._terminal.plug()
-            self._forget()
+            if not self._terminal.plugged:
+                self._terminal.plug()
+                self._forget()
 
     def _forget(self):
         self._receiver.forget()
