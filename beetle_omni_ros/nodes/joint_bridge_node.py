@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 import time
 
 from sensor_msgs.msg import JointState
@@ -55,7 +56,7 @@ class JointBridgeNode(LifecycleFlightNode):
         self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
         self._bus = self._loop = None
         self._was_active = ''
-        self._latency = health.Distribution()
+        self._latency, self._since = health.Distribution(), 'publication'
         self._state = self.create_publisher(String, 'joint_bridge/state', qos.LATCHED)
         self._told = ''
         self._joints = self.create_publisher(JointState, 'joint_states', qos.SENSOR)
@@ -148,6 +149,8 @@ class JointBridgeNode(LifecycleFlightNode):
 
     def _on_command(self, command, published):
         if self._loop is not None:
+            if math.isnan(published):
+                self._since, published = 'arrival', time.time()
             left = COMMAND_AGE - max(0.0, self.now() - command.stamp)
             self._loop.offer(Goal(command.tilt, published, time.monotonic() + left))
 
@@ -195,7 +198,7 @@ class JointBridgeNode(LifecycleFlightNode):
 
     def _latency_status(self):
         times = self._latency
-        return health.OK, 'publication of command (source timestamp) to its last byte written', {
+        return health.OK, f'{self._since} of command to its last byte written', {
             'median_ms': 1e3 * times.quantile(0.5), 'p99_ms': 1e3 * times.quantile(0.99),
             'max_ms': 1e3 * times.max, 'count': times.count}
 

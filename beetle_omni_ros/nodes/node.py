@@ -9,7 +9,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from beetle_omni_ros.nodes import convert, instance, parameters, publication, qos
+from beetle_omni_ros.nodes import arrival, convert, instance, parameters, qos
 from beetle_omni_ros.nodes.health import Health
 
 # A stamp this far ahead of the clock comes from another clock.
@@ -74,13 +74,13 @@ class FlightNode(Node):
             profile: quality of service.
             max_age: refuse stamps older than this, or ahead of the clock [s]; None: any.
             stale_after: silence that is an error, once the topic came [s]; None: none.
-            published: ``handle`` gets as well when the message was published [system s].
+            published: pass the time of publication [s, system time, or nan] to ``handle`` too.
 
         """
         health = self.health
         health.watch(topic, stale_after)
 
-        def callback(message, *sent):
+        def callback(message, *publication):
             try:
                 value = read(message)
             except convert.MessageError as error:
@@ -93,11 +93,10 @@ class FlightNode(Node):
                 health.rejected(topic, 'stamp in the future')
             else:
                 health.received(topic, age)
-                handle(value, *sent)
+                handle(value, *publication)
 
-        if published:
-            callback = publication.with_time(callback)
-        self.create_subscription(message_type, topic, callback, profile)
+        taken = arrival.with_publication(callback) if published else callback
+        self.create_subscription(message_type, topic, taken, profile)
 
     def timed(self, function: Callable, *args):
         """Call ``function`` and count its CPU and wall time."""
