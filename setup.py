@@ -13,7 +13,7 @@ from setuptools import find_packages, setup
 
 PACKAGE = 'beetle_omni_ros'
 NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node',
-         'recorder_node', 'viewer_node')
+         'recorder_node', 'viewer_node', 'joint_bridge_node')
 
 
 def version():

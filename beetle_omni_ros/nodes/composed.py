@@ -10,7 +10,7 @@ from beetle_omni_ros.nodes import runner
 NODES = {'sim_node': 'SimNode', 'ekf_node': 'EkfNode', 'nmpc_node': 'NmpcNode',
          'rl_node': 'RlNode', 'supervisor_node': 'SupervisorNode',
          'reference_node': 'ReferenceNode', 'recorder_node': 'RecorderNode',
-         'viewer_node': 'ViewerNode'}
+         'viewer_node': 'ViewerNode', 'joint_bridge_node': 'JointBridgeNode'}
 
 
 def main(args=None):

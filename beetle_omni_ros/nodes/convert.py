@@ -174,9 +174,9 @@ def joints(message: JointState) -> Joints:
                   finite(velocity, 'velocity'))
 
 
-def joint_message(stamp, position, velocity, effort=()) -> JointState:
-    """Write the four measured tilt joints."""
-    message = JointState(name=list(JOINT_NAMES), position=_floats(position),
+def joint_message(stamp, position, velocity, effort=(), names=JOINT_NAMES) -> JointState:
+    """Write the measured tilt joints, all four or those in ``names``."""
+    message = JointState(name=list(names), position=_floats(position),
                          velocity=_floats(velocity), effort=_floats(effort))
     _header(message, stamp, '')
     return message
