@@ -147,9 +147,8 @@ class RotorBridgeNode(FlightNode):
         if self._absent and text.startswith('waiting'):
             text = f'waiting: {self._absent}'       # says why the port is away
         if text != self._state:
-            lost = text.startswith('lost')
-            if lost or self._state.startswith('lost'):
-                self._log('error' if lost else 'info', f'motor board: {text}')
+            if text.startswith('lost'):
+                self._log('error', f'motor board: {text}')
             self._state = text
             self._states.publish(String(data=text))
 
