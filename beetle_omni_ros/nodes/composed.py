@@ -9,6 +9,7 @@ from beetle_omni_ros.nodes import runner
 
 NODES = {'sim_node': 'SimNode', 'ekf_node': 'EkfNode', 'nmpc_node': 'NmpcNode',
          'rl_node': 'RlNode', 'supervisor_node': 'SupervisorNode',
+         'rotor_bridge_node': 'RotorBridgeNode',
          'reference_node': 'ReferenceNode', 'recorder_node': 'RecorderNode',
          'viewer_node': 'ViewerNode', 'joint_bridge_node': 'JointBridgeNode'}
 

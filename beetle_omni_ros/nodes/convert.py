@@ -212,6 +212,13 @@ def battery_message(stamp: float, voltage: float, current: float, cells: int) ->
     return message
 
 
+def rotor_message(stamp: float, speed: np.ndarray) -> JointState:
+    """Write the four rotors' speeds [rad/s], positive whatever the spin; NaN unknown."""
+    message = JointState(name=list(ROTOR_NAMES), velocity=_floats(speed))
+    _header(message, stamp, '')
+    return message
+
+
 def battery(message: BatteryState) -> Battery:
     """Read the pack."""
     if not isfinite(message.voltage):

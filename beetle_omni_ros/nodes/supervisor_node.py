@@ -77,6 +77,9 @@ class SupervisorNode(FlightNode):
         for name in CONTROLLERS:
             self.listen(JointState, f'{name}/command', convert.command, self._on_command(name),
                         qos.COMMAND, stale_after=None)
+        for name in ('joint', 'rotor'):
+            self.create_subscription(String, f'{name}_bridge/state', self._on_bridge(name),
+                                     qos.LATCHED)
 
     def _changed(self, new):
         answer = self._supervisor.select(new.controller, self.now())
@@ -112,6 +115,12 @@ class SupervisorNode(FlightNode):
             accepted = supervisor.on_command(name, command, self.now())
             if accepted and name == supervisor.active and supervisor.state == FLYING:
                 self._update()      # on with it at once, not at the next look
+        return handle
+
+    def _on_bridge(self, name):
+        def handle(message):
+            self._supervisor.on_actuators(name, message.data, self.now())
+            self._update()
         return handle
 
     def _update(self):
