@@ -12,7 +12,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from witness import PATIENT, READY, Witness
 
 from beetle_omni_ros.nodes.actuators import bridged, BRIDGES
-from beetle_omni_ros.nodes.graph import BRIDGES_COMPOSED, Graph
+from beetle_omni_ros.nodes.graph import Graph
 
 FLYING = 'flying:nmpc'
 DEVICES = 'sim_node: devices'
