@@ -15,6 +15,7 @@ import beetle_omni_ros
 from beetle_omni_ros.nodes.actuators import BRIDGES
 
 COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'
+PORT_TIMEOUT = 30.0     # s for the simulator to make its serial ports
 STOP_TIMEOUT = 8.0      # s for a process to stop by itself before it is killed
 
 
@@ -36,6 +37,8 @@ class Graph:
         """Prepare; :meth:`start` starts."""
         self.folder, self.domain = Path(folder), domain
         self.nodes = list(parameters)
+        simulator = parameters.get('sim_node', {})
+        self._ports = [port for port in map(simulator.get, ('servo_port', 'board_port')) if port]
         self._file = self.folder / 'parameters.yaml'
         self._file.write_text(yaml.safe_dump(
             {f'/**/{node}': {'ros__parameters': values}
@@ -50,9 +53,22 @@ class Graph:
         self.processes: dict[str, subprocess.Popen] = {}
 
     def start(self) -> None:
-        """Start every process; each ends with this one, however this one ends."""
+        """
+        Start every process, the bridges when the ports of a simulator are there.
+
+        Each ends with this process, however this one ends.
+        """
         for name in self._commands:
-            self.start_process(name)
+            if name not in (BRIDGES_COMPOSED, *BRIDGES):
+                self.start_process(name)
+        # They would wait for their ports too, but complain.
+        deadline = time.monotonic() + PORT_TIMEOUT
+        while not all(map(os.path.exists, self._ports)) and time.monotonic() < deadline \
+                and not self.dead():
+            time.sleep(0.05)
+        for name in self._commands:
+            if name in (BRIDGES_COMPOSED, *BRIDGES):
+                self.start_process(name)
 
     def start_process(self, name: str) -> subprocess.Popen:
         """Start one process, also again after it died."""

@@ -193,7 +193,10 @@ class EmulatedMotorBoard:
         self._executes = executes = self._firmware.runs(now)
         if executed and not executes:
             self._forget()
-        for frame in frames(self._terminal.read()):
+        received = self._terminal.read()
+        # A board reads its clock after the question; this thread may have waited in between.
+        now = time.monotonic()
+        for frame in frames(received):
             self._incoming.put(frame, now, faults.corrupt_in, faults.drop_in, faults.delay_in)
         data = self._incoming.take(now)
         if executes:
