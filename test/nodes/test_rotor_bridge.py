@@ -12,6 +12,11 @@ pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
 from rotor_bench import bench, HOVER, NODE, QUICK, SOON, START
+from std_msgs.msg import String
+
+from beetle_omni_ros.nodes import qos
+from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes.operator import Operator
 
 
 @pytest.fixture(scope='module')
@@ -251,3 +256,29 @@ def test_a_port_that_is_absent_is_waited_for_and_named(tmp_path):
         assert commander.reaches('ready'), (commander.told, made.log)
         made.take_off()
         assert made.log[0].count('cannot be opened') == 1
+
+
+def test_supervisor_node_refuses_to_arm_in_the_words_of_the_bridges(ros_domain, tmp_path):
+    graph = Graph({'supervisor_node': {}}, tmp_path, ros_domain, composed=False)
+    operator = None
+    try:
+        graph.start()
+        operator = Operator(ros_domain)
+        bridges = {name: operator._node.create_publisher(String, f'{name}_bridge/state',
+                                                         qos.LATCHED)
+                   for name in ('joint', 'rotor')}
+        assert operator.wait(lambda: operator.state == 'disarmed', START), graph.dead()
+        for name, text, answer in (
+                ('rotor', 'waiting: battery low', 'rotor_bridge_node waiting: battery low'),
+                ('joint', 'lost: gimbal3 silent', 'joint_bridge_node lost: gimbal3 silent; '
+                                                  'rotor_bridge_node waiting: battery low'),
+                ('rotor', 'ready', 'joint_bridge_node lost: gimbal3 silent')):
+            bridges[name].publish(String(data=text))
+            assert operator.wait(lambda answer=answer: operator.call('arm') == (
+                False, f'arm refused: {answer}'), SOON), operator.call('arm')
+        bridges['joint'].publish(String(data='ready'))
+        assert operator.wait(lambda: 'no fresh state estimate' in operator.call('arm')[1], SOON)
+    finally:
+        graph.stop()
+        if operator:
+            operator.close()
