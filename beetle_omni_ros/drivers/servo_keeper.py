@@ -210,6 +210,8 @@ class ServoKeeper:
         except ServoBusError:
             pass
         servo.silent, servo.misses = False, 0
+        for other in self._servos:
+            other.next_probe = now  # perhaps it was the bus
         self.say(f'{self._place(servo)}: answers again')
         self.recover(servo)
 
