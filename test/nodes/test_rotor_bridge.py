@@ -55,7 +55,9 @@ def test_it_arms_at_takeoff_follows_the_thrusts_and_disarms_with_the_supervisor(
         assert commander.wait(lambda thrust=thrust: bridge.follows(thrust), SOON)
     commander.supervise('disarmed')
     assert commander.wait(lambda: not board.armed, SOON) and not board.commands.any()
-    assert set(commander.told) <= {'ready', 'waiting: throttle not low'}
+    assert commander.wait(lambda: 'waiting: throttle not low' in commander.told
+                          and commander.bridge == 'ready', SOON), commander.told
+    assert not any(text.startswith('lost') for text in commander.told)
 
 
 def test_thrusts_arrive_at_a_sagging_battery(flying):
