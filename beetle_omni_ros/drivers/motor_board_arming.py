@@ -87,9 +87,10 @@ class Arming:
     @property
     def missing(self) -> str:
         """What would keep the board from arming now, on either side; '' when nothing."""
-        missing = self._board.ready or ', '.join(
-            text for text in self._board.status.conditions if text in BLOCKS_ARMING)
-        return missing or ('' if self._supervisor else 'nothing heard of the supervisor')
+        missing = self._board.ready or self._disarm and 'disarming is not confirmed yet'
+        blocking = missing or ', '.join(text for text in self._board.status.conditions
+                                        if text in BLOCKS_ARMING)
+        return blocking or ('' if self._supervisor else 'nothing heard of the supervisor')
 
     def _look_at_answer(self, elapsed):
         answer, status = self._command.result, self._board.status

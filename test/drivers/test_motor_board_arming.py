@@ -86,6 +86,9 @@ def test_it_waits_for_the_board_and_for_the_supervisor_and_says_for_which(bench)
     board.status = DISARMED
     assert arming.text == 'waiting: nothing heard of the supervisor'
     arming.follow('disarmed')
+    assert arming.text == 'waiting: disarming is not confirmed yet'
+    board.answer()
+    arming.update(CYCLE)
     assert arming.text == 'ready'
 
 
@@ -123,6 +126,8 @@ def test_a_refusal_to_arm_is_told_and_not_tried_again(bench):
         arming.update(CYCLE)
     assert board.asked is False
     arming.follow('disarmed')
+    board.answer()
+    arming.update(CYCLE)
     assert arming.text == 'ready'
 
 
@@ -152,6 +157,7 @@ def test_a_board_that_stopped_in_flight_is_lost_until_the_supervisor_is_disarmed
         assert arming.text == f'lost: {why}' and board.asked is False
     arming.follow('disarmed')
     board.answer()
+    arming.update(CYCLE)
     assert arming.text == 'ready'
     arming.follow('takeoff')
     assert board.asked is True
@@ -210,7 +216,7 @@ def test_the_real_driver_and_board_follow_it():
             return until(lambda: arming.update(CYCLE) or condition())
 
         arming.follow('disarmed')
-        assert arming.text == 'ready'
+        assert reaches(lambda: arming.text == 'ready')
         arming.follow('takeoff')
         assert reaches(lambda: arming.phase == 'flies') and emulated.armed
         emulated.reboot()

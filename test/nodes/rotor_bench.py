@@ -40,6 +40,7 @@ class Commander(Operator):
         node = self._node
         self.told, self.batteries, self.rotors = [], [], []
         self.thrust, self.period, self.age, self.stamps = None, 0.01, 0.0, []
+        self.supervised = ''
         self._supervisor = node.create_publisher(String, 'supervisor/state', qos.LATCHED)
         self._commands = node.create_publisher(JointState, 'command', qos.COMMAND)
         node.create_subscription(String, 'rotor_bridge/state',
@@ -61,6 +62,7 @@ class Commander(Operator):
 
     def supervise(self, state):
         """Say what the supervisor says."""
+        self.supervised = state
         self._supervisor.publish(String(data=state))
 
     @property
@@ -111,8 +113,11 @@ class Bench:
         board.plug()
         board.set_battery(25.2, 0.0)
         commander.thrust, commander.period, commander.age = None, 0.01, 0.0
+        flew, told = commander.supervised != 'disarmed', len(commander.told)
         commander.supervise('disarmed')
-        return commander.wait(lambda: not board.armed, SOON) and commander.reaches('ready')
+        # The 'ready' of the flight is not yet that of the ground.
+        return commander.wait(lambda: not flew or len(commander.told) > told, SOON) \
+            and commander.reaches('ready') and not board.armed
 
     @property
     def log(self):
