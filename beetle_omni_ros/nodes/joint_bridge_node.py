@@ -96,7 +96,7 @@ class JointBridgeNode(LifecycleFlightNode):
 
     def deactivate(self):
         """Take the torque off."""
-        if self.refusal == '' and self._bus.enabled:
+        if self._bus.enabled:
             self._was_active = 'no torque, deactivated'
         with self._loop.exclusive() as bus:
             confirmed = bus.disable()
@@ -116,8 +116,9 @@ class JointBridgeNode(LifecycleFlightNode):
             loop.stop()
             self._log(loop)
         bus.close()
-        for line in bus.take_events():
-            self.get_logger().warning(line)
+        if loop is not None:    # else a refusal has said what there is to say
+            for line in bus.take_events():
+                self.get_logger().warning(line)
 
     def close(self):
         """Leave no torque behind."""

@@ -42,7 +42,7 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
         """Open the device; whatever was opened when it raises, :meth:`release` closes."""
 
     def activate(self) -> None:
-        """Power the device."""
+        """Power the device; when it raises, nothing has power."""
 
     def deactivate(self) -> None:
         """Take the power off."""
@@ -82,19 +82,19 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Power."""
-        return self._attempt('activate', self.activate, self.deactivate)
+        return self._attempt('activate', self.activate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take the power off; the operator has decided, no more starts by itself."""
-        return self._attempt('deactivate', self._ordered(self.deactivate), self.release)
+        return self._attempt('deactivate', self._ordered(self.deactivate))
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close."""
-        return self._attempt('clean up', self._ordered(self.release), self.release)
+        return self._attempt('clean up', self._ordered(self.release))
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close for good."""
-        return self._attempt('shut down', self._ordered(self.release), self.release)
+        return self._attempt('shut down', self._ordered(self.release))
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close after a mistake in the code; it can be configured again."""
@@ -108,7 +108,7 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
             action()
         return act
 
-    def _attempt(self, what, action, undo):
+    def _attempt(self, what, action, undo=lambda: None):
         before, self.refusal = self.refusal, ''
         try:
             action()
