@@ -22,7 +22,7 @@ def sent(saturated=NONE, reason=''):
     ([0.007, 0.003, 0.0051], 3, 0),     # nearer to one period than to two
     ([0.005, 0.0076, 0.005], 4, 1),
     ([0.005, 0.021, 0.005], 6, 3),
-    ([0.001, 0.0], 2, 0)])
+    ([0.001, 0.0, 0.004], 1, 0)])
 def test_a_period_without_a_target_is_missed(gaps, cycles, missed):
     stream = TargetStream(PERIOD)
     for now in 100 + np.cumsum([0.0, *gaps]):
