@@ -47,7 +47,7 @@ class TargetStream:
         if self._last is not None:
             # What lies nearer to one period than to two was in time.
             cycles = round((now - self._last) / self._period)
-            self.cycles += max(cycles, 1)
+            self.cycles += cycles
             self.missed += max(cycles - 1, 0)
         self._last = now
         self.command = sent.command
