@@ -124,6 +124,11 @@ class MotorBoard:
         return self._watch.status
 
     @property
+    def connected(self) -> bool:
+        """Whether the port is there, so that targets can be sent."""
+        return self._link.connected
+
+    @property
     def ready(self) -> str:
         """What is missing for arming on this side; '' when nothing is."""
         status, now = self._watch.status, time.monotonic()

@@ -19,7 +19,8 @@ class Arming:
     Keeps the board armed while the supervisor flies, and only then.
 
     It arms once, when the supervisor leaves 'disarmed'. A board that is lost afterwards is
-    disarmed and left alone until the supervisor has been 'disarmed' again.
+    disarmed and left alone until the supervisor has been 'disarmed' again. One that is merely not
+    heard, while targets can be sent, goes on: its rotors carry the robot to the ground.
 
     Attributes:
         phase: 'rests', 'arms', 'flies' or 'lost'; targets are for 'flies' alone.
@@ -31,7 +32,7 @@ class Arming:
         self._board = board
         self._command: ArmCommand | None = None
         self._supervisor = ''
-        self._lost = ''
+        self._lost = self._deaf = ''
         self._gone = 0.0
         self._disarm = False        # whether the board has yet to confirm it
         self.phase = RESTS
@@ -62,7 +63,11 @@ class Arming:
             self._gone = self._gone + elapsed if missing else 0.0
             if status is None or not status.armed:
                 self._lose(_ending(status))
-            elif self._gone >= PATIENCE:
+            elif self._gone < PATIENCE:
+                self._deaf = self._deaf and missing
+            elif self._board.connected:
+                self._deaf = missing
+            else:
                 self._lose(missing)
         else:
             answer = self._command and self._command.result
@@ -78,9 +83,11 @@ class Arming:
 
     @property
     def text(self) -> str:
-        """What the supervisor needs to know: 'ready', 'waiting: WHY' or 'lost: WHY'."""
+        """What the supervisor needs to know: 'ready', 'waiting:', 'silent:' or 'lost: WHY'."""
         if self.phase == LOST:
             return f'lost: {self._lost}'
+        if self.phase == FLIES and self._deaf:
+            return f'silent: {self._deaf}'
         missing = self.missing if self.phase == RESTS else ''
         return f'waiting: {missing}' if missing else 'ready'
 
@@ -99,7 +106,7 @@ class Arming:
         if not answer.accepted:
             self._lose(f'not armed: {answer.reason}')
         elif status.armed:
-            self.phase, self._gone = FLIES, 0.0
+            self.phase, self._gone, self._deaf = FLIES, 0.0, ''
         else:
             self._gone += elapsed       # the link's thread is just about to note it
             if self._gone >= PATIENCE:

@@ -174,6 +174,18 @@ def joints(message: JointState) -> Joints:
                   finite(velocity, 'velocity'))
 
 
+def known_joints(message: JointState) -> Joints:
+    """Read those tilt joints that the message names; angle and rate of the others are nan."""
+    names = [name for name in JOINT_NAMES if name in message.name]
+    order = _order(message.name, names)
+    position, velocity = np.full((2, 4), np.nan)
+    places = [JOINT_NAMES.index(name) for name in names]
+    position[places] = finite(_values(message.position, order, 'position'), 'position')
+    velocity[places] = finite(_values(message.velocity, order, 'velocity'), 'velocity') \
+        if len(message.velocity) else 0.0
+    return Joints(seconds(message.header.stamp), position, velocity)
+
+
 def joint_message(stamp, position, velocity, effort=(), names=JOINT_NAMES) -> JointState:
     """Write the measured tilt joints, all four or those in ``names``."""
     message = JointState(name=list(names), position=_floats(position),

@@ -175,7 +175,7 @@ class JointBridgeNode(LifecycleFlightNode):
             self._log(self._loop)
         text = self._state_text()
         if text != self._told:
-            if text.startswith('lost'):
+            if text.startswith('lost') and not self._was_active:
                 self.get_logger().error(text)
             else:
                 self.get_logger().info(text)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-READY = 'ready'
+READY, SILENT, LOST = 'ready', 'silent:', 'lost:'
 NODES = {'joint': 'joint_bridge_node', 'rotor': 'rotor_bridge_node'}
 
 
 class Actuators:
     """
-    The newest state of each bridge: 'ready', 'waiting: WHY' or 'lost: WHY'.
+    The newest state of each bridge: 'ready', 'waiting: WHY', 'silent: WHY' or 'lost: WHY'.
 
     A bridge that was never heard has no influence: without bridges the simulator takes commands
     directly.
@@ -29,6 +29,16 @@ class Actuators:
         """'' while bridge ``name`` obeys or was never heard, else its node and what it said."""
         told = self._told.get(name, READY)
         return '' if told == READY else f'{NODES[name]} {told}'
+
+    @property
+    def rotors_may_turn(self) -> bool:
+        """Whether the motor board may still follow, although it is not heard."""
+        return self._told.get('rotor', '').startswith(SILENT)
+
+    @property
+    def joints_lost(self) -> bool:
+        """Whether some joint does not follow."""
+        return self._told.get('joint', '').startswith(LOST)
 
     @property
     def why_not_arm(self) -> str:

@@ -59,7 +59,7 @@ class Inputs:
         return not reason
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
-        """Take raw joint feedback (4,), beside what comes with the state."""
+        """Take raw joint feedback (4,), nan where unknown, beside what comes with the state."""
         return not self._ahead(stamp) and self.vehicle.on_joints(stamp, position, velocity)
 
     def on_imu(self, stamp: float, specific_force: np.ndarray,
@@ -91,7 +91,7 @@ class Inputs:
 
         Args:
             name: 'joint' or 'rotor'.
-            text: 'ready', 'waiting: WHY' or 'lost: WHY'.
+            text: 'ready', 'waiting: WHY', 'silent: WHY' or 'lost: WHY'.
             now: time [s].
 
         Returns:
@@ -99,6 +99,7 @@ class Inputs:
 
         """
         known = self.actuators.tell(name, text)
+        self.vehicle.stuck = self.actuators.joints_lost
         if not known:
             self._say(now, WARNING, f"unknown bridge '{name}'", 'unknown bridge')
         return known

@@ -150,9 +150,12 @@ class Supervisor(Inputs):
         if vehicle.battery_low:
             self._say(now, WARNING, f'battery low: {vehicle.voltage:.1f} V', 'battery')
         no_rotors, no_joints = map(self.actuators.fault, ('rotor', 'joint'))
-        if no_rotors:
+        if no_rotors and not self.actuators.rotors_may_turn:
             return self._lose_rotors(now, no_rotors)
         if self.state == LANDING:
+            return
+        if no_rotors:
+            self._land(now, ERROR, f'{no_rotors}: landing while it may follow')
             return
         if vehicle.estimate.silent:
             why = f' (last refused: {vehicle.last_refusal})' if vehicle.last_refusal else ''

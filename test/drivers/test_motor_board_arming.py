@@ -30,6 +30,7 @@ class Cardboard:
 
     def __init__(self):
         self.ready, self.status, self.commands = '', DISARMED, []
+        self.connected = True
 
     def start_arm(self):
         return self._start(Command(True))
@@ -163,9 +164,12 @@ def test_a_board_that_stopped_in_flight_is_lost_until_the_supervisor_is_disarmed
     assert board.asked is True
 
 
-def test_a_board_that_is_not_heard_is_lost_after_patience_and_a_pause_of_our_own_is_no_silence(
-        bench):
+@pytest.mark.parametrize(('connected', 'text'), [
+    (True, 'silent: nothing heard of the board'), (False, 'lost: nothing heard of the board')])
+def test_a_board_that_is_not_heard_is_told_after_patience_and_a_pause_of_our_own_is_no_silence(
+        bench, connected, text):
     board, arming = in_flight(bench)
+    board.connected = connected
     for _ in range(20):     # held up again and again, but heard in between
         board.ready = 'nothing heard of the board'
         arming.update(10.0)
@@ -177,7 +181,11 @@ def test_a_board_that_is_not_heard_is_lost_after_patience_and_a_pause_of_our_own
         arming.update(10.0)
     assert arming.phase == 'flies'
     arming.update(10.0)
-    assert arming.text == 'lost: nothing heard of the board'
+    assert arming.text == text
+    assert board.asked is connected     # one that may still fly is not disarmed
+    board.ready = ''
+    arming.update(CYCLE)
+    assert arming.text == ('ready' if connected else text)
 
 
 @pytest.mark.parametrize('states', [['flying:nmpc'], ['disarmed', 'emergency_stop', 'takeoff']])

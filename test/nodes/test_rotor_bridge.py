@@ -133,15 +133,13 @@ def test_a_stream_that_stays_away_disarms_and_is_not_armed_again_in_this_flight(
 @pytest.mark.parametrize(('fault', 'why'), [
     (lambda board: board.reboot(), 'lost: restarted'),
     (lambda board: board.hang(), 'lost: restarted (watchdog reset)'),
-    (lambda board: board.unplug(), 'lost: {port}: port is away'),
-    (lambda board: setattr(board.faults, 'mute', True), 'lost: nothing heard of the board')])
+    (lambda board: board.unplug(), 'lost: {port}: port is away')])
 def test_a_lost_board_stays_disarmed_until_the_supervisor_was(flying, fault, why):
     board, commander = flying.board, flying.commander
     fault(board)
     assert commander.reaches(why.format(port=board.port)), commander.told
     assert commander.wait(lambda: not board.armed and not board.commands.any(), SOON)
     board.plug()
-    board.faults.mute = False
     commander.spin(0.3)         # the supervisor goes on, and the board could be armed again
     assert commander.bridge.startswith('lost') and not board.armed
     commander.supervise('emergency_stop')
@@ -151,6 +149,19 @@ def test_a_lost_board_stays_disarmed_until_the_supervisor_was(flying, fault, why
     commander.supervise('disarmed')
     assert commander.reaches('ready'), commander.told
     flying.take_off()
+
+
+def test_a_board_that_is_not_heard_keeps_its_targets_until_the_supervisor_is_down(flying):
+    board, commander = flying.board, flying.commander
+    board.faults.mute = True
+    assert commander.reaches('silent: nothing heard of the board'), commander.told
+    commander.spin(0.3)
+    assert board.armed and board.commands.all()
+    commander.thrust = None
+    commander.supervise('disarmed')
+    assert commander.wait(lambda: not board.armed, SOON)
+    board.faults.mute = False
+    assert commander.reaches('ready'), commander.told
 
 
 @pytest.mark.parametrize('faults', [

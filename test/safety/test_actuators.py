@@ -68,6 +68,16 @@ def test_a_lost_motor_board_in_flight_stops_everything_until_disarmed(landing):
     assert puppet.supervisor.disarm(puppet.now)
 
 
+def test_a_motor_board_that_is_not_heard_carries_the_robot_to_the_ground():
+    puppet = Puppet().fly()
+    told(puppet, 'rotor', 'silent: nothing heard of the board')
+    assert puppet.supervisor.state == 'landing' and puppet.command.thrust.any()
+    assert any('silent: nothing heard of the board: landing' in said
+               for said in puppet.texts('error'))
+    told(puppet, 'rotor', 'lost: restarted')
+    assert puppet.supervisor.state == 'emergency_stop'
+
+
 @pytest.mark.parametrize('name', ['joint', 'rotor'])
 def test_a_bridge_lost_before_lift_off_just_stops_the_motors(name):
     puppet = Puppet()
