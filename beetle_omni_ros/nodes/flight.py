@@ -80,11 +80,11 @@ class Flight:
                 raise FlightError(f"the flight ended early, supervisor in '{operator.state}'")
             if flown > self._task.duration + SPARE_TIME:
                 raise FlightError(f"the task hangs at '{operator.progress}'")
-        for name, key in (('median_ms', 'latency_median_ms'), ('p99_ms', 'latency_p99_ms'),
-                          ('max_ms', 'latency_max_ms')):
-            value = operator.values('sim_node: latency').get(name)
+        status, prefix = ('rotor_bridge_node', 'age_') if self._bridges else ('sim_node', '')
+        for name in ('median_ms', 'p99_ms', 'max_ms'):
+            value = operator.values(f'{status}: latency').get(prefix + name)
             if value is not None:
-                self.measured[key] = float(value)
+                self.measured[f'latency_{name}'] = float(value)
         self.measured.update(counts.measured())
 
     def _measure(self, key, seconds, start):

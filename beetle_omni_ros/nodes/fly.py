@@ -179,8 +179,9 @@ def _print_measured(meta, console):
                       + (f", of it {measured['bridges_cpu_percent']:.0f} % in the bridges"
                          if 'bridges_cpu_percent' in measured else ''))
     if 'latency_p99_ms' in measured:
-        console.print('latency, stamp of the IMU sample to the arrival of its command at the '
-                      f"actuators: {_times(measured, 'latency')}")
+        end = 'its command at the actuators' if meta['actuators'] == 'direct' \
+            else 'the last byte of its command to the motor board'
+        console.print(f"latency, stamp of the IMU sample to {end}: {_times(measured, 'latency')}")
     for name, text in (('servos', 'servo bus'), ('motor_board', 'motor board')):
         if f'{name}_cycles' in measured:
             console.print(f"{text}: {measured[f'{name}_cycles']} cycles of 5 ms, "

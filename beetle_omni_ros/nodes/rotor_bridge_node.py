@@ -74,10 +74,11 @@ class RotorBridgeNode(FlightNode):
         if not self._send():
             return
         self._timer.reset()     # again in a period, unless a newer one comes first
+        age = self.now() - command.stamp
         if math.isnan(published):
-            self._stream.answered(self.now() - command.stamp, 'the stamp of the command')
+            self._stream.answered(age, 'the stamp of the command', age)
         else:
-            self._stream.answered(time.time() - published, 'the publication of the command')
+            self._stream.answered(time.time() - published, 'the publication of the command', age)
 
     def _on_supervisor(self, message):
         self._arming.follow(message.data)

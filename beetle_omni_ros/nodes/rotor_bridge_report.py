@@ -51,10 +51,12 @@ class RotorBridgeReport:
         return level, text, {**values, **_link(update)}
 
     def _latency_status(self):
-        times = self._stream.latency
+        times, ages = self._stream.latency, self._stream.age
         return health.OK, f'from {self._stream.latency_from} to the last byte written', {
             'median_ms': 1e3 * times.quantile(0.5), 'p99_ms': 1e3 * times.quantile(0.99),
-            'max_ms': 1e3 * times.max, 'count': times.count}
+            'max_ms': 1e3 * times.max, 'count': times.count,
+            'age_median_ms': 1e3 * ages.quantile(0.5), 'age_p99_ms': 1e3 * ages.quantile(0.99),
+            'age_max_ms': 1e3 * ages.max}
 
     def _rotor_status(self, k):
         stream, rotors = self._stream, self._rotors

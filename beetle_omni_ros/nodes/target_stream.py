@@ -20,6 +20,8 @@ class TargetStream:
         unsent: reason -> targets that could not be sent.
         latency: from the publication of a command to the last byte of its target, once for each.
         latency_from: what its beginning is.
+        age: of commands as the last byte of their target is written, by their stamp: the latency of
+            the whole loop, from the IMU sample on.
         command: (4,) normalised commands of the newest target.
         saturated: (4,) targets of each rotor beyond what the battery can give.
 
@@ -32,6 +34,7 @@ class TargetStream:
         self.cycles = self.missed = 0
         self.unsent: Counter = Counter()
         self.latency, self.latency_from = Distribution(), 'no command yet'
+        self.age = Distribution()
         self.command = np.zeros(4)
         self.saturated = np.zeros(4, dtype=int)
 
@@ -53,7 +56,8 @@ class TargetStream:
         self.command = sent.command
         self.saturated += sent.saturated
 
-    def answered(self, seconds: float, begin: str) -> None:
-        """Take the latency of one command, counted from ``begin``."""
+    def answered(self, seconds: float, begin: str, age: float) -> None:
+        """Take the latency [s] of one command, counted from ``begin``, and its age [s]."""
         self.latency.add(seconds)
         self.latency_from = begin
+        self.age.add(age)
