@@ -20,8 +20,8 @@ class TargetStream:
         unsent: reason -> targets that could not be sent.
         latency: from the publication of a command to the last byte of its target, once for each.
         latency_from: what its beginning is.
-        age: of commands as the last byte of their target is written, by their stamp: the latency of
-            the whole loop, from the IMU sample on.
+        age: of commands, by their stamp, as the last byte of their target is written: the latency
+            of the whole loop, from the IMU sample on.
         command: (4,) normalised commands of the newest target.
         saturated: (4,) targets of each rotor beyond what the battery can give.
 
