@@ -1,4 +1,4 @@
-"""Subcommands about the actuators: identify joint, identify rotor."""
+"""Subcommands about the real robot: identify joint, identify rotor, check."""
 
 from __future__ import annotations
 
@@ -50,3 +50,40 @@ def rotor(log: Annotated[Path, typer.Argument(
     """
     from beetle_omni_ros.identify.command import run_identify_rotor
     run_identify_rotor(log, robot=robot, report=report, params=params, json_path=json_path)
+
+
+def check(servo_port: Annotated[Optional[str], typer.Option(
+              '--servo-port', metavar='PORT', help='Default: that of --servo-bus.')] = None,
+          board_port: Annotated[Optional[str], typer.Option(
+              '--board-port', metavar='PORT', help='Default: that of --motor-board.')] = None,
+          servo_bus: Annotated[Optional[Path], typer.Option(
+              '--servo-bus', metavar='FILE', help='Default: the shipped '
+                                                  'params/servo_bus.yaml.')] = None,
+          motor_board: Annotated[Optional[Path], typer.Option(
+              '--motor-board', metavar='FILE', help='Default: the shipped '
+                                                    'params/motor_board.yaml.')] = None,
+          robot: PublishedOption = None,
+          seconds: Annotated[float, typer.Option(
+              '--seconds', min=1, max=600, help='To listen to the motor board, and to ROS.')]
+          = 3.0,
+          skip: Annotated[Optional[list[str]], typer.Option(
+              '--skip', metavar='servos|board|ros', help='Leave a part out; may be '
+                                                         'repeated.')] = None,
+          namespace: Annotated[str, typer.Option(
+              '--namespace', metavar='NAME', help="Of the robot's topics.")] = '',
+          json_path: JsonOption = None):
+    """
+    Look at the real robot before a flight: ports, servos, motor board, MoCap, IMU, clocks.
+
+    Nothing moves and nothing is set. Exit status 0: nothing failed; 1: something did.
+    Example: beetle_omni check --servo-port /dev/ttyUSB0 --skip board
+    """
+    def listen(duration):
+        from beetle_omni_ros.nodes.listener import listen as listen_to_ros
+        return listen_to_ros(duration, namespace)
+
+    from beetle_omni_ros.bringup.command import run_check
+    raise typer.Exit(run_check(
+        listen=listen, servo_port=servo_port, board_port=board_port, servo_bus=servo_bus,
+        motor_board=motor_board, robot=robot, seconds=seconds, skip=tuple(skip or ()),
+        json_path=json_path))
