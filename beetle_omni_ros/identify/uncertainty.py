@@ -61,7 +61,8 @@ class Uncertainty:
         return float((high - low) / 2 / term.scale)
 
 
-def uncertainties(log: JointLog, noise: Noise, problems: Problems) -> list[Uncertainty]:
+def uncertainties(log: JointLog, noise: Noise, problems: Problems,
+                  profiled: np.ndarray) -> list[Uncertainty]:
     """
     Judge fitted parameter sets, one for each row of ``problems``.
 
@@ -69,6 +70,7 @@ def uncertainties(log: JointLog, noise: Noise, problems: Problems) -> list[Uncer
         log: what they were fitted to.
         noise: its whitening.
         problems: with the fitted sets; only ``free`` numbers are judged.
+        profiled: (B,) rows whose curved numbers are wanted; the others' have their local width.
 
     """
     fitter = Fitter(log, noise, Prior.none())
@@ -87,7 +89,8 @@ def uncertainties(log: JointLog, noise: Noise, problems: Problems) -> list[Uncer
         intervals = np.stack([decode(np.clip(points[k] + side * width, LOW, HIGH))
                               for side in (-1, 1)], axis=1)
         results.append(Uncertainty(intervals, covariance / np.outer(size, size), scatter))
-    _profile(fitter, problems, results)
+    wanted = np.flatnonzero(profiled)
+    _profile(fitter, problems.pick(wanted), [results[k] for k in wanted])
     return results
 
 
