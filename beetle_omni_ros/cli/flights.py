@@ -31,6 +31,10 @@ def fly(bag: Annotated[Path, typer.Option(
         task: TaskOption = 'waypoints',
         conditions: ConditionsOption = 'nominal',
         seed: SeedOption = 0,
+        actuators: Annotated[str, typer.Option(
+            '--actuators', metavar='emulated|direct',
+            help='Through joint_bridge_node, rotor_bridge_node, serial ports and emulated '
+                 'devices; or straight into the simulated plant.')] = 'emulated',
         robot: RobotOption = None,
         plant: PlantOption = None,
         policy: PolicyOption = None,
@@ -39,8 +43,8 @@ def fly(bag: Annotated[Path, typer.Option(
             '--standby/--alone', help='The other controller runs too, to be selected in flight; '
                                       'or only the active one.')] = True,
         composed: Annotated[bool, typer.Option(
-            '--composed/--separate', help='All nodes in one process, or one process each.')]
-        = True,
+            '--composed/--separate', help='One process, and one for the bridges; or one for '
+                                          'each node.')] = True,
         domain_id: Annotated[Optional[int], typer.Option(
             '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
         json_path: JsonOption = None):
@@ -55,9 +59,9 @@ def fly(bag: Annotated[Path, typer.Option(
     from beetle_omni_ros.nodes.fly import FlightError, run_fly
     try:
         code = run_fly(controller=controller, task=task, bag=bag, seed=seed,
-                       conditions=conditions, robot=robot, plant=plant, policy=policy,
-                       allow_other_robot=allow_other_robot, standby=standby, composed=composed,
-                       json_path=json_path, domain_id=domain_id)
+                       conditions=conditions, actuators=actuators, robot=robot, plant=plant,
+                       policy=policy, allow_other_robot=allow_other_robot, standby=standby,
+                       composed=composed, json_path=json_path, domain_id=domain_id)
     except FlightError as error:
         raise typer.Exit(fail(error, FAILED)) from None
     raise typer.Exit(code if isinstance(code, int) else 0)
