@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-import sys
 import time
 
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -31,7 +30,6 @@ from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
 COMMAND_AGE = 0.1       # s, older commands are not executed
-THREAD_SWITCH = 0.0005  # s
 EVENTS = {*(f'servo_faults.{name}' for name in SERVO_EVENTS),
           *(f'board_faults.{name}' for name in BOARD_EVENTS)}
 
@@ -109,9 +107,6 @@ class SimNode(FlightNode):
     def _make_devices(self):
         """Let the bridges' drivers move the plant through serial ports."""
         given = self.parameters
-        # The devices' threads wait for the interpreter no longer than this: a driver gives a
-        # servo 3 ms for its answer, and a controller's step may take as long.
-        sys.setswitchinterval(THREAD_SWITCH)
         servos = ServoBusParameters.load(given.servo_bus_file or None)
         bus = EmulatedServoBus(
             servos.ids.astype(int).tolist(), port=given.servo_port or None,
