@@ -9,12 +9,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 import numpy as np
 import rclpy
+from rclpy.exceptions import NameValidationException
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import BatteryState, Imu, JointState
 from std_msgs.msg import String
 
 from beetle_omni_ros.bringup.heard import BRIDGES, Heard, Status, Stream
 from beetle_omni_ros.nodes import convert, qos, runner
+from beetle_omni_ros.robot.schema import ParameterError
 
 # Topic -> type, how it is read, what of it no living sensor repeats.
 STREAMS = {
@@ -32,11 +34,14 @@ def listen(seconds: float, namespace: str = '') -> Heard:
         seconds: how long.
         namespace: of the robot's topics.
 
+    Raises:
+        ParameterError: no such namespace is possible.
+
     """
     context = rclpy.Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = rclpy.create_node('check', context=context, namespace=namespace)
+        node = _node(context, namespace)
         heard = Heard(context.get_domain_id(), seconds, {topic: Stream() for topic in STREAMS})
         _subscribe(node, heard)
         executor = runner.make_executor(context)
@@ -49,6 +54,13 @@ def listen(seconds: float, namespace: str = '') -> Heard:
     finally:
         context.try_shutdown()
     return heard
+
+
+def _node(context, namespace):
+    try:
+        return rclpy.create_node('check', context=context, namespace=namespace)
+    except NameValidationException as error:
+        raise ParameterError(f"namespace '{namespace}': {str(error).splitlines()[0]}") from None
 
 
 def _subscribe(node, heard):

@@ -1,6 +1,7 @@
 """`beetle_omni check` from the command line: table, JSON, exit status, one-line refusals."""
 
 import json
+import subprocess
 import sys
 
 import pytest
@@ -13,6 +14,8 @@ from servo_bench import JOINTS
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.bringup import servos
+from beetle_omni_ros.bringup.command import run_check
+from beetle_omni_ros.bringup.heard import Heard, Status
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
@@ -81,6 +84,29 @@ def test_without_ros_the_rest_is_looked_at(robot, tmp_path, monkeypatch):
     assert [row['item'] for row in result['findings'] if row['part'] == 'servos']
     (ros,) = [row for row in result['findings'] if row['part'] == 'ros']
     assert 'not installed' in ros['found'] and '[ros]' in ros['remedy']
+
+
+def test_a_port_that_the_bridge_has_is_not_opened(robot, tmp_path):
+    bus, _, _ = robot
+    heard = Heard(0, 1.0, {}, {'joint_bridge': 'ready'},
+                  {'joint_bridge_node: gimbal2': Status(2, 'overload', {})})
+    path, told = tmp_path / 'result.json', []
+    bus.network.handle = lambda packet, *_: told.append(packet) or []
+    bridge = subprocess.Popen([sys.executable, '-c', 'import sys; f = open(sys.argv[1], "rb", 0); '
+                               'print("open", flush=True); sys.stdin.read()', bus.port],
+                              stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    try:
+        bridge.stdout.readline()
+        status = run_check(listen=lambda _: heard, servo_port=bus.port, skip=('board',),
+                           json_path=path)
+    finally:
+        bridge.communicate()
+    rows = {row['item']: row for row in json.loads(path.read_text())['findings']}
+    assert status == 1 and not told
+    assert rows['servo port']['level'] == rows['joint_bridge state']['level'] == 'ok'
+    assert str(bridge.pid) in rows['servo port']['found']
+    assert rows['joint_bridge gimbal2']['level'] == 'fail'
+    assert rows['joint_bridge gimbal2']['part'] == 'servos'
 
 
 @pytest.mark.parametrize(('arguments', 'named'), [

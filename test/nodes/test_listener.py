@@ -17,6 +17,7 @@ from beetle_omni_ros.bringup.topics import check_topics
 from beetle_omni_ros.nodes import convert, qos
 from beetle_omni_ros.nodes.listener import listen
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
 
 UPRIGHT = np.array([0, 0, 0, 1.0])
 
@@ -109,3 +110,9 @@ def test_an_empty_graph_and_a_namespace(ros_domain):
     assert not heard.runs('joint_bridge') and not heard.streams['mocap/pose'].arrivals
     with Drivers(ros_domain):
         assert not listen(1.0, 'robot1').streams['imu/data_raw'].arrivals
+
+
+def test_an_impossible_namespace_is_refused_in_one_line(ros_domain):
+    with pytest.raises(ParameterError, match="namespace 'a b'") as caught:
+        listen(0.1, 'a b')
+    assert '\n' not in str(caught.value)
