@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from beetle_omni_ros import __version__
@@ -116,7 +116,9 @@ def _told(found):
 
 
 def _print(console, found, skip):
-    table = Table('item', 'finding', '', 'what to do', title='Bring-up', title_justify='left')
+    table = Table(*(Column(name, overflow='fold') for name in ('item', 'finding', '',
+                                                               'what to do')),
+                  title='Bring-up', title_justify='left')
     for part in PARTS:
         for finding in found.get(part, []):
             table.add_row(Text(finding.item), Text(finding.found),

@@ -48,5 +48,6 @@ def graded(item: str, found: str, value: float, remedy: str, *, warn: float, fai
 
 def missing_library(item: str, error: ModuleNotFoundError, extra: str) -> Finding:
     """Say which extra of pip brings a library that is not installed."""
-    return Finding(item, FAIL, f"not looked at: the module '{error.name}' is not installed",
+    module = (error.name or '').partition('.')[0]
+    return Finding(item, FAIL, f"not looked at: the module '{module}' is not installed",
                    f"pip install 'beetle_omni_ros[{extra}]'")

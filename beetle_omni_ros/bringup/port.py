@@ -11,7 +11,7 @@ import stat
 from beetle_omni_ros.bringup.finding import FAIL, Finding, OK
 
 SYS, PROC = Path('/sys'), Path('/proc')
-SHOWN_COMMAND = 60      # characters of a command line
+SHOWN_COMMAND = 90      # characters of a command line
 USB_DEPTH = 6           # folders from a tty up to its USB device
 
 
@@ -145,7 +145,8 @@ def _command(folder):
         text = (folder / 'cmdline').read_bytes().replace(b'\0', b' ').decode(errors='replace')
     except OSError:
         text = ''
-    text = text.strip() or 'unknown'
+    program, _, rest = text.strip().partition(' ')
+    text = f'{os.path.basename(program)} {rest}'.strip() or 'unknown'
     return text if len(text) <= SHOWN_COMMAND else text[:SHOWN_COMMAND - 3] + '...'
 
 

@@ -8,6 +8,8 @@ from beetle_omni_ros.bringup.finding import FAIL, Finding, OK, WARN
 from beetle_omni_ros.bringup.heard import BRIDGES, Heard
 
 OF_DIAGNOSTICS = {0: OK, 1: WARN}       # errors and stale ones fail
+FAULTS = {'joint_bridge': 'docs/hardware.md: What happens when',
+          'rotor_bridge': 'docs/firmware.md: outcome of faults'}
 UNUSED = ('node', 'inputs', 'compute')  # of every node; the topics themselves are judged
 
 
@@ -37,7 +39,7 @@ def reported(bridge: str, heard: Heard) -> list[Finding]:
             continue
         level = OF_DIAGNOSTICS.get(status.level, FAIL)
         findings.append(Finding(f'{bridge} {name}', level, status.message or 'no message',
-                                '' if level == OK else 'docs/hardware.md, What happens when',
+                                '' if level == OK else FAULTS[bridge],
                                 status.values))
     if len(findings) == 1:
         findings.append(Finding(f'{bridge} diagnostics', WARN, f'none within {heard.seconds:g} s',

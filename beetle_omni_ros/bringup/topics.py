@@ -14,6 +14,7 @@ MOCAP, IMU, JOINTS, BATTERY = 'mocap/pose', 'imu/data_raw', 'joint_states', 'bat
 TOPICS = {MOCAP: ('mocap', 'the MoCap driver', None), IMU: ('imu', 'the IMU driver', None),
           JOINTS: ('joint', 'joint_bridge_node', 'joint_bridge'),
           BATTERY: ('battery', 'rotor_bridge_node', 'rotor_bridge')}
+MISSED = 3              # messages in a row whose absence is a pause
 CLOCK_SPREAD = 0.2      # a large age that varies by less than this share of it is a clock's
 
 
@@ -89,9 +90,9 @@ def _of_rate(topic, stream, wanted, limits):
     if not rate >= limits.rate_low * wanted:
         level = FAIL if not rate >= limits.rate_fail * wanted else WARN
         remedy = f'wanted are {wanted:g} Hz: settings of its driver, network, load'
-    elif rate > limits.rate_high * wanted:
+    elif rate > limits.rate_high * wanted and topic in (MOCAP, IMU):
         level, remedy = WARN, f'wanted are {wanted:g} Hz: set its driver'
-    elif gap > limits.gap:
+    elif gap > max(limits.gap, MISSED / wanted):
         level, remedy = WARN, 'network (cable instead of Wi-Fi), load of the computers'
     return Finding(f'{topic} rate', level, found, remedy, values)
 

@@ -56,6 +56,12 @@ def test_rates_are_judged(rate, level):
     assert finding.level == level and f'{rate}.0 Hz' in finding.found
 
 
+def test_a_battery_may_be_told_slowly_or_often():
+    for rate in (10, 50):
+        assert levels(judged(battery=stream(rate, 0.001))) == {}
+    assert levels(judged(battery=stream(5, 0.001))) == {'battery_state rate': 'fail'}
+
+
 def test_a_pause_is_told():
     paused = stream(100, 0.01)
     paused.arrivals[200:] = [t + 0.15 for t in paused.arrivals[200:]]
