@@ -12,8 +12,8 @@ import re
 from setuptools import find_packages, setup
 
 PACKAGE = 'beetle_omni_ros'
-NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node',
-         'recorder_node', 'viewer_node')
+NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'joint_bridge_node',
+         'rotor_bridge_node', 'reference_node', 'recorder_node', 'viewer_node')
 
 
 def version():

@@ -1,36 +1,52 @@
 """
-Loop rate, latency and CPU of the actuator drivers: `python benchmarks/bus.py [SECONDS]`.
+Loop rate, latency and CPU of both actuator drivers: `python benchmarks/bus.py`.
 
-The emulated servos run in a process of their own, as `sim_node` does. With --wire their answers
-take the time of 1 Mbit/s.
+Each driver runs at 200 Hz in this process against its emulated device in a process of its own.
+"to last byte" is the time from the call that takes a command until its last byte is written,
+"to rotor target" until the emulated board has it; CPU is that of this process, the driver's own
+threads included. --faults adds what each fault of the servo bus costs, --wire lets the servos'
+answers take the time of 1 Mbit/s.
 """
 
+import argparse
 from dataclasses import replace
+import json
+import multiprocessing
 from pathlib import Path
-import subprocess
 import sys
 import time
+import timeit
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from beetle_omni_ros.drivers.motor_board import MotorBoard  # noqa: E402
+from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters  # noqa: E402
 from beetle_omni_ros.drivers.servo_bus import ServoBus  # noqa: E402
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters  # noqa: E402
 from beetle_omni_ros.robot.parameters import RobotParameters  # noqa: E402
 
-PERIOD = 0.005  # [s]
-STAGES = ('write', 'read', 'health', 'tick')
+PERIOD = 0.005          # [s]
+POLL_TICKS = 2          # of the motor board, as rotor_bridge_node does
+# What both bridges together may need is 30 %; see docs/nodes.md for the nodes around the drivers.
+TARGETS = {'to last byte [ms]': 'p99 2', 'missed cycles': '0', 'CPU [%]': '15'}
+FAULTS = (('servo 3 silent from 1 s to 2 s', 'silent 3', 'silent'),
+          ('all silent from 1 s to 2 s', 'silent 1 2 3 4', 'silent'),
+          ('servo 2 restarts at 1 s', 'reboot 1', 'silent'),
+          ('unplugged from 1 s to 2 s', 'unplug', 'replug'))
 
 
-def serve(wire):
-    """Run the emulated servos; obey lines on standard input."""
+def serve_servos(pipe, wire):
+    """Run the emulated servos; obey lines until an empty one."""
     from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
     with EmulatedServoBus(motion=RobotParameters.load().joints, timing=wire) as emulated:
-        print(emulated.port, flush=True)
-        for line in sys.stdin:
-            word, *rest = line.split()
+        pipe.send(emulated.port)
+        while words := pipe.recv().split():
+            word, *rest = words
             if word == 'silent':
                 emulated.faults.silent = set(map(int, rest))
             elif word == 'reboot':
@@ -39,36 +55,57 @@ def serve(wire):
                 {'unplug': emulated.unplug, 'replug': emulated.replug}[word]()
 
 
-def loop(bus, duration, script=()):
+def serve_board(pipe):
+    """Run the emulated board until told to stop; then tell when which target came."""
+    from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
+    with EmulatedMotorBoard() as board:
+        arrivals = []
+        board.on_target = lambda now, values: arrivals.append((values[0], now))
+        pipe.send(board.port)
+        pipe.recv()
+        pipe.send((arrivals, board.refused))
+
+
+class Device:
+    """An emulated device in a process of its own; ``port`` is where to open it."""
+
+    def __init__(self, serve, *arguments):
+        context = multiprocessing.get_context('spawn')
+        self.pipe, there = context.Pipe()
+        self._process = context.Process(target=serve, args=(there, *arguments), daemon=True)
+        self._process.start()
+        self.port = self.pipe.recv()
+
+    def tell(self, text):
+        """Return a function that tells it ``text``."""
+        return lambda: self.pipe.send(text)
+
+    def close(self):
+        """Let it end."""
+        self._process.join(5)
+
+
+def run(tick, seconds, script=()):
     """
-    Run the bridge's loop at 200 Hz.
+    Call ``tick(k, elapsed)`` at 200 Hz; cycles that passed meanwhile are missed.
 
     Args:
-        bus: enabled.
-        duration: [s].
+        tick: one cycle.
+        seconds: [s].
         script: (time [s], function) to call on the way, in order.
 
     Returns:
-        stage -> times [s], missed ticks, readings lost (4,), CPU share.
+        rate [Hz], missed cycles, CPU of this process as a share of a core.
 
     """
-    times, script = {stage: [] for stage in STAGES}, list(script)
-    missed, lost = 0, np.zeros(4, int)
+    script, missed, ticks = list(script), 0, 0
     began, cpu = time.monotonic(), time.process_time()
     due = began
-    while due - began < duration:
+    while due - began < seconds:
         if script and due - began >= script[0][0]:
             script.pop(0)[1]()
-        phase = 2 * np.pi * 0.5 * (due - began)
-        marks = [time.perf_counter()]
-        bus.write_goals(2 * np.sin(phase + np.arange(4)))
-        marks.append(time.perf_counter())
-        lost += ~bus.read().valid
-        marks.append(time.perf_counter())
-        bus.poll_health()
-        marks.append(time.perf_counter())
-        for stage, spent in zip(STAGES, [*np.diff(marks), marks[-1] - marks[0]], strict=True):
-            times[stage].append(spent)
+        tick(ticks, due - began)
+        ticks += 1
         due += PERIOD
         late = time.monotonic() - due
         if late > 0:
@@ -77,54 +114,114 @@ def loop(bus, duration, script=()):
             due += skipped * PERIOD
         time.sleep(max(0.0, due - time.monotonic()))
     elapsed = time.monotonic() - began
-    return times, missed, lost, (time.process_time() - cpu) / elapsed
+    return {'rate [Hz]': ticks / elapsed, 'missed cycles': missed,
+            'CPU [%]': 100 * (time.process_time() - cpu) / elapsed}
 
 
-def show(title, result, duration):
-    """Print one run."""
-    times, missed, lost, cpu = result
-    print(f'{title}: {len(times["tick"]) / duration:.1f} Hz, {missed} ticks missed, readings lost '
-          f'{lost.tolist()}, CPU {100 * cpu:.1f} % of a core')
-    for stage, spent in times.items():
-        median, p99, top = np.percentile(spent, [50, 99, 100]) * 1e3
-        print(f'    {stage:7s} median {median:6.3f} ms   p99 {p99:6.3f} ms   max {top:6.3f} ms')
+def quantiles(seconds):
+    """Median, 99 % and maximum [ms]."""
+    values = 1e3 * np.asarray(seconds)
+    return {'median': float(np.median(values)), 'p99': float(np.quantile(values, 0.99)),
+            'max': float(values.max())}
 
 
-def main(duration=10.0, wire=False):
-    """Measure the healthy bus, then what each fault costs."""
-    device = subprocess.Popen([sys.executable, __file__, 'serve', *(['--wire'] if wire else [])],
-                              stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+def servo_loop(bus, seconds, script=()):
+    """One run of the servo bus: write, read, one step of upkeep in each cycle."""
+    stages = {'to last byte': [], 'read': [], 'upkeep': [], 'cycle': []}
+    lost = np.zeros(4, int)
 
-    def tell(text):
-        def send():
-            device.stdin.write(text + '\n')
-            device.stdin.flush()
-        return send
+    def tick(_, elapsed):
+        goals = 2 * np.sin(np.pi * elapsed + np.arange(4))
+        marks = [time.perf_counter()]
+        bus.write_goals(goals)
+        marks.append(time.perf_counter())
+        np.add(lost, ~bus.read().valid, out=lost)
+        marks.append(time.perf_counter())
+        bus.poll_health()
+        marks.append(time.perf_counter())
+        for stage, spent in zip(stages.values(), [*np.diff(marks), marks[-1] - marks[0]]):
+            stage.append(spent)
 
-    bus = ServoBus(replace(ServoBusParameters.load(), port=device.stdout.readline().strip()),
+    measured = run(tick, seconds, script)
+    for name, spent in stages.items():
+        measured[f'{name} [ms]'] = quantiles(spent)
+    return {**measured, 'readings lost': int(lost.sum())}
+
+
+def measure_servos(seconds, wire, faults):
+    """Title -> numbers of the servo bus, healthy and, if asked, with each fault."""
+    device = Device(serve_servos, wire)
+    bus = ServoBus(replace(ServoBusParameters.load(), port=device.port),
                    RobotParameters.load().joints)
     try:
         bus.open()
         bus.configure()
         bus.enable()
-        print(f'servo bus, 200 Hz for {duration:g} s' + (', answers at 1 Mbit/s' if wire else ''))
-        show('healthy', loop(bus, duration), duration)
-        for title, begin, end in (('servo 3 silent from 1 s to 2 s', 'silent 3', 'silent'),
-                                  ('all silent from 1 s to 2 s', 'silent 1 2 3 4', 'silent'),
-                                  ('servo 2 restarts at 1 s', 'reboot 1', 'silent'),
-                                  ('unplugged from 1 s to 2 s', 'unplug', 'replug')):
-            show(title, loop(bus, 3.0, [(1.0, tell(begin)), (2.0, tell(end))]), 3.0)
-            for line in bus.take_events():
-                print('    ' + line)
+        found = {'servo bus': servo_loop(bus, seconds)}
+        for title, begin, end in FAULTS if faults else ():
+            found[title] = servo_loop(bus, 3.0, [(1.0, device.tell(begin)),
+                                                 (2.0, device.tell(end))])
+            bus.take_events()
     finally:
         bus.close()
-        device.stdin.close()
-        device.wait(5)
+        device.tell('')()
+        device.close()
+    return found
+
+
+def measure_board(seconds):
+    """Numbers of the motor board: one target in each cycle, telemetry polled as the node does."""
+    device = Device(serve_board)
+    sent, thrusts = [], np.random.default_rng(0).uniform(2, 15, (1000, 4))
+    with MotorBoard(replace(MotorBoardParameters.load(), port=device.port)) as board:
+        if missing := board.wait_ready(5):
+            raise SystemExit(missing)
+        if not (answer := board.arm()).accepted:
+            raise SystemExit(answer.reason)
+
+        def tick(k, _):
+            begin = time.monotonic()
+            result = board.send(thrusts[k % 1000], time.time())
+            sent.append((begin, time.monotonic(), board._last_stamp[1], result.sent))
+            if k % POLL_TICKS == 0:
+                board.poll()
+
+        measured = run(tick, seconds)
+        lost = board.poll().link.received.lost
+        device.tell('end')()
+        arrivals, refused = device.pipe.recv()
+    device.close()
+    arrived = dict(arrivals)
+    delays = [arrived[stamp] - begin for begin, _, stamp, _ in sent if stamp in arrived]
+    command = thrusts[0]
+    return {**measured, 'to last byte [ms]': quantiles([end - begin for begin, end, *_ in sent]),
+            'to rotor target [ms]': quantiles(delays),
+            'not sent': sum(not ok for *_, ok in sent), 'not arrived': len(sent) - len(delays),
+            'refused by the board': sum(refused.values()), 'packets lost to us': lost,
+            'thrust map [us]': 1e3 * min(timeit.repeat(
+                lambda: board.thrust_map.command(command, 23.4), number=1000, repeat=3))}
+
+
+def main():
+    """Measure and print a table; write the numbers where asked."""
+    arguments = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    arguments.add_argument('--seconds', type=float, default=10, help='for each driver')
+    arguments.add_argument('--wire', action='store_true', help='servos answer at 1 Mbit/s')
+    arguments.add_argument('--faults', action='store_true', help='the servo bus with each fault')
+    arguments.add_argument('--json', type=Path, help='file for the numbers')
+    given = arguments.parse_args()
+    found = {'motor board': measure_board(given.seconds),
+             **measure_servos(given.seconds, given.wire, given.faults)}
+    for title, numbers in found.items():
+        table = Table(title, 'median', 'p99', 'max', 'target')
+        for name, value in numbers.items():
+            values = value.values() if isinstance(value, dict) else (value,)
+            cells = [f'{number:.4g}' for number in values] + [''] * (3 - len(values))
+            table.add_row(name.replace('[', r'\['), *cells, TARGETS.get(name, ''))
+        Console().print(table)
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=1))
 
 
 if __name__ == '__main__':
-    words = [word for word in sys.argv[1:] if word != '--wire']
-    if words[:1] == ['serve']:
-        serve('--wire' in sys.argv)
-    else:
-        main(*map(float, words[:1]), wire='--wire' in sys.argv)
+    main()

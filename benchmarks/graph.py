@@ -1,13 +1,16 @@
 """
 CPU and latency of the ROS graph: ``python benchmarks/graph.py [--seconds 24]``.
 
-Flies poses in real time, once with all nodes in one process and once with a process for
-each, and prints for both
+Flies poses in real time, with all nodes in one process, with a process for each, and with all
+but the bridges in one process, and prints for each
 
 - CPU: user and system time of all node processes (simulator and recorder included) while
   the task is flown, in % of one core;
 - latency: from the stamp of an IMU sample, which the simulator sets as it publishes it, to
   the arrival of the command that answers it at the actuators, in the simulator's callback.
+
+With the bridges the devices are emulated in the simulator's process, and the latency ends with the
+last byte of the command to the motor board; the bridges' own numbers stand beside it.
 """
 
 import argparse
@@ -21,43 +24,62 @@ from rich.table import Table
 
 from beetle_omni_ros.nodes.fly import run_fly
 
-TARGETS = {'cpu_percent': 60.0, 'latency_p99_ms': 5.0}   # of the composed graph
-COLUMNS = {'cpu_percent': 'CPU [%]', 'latency_median_ms': 'median [ms]',
-           'latency_p99_ms': '99 % [ms]', 'latency_max_ms': 'max [ms]'}
+# name -> (composed, actuators, targets)
+ARRANGEMENTS = {
+    'one process, direct': (True, 'direct', {'cpu_percent': 60.0, 'latency_p99_ms': 5.0}),
+    'separate processes, direct': (False, 'direct', {}),
+    'composed, with bridges': (True, 'emulated', {
+        'bridges_cpu_percent': 30.0, 'servos_missed_cycles': 0, 'servos_latency_p99_ms': 2.0,
+        'motor_board_missed_cycles': 0, 'motor_board_latency_p99_ms': 2.0})}
+ROWS = {'cpu_percent': 'CPU of all nodes [%]', 'latency_median_ms': 'latency, median [ms]',
+        'latency_p99_ms': '99 %', 'latency_max_ms': 'max',
+        'bridges_cpu_percent': 'CPU of the bridges [%]',
+        'servos_cycles': 'servo bus: cycles', 'servos_missed_cycles': 'missed',
+        'servos_latency_p99_ms': 'command to last byte, 99 % [ms]',
+        'motor_board_cycles': 'motor board: cycles', 'motor_board_missed_cycles': 'missed',
+        'motor_board_latency_p99_ms': 'command to last byte, 99 % [ms]'}
 POSES = ['0,0,1,0,0,0', '0.5,0,1,30,0,0', '0,0.5,1.2,0,-25,45']
 POSE_SECONDS = 8
 
 
-def measure(folder: Path, composed: bool, seconds: float) -> dict:
+def measure(folder: Path, name: str, seconds: float) -> dict:
     """Fly once; return what was measured."""
+    composed, actuators, _ = ARRANGEMENTS[name]
     rows = [POSES[k % len(POSES)] for k in range(max(1, round(seconds / POSE_SECONDS)))]
-    task, result = folder / 'poses.csv', folder / f'{composed}.json'
+    task, result = folder / 'poses.csv', folder / 'result.json'
     task.write_text('\n'.join(['x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg', *rows]) + '\n')
-    status = run_fly(task=str(task), composed=composed, json_path=result,
+    result.unlink(missing_ok=True)
+    status = run_fly(task=str(task), composed=composed, actuators=actuators, json_path=result,
                      console=Console(quiet=True))
     if status or not result.exists():
-        sys.exit(f"flight with {'one process' if composed else 'separate processes'} failed "
-                 f'(status {status})')
+        sys.exit(f'flight with {name} failed (status {status})')
     return json.loads(result.read_text())['meta']['graph']
 
 
 def main():
-    """Measure both arrangements and print a table."""
+    """Measure the arrangements and print a table."""
     arguments = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     arguments.add_argument('--seconds', type=float, default=24, help='flight time of each')
     arguments.add_argument('--json', type=Path, help='file for the numbers')
     given = arguments.parse_args()
-    table = Table('arrangement', *COLUMNS.values())
+    table = Table('', *ARRANGEMENTS)
     measured = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name, composed in (('one process', True), ('separate processes', False)):
-            measured[name] = measure(Path(folder), composed, given.seconds)
-            table.add_row(name, *(f'{measured[name][key]:.2f}' for key in COLUMNS))
-    table.add_row('target (one process)', *(f'{TARGETS[key]:g}' if key in TARGETS else ''
-                                            for key in COLUMNS))
+        for name in ARRANGEMENTS:
+            measured[name] = measure(Path(folder), name, given.seconds)
+    for key, text in ROWS.items():
+        table.add_row(text, *(_cell(measured[name].get(key), targets.get(key))
+                              for name, (_, _, targets) in ARRANGEMENTS.items()))
     Console().print(table)
     if given.json:
         given.json.write_text(json.dumps(measured, indent=1) + '\n')
+
+
+def _cell(value, target):
+    if value is None:
+        return ''
+    text = str(value) if isinstance(value, int) else f'{value:.2f}'
+    return text if target is None else f'{text} (target {target:g})'
 
 
 if __name__ == '__main__':

@@ -7,6 +7,7 @@ The robot stays on the ground until ``supervisor_node/arm`` is called.
 import shutil
 import subprocess
 import sys
+import tempfile
 
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
@@ -18,7 +19,16 @@ PACKAGE = 'beetle_omni_ros'
 ARGUMENTS = {
     # name: (default, choices or None, description)
     'backend': ('sim', ['sim', 'none'],
-                'who provides sensors and actuators: the simulator, or nodes started elsewhere'),
+                'who provides the sensors: the simulator, or nodes started elsewhere'),
+    'actuators': ('bridges', ['bridges', 'direct', 'none'],
+                  'how commands reach the actuators: through joint_bridge_node and '
+                  'rotor_bridge_node (with backend sim to emulated devices); straight into the '
+                  'simulated plant; or by nodes started elsewhere'),
+    'autostart': ('', ['', 'none', 'configure', 'activate'],
+                  'how far joint_bridge_node goes by itself; empty: activate with backend sim, '
+                  'else configure'),
+    'servo_bus_file': ('', None, 'parameters of joint_bridge_node; empty: the shipped ones'),
+    'motor_board_file': ('', None, 'parameters of rotor_bridge_node; empty: the shipped ones'),
     'controller': ('nmpc', ['nmpc', 'rl'], 'the active controller'),
     'standby': ('true', ['true', 'false'], 'the other controller runs too, to be selected in '
                                            'flight; the policy only if it fits the robot'),
@@ -56,6 +66,8 @@ def node_parameters(given):
         if given['plant_file'] or given['robot_file']:
             nodes['sim_node']['robot_file'] = given['plant_file'] or given['robot_file']
     nodes['ekf_node'] = robot
+    for node, values in bridges(given, robot).items():
+        nodes[node] = {**nodes.get(node, {}), **values}
     controllers, left_out = controller_nodes(
         given['controller'], robot_file=given['robot_file'], policy=given['policy'],
         allow_other_robot=given['allow_other_robot'] == 'true',
@@ -71,11 +83,48 @@ def node_parameters(given):
     return nodes
 
 
+def bridges(given, robot):
+    """Node name -> parameters that the actuators ask for."""
+    from beetle_omni_ros.nodes.actuators import bridged, BRIDGES
+    if given['actuators'] != 'bridges':
+        return {}
+    if given['backend'] == 'sim':
+        # in a folder of its own: ports of two simulations must not meet
+        nodes = bridged(tempfile.mkdtemp(prefix='beetle_omni_ports_'), robot)
+    else:
+        nodes = {node: dict(robot) for node in BRIDGES}
+    nodes['joint_bridge_node']['autostart'] = given['autostart'] or (
+        'activate' if given['backend'] == 'sim' else 'configure')
+    for node, key in zip(BRIDGES, ('servo_bus_file', 'motor_board_file')):
+        if given[key]:
+            nodes[node][key] = given[key]
+    return nodes
+
+
 def recorded_topics(namespace):
     """Absolute names of the topics of INTERFACES."""
+    from beetle_omni_ros.nodes.recorder_node import OWN_TOPICS
     from beetle_omni_ros.runs.topics import TOPICS
     prefix = f"/{namespace.strip('/')}/" if namespace.strip('/') else '/'
-    return [prefix + topic for topic in (*TOPICS, 'reference/state')]
+    return [prefix + topic for topic in (*TOPICS, *OWN_TOPICS)]
+
+
+def grouped(nodes):
+    """Nodes by process: the bridges, which wait for their ports, have one of their own."""
+    from beetle_omni_ros.nodes.actuators import BRIDGES
+    groups = ({name: nodes[name] for name in nodes if (name in BRIDGES) == apart}
+              for apart in (False, True))
+    return [group for group in groups if group]
+
+
+def composed(nodes, namespace):
+    """One process that runs ``nodes``."""
+    overrides = [argument for node, values in nodes.items() for key, value in values.items()
+                 for argument in ('-p', f'{node}:{key}:={value}')]
+    if namespace:
+        overrides += ['-r', f'__ns:=/{namespace}']
+    return ExecuteProcess(cmd=[sys.executable, '-m', f'{PACKAGE}.nodes.composed', *nodes,
+                               '--ros-args', *overrides], output='screen')
 
 
 def actions(context):
@@ -91,14 +140,7 @@ def actions(context):
         else:
             nodes['recorder_node'] = {'bag': given['record']}
     if given['composed'] == 'true':
-        overrides = [argument for node, values in nodes.items() for key, value in values.items()
-                     for argument in ('-p', f'{node}:{key}:={value}')]
-        namespace = given['namespace'].strip('/')
-        if namespace:
-            overrides += ['-r', f'__ns:=/{namespace}']
-        processes.append(ExecuteProcess(
-            cmd=[sys.executable, '-m', f'{PACKAGE}.nodes.composed', *nodes, '--ros-args',
-                 *overrides], output='screen'))
+        processes += [composed(group, given['namespace'].strip('/')) for group in grouped(nodes)]
     else:
         processes += [Node(package=PACKAGE, executable=name, name=name, parameters=[values],
                            namespace=given['namespace'], output='screen')

@@ -34,7 +34,8 @@ def refused(capsys, *arguments):
     return lines[0]
 
 
-@pytest.mark.parametrize('command', [[], ['fly'], ['evaluate'], ['compare'], ['report']])
+@pytest.mark.parametrize('command', [
+    [], ['fly'], ['evaluate'], ['compare'], ['report'], ['train'], ['identify'], ['check']])
 def test_every_command_has_help(capsys, command):
     assert cli.main([*command, '--help']) == 0
     assert 'Usage' in capsys.readouterr().out

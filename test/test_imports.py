@@ -22,10 +22,12 @@ ALLOWED = {
     'evaluation': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs'),
     'comparison': ('robot', 'runs', 'evaluation'),
     'identify': ('robot', 'runs'),
-    'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers'),
+    'bringup': ('robot', 'drivers', 'runs.json_file'),
+    'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers',
+              'bringup.heard'),
     'train': ('robot', 'control.observation', 'control.policy_file', 'runs.json_file'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
-            'nodes', 'train', 'identify'),
+            'nodes', 'train', 'identify', 'bringup'),
 }
 
 # Library -> the only room that imports it.

@@ -12,6 +12,7 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 
 import beetle_omni_ros
+from beetle_omni_ros.bringup.limits import CheckLimits
 from beetle_omni_ros.control.hover import HoverParameters
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.policy import PolicyParameters
@@ -35,8 +36,9 @@ DISTRIBUTION = {'yaml': 'pyyaml', 'mcap_ros2': 'mcap-ros2-support', 'serial': 'p
 KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-ros2-support',
        'casadi': 'casadi-pip', 'serial': 'python3-serial', 'PIL': 'python3-pil'}
 PARAMETER_CLASSES = {
-    'ekf.yaml': EkfParameters, 'emulated_board.yaml': EmulatedBoardParameters,
-    'hover.yaml': HoverParameters, 'motor_board.yaml': MotorBoardParameters,
+    'check.yaml': CheckLimits, 'ekf.yaml': EkfParameters,
+    'emulated_board.yaml': EmulatedBoardParameters, 'hover.yaml': HoverParameters,
+    'motor_board.yaml': MotorBoardParameters,
     'nmpc.yaml': NmpcParameters,
     'nmpc_published.yaml': NmpcParameters, 'rl.yaml': PolicyParameters,
     'robot.yaml': RobotParameters, 'robot_weak_and_heavy.yaml': RobotParameters,

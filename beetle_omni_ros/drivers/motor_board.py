@@ -15,6 +15,7 @@ from beetle_omni_ros.drivers.mavlink_dialect import common
 from beetle_omni_ros.drivers.motor_board_command import ArmCommand
 from beetle_omni_ros.drivers.motor_board_link import BoardLink
 from beetle_omni_ros.drivers.motor_board_messages import (
+    BoardStatus,
     BoardUpdate,
     CommandResult,
     CONTRACT_VERSION,
@@ -116,6 +117,16 @@ class MotorBoard:
     def __exit__(self, *_) -> None:
         """Close."""
         self.close()
+
+    @property
+    def status(self) -> BoardStatus | None:
+        """The board's last heartbeat, or None."""
+        return self._watch.status
+
+    @property
+    def connected(self) -> bool:
+        """Whether the port is there, so that targets can be sent."""
+        return self._link.connected
 
     @property
     def ready(self) -> str:

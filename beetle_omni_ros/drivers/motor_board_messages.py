@@ -15,9 +15,10 @@ CONTRACT_VERSION = 1
 STATES = {0: 'boot', 1: 'disarmed', 2: 'armed', 3: 'running'}
 STOP_REASONS = {0: 'none', 1: 'asked by the host', 2: 'heartbeat of the host lost',
                 3: 'no target for too long', 4: 'watchdog reset'}
-UNHEARD = 'no heartbeat of the host'
-CONDITIONS = {1: 'booting', 2: UNHEARD, 4: 'throttle not low',
+UNHEARD, THROTTLE = 'no heartbeat of the host', 'throttle not low'
+CONDITIONS = {1: 'booting', 2: UNHEARD, 4: THROTTLE,
               8: 'battery low', 16: 'ESC failure', 32: 'targets timed out', 64: 'saturated'}
+BLOCKS_ARMING = tuple(text for bit, text in CONDITIONS.items() if bit <= 16)
 RESULTS = {0: 'accepted', 1: 'refused', 2: 'denied', 3: 'unsupported', 4: 'failed'}
 ESC_FAILURES = {1: 'over-current', 2: 'over-voltage', 4: 'overheated', 8: 'over-rpm',
                 16: 'inconsistent command', 32: 'stuck', 64: 'generic'}

@@ -20,6 +20,8 @@ class MotorBoardParameters:
     board_component: int = parameter(doc="board's MAVLink component id", low=1, high=255)
     host_system: int = parameter(doc='our MAVLink system id', low=1, high=255)
     host_component: int = parameter(doc='our MAVLink component id', low=1, high=255)
+    target_rate: float = parameter(doc='at which the newest target is sent again', unit='Hz',
+                                   low=20, high=1000, read_only=True)
     heartbeat_rate: float = parameter(doc='of our heartbeats', unit='Hz', low=1, high=50)
     timesync_rate: float = parameter(doc='of time requests', unit='Hz', low=0.1, high=50)
     clock_drift: float = parameter(doc='bound of the clocks against each other', unit='s/s',

@@ -18,6 +18,7 @@ from beetle_omni_ros.drivers.motor_board_messages import (
     rotors_of,
     RotorStates,
     status_of,
+    THROTTLE,
 )
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -98,8 +99,10 @@ class BoardWatch:
     def acknowledged(self, arm: bool) -> None:
         """Note that the board has armed or disarmed as asked, before its heartbeat says so."""
         if self.status is not None and self.status.armed != arm:
+            # What keeps it from arming again comes with the heartbeat that follows.
             self.status = replace(self.status, stamp=self._host_clock(),
-                                  state='armed' if arm else 'disarmed')
+                                  state='armed' if arm else 'disarmed',
+                                  conditions=self.status.conditions if arm else (THROTTLE,))
             self._say('info', self.status.state)
 
     def connection(self, connected: bool, text: str) -> None:

@@ -230,24 +230,38 @@ class ServoBus:
             except PortLost as error:
                 self._keeper.lost(error)
         if self._link.is_open:
-            answered = self._take(asked, answers)
+            answered = self._keeper.take(asked, answers, self.enabled)
         else:
             answered = set()
             self._keeper.reconnect(self.enabled)
         return readings(self._servos, stamp, answered, self.parameters.torque_per_current)
 
-    def poll_health(self) -> list[ServoHealth]:
+    def upkeep(self):
         """
-        Do at most one transaction of upkeep; report what is known about each servo.
+        Do at most one transaction beside goals and feedback.
 
-        Upkeep is: a step in bringing a servo back, a look for a silent one, or reading torque,
+        That is: a step in bringing a servo back, a look for a silent one, or reading torque,
         hardware error, watchdog, voltage and temperature of all.
         """
         try:
             self._keeper.step(self.enabled)
         except PortLost as error:
             self._keeper.lost(error)
+
+    def health(self) -> list[ServoHealth]:
+        """What is known about each servo, without a transaction."""
         return self._keeper.report(self.enabled)
+
+    def poll_health(self) -> list[ServoHealth]:
+        """Do :meth:`upkeep`, then report the :meth:`health`."""
+        self.upkeep()
+        return self.health()
+
+    @property
+    def obeying(self) -> np.ndarray:
+        """(4,) bool: connected, answering, and with torque, as far as known."""
+        return np.array([self._link.is_open and not servo.silent and servo.torque is True
+                         for servo in self._servos])
 
     def take_events(self) -> list[str]:
         """Lines for the log since the last call."""
@@ -286,18 +300,3 @@ class ServoBus:
         except PortLost as error:
             self._keeper.lost(error)
             raise ServoBusError(f'{self._link.where()}: {error}') from None
-
-    def _take(self, asked, answers):
-        """Hand out the answers, return whose; the first servo without one is the suspect."""
-        suspect, answered, now = None, set(), time.monotonic()
-        for servo in asked:
-            error, data = answers.get(servo.identifier, (0, b''))
-            if len(data) == FEEDBACK_SIZE and not error:
-                answered.add(servo.identifier)
-                if servo.take(data, now, self.enabled):
-                    self._keeper.restarted(servo, self.enabled)
-            elif suspect is None:
-                suspect = servo
-        if suspect is not None:
-            self._keeper.missed(suspect)
-        return answered

@@ -11,7 +11,7 @@ from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.drivers.servo_port import PortLost
 from beetle_omni_ros.drivers.servo_recovery import recovery
 from beetle_omni_ros.drivers.servo_setup import watchdog_counts
-from beetle_omni_ros.drivers.servo_state import Servo, ServoHealth
+from beetle_omni_ros.drivers.servo_state import FEEDBACK_SIZE, Servo, ServoHealth
 
 # Read in turn, each from all servos at once: first register and number of bytes. No gaps: a
 # servo may refuse to read across addresses that do not exist. All of another length: an answer
@@ -109,6 +109,22 @@ class ServoKeeper:
 
     # --- servos -------------------------------------------------------------------------------
 
+    def take(self, asked: list[Servo], answers: dict[int, tuple[int, bytes]],
+             enabled: bool) -> set[int]:
+        """Hand out feedback, return whose; the first servo without an answer is the suspect."""
+        suspect, answered, now = None, set(), time.monotonic()
+        for servo in asked:
+            error, data = answers.get(servo.identifier, (0, b''))
+            if len(data) == FEEDBACK_SIZE and not error:
+                answered.add(servo.identifier)
+                if servo.take(data, now, enabled):
+                    self.restarted(servo, enabled)
+            elif suspect is None:
+                suspect = servo
+        if suspect is not None:
+            self.missed(suspect)
+        return answered
+
     def missed(self, servo: Servo):
         """Count a missing answer; after some in a row leave the servo out and look for it."""
         servo.misses += 1
@@ -194,6 +210,8 @@ class ServoKeeper:
         except ServoBusError:
             pass
         servo.silent, servo.misses = False, 0
+        for other in self._servos:
+            other.next_probe = now  # perhaps it was the bus
         self.say(f'{self._place(servo)}: answers again')
         self.recover(servo)
 
@@ -227,6 +245,10 @@ class ServoKeeper:
             servo.torque = bool(data[0])
             if enabled and not servo.torque and not servo.resting:
                 self.recover(servo)
+            elif servo.torque and not enabled:
+                # It could not be reached when the torque was taken off.
+                self._link.sync_write(register, {servo.identifier: 0})
+                self.say(f'{self._place(servo)}: had torque left, taken off')
         elif register is registers.STATUS_LEVEL:
             servo.error = data[2]  # Hardware Error Status is the third
         elif register is registers.WATCHDOG:

@@ -30,7 +30,7 @@ class ServoTiming:
 
     reply: float = parameter(0.003, doc='wait for an answer, beside its time on the wire',
                              unit='s', low=0.0002, high=0.1)
-    silent_after: int = parameter(3, doc='missed answers in a row until a servo is left out',
+    silent_after: int = parameter(10, doc='missed answers in a row until a servo is left out',
                                   low=1, high=100)
     probe_first: float = parameter(0.1, doc='first look whether a silent servo is back',
                                    unit='s', low=0.005, high=10)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.servo_link import NoAnswer, Refused, ServoBusError, ServoLink
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.drivers.servo_port import PortLost
 from beetle_omni_ros.drivers.servo_registers import Register
 from beetle_omni_ros.drivers.servo_turns import TURN
 
@@ -181,9 +183,14 @@ def power(link: ServoLink, parameters: ServoBusParameters, servo):
     servo.torque, servo.watchdog_expired = True, False
 
 
-def scan(parameters: ServoBusParameters) -> list[tuple[int, int, int]]:
+def scan(parameters: ServoBusParameters,
+         others: Iterable[int] = (1,)) -> list[tuple[int, int, int]]:
     """
-    Look for servos at every baud rate: those of the parameters and a new servo's id 1.
+    Look for servos at every baud rate that the port can do.
+
+    Args:
+        parameters: of the bus; its ids are looked for.
+        others: further ids; by default a new servo's.
 
     Returns:
         (baud rate, ID, model) of each that answers.
@@ -192,18 +199,25 @@ def scan(parameters: ServoBusParameters) -> list[tuple[int, int, int]]:
         PortLost: the port cannot be opened.
 
     """
-    found = []
+    found, failure, opened = [], None, False
     for baud_rate in registers.BAUD_CODES:
         link = ServoLink(parameters.port, baud_rate, max(parameters.timing.reply, 0.005))
         try:
             link.open()
-            for identifier in sorted({1, *(int(name) for name in parameters.ids)}):
+        except PortLost as error:
+            failure = error     # not every adapter can do every rate
+            continue
+        opened = True
+        try:
+            for identifier in sorted({*others, *(int(name) for name in parameters.ids)}):
                 try:
                     found.append((baud_rate, identifier, link.ping(identifier)))
                 except ServoBusError:
                     continue
         finally:
             link.close()
+    if not opened:
+        raise failure
     return found
 
 

@@ -172,7 +172,8 @@ def _models(log, noise, choices: list[Choice], sets, weight, start):
                                  weight[j:j + 1]))
             owner.append((j, name))
     problems = Problems.join(rows)
-    judged = dict(zip(owner, uncertainties(log, noise, problems), strict=True))
+    profiled = np.array([name in (None, 'delay') for _, name in owner])
+    judged = dict(zip(owner, uncertainties(log, noise, problems, profiled), strict=True))
     plans = separating_experiments(
         sets, np.array([free_mask(choice.kept) for choice in choices]), noise,
         np.array([judged[j, None].scatter for j in range(len(choices))]))

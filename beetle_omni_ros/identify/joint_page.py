@@ -55,7 +55,7 @@ def _value(term):
     numbers = [None if v is None else factor * v for v in (term['value'], *term['interval'])]
     value, low, high = ('inf' if v is None else f'{v:.{digits}g}' if abs(v) < 99.5 else f'{v:.0f}'
                         for v, digits in zip(numbers, (3, 2, 2), strict=True))
-    text = f'{value} ({low}..{high})'
+    text = f'{value},\n{low}..{high}'      # two lines: four joints fit into 80 columns
     return text if term['kept'] else f'[{text}]'
 
 

@@ -118,36 +118,62 @@ def _commands(log, joint, delay, edges, held):
 
 
 def _integrate(value, command, early, q, v, step):
-    """(K + 1, B) positions; ``early``: where within a step the command changes."""
+    """
+    Positions (K + 1, B); ``early``: where within a step the command changes.
+
+    Most batches are small and most of the time goes into calls of numpy: what is constant, absent
+    or can be done for all steps at once stays out of the loop, and nothing is allocated in it.
+    """
     wn, half = value['natural_frequency'], 0.5 * step
     damping = step * value['damping_ratio'] * wn
     keep, gain = (1 - damping) / (1 + damping), step * wn**2 / (1 + damping)
     coulomb, stiction = value['coulomb_friction'] * gain, value['stiction'] * gain
-    fade, gap = 1 / value['stribeck_velocity'], value['backlash']
     sine, cosine = value['load_sine'], value['load_cosine']
     torque, speed = value['torque_limit'], value['velocity_limit']
-    sticky, play, load = stiction.any(), gap.any(), sine.any() or cosine.any()
+    sticky, load = stiction.any(), sine.any() or cosine.any()
     weak, slow = (torque < 0.9 * NEVER).any(), (speed < 0.9 * NEVER).any()
-    positions, shown = np.empty((len(command) + 1, len(q))), q.copy()
-    positions[0] = q
-    early = early * (gain * step)
-    for k, target in enumerate(command):
-        q += half * v
-        error = target - q
+    # Positions half a step ahead of their velocities: one addition moves both halves.
+    middle, velocity = np.empty((2, len(command) + 1, len(q)))
+    middle[0], velocity[0] = q + half * v, v
+    error, part, friction, opposite = np.empty_like(q), np.empty_like(q), coulomb, -coulomb
+    jumps, jump = early.any(axis=1).tolist(), early * (gain * step)
+    add, subtract, multiply = np.add, np.subtract, np.multiply
+    maximum, minimum = np.maximum, np.minimum
+    rows = zip(command, middle, middle[1:], velocity, velocity[1:], jumps, jump)
+    for target, here, ahead, before, after, jumped, moved in rows:
+        subtract(target, here, out=error)
         if load:
-            error -= sine * np.sin(q) + cosine * np.cos(q)
+            error -= sine * np.sin(here) + cosine * np.cos(here)
         if weak:
-            error = np.minimum(np.maximum(error, -torque), torque)
-        friction = coulomb + stiction * np.exp(-fade * np.abs(v)) if sticky else coulomb
-        v = keep * v + gain * error
-        v -= np.minimum(np.maximum(v, -friction), friction)
+            minimum(maximum(error, -torque, out=error), torque, out=error)
+        if sticky:
+            friction = coulomb + stiction * np.exp(-np.abs(before) / value['stribeck_velocity'])
+            opposite = -friction
+        multiply(keep, before, out=after)
+        add(after, multiply(gain, error, out=part), out=after)
+        minimum(maximum(after, opposite, out=part), friction, out=part)
+        subtract(after, part, out=after)
         if slow:
-            v = np.minimum(np.maximum(v, -speed), speed)
-        # A joint that friction or a limit holds does not feel when the command changed.
-        q += half * v + early[k] * ((v != 0) & (np.abs(v) < speed) & (np.abs(error) < torque))
-        if play:
-            shown = np.minimum(np.maximum(shown, q - gap), q + gap)
-        positions[k + 1] = shown if play else q
+            minimum(maximum(after, -speed, out=after), speed, out=after)
+        add(here, multiply(step, after, out=part), out=ahead)
+        if jumped:
+            # A joint that friction or a limit holds does not feel when the command changed.
+            free = after != 0
+            if slow:
+                free &= np.abs(after) < speed
+            if weak:
+                free &= np.abs(error) < torque
+            add(ahead, multiply(moved, free, out=part), out=ahead)
+    positions = middle - half * velocity
+    return _with_play(positions, value['backlash']) if value['backlash'].any() else positions
+
+
+def _with_play(positions, gap):
+    """What the encoder shows behind a play of ``gap`` to each side."""
+    shown = positions[0]
+    low, high = positions - gap, positions + gap
+    for k in range(1, len(positions)):
+        shown = positions[k] = np.minimum(np.maximum(shown, low[k]), high[k])
     return positions
 
 

@@ -61,7 +61,8 @@ class Uncertainty:
         return float((high - low) / 2 / term.scale)
 
 
-def uncertainties(log: JointLog, noise: Noise, problems: Problems) -> list[Uncertainty]:
+def uncertainties(log: JointLog, noise: Noise, problems: Problems,
+                  profiled: np.ndarray) -> list[Uncertainty]:
     """
     Judge fitted parameter sets, one for each row of ``problems``.
 
@@ -69,6 +70,7 @@ def uncertainties(log: JointLog, noise: Noise, problems: Problems) -> list[Uncer
         log: what they were fitted to.
         noise: its whitening.
         problems: with the fitted sets; only ``free`` numbers are judged.
+        profiled: (B,) rows whose curved numbers are wanted; the others' have their local width.
 
     """
     fitter = Fitter(log, noise, Prior.none())
@@ -87,7 +89,8 @@ def uncertainties(log: JointLog, noise: Noise, problems: Problems) -> list[Uncer
         intervals = np.stack([decode(np.clip(points[k] + side * width, LOW, HIGH))
                               for side in (-1, 1)], axis=1)
         results.append(Uncertainty(intervals, covariance / np.outer(size, size), scatter))
-    _profile(fitter, problems, results)
+    wanted = np.flatnonzero(profiled)
+    _profile(fitter, problems.pick(wanted), [results[k] for k in wanted])
     return results
 
 
@@ -240,8 +243,7 @@ def separating_experiments(sets: np.ndarray, free: np.ndarray, noise: Noise, sca
     free = free.copy()
     free[:, INDEX['delay']] = True
     best: list[Experiment] = []
-    for frequency in FREQUENCIES:
-        found = _widths(sets, free, noise, scatter, frequency)
+    for found in _plans(sets, free, noise, scatter):
         worst = max(plan.delay_width for plan in found)
         if not best or worst < max(plan.delay_width for plan in best):
             best = found
@@ -250,27 +252,30 @@ def separating_experiments(sets: np.ndarray, free: np.ndarray, noise: Noise, sca
     return best
 
 
-def _widths(sets, free, noise, scatter, frequency):
-    """What a sine of this frequency would tell about each joint."""
+def _plans(sets, free, noise, scatter):
+    """For each frequency, what its sine would tell about each joint; all in one simulation."""
+    count, many = len(sets), len(FREQUENCIES)
     t = np.arange(0.0, EXCITATION_TIME, EXCITATION_PERIOD)
-    omega = 2 * np.pi * frequency
-    amplitude = min(LARGEST_AMPLITUDE, LARGEST_SPEED / omega)
-    command = np.tile(amplitude * np.sin(omega * t), (len(sets), 1))
-    joints = np.arange(len(sets))
-    numbers = tuple(int(j) + 1 for j in joints)
-    blank = JointLog('', t, numbers, np.zeros_like(command), command)
-    log = JointLog('', t, numbers, simulate(blank, joints, sets), command)
-    weight = np.tile((t >= 1.0).astype(float), (len(sets), 1))
+    omega = 2 * np.pi * np.repeat(FREQUENCIES, count)
+    amplitude = np.minimum(LARGEST_AMPLITUDE, LARGEST_SPEED / omega)
+    command = amplitude[:, None] * np.sin(omega[:, None] * t)
+    sets, free = np.tile(sets, (many, 1)), np.tile(free, (many, 1))
+    noise = Noise(np.tile(noise.filter, (many, 1)), np.tile(noise.sigma, many))
+    rows = np.arange(count * many)
+    blank = JointLog('', t, tuple(rows.tolist()), np.zeros_like(command), command)
+    log = JointLog('', t, blank.joints, simulate(blank, rows, sets), command)
+    weight = np.tile((t >= 1.0).astype(float), (len(rows), 1))
     information = Fitter(log, noise, Prior.none()).information(
-        Problems(joints, sets, free, weight))
+        Problems(rows, sets, free, weight))
     f, d = INDEX['natural_frequency'], INDEX['delay']
     scale = np.array([term.scale for term in TERMS.values()])
-    found = []
-    for values, mask, matrix, factor in zip(sets, free, information, scatter, strict=True):
-        width = np.sqrt(RISE * factor * np.diag(_inverse(matrix, mask))) * scale
-        found.append(Experiment(frequency, amplitude, EXCITATION_TIME, float(width[d]),
-                                float(width[f] * values[f])))
-    return found
+    plans = []
+    for row, factor in zip(rows, np.tile(scatter, many), strict=True):
+        width = np.sqrt(RISE * factor * np.diag(_inverse(information[row], free[row]))) * scale
+        plans.append(Experiment(float(omega[row] / 2 / np.pi), float(amplitude[row]),
+                                EXCITATION_TIME, float(width[d]),
+                                float(width[f] * sets[row, f])))
+    return [plans[k:k + count] for k in range(0, len(plans), count)]
 
 
 __all__ = ['Experiment', 'NAMES', 'separating_experiments', 'traded', 'uncertainties',

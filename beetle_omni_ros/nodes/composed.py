@@ -9,8 +9,9 @@ from beetle_omni_ros.nodes import runner
 
 NODES = {'sim_node': 'SimNode', 'ekf_node': 'EkfNode', 'nmpc_node': 'NmpcNode',
          'rl_node': 'RlNode', 'supervisor_node': 'SupervisorNode',
+         'rotor_bridge_node': 'RotorBridgeNode',
          'reference_node': 'ReferenceNode', 'recorder_node': 'RecorderNode',
-         'viewer_node': 'ViewerNode'}
+         'viewer_node': 'ViewerNode', 'joint_bridge_node': 'JointBridgeNode'}
 
 
 def main(args=None):
@@ -27,10 +28,19 @@ def main(args=None):
         problem = f"unknown node '{unknown[0]}'" if unknown else 'each node once, at least one'
         print(f'composed: error: {problem}; {usage}', file=sys.stderr)
         sys.exit(runner.UNUSABLE)
-    classes = [getattr(import_module(f'{__package__}.{name}'), NODES[name]) for name in names]
+    classes = [_class(name) for name in names]
     program = argv[:1]
     ros_arguments = [a for a in argv[1:] if a not in names]
     sys.exit(runner.run(classes, program + ros_arguments, 'composed'))
+
+
+def _class(name):
+    try:
+        return getattr(import_module(f'{__package__}.{name}'), NODES[name])
+    except ModuleNotFoundError as error:
+        print(f"composed: error: {name} needs the Python package '{error.name}'; what bridges "
+              "need installs the extra 'hardware' of beetle_omni_ros", file=sys.stderr)
+        sys.exit(runner.UNUSABLE)
 
 
 if __name__ == '__main__':

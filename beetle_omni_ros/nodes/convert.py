@@ -174,9 +174,21 @@ def joints(message: JointState) -> Joints:
                   finite(velocity, 'velocity'))
 
 
-def joint_message(stamp, position, velocity, effort=()) -> JointState:
-    """Write the four measured tilt joints."""
-    message = JointState(name=list(JOINT_NAMES), position=_floats(position),
+def known_joints(message: JointState) -> Joints:
+    """Read those tilt joints that the message names; angle and rate of the others are nan."""
+    names = [name for name in JOINT_NAMES if name in message.name]
+    order = _order(message.name, names)
+    position, velocity = np.full((2, 4), np.nan)
+    places = [JOINT_NAMES.index(name) for name in names]
+    position[places] = finite(_values(message.position, order, 'position'), 'position')
+    velocity[places] = finite(_values(message.velocity, order, 'velocity'), 'velocity') \
+        if len(message.velocity) else 0.0
+    return Joints(seconds(message.header.stamp), position, velocity)
+
+
+def joint_message(stamp, position, velocity, effort=(), names=JOINT_NAMES) -> JointState:
+    """Write the measured tilt joints, all four or those in ``names``."""
+    message = JointState(name=list(names), position=_floats(position),
                          velocity=_floats(velocity), effort=_floats(effort))
     _header(message, stamp, '')
     return message
@@ -208,6 +220,13 @@ def battery_message(stamp: float, voltage: float, current: float, cells: int) ->
         power_supply_status=BatteryState.POWER_SUPPLY_STATUS_DISCHARGING,
         power_supply_technology=BatteryState.POWER_SUPPLY_TECHNOLOGY_LIPO,
         cell_voltage=[nan] * cells)
+    _header(message, stamp, '')
+    return message
+
+
+def rotor_message(stamp: float, speed: np.ndarray) -> JointState:
+    """Write the four rotors' speeds [rad/s], positive whatever the spin; NaN unknown."""
+    message = JointState(name=list(ROTOR_NAMES), velocity=_floats(speed))
     _header(message, stamp, '')
     return message
 

@@ -12,8 +12,10 @@ import time
 import yaml
 
 import beetle_omni_ros
+from beetle_omni_ros.nodes.actuators import BRIDGES
 
-COMPOSED = 'composed'
+COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'
+PORT_TIMEOUT = 30.0     # s for the simulator to make its serial ports
 STOP_TIMEOUT = 8.0      # s for a process to stop by itself before it is killed
 
 
@@ -25,7 +27,8 @@ class Graph:
         parameters: node name -> parameters that differ from the shipped ones.
         folder: for the parameter file and what the processes print; must exist.
         domain: ROS domain.
-        composed: one process for all, or one for each.
+        composed: one process for all but the bridges, which share another: they wait for their
+            serial ports; or one for each.
 
     """
 
@@ -34,19 +37,38 @@ class Graph:
         """Prepare; :meth:`start` starts."""
         self.folder, self.domain = Path(folder), domain
         self.nodes = list(parameters)
+        simulator = parameters.get('sim_node', {})
+        self._ports = [port for port in map(simulator.get, ('servo_port', 'board_port')) if port]
         self._file = self.folder / 'parameters.yaml'
         self._file.write_text(yaml.safe_dump(
             {f'/**/{node}': {'ros__parameters': values}
              for node, values in parameters.items() if values}) if any(parameters.values())
             else '/**: {ros__parameters: {}}\n')
-        self._commands = {COMPOSED: [COMPOSED, *self.nodes]} if composed \
-            else {node: [node] for node in self.nodes}
+        self._commands = {node: [node] for node in self.nodes}
+        if composed:
+            bridges = [node for node in self.nodes if node in BRIDGES]
+            others = [node for node in self.nodes if node not in BRIDGES]
+            self._commands = {name: [COMPOSED, *nodes] for name, nodes in
+                              ((COMPOSED, others), (BRIDGES_COMPOSED, bridges)) if nodes}
         self.processes: dict[str, subprocess.Popen] = {}
 
     def start(self) -> None:
-        """Start every process; each ends with this one, however this one ends."""
+        """
+        Start every process, the bridges when the ports of a simulator are there.
+
+        Each ends with this process, however this one ends.
+        """
         for name in self._commands:
-            self.start_process(name)
+            if name not in (BRIDGES_COMPOSED, *BRIDGES):
+                self.start_process(name)
+        # They would wait for their ports too, but complain.
+        deadline = time.monotonic() + PORT_TIMEOUT
+        while not all(map(os.path.exists, self._ports)) and time.monotonic() < deadline \
+                and not self.dead():
+            time.sleep(0.05)
+        for name in self._commands:
+            if name in (BRIDGES_COMPOSED, *BRIDGES):
+                self.start_process(name)
 
     def start_process(self, name: str) -> subprocess.Popen:
         """Start one process, also again after it died."""
@@ -73,9 +95,10 @@ class Graph:
         return {name: _ending(process.returncode, self.log(name))
                 for name, process in self.processes.items() if process.poll() is not None}
 
-    def cpu_seconds(self) -> float:
-        """CPU time that the living processes have used."""
-        return sum(_cpu_seconds(p.pid) for p in self.processes.values() if p.poll() is None)
+    def cpu_seconds(self, bridges: bool = False) -> float:
+        """CPU time that the living processes have used, or those of the bridges alone."""
+        return sum(_cpu_seconds(p.pid) for name, p in self.processes.items() if p.poll() is None
+                   and (not bridges or name in (BRIDGES_COMPOSED, *BRIDGES)))
 
     def kill(self, name: str) -> None:
         """End one process as a crash would."""
@@ -84,14 +107,18 @@ class Graph:
 
     def stop(self) -> list[str]:
         """
-        Stop everything, the recorder last so that the bag has the end.
+        Stop everything: bridges first, which switch the actuators off while these are there.
+
+        The recorder comes last, so that the bag has the end.
 
         Returns:
             Names of the processes that had to be killed.
 
         """
+        first = [name for name in self.processes if name in (BRIDGES_COMPOSED, *BRIDGES)]
         last = [name for name in self.processes if name == 'recorder_node']
-        return self._end([n for n in self.processes if n not in last]) + self._end(last)
+        others = [name for name in self.processes if name not in (*first, *last)]
+        return self._end(first) + self._end(others) + self._end(last)
 
     def _end(self, names):
         """Interrupt, again each second: a process that still imports may swallow the first."""

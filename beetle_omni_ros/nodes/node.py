@@ -9,7 +9,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from beetle_omni_ros.nodes import convert, instance, parameters, qos
+from beetle_omni_ros.nodes import arrival, convert, instance, parameters, qos
 from beetle_omni_ros.nodes.health import Health
 
 # A stamp this far ahead of the clock comes from another clock.
@@ -62,7 +62,7 @@ class FlightNode(Node):
 
     def listen(self, message_type: type, topic: str, read: Callable, handle: Callable,
                profile: QoSProfile = qos.SENSOR, max_age: float | None = None,
-               stale_after: float | None = 0.5) -> None:
+               stale_after: float | None = 0.5, published: bool = False) -> None:
         """
         Subscribe ``topic``: convert with ``read``, refuse what is bad, pass to ``handle``.
 
@@ -74,12 +74,13 @@ class FlightNode(Node):
             profile: quality of service.
             max_age: refuse stamps older than this, or ahead of the clock [s]; None: any.
             stale_after: silence that is an error, once the topic came [s]; None: none.
+            published: pass the time of publication [s, system time, or nan] to ``handle`` too.
 
         """
         health = self.health
         health.watch(topic, stale_after)
 
-        def callback(message):
+        def callback(message, *publication):
             try:
                 value = read(message)
             except convert.MessageError as error:
@@ -92,9 +93,10 @@ class FlightNode(Node):
                 health.rejected(topic, 'stamp in the future')
             else:
                 health.received(topic, age)
-                handle(value)
+                handle(value, *publication)
 
-        self.create_subscription(message_type, topic, callback, profile)
+        taken = arrival.with_publication(callback) if published else callback
+        self.create_subscription(message_type, topic, taken, profile)
 
     def timed(self, function: Callable, *args):
         """Call ``function`` and count its CPU and wall time."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -12,6 +13,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.nodes import qos, runner
+from beetle_omni_ros.nodes.actuators import READY, STATES
 
 SERVICES = ('arm', 'disarm', 'land', 'emergency_stop')
 
@@ -23,6 +25,7 @@ class Operator:
     Attributes:
         state: the supervisor's state, '' before it is known.
         progress: the reference's progress, '' before it is known.
+        bridges: bridge node -> its state, of those that told one.
         commands: messages of the watched controller so far.
         diagnostics: status name -> newest DiagnosticStatus.
 
@@ -38,11 +41,14 @@ class Operator:
         self._executor.add_node(self._node)
         self.state = self.progress = ''
         self.states: list[str] = []
+        self.bridges: dict[str, str] = {}
         self.commands = 0
         self.diagnostics: dict[str, DiagnosticStatus] = {}
         node = self._node
         node.create_subscription(String, 'supervisor/state', self._on_state, qos.LATCHED)
         node.create_subscription(String, 'reference/state', self._on_progress, qos.LATCHED)
+        for bridge, topic in STATES.items():
+            node.create_subscription(String, topic, self._on_bridge(bridge), qos.LATCHED)
         node.create_subscription(JointState, f'{controller}/command', self._on_command,
                                  qos.SENSOR, raw=True)
         node.create_subscription(DiagnosticArray, 'diagnostics', self._on_diagnostics, qos.EVENT)
@@ -57,6 +63,11 @@ class Operator:
     def _on_progress(self, message):
         self.progress = message.data
 
+    def _on_bridge(self, name):
+        def handle(message):
+            self.bridges[name] = message.data
+        return handle
+
     def _on_command(self, _):
         self.commands += 1
 
@@ -68,6 +79,12 @@ class Operator:
     def ready(self) -> bool:
         """Whether the supervisor can be called and the controller commands."""
         return self.commands > 0 and self._clients['arm'].service_is_ready()
+
+    def waits_for(self, bridges: Sequence[str]) -> str:
+        """What keeps a bridge of these from flying, in its words; '' when nothing does."""
+        told = {name: self.bridges.get(name, 'silent') for name in bridges}
+        return '; '.join(f'{name} {text}' for name, text in told.items()
+                         if not text.startswith(READY))
 
     def spin(self, seconds: float) -> None:
         """Take in messages for so long."""

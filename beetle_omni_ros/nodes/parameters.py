@@ -123,6 +123,8 @@ def _descriptor(entry, hint, fixed) -> ParameterDescriptor:
     unit = f" [{meta['unit']}]" if meta.get('unit') else ''
     descriptor = ParameterDescriptor(
         description=meta.get('doc', '') + unit,
+        # ROS takes an empty list for one of another type, and [2] is none of floats.
+        dynamic_typing=hint is np.ndarray and meta.get('shape') is None,
         read_only=fixed or bool(meta.get('read_only')),
         additional_constraints=f"one of {', '.join(meta['choices'])}" if meta.get('choices')
         else '')

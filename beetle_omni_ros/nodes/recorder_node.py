@@ -14,10 +14,13 @@ from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.bag import BagError, BagWriter
 from beetle_omni_ros.runs.topics import LATCHED as LATCHED_TOPIC
+from beetle_omni_ros.runs.topics import SENSOR as SENSOR_TOPIC
 from beetle_omni_ros.runs.topics import Topic, TOPICS
 
 FLUSH_PERIOD = 0.4      # s; a crash loses at most what came after the last flush
-OWN_TOPICS = {'reference/state': Topic('std_msgs/msg/String', LATCHED_TOPIC)}
+STATE = Topic('std_msgs/msg/String', LATCHED_TOPIC)
+OWN_TOPICS = {'reference/state': STATE, 'joint_bridge/state': STATE, 'rotor_bridge/state': STATE,
+              'rotor_states': Topic('sensor_msgs/msg/JointState', SENSOR_TOPIC)}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,9 @@ from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 OK, FAILED, UNUSABLE = 0, 1, 2
 # The events executor of Jazzy dispatches nothing in the calls that take no timeout.
 FOREVER = 1e8
+# A driver gives a servo 3 ms for its answer, so that no thread may keep the interpreter to itself
+# for the usual 5 ms.
+THREAD_SWITCH = 0.0005  # s
 REAL_TIME_PRIORITY = 1  # lowest of the real-time ones: above every ordinary process
 PR_SET_PDEATHSIG = 1    # of linux/prctl.h
 
@@ -72,6 +75,8 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
         # that no pause of some 10 ms lands in a control cycle.
         gc.collect()
         gc.freeze()
+        if any(getattr(node, 'real_time', False) for node in nodes):
+            sys.setswitchinterval(THREAD_SWITCH)
         # Alone in its process a node shares the processor as any other: real-time processes
         # that wait for one another have held up the simulator for a third of a second.
         if len(nodes) > 1 and any(getattr(node, 'real_time', False) for node in nodes):

@@ -1,4 +1,4 @@
-"""The simulated robot in real time: sensors out, commands in."""
+"""The simulated robot in real time: sensors out, commands in, or devices on serial ports."""
 
 from __future__ import annotations
 
@@ -7,17 +7,31 @@ import time
 
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import BatteryState, Imu, JointState
 
+from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.nodes import convert, health, qos, runner
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.nodes.pacing import Pacing
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+from beetle_omni_ros.sim.emulated.fault_switches import (
+    BOARD_EVENTS,
+    BoardFaultSwitches,
+    SERVO_EVENTS,
+    ServoFaultSwitches,
+    switched_on,
+)
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
+from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
+from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
 COMMAND_AGE = 0.1       # s, older commands are not executed
+EVENTS = {*(f'servo_faults.{name}' for name in SERVO_EVENTS),
+          *(f'board_faults.{name}' for name in BOARD_EVENTS)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,9 +47,19 @@ class SimNodeParameters:
                                 doc='randomisation of plant and sensors')
     seed: int = parameter(0, doc='of every random number', low=0, high=2**31 - 1,
                           read_only=True)
-    actuators: str = parameter('direct', choices=('direct',), read_only=True,
-                               doc='how commands reach the plant')
+    actuators: str = parameter('direct', choices=('direct', 'emulated'), read_only=True,
+                               doc='how commands reach the plant: from the topic, or through '
+                               'emulated devices on serial ports')
+    servo_port: str = parameter('', doc="path of the servos' port to make; empty: a temporary one",
+                                read_only=True)
+    board_port: str = parameter('', doc="path of the motor board's port to make; empty: a "
+                                'temporary one', read_only=True)
+    servo_bus_file: str = parameter(
+        '', doc='ids, signs, zeros and baud rate of the emulated servos; empty: the shipped file',
+        read_only=True)
     payload: float = parameter(0.0, doc='mass attached below the body', unit='kg', low=0, high=2)
+    servo_faults: ServoFaultSwitches = group(ServoFaultSwitches, 'faults of the servo bus')
+    board_faults: BoardFaultSwitches = group(BoardFaultSwitches, 'faults of the motor board')
 
 
 class SimNode(FlightNode):
@@ -45,6 +69,7 @@ class SimNode(FlightNode):
 
     def __init__(self):
         """Build the plant at rest on the ground."""
+        self._devices: EmulatedActuators | None = None
         super().__init__('sim_node', SimNodeParameters, on_change=self._changed)
         given = self.parameters
         self._robot = RobotParameters.load(given.robot_file or None)
@@ -57,25 +82,93 @@ class SimNode(FlightNode):
         self._publish_to = {
             'mocap': self.create_publisher(PoseStamped, 'mocap/pose', qos.SENSOR),
             'imu': self.create_publisher(Imu, 'imu/data_raw', qos.SENSOR),
-            'truth': self.create_publisher(Odometry, 'ground_truth/odom', qos.ESTIMATE),
-            'joints': self.create_publisher(JointState, 'joint_states', qos.SENSOR),
-            'battery': self.create_publisher(BatteryState, 'battery_state', qos.SENSOR)}
-        self.listen(JointState, 'command', convert.command, self._on_command, qos.COMMAND,
-                    max_age=COMMAND_AGE)
+            'truth': self.create_publisher(Odometry, 'ground_truth/odom', qos.ESTIMATE)}
         self.listen(WrenchStamped, 'disturbance', convert.wrench, self._on_wrench, qos.EVENT,
                     stale_after=None)
         self.health.track_compute(self._simulator.tick)
         self.health.report('pacing', self._pacing_status)
-        self.health.report('latency', self._latency_status)
+        if given.actuators == 'emulated':
+            self._make_devices()
+        else:
+            self._take_commands()
         self.create_timer(self._simulator.tick, self._on_timer, clock=self.steady_clock)
 
+    def _take_commands(self):
+        """Let the topic move the plant, and publish what the devices would measure."""
+        self._refuse_faults(self.parameters)
+        self._step = self._simulator.step
+        self._publish_to['joints'] = self.create_publisher(JointState, 'joint_states', qos.SENSOR)
+        self._publish_to['battery'] = self.create_publisher(BatteryState, 'battery_state',
+                                                            qos.SENSOR)
+        self.listen(JointState, 'command', convert.command, self._on_command, qos.COMMAND,
+                    max_age=COMMAND_AGE)
+        self.health.report('latency', self._latency_status)
+
+    def _make_devices(self):
+        """Let the bridges' drivers move the plant through serial ports."""
+        given = self.parameters
+        servos = ServoBusParameters.load(given.servo_bus_file or None)
+        bus = EmulatedServoBus(
+            servos.ids.astype(int).tolist(), port=given.servo_port or None,
+            baud_rate=servos.baud_rate, signs=servos.signs.astype(int).tolist(),
+            zeros=servos.zeros.astype(int).tolist(), seed=given.seed)
+        try:
+            board = EmulatedMotorBoard(self._robot, seed=given.seed,
+                                       port=given.board_port or None)
+        except Exception:
+            bus.close()
+            raise
+        self._devices = EmulatedActuators(self._simulator, bus, board)
+        self._step = self._devices.step
+        self.health.report('devices', self._devices_status)
+        self.get_logger().info(f'servos at {bus.port}, motor board at {board.port}')
+        try:
+            self._devices.set_faults(given.servo_faults, given.board_faults)
+        except ParameterError:
+            self.close()
+            raise
+        self._reset_events([self.get_parameter(name) for name in EVENTS])
+        self.add_post_set_parameters_callback(self._reset_events)
+
+    def close(self) -> None:
+        """Switch the emulated devices off."""
+        if self._devices is not None:
+            self._devices.close()
+
     def _changed(self, new):
-        self._simulator.set_payload(new.payload)
-        self.get_logger().info(f'payload {new.payload:g} kg')
+        if self._devices is None:
+            self._refuse_faults(new)
+        else:
+            before = self._devices.faults
+            self._devices.set_faults(new.servo_faults, new.board_faults)
+            if self._devices.faults != before:
+                self.get_logger().info('faults: ' + (', '.join(self._devices.faults) or 'none'))
+        if new.payload != self.parameters.payload:
+            self._simulator.set_payload(new.payload)
+            self.get_logger().info(f'payload {new.payload:g} kg')
+        self.parameters = new
+
+    @staticmethod
+    def _refuse_faults(given):
+        """Refuse faults of devices that are not there."""
+        for group_name, events in (('servo_faults', SERVO_EVENTS), ('board_faults', BOARD_EVENTS)):
+            faults = getattr(given, group_name)
+            wanted = switched_on(faults) + [name for name in events if getattr(faults, name)]
+            if wanted:
+                raise ParameterError(f'{group_name}: {wanted[0]}: there are no devices with '
+                                     'actuators direct; start with actuators:=emulated')
+
+    def _reset_events(self, changed):
+        """Give events that have happened their value of rest, so that they can be set again."""
+        happened = [Parameter(one.name, value=type(one.value)()) for one in changed
+                    if one.name in EVENTS and one.value]
+        if happened:
+            self.get_logger().info(', '.join(one.name for one in happened) + ': done')
+            self.set_parameters(happened)
 
     def _on_timer(self):
         for _ in range(self._pacing.due()):
-            self._publish(self.timed(self._simulator.step))
+            self._publish(self.timed(self._step))
 
     def _publish(self, frame):
         epoch, publish_to = self._pacing.epoch, self._publish_to
@@ -83,7 +176,7 @@ class SimNode(FlightNode):
         if frame.mocap is not None:
             publish_to['mocap'].publish(convert.pose_message(
                 epoch + frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion))
-        if frame.joints is not None:
+        if self._devices is None and frame.joints is not None:
             publish_to['joints'].publish(convert.joint_message(
                 epoch + frame.joints.stamp, frame.joints.position, frame.joints.velocity,
                 frame.joints.effort))
@@ -94,7 +187,7 @@ class SimNode(FlightNode):
         publish_to['truth'].publish(convert.odometry_message(
             epoch + truth.stamp, truth.position, truth.velocity, truth.quaternion,
             truth.angular_velocity))
-        if frame.battery is not None:
+        if self._devices is None and frame.battery is not None:
             publish_to['battery'].publish(convert.battery_message(
                 epoch + frame.battery.stamp, frame.battery.voltage, frame.battery.current,
                 self._robot.battery.cells))
@@ -113,6 +206,11 @@ class SimNode(FlightNode):
         return level, f'{pacing.lost_ticks} ticks lost', {
             'ticks': pacing.ticks, 'lost_ticks': pacing.lost_ticks,
             'clock_steps': pacing.clock_steps, 'simulated_s': self._simulator.time}
+
+    def _devices_status(self):
+        faults = self._devices.faults
+        level = health.WARN if faults else health.OK
+        return level, 'faults: ' + (', '.join(faults) or 'none'), self._devices.status()
 
     def _latency_status(self):
         times = self._latency

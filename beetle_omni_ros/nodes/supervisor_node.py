@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+import numpy as np
 from sensor_msgs.msg import BatteryState, Imu, JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -66,7 +67,7 @@ class SupervisorNode(FlightNode):
     def _listen(self):
         supervisor = self._supervisor
         self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.ESTIMATE)
-        self.listen(JointState, 'joint_states', convert.joints, self._on_joints,
+        self.listen(JointState, 'joint_states', convert.known_joints, self._on_joints,
                     max_age=SENSOR_AGE)
         self.listen(Imu, 'imu/data_raw', convert.imu_sample, lambda s: supervisor.on_imu(
             s.stamp, s.specific_force, s.angular_velocity), max_age=SENSOR_AGE)
@@ -77,6 +78,9 @@ class SupervisorNode(FlightNode):
         for name in CONTROLLERS:
             self.listen(JointState, f'{name}/command', convert.command, self._on_command(name),
                         qos.COMMAND, stale_after=None)
+        for name in ('joint', 'rotor'):
+            self.create_subscription(String, f'{name}_bridge/state', self._on_bridge(name),
+                                     qos.LATCHED)
 
     def _changed(self, new):
         answer = self._supervisor.select(new.controller, self.now())
@@ -93,7 +97,8 @@ class SupervisorNode(FlightNode):
         return handle
 
     def _on_joints(self, joints):
-        self._joints = joints
+        if not np.isnan(joints.position).any():
+            self._joints = joints
         self._supervisor.on_joints(joints.stamp, joints.position, joints.velocity)
 
     def _on_odom(self, odom):
@@ -112,6 +117,12 @@ class SupervisorNode(FlightNode):
             accepted = supervisor.on_command(name, command, self.now())
             if accepted and name == supervisor.active and supervisor.state == FLYING:
                 self._update()      # on with it at once, not at the next look
+        return handle
+
+    def _on_bridge(self, name):
+        def handle(message):
+            self._supervisor.on_actuators(name, message.data, self.now())
+            self._update()
         return handle
 
     def _update(self):

@@ -8,6 +8,7 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.actuators import Actuators
 from beetle_omni_ros.safety.events import EventLog, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.selection import Selection
@@ -21,6 +22,7 @@ class Inputs:
     Attributes:
         events: what happened, oldest first.
         vehicle: the latest of estimate, joints, sensors and battery.
+        actuators: what the bridges to servos and motor board say.
 
     """
 
@@ -29,6 +31,7 @@ class Inputs:
         self._parameters, self._robot = parameters, robot
         self._selection = Selection(controllers, parameters.controller, parameters.commands, robot)
         self.vehicle = Vehicle(parameters, robot)
+        self.actuators = Actuators()
         self.events = EventLog(parameters.quiet_time)
         self._now: float | None = None
 
@@ -56,7 +59,7 @@ class Inputs:
         return not reason
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
-        """Take raw joint feedback (4,), beside what comes with the state."""
+        """Take raw joint feedback (4,), nan where unknown, beside what comes with the state."""
         return not self._ahead(stamp) and self.vehicle.on_joints(stamp, position, velocity)
 
     def on_imu(self, stamp: float, specific_force: np.ndarray,
@@ -81,6 +84,25 @@ class Inputs:
             return False
         self.vehicle.voltage = float(voltage)
         return True
+
+    def on_actuators(self, name: str, text: str, now: float) -> bool:
+        """
+        Take what the bridge to an actuator says of itself; the next update acts on it.
+
+        Args:
+            name: 'joint' or 'rotor'.
+            text: 'ready', 'waiting: WHY', 'silent: WHY' or 'lost: WHY'.
+            now: time [s].
+
+        Returns:
+            whether there is such a bridge.
+
+        """
+        known = self.actuators.tell(name, text)
+        self.vehicle.stuck = self.actuators.joints_lost
+        if not known:
+            self._say(now, WARNING, f"unknown bridge '{name}'", 'unknown bridge')
+        return known
 
     def _tick(self, now):
         """Time since the last update, as far as it counts; follows a clock that was set back."""

@@ -63,7 +63,7 @@ class Supervisor(Inputs):
         """Start the motors and take off, or say why not."""
         if self.state != DISARMED:
             return self._refuse(now, f'arm refused: {self.state}, not disarmed')
-        reason = self.vehicle.why_not_arm()
+        reason = self.actuators.why_not_arm or self.vehicle.why_not_arm()
         if reason:
             return self._refuse(now, f'arm refused: {reason}')
         self._takeoff = Takeoff(self._parameters.takeoff, self._allocator, self._hover,
@@ -136,6 +136,7 @@ class Supervisor(Inputs):
         told = {'state': self.state, 'controller': self.active, 'source': self.source,
                 'estimator': self.vehicle.status or 'never heard',
                 'on_backup_estimator': int(self.vehicle.backup.running)}
+        told.update(self.actuators.diagnostics())
         told.update(self._selection.diagnostics())
         for reason, count in self.vehicle.refused.items():
             told[f'refused.{reason}'] = count
@@ -148,12 +149,20 @@ class Supervisor(Inputs):
         vehicle, envelope = self.vehicle, self._parameters.envelope
         if vehicle.battery_low:
             self._say(now, WARNING, f'battery low: {vehicle.voltage:.1f} V', 'battery')
+        no_rotors, no_joints = map(self.actuators.fault, ('rotor', 'joint'))
+        if no_rotors and not self.actuators.rotors_may_turn:
+            return self._lose_rotors(now, no_rotors)
         if self.state == LANDING:
+            return
+        if no_rotors:
+            self._land(now, ERROR, f'{no_rotors}: landing while it may follow')
             return
         if vehicle.estimate.silent:
             why = f' (last refused: {vehicle.last_refusal})' if vehicle.last_refusal else ''
             self._land(now, ERROR, f'ekf_node {vehicle.estimate.text}{why}: controlled descent '
                                    'on raw sensors')
+        elif no_joints:
+            self._land(now, ERROR, f'{no_joints}: landing with the joints as they are')
         elif vehicle.joints.silent:
             self._land(now, ERROR, f'joint_bridge_node {vehicle.joints.text}: landing with the '
                                    'joints assumed where they were commanded')
@@ -163,6 +172,12 @@ class Supervisor(Inputs):
             self._react(envelope.fence_reaction, now, 'left the fence')
         elif vehicle.lost and envelope.lost_reaction != 'none':
             self._react(envelope.lost_reaction, now, 'tumbling or falling')
+
+    def _lose_rotors(self, now, why):
+        if self._on_ground:
+            self._motors_off(DISARMED, now, ERROR, f'{why}; still on the ground: motors off')
+        else:
+            self.emergency_stop(now, why)
 
     def _react(self, reaction, now, why):
         if reaction == 'emergency_stop':

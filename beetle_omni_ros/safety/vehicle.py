@@ -28,6 +28,7 @@ class Vehicle:
         state: the last good estimate, or None.
         status: the estimator's status that came with it.
         tilt, tilt_velocity, tilt_stamp: latest joint feedback.
+        stuck: whether joints do not follow commands: then a silent one is where it was last seen.
         voltage: of the pack [V], None before the first.
         refused: 'estimate: stale stamp' and the like -> count.
         last_refusal: reason of the last refused estimate, '' after a good one.
@@ -40,6 +41,7 @@ class Vehicle:
         self.state: State | None = None
         self.status = ''
         self.tilt, self.tilt_velocity, self.tilt_stamp = np.zeros(4), np.zeros(4), -np.inf
+        self.stuck = False
         self.voltage: float | None = None
         self.estimate = Silence(limits.timeout)
         self.joints = Silence(limits.joint_timeout)
@@ -80,20 +82,26 @@ class Vehicle:
         return ''
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
-        """Take joint feedback when it is newer and finite."""
-        if not (np.isfinite(stamp) and stamp > self.tilt_stamp and _finite(position, 4)
-                and np.abs(position).max() < ABSURD):
+        """
+        Take joint feedback when it is newer; where an angle is nan the last one stays.
+
+        Only a complete one ends the joints' silence.
+        """
+        known = np.isfinite(position) if np.shape(position) == (4,) else np.zeros(4, dtype=bool)
+        if not (np.isfinite(stamp) and stamp > self.tilt_stamp and known.any()
+                and np.abs(np.where(known, position, 0.0)).max() < ABSURD):
             return False
-        self.tilt, self.tilt_stamp = np.array(position, dtype=float), float(stamp)
-        self.tilt_velocity = np.array(velocity, dtype=float) if _finite(velocity, 4) \
-            else np.zeros(4)
-        self.joints.heard()
+        self.tilt, self.tilt_stamp = np.where(known, position, self.tilt), float(stamp)
+        moving = known & np.isfinite(velocity) if np.shape(velocity) == (4,) else False
+        self.tilt_velocity = np.where(moving, velocity, 0.0)
+        if known.all():
+            self.joints.heard()
         return True
 
     def seen(self, in_force: Command | None, state: State | None = None) -> State:
-        """A state for the hover controller; with silent joints, tilts as commanded."""
+        """A state for the hover controller; silent joints that may follow are as commanded."""
         state = self.state if state is None else state
-        if self.joints.silent and in_force is not None:
+        if self.joints.silent and in_force is not None and not self.stuck:
             return replace(state, tilt=in_force.tilt, tilt_velocity=np.zeros(4),
                            command=in_force)
         return replace(state, tilt=self.tilt, tilt_velocity=self.tilt_velocity,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -57,12 +59,13 @@ class Plant:
         self._ground_height: float | None = None
         self._wrench = np.zeros(6)
         self._payload: float | None = None      # not yet set
+        self._powered = (True,) * 4
         self.reset()
 
     def reset(self, position: np.ndarray | None = None,
               quaternion: np.ndarray | None = None) -> None:
         """
-        Put the robot at rest, tilts zero, rotors off; wrench and payload go.
+        Put the robot at rest, tilts zero, rotors off, servos powered; wrench and payload go.
 
         Args:
             position: (3,) of base_link in world [m]; by default standing at the origin.
@@ -70,6 +73,7 @@ class Plant:
 
         """
         self.set_payload(0.0)
+        self.set_powered((True,) * 4)
         self._wrench[:] = 0.0
         if position is None:
             position = (0.0, 0.0, self._standing_height())
@@ -96,6 +100,22 @@ class Plant:
         """Tilt targets (4,) [rad] and thrust commands (4,) [N], both within their limits."""
         self.data.ctrl[:4] = thrust
         self.data.ctrl[4:] = tilt
+
+    def set_powered(self, powered: Sequence[bool]) -> None:
+        """
+        Switch the torque of each servo, (4,).
+
+        Without it a joint is free but for the servo's damping, which neither the torque limit nor
+        the rate limit of the motor bounds.
+        """
+        powered = tuple(map(bool, powered))
+        if powered == self._powered:
+            return
+        self._powered = powered
+        stiffness = self._robot.joints.kp * np.array(powered)
+        self.model.actuator_gainprm[4:, 0] = stiffness
+        self.model.actuator_biasprm[4:, 1] = -stiffness
+        self.model.actuator_forcelimited[4:] = powered
 
     def set_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
         """External force (3,) in world [N] and torque (3,) in base_link [N m] at base_link."""
@@ -155,8 +175,10 @@ class Plant:
     def _may_reach_rate_limit(self):
         """Whether a servo's torque could take its joint to the rate limit within the next tick."""
         limit, gain = 0.9 * self._robot.joints.velocity_limit, self._rate_gain
-        return any(abs(rate) + gain * abs(target - tilt) > limit for tilt, rate, target in zip(
-            self._tilt.tolist(), self._rate.tolist(), self._target.tolist()))
+        return any(powered and abs(rate) + gain * abs(target - tilt) > limit
+                   for tilt, rate, target, powered in zip(
+                       self._tilt.tolist(), self._rate.tolist(), self._target.tolist(),
+                       self._powered))
 
     def _limit_rates(self):
         """Cap each servo's torque at what takes its joint to the rate limit, and no further."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,8 +83,30 @@ class Truth:
 
 
 @dataclass(frozen=True, slots=True)
+class Drive:
+    """
+    What actuators outside the simulator do in one tick.
+
+    Attributes:
+        tilt: (4,) angles that the servos drive to [rad].
+        powered: (4,) whether a servo has torque.
+        thrust: (4,) thrusts to which the rotors strive [N], as the battery allows.
+
+    """
+
+    tilt: np.ndarray
+    powered: Sequence[bool]
+    thrust: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
-    """What became available in one tick; None where nothing did."""
+    """
+    What became available in one tick; None where nothing did.
+
+    With a :class:`Drive`, joints and battery are what those devices measure: each tick, with bias
+    and noise, neither late nor rounded, because they do that themselves.
+    """
 
     time: float
     imu: ImuReading | None

@@ -109,9 +109,17 @@ class Sensors:
         for _ in range(self._imu.maxlen):
             self._imu.append(np.concatenate([specific_force, truth.angular_velocity]))
 
-    def read(self, tick: int, truth: Truth, plant: Plant, battery: Battery) -> tuple:
+    def read(self, tick: int, truth: Truth, plant: Plant, battery: Battery,
+             devices: bool = False) -> tuple:
         """
         Readings that become available at ``truth.stamp``, the end of tick number ``tick``.
+
+        Args:
+            tick: number of the tick.
+            truth: state at its end.
+            plant: for the servos' torques.
+            battery: at its end.
+            devices: whether joints and battery are for devices that measure them themselves.
 
         Returns:
             (imu, mocap, joints, battery), None where there is none.
@@ -121,9 +129,16 @@ class Sensors:
         self._before = truth
         imu = self._imu[0] + self._imu_noise.next()
         self._mocap.append(self._capture(truth) if tick % self._mocap_period == 0 else None)
-        self._joints.append((truth.stamp, truth.tilt, truth.tilt_velocity, plant.effort))
-        return (ImuReading(truth.stamp, imu[:3], imu[3:]), self._mocap[0],
-                self._joint_reading(), self._battery_reading(tick, truth.stamp, battery))
+        motion = ImuReading(truth.stamp, imu[:3], imu[3:])
+        effort = plant.effort
+        self._joints.append((truth.stamp, truth.tilt, truth.tilt_velocity, effort))
+        if devices:
+            shown = truth.tilt + self._tilt_noise.next()
+            return (motion, self._mocap[0],
+                    JointReading(truth.stamp, shown, truth.tilt_velocity, effort),
+                    self._pack_reading(truth.stamp, battery))
+        return motion, self._mocap[0], self._joint_reading(), None if \
+            tick % self._battery_period else self._pack_reading(truth.stamp, battery)
 
     def _capture(self, truth):
         noise = self._mocap_noise.next()
@@ -137,9 +152,7 @@ class Sensors:
             velocity = np.rint(velocity / self._velocity_step) * self._velocity_step
         return JointReading(stamp, tilt, velocity, effort)
 
-    def _battery_reading(self, tick, stamp, battery):
-        if tick % self._battery_period:
-            return None
+    def _pack_reading(self, stamp, battery):
         voltage, current = self._battery_noise.next().tolist()
         return BatteryReading(stamp, battery.voltage + voltage, -(battery.current + current))
 

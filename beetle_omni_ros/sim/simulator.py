@@ -13,8 +13,10 @@ from beetle_omni_ros.sim.command_link import CommandLink
 from beetle_omni_ros.sim.conditions import draw
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW
-from beetle_omni_ros.sim.readings import Frame, Truth
+from beetle_omni_ros.sim.readings import Drive, Frame, Truth
 from beetle_omni_ros.sim.sensors import Sensors
+
+POWERED = (True,) * 4
 
 
 class Simulator:
@@ -135,21 +137,44 @@ class Simulator:
         """What is left in the pack, 1 is full."""
         return self._battery.charge
 
+    @property
+    def voltage(self) -> float:
+        """True pack voltage under load [V]."""
+        return self._battery.voltage
+
+    @property
+    def current(self) -> float:
+        """True current drawn from the pack [A], positive."""
+        return self._battery.current
+
     def swap_battery(self) -> None:
         """Put in a fresh pack, also in flight: a task may be longer than a charge."""
         self._battery.reset()
 
-    def step(self) -> Frame:
-        """Advance one tick; return what became available in it."""
+    def step(self, drive: Drive | None = None) -> Frame:
+        """
+        Advance one tick; return what became available in it.
+
+        Args:
+            drive: what actuators outside do, without further delay or timeout; by default
+                servos and rotors follow :meth:`command`.
+
+        """
         plant, link, battery = self._plant, self._link, self._battery
-        link.update(self.time)
-        plant.set_targets(link.tilt, np.minimum(link.thrust, battery.thrust_limit))
+        if drive is None:
+            link.update(self.time)
+            plant.set_powered(POWERED)
+            plant.set_targets(link.tilt, np.minimum(link.thrust, battery.thrust_limit))
+        else:
+            plant.set_powered(drive.powered)
+            plant.set_targets(drive.tilt, drive.thrust)
         plant.step()
         self._ticks += 1
         self.time = self._ticks * self.tick
         self.truth = truth = self._truth()
         battery.step(truth.thrust, self.tick)
-        imu, mocap, joints, pack = self._sensors.read(self._ticks, truth, plant, battery)
+        imu, mocap, joints, pack = self._sensors.read(self._ticks, truth, plant, battery,
+                                                        devices=drive is not None)
         return Frame(self.time, imu, mocap, joints, pack, truth)
 
     def _truth(self):

@@ -195,6 +195,16 @@ def test_torque_that_could_not_be_taken_off_is_taken_off_when_the_cable_is_back(
         until(lambda *_: not emulated.torque_enabled.any(), bus, GOAL)
 
 
+def test_torque_of_a_servo_that_was_silent_meanwhile_is_taken_off_when_it_answers():
+    with running() as (bus, emulated):
+        emulated.faults.silent = {3}
+        assert not bus.disable()
+        emulated.faults.silent = set()
+        assert emulated.torque_enabled.tolist() == [False, False, True, False]
+        until(lambda *_: not emulated.torque_enabled.any(), bus, GOAL)
+        assert any('had torque left' in line for line in bus.take_events())
+
+
 def test_disabling_confirms_on_a_bad_line_or_says_that_it_did_not():
     with running(**BRISK) as (bus, emulated):
         emulated.faults.dropped = 0.3

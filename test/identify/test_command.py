@@ -19,7 +19,7 @@ def logs(tmp_path_factory):
     """Paths of a slow log and of two fast ones."""
     folder = tmp_path_factory.mktemp('logs')
     fast = sweep(3.0, periods=(0.4, 0.6), amplitudes=(0.3, 0.5))
-    return [write(folder / 'slow.csv', log_of(*sweep(duration=6.0), SERVOS, seed=1)),
+    return [write(folder / 'slow.csv', log_of(*sweep(3.0, periods=(0.8, 1.0)), SERVOS, seed=1)),
             write(folder / 'fast.csv', log_of(*fast, SERVOS, seed=2)),
             write(folder / 'first.csv', log_of(*fast, SERVOS[:1], seed=3))]
 

@@ -62,6 +62,14 @@ def test_joints_are_found_by_name_not_by_place(rng):
     assert np.array_equal(convert.joints(shuffled).velocity, -position)
 
 
+def test_rotor_speeds_stand_under_the_rotors_names():
+    message = over_the_wire(convert.rotor_message(2.5, np.array([1.0, np.nan, 3, 400])))
+    assert list(message.name) == ['rotor1', 'rotor2', 'rotor3', 'rotor4']
+    np.testing.assert_array_equal(message.velocity, [1, np.nan, 3, 400])
+    assert not len(message.position) and not len(message.effort)
+    assert convert.seconds(message.header.stamp) == 2.5
+
+
 def test_odometry_carries_the_twist_in_base_link(rng):
     rotation, velocity, rate = unit(rng), rng.normal(size=3), rng.normal(size=3)
     message = convert.odometry_message(3.0, rng.normal(size=3), velocity, rotation, rate,

@@ -43,8 +43,7 @@ def flight(ros_domain, tmp_path):
         graph.start()
         witness = Witness(ros_domain)
         assert witness.wait(lambda: witness.ready and witness.progress, READY), graph.dead()
-        assert witness.wait(lambda: witness.call('arm')[0], 10), witness.call('arm')
-        assert witness.wait(lambda: witness.progress.startswith('flying'), 20), witness.states
+        witness.take_off(lambda: witness.progress.startswith('flying'))
         yield graph, witness, bag
     finally:
         stubborn = graph.stop()

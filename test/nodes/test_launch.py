@@ -7,6 +7,7 @@ from types import ModuleType
 import pytest
 
 from beetle_omni_ros.nodes import composed, standby
+from beetle_omni_ros.nodes.actuators import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.topics import TOPICS
@@ -56,26 +57,56 @@ def test_the_arguments_of_the_interface_are_declared(bringup):
     assert all(d.kwargs['description'] for d in declared)
 
 
-def test_composed_is_one_process_with_every_node(bringup):
-    process, = bringup.start(seed='7', namespace='/robot1')
+def test_composed_is_one_process_and_one_for_the_bridges(bringup):
+    process, bridges = bringup.start(seed='7', namespace='/robot1')
+    command = bridges.kwargs['cmd']
+    assert command[3:command.index('--ros-args')] == ['joint_bridge_node', 'rotor_bridge_node']
+    assert command[-2:] == ['-r', '__ns:=/robot1']
     command = process.kwargs['cmd']
     nodes = command[3:command.index('--ros-args')]
     assert nodes == ['sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node']
-    assert set(nodes) <= set(composed.NODES)
+    assert {*nodes, *BRIDGES} <= set(composed.NODES)
     assert 'sim_node:seed:=7' in command
     assert command[-2:] == ['-r', '__ns:=/robot1']
 
 
 def test_separate_nodes_and_no_simulator_for_another_backend(bringup):
-    nodes = bringup.start(composed='false', backend='none', task='waypoints', viewer='true',
-                          namespace='robot1')
+    nodes = bringup.start(composed='false', backend='none', actuators='none', task='waypoints',
+                          viewer='true', namespace='robot1')
     assert [n.kwargs['executable'] for n in nodes] == [
         'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node', 'viewer_node']
     assert all(n.kwargs['namespace'] == 'robot1' for n in nodes)
 
 
+def test_simulator_and_bridges_meet_at_the_same_ports(bringup):
+    nodes = {n.kwargs['name']: n.kwargs['parameters'][0]
+             for n in bringup.start(composed='false')}
+    assert nodes['sim_node']['actuators'] == 'emulated'
+    assert nodes['sim_node']['servo_port'] == nodes['joint_bridge_node']['port']
+    assert nodes['sim_node']['board_port'] == nodes['rotor_bridge_node']['port']
+    assert nodes['joint_bridge_node']['autostart'] == 'activate'
+    again = {n.kwargs['name']: n.kwargs['parameters'][0]
+             for n in bringup.start(composed='false')}
+    assert again['sim_node']['servo_port'] != nodes['sim_node']['servo_port']
+    direct = bringup.start(composed='false', actuators='direct')
+    assert not set(BRIDGES) & {n.kwargs['name'] for n in direct}
+    assert 'actuators' not in next(n for n in direct if n.kwargs['name'] == 'sim_node'
+                                   ).kwargs['parameters'][0]
+
+
+def test_on_the_robot_the_bridges_take_their_own_files_and_give_no_torque(bringup):
+    nodes = {n.kwargs['name']: n.kwargs['parameters'][0] for n in bringup.start(
+        composed='false', backend='none', robot_file='r.yaml', servo_bus_file='s.yaml',
+        motor_board_file='m.yaml')}
+    assert nodes['joint_bridge_node'] == {
+        'robot_file': 'r.yaml', 'autostart': 'configure', 'servo_bus_file': 's.yaml'}
+    assert nodes['rotor_bridge_node'] == {'robot_file': 'r.yaml', 'motor_board_file': 'm.yaml'}
+    assert 'sim_node' not in nodes
+
+
 def test_the_plant_may_differ_from_what_is_believed(bringup):
-    nodes = bringup.start(composed='false', robot_file='a.yaml', plant_file='b.yaml')
+    nodes = bringup.start(composed='false', robot_file='a.yaml', plant_file='b.yaml',
+                          actuators='direct')
     given = {n.kwargs['name']: n.kwargs['parameters'][0].get('robot_file') for n in nodes}
     assert given == {'sim_node': 'b.yaml', 'ekf_node': 'a.yaml', 'nmpc_node': 'a.yaml',
                      'rl_node': 'a.yaml', 'supervisor_node': 'a.yaml'}
@@ -93,7 +124,7 @@ def test_either_controller_is_active_and_the_other_stands_by(bringup, capsys, mo
     assert controllers(controller='rl', standby='false') == ('rl', {'rl_node': {}})
     assert controllers(controller='rl', policy='/p.onnx', allow_other_robot='true') == (
         'rl', {'rl_node': {'policy': '/p.onnx', 'allow_other_robot': True}, 'nmpc_node': {}})
-    process, = bringup.start(allow_other_robot='true')
+    process, _ = bringup.start(allow_other_robot='true')
     assert 'rl_node:allow_other_robot:=True' in process.kwargs['cmd']
     assert not capsys.readouterr().err
     monkeypatch.setattr(standby, 'unfit', lambda *_: 'robot_hash: another robot')

@@ -185,8 +185,7 @@ def flight(request, ros_domain, tmp_path):
         pilot = Pilot(ros_domain)
         assert pilot.wait(lambda: pilot.ready and pilot.client.services_are_ready(), READY), \
             graph.dead()
-        assert pilot.wait(lambda: pilot.call('arm')[0], 10), pilot.call('arm')
-        assert pilot.wait(lambda: pilot.progress.startswith('flying'), 30), pilot.states
+        pilot.take_off(lambda: pilot.progress.startswith('flying'))
         yield graph, pilot
     finally:
         stubborn = graph.stop()

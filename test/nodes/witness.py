@@ -10,6 +10,7 @@ from beetle_omni_ros.nodes import convert, qos
 from beetle_omni_ros.nodes.operator import Operator
 
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
+TAKEOFF_ATTEMPTS = 3
 READY = 240     # s; without a cache the controller is compiled first
 # A busy test machine must not look like a dead node; 80 ms leave the supervisor 20 ms
 # before the actuators stop by themselves.
@@ -39,3 +40,13 @@ class Witness(Operator):
         self.height_min = np.inf
         self.spin(seconds)
         return 0.5 < self.height_min < np.inf
+
+    def take_off(self, flies):
+        """Arm and climb until ``flies()``; a start that a busy machine spoilt is tried again."""
+        for _ in range(TAKEOFF_ATTEMPTS):
+            assert self.wait(lambda: self.call('arm')[0], 15), self.call('arm')
+            self.states.clear()
+            self.wait(lambda: flies() or 'disarmed' in self.states, 30)
+            if flies():
+                return
+        raise AssertionError(f'no take-off: {self.states}')

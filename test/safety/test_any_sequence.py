@@ -20,6 +20,8 @@ actions = st.lists(st.one_of(
     st.tuples(st.just('state'), offsets, vectors, vectors, vectors),
     st.tuples(st.just('raw'), offsets, vectors, vectors),
     st.tuples(st.just('battery'), numbers),
+    st.tuples(st.just('bridge'), st.sampled_from(['joint', 'rotor', 'x']),
+              st.sampled_from(['ready', 'waiting: port', 'lost: it', '', 'x'])),
     st.tuples(st.just('toggle'), st.sampled_from(
         ['estimate', 'joints', 'imu', 'mocap', 'nmpc', 'rl'])),
     st.tuples(st.just('ask'), st.sampled_from(
@@ -52,6 +54,8 @@ def perform(puppet, action):
         supervisor.on_joints(puppet.now + rest[0], rest[1], rest[2])
     elif kind == 'battery':
         supervisor.on_battery(rest[0])
+    elif kind == 'bridge':
+        supervisor.on_actuators(*rest, puppet.now)
     elif kind == 'toggle':
         puppet.alive ^= {rest[0]}
     elif rest[0] in ('nmpc', 'rl', 'x'):

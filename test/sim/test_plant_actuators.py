@@ -1,7 +1,9 @@
 """Servos and rotors of the plant answer as their parameters say."""
 
+from dataclasses import replace
+
 import numpy as np
-from sim_robots import immovable, plant, ROBOT
+from sim_robots import HIGH, immovable, plant, ROBOT
 
 JOINT = ROBOT.joints
 TICK = 0.005
@@ -81,3 +83,69 @@ def test_thrust_follows_first_order_lag_up_and_down():
         made.step()
     np.testing.assert_allclose(made.thrust, top * np.exp(-0.1 / ROBOT.rotors.time_constant),
                                rtol=1e-6)
+
+
+def damped(time, rate):
+    """Closed form of J q'' = -Kd q' from ``rate``: angle turned and rate left."""
+    decay = np.exp(-JOINT.kd / JOINT.inertia * time)
+    return rate * JOINT.inertia / JOINT.kd * (1 - decay), rate * decay
+
+
+def test_a_joint_without_torque_ignores_its_target_and_only_its_damping_slows_it():
+    made = plant(immovable())
+    made.set_powered([True, False, False, True])
+    made.set_targets(np.full(4, 0.1), np.zeros(4))
+    made.data.qvel[6:] = [0.0, 8.0, 30.0, 0.0]      # the last beyond the motor's rate limit
+    for k in range(1, 31):
+        made.step()
+        tilt, rate = made.state[0][7:], made.state[1][6:]
+        turned, left = damped(k * TICK, np.array([8.0, 30.0]))
+        np.testing.assert_allclose(tilt[1:3], turned, atol=1e-4)
+        np.testing.assert_allclose(rate[1:3], left, rtol=1e-2, atol=1e-3)
+        expected, _ = second_order(k * TICK, 0.1)
+        np.testing.assert_allclose(tilt[[0, 3]], expected, atol=1e-4)
+
+
+def test_a_joint_without_torque_is_not_stiffened_by_a_weak_motors_limits():
+    weak = replace(immovable(), joints=replace(JOINT, effort_limit=0.01, velocity_limit=1.0))
+    made = plant(weak)
+    made.set_powered([False] * 4)
+    made.data.qvel[6:] = 5.0
+    made.step()
+    np.testing.assert_allclose(made.state[1][6:], damped(TICK, 5.0)[1], rtol=1e-3)
+
+
+def test_torque_that_returns_takes_the_joint_to_its_target_again():
+    made = plant(immovable())
+    made.set_powered([False] * 4)
+    made.set_targets(np.full(4, 0.3), np.zeros(4))
+    for _ in range(20):
+        made.step()
+    np.testing.assert_array_equal(made.state[0][7:], 0)
+    made.set_powered([True] * 4)
+    for _ in range(100):
+        made.step()
+    np.testing.assert_allclose(made.state[0][7:], 0.3, atol=1e-3)
+
+
+def test_a_joint_without_torque_lets_its_module_hang():
+    """Accelerated upward as in gravity, the module swings to below its axis."""
+    made = plant(immovable())
+    made.set_targets(np.ones(4), np.zeros(4))
+    for k in range(800):
+        made.set_powered([k < 100, True, True, True])
+        made.set_wrench([0, 0, 190 * 9.8], np.zeros(3))
+        made.step()
+    tilt = made.state[0][7:]
+    assert abs(tilt[0]) < 1e-3
+    assert np.all(np.abs(tilt[1:] - 1.0) < 0.06)
+
+
+def test_a_reset_gives_the_torque_back():
+    made = plant(immovable())
+    made.set_powered([False] * 4)
+    made.reset(HIGH)
+    made.set_targets(np.full(4, 0.2), np.zeros(4))
+    for _ in range(100):
+        made.step()
+    np.testing.assert_allclose(made.state[0][7:], 0.2, atol=1e-3)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import math
-import os
-import select
+from pathlib import Path
 import threading
 import time
 
@@ -17,7 +16,7 @@ from beetle_omni_ros.sim.emulated import mavlink
 from beetle_omni_ros.sim.emulated.board_faults import BoardFaults, frames, Line
 from beetle_omni_ros.sim.emulated.board_firmware import BoardFirmware
 from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
-from beetle_omni_ros.sim.emulated.board_port import PluggablePort
+from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
 
 TICK = 0.01             # [s] longest sleep of the thread
 
@@ -38,7 +37,8 @@ class EmulatedMotorBoard:
     """
 
     def __init__(self, robot: RobotParameters | None = None,
-                 parameters: EmulatedBoardParameters | None = None, seed: int = 0):
+                 parameters: EmulatedBoardParameters | None = None, seed: int = 0,
+                 port: str | Path | None = None):
         """
         Power on.
 
@@ -46,6 +46,10 @@ class EmulatedMotorBoard:
             robot: the true one: its rotor map turns PWM into thrust.
             parameters: by default params/emulated_board.yaml.
             seed: of random faults.
+            port: path of the port to make; a temporary one by default.
+
+        Raises:
+            OSError: the port cannot be made.
 
         """
         robot = robot or RobotParameters.load()
@@ -56,12 +60,12 @@ class EmulatedMotorBoard:
         self._lock = threading.RLock()
         self._firmware = BoardFirmware(self._parameters, robot.battery.cells, time.monotonic())
         self._voltage, self._current = robot.battery.full_voltage, 0.0
+        self._error = 0.0, 0.0
         self._thrust: np.ndarray | None = None
         self._parser = mavlink.Parser()
         self._incoming, self._outgoing = Line(seed), Line(seed + 1)
         self._sequence, self._executes = 0, True
-        self._port = PluggablePort('motor_board')
-        self._wake_read, self._wake_write = os.pipe()
+        self._terminal = PseudoTerminal(port, 'motor_board')
         self._stop = False
         self._thread = threading.Thread(target=self._run, name='emulated_motor_board', daemon=True)
         self._thread.start()
@@ -69,18 +73,16 @@ class EmulatedMotorBoard:
     @property
     def port(self) -> str:
         """Path of the serial port to open; the same after unplugging and plugging in."""
-        return self._port.path
+        return self._terminal.port
 
     def close(self) -> None:
         """Power off."""
         if self._stop:
             return
         self._stop = True
-        os.write(self._wake_write, b'x')
+        self._terminal.interrupt()
         self._thread.join(2.0)
-        self._port.close()
-        os.close(self._wake_read)
-        os.close(self._wake_write)
+        self._terminal.close()
 
     def __enter__(self) -> EmulatedMotorBoard:
         """Already on."""
@@ -127,9 +129,18 @@ class EmulatedMotorBoard:
         """Reason -> targets not followed since the board's start."""
         return dict(self._firmware.refused)
 
-    def set_battery(self, voltage: float, current: float) -> None:
-        """Tell the pack's voltage under load [V] and the current drawn [A, positive]."""
-        self._voltage, self._current = float(voltage), float(current)
+    def set_battery(self, voltage: float, current: float,
+                    error: tuple[float, float] = (0.0, 0.0)) -> None:
+        """
+        Tell the pack's state.
+
+        Args:
+            voltage: true one under load [V].
+            current: true one drawn [A, positive].
+            error: what the board measures more than these [V, A].
+
+        """
+        self._voltage, self._current, self._error = float(voltage), float(current), error
 
     def set_rotors(self, thrust: np.ndarray, temperature: np.ndarray | None = None) -> None:
         """Tell the rotors' present thrusts (4,) [N] and, if known, ESC temperatures (4,) [C]."""
@@ -151,37 +162,30 @@ class EmulatedMotorBoard:
     def unplug(self) -> None:
         """Pull the cable."""
         with self._lock:
-            self._port.unplug()
+            self._terminal.unplug()
             self._incoming.clear()
             self._outgoing.clear()
 
     def plug(self) -> None:
         """Put the cable back in; the port has its old name."""
         with self._lock:
-            self._port.plug()
-        os.write(self._wake_write, b'x')
+            self._terminal.plug()
 
     def _forget(self):
         self._parser, self._sequence = mavlink.Parser(), 0
 
     def _run(self):
         while not self._stop:
-            try:
-                self._sleep()
-            except (OSError, ValueError):
-                continue        # the cable was pulled while waiting for it
+            self._terminal.wait(self._patience())
             with self._lock:
                 self._step(time.monotonic())
 
-    def _sleep(self):
+    def _patience(self):
+        """How long nothing will be due [s]."""
         now = time.monotonic()
         telemetry = self._firmware.telemetry.next()
-        due = min(telemetry if telemetry > now else now + TICK, self._incoming.next(),
-                  self._outgoing.next(), now + TICK)
-        ports = [self._wake_read] + ([self._port.fileno()] if self._port.plugged else [])
-        readable = select.select(ports, [], [], max(0.0, due - now))[0]
-        if self._wake_read in readable:
-            os.read(self._wake_read, 16)
+        return min(telemetry if telemetry > now else now + TICK, self._incoming.next(),
+                   self._outgoing.next(), now + TICK) - now
 
     def _step(self, now):
         """Do all that is due: receive, execute, send."""
@@ -189,7 +193,10 @@ class EmulatedMotorBoard:
         self._executes = executes = self._firmware.runs(now)
         if executed and not executes:
             self._forget()
-        for frame in frames(self._port.read()) if self._port.plugged else ():
+        received = self._terminal.read()
+        # A board reads its clock after the question; this thread may have waited in between.
+        now = time.monotonic()
+        for frame in frames(received):
             self._incoming.put(frame, now, faults.corrupt_in, faults.drop_in, faults.delay_in)
         data = self._incoming.take(now)
         if executes:
@@ -199,10 +206,9 @@ class EmulatedMotorBoard:
                 if self.on_target and message.number == mavlink.ACTUATOR_TARGET:
                     self.on_target(now, message.values)
             self._send(self._firmware.due(now, self._parser), now)
-        if self._port.plugged:
-            out = self._outgoing.take(now)
-            if out:
-                self._port.write(out)
+        out = self._outgoing.take(now)
+        if out:
+            self._terminal.write(out)
 
     def _send(self, messages, now):
         faults = self.faults
@@ -216,7 +222,8 @@ class EmulatedMotorBoard:
     def _measure(self, now):
         """Write into the sensors what the world is like."""
         telemetry = self._firmware.telemetry
-        telemetry.voltage, telemetry.current = self.voltage, self._current
+        telemetry.voltage = self.voltage + self._error[0]
+        telemetry.current = self._current + self._error[1]
         telemetry.failed = frozenset(rotor - 1 for rotor in self.faults.failed_escs)
         thrust = self._thrust
         if thrust is None:

@@ -1,4 +1,4 @@
-"""A serial port without hardware: a pseudo-terminal behind a link that can be unplugged."""
+"""A serial port without hardware: a pseudo-terminal under a name that stays, to be unplugged."""
 
 from __future__ import annotations
 
@@ -12,91 +12,130 @@ import tty
 
 SPEEDS = {getattr(termios, name): int(name[1:]) for name in dir(termios)
           if name[0] == 'B' and name[1:].isdigit()}
+CHUNK = 4096    # [B] the size of the kernel's buffer
 
 
 class PseudoTerminal:
     """
-    The device's side of a serial line.
+    The device's end of a serial cable.
+
+    One thread waits; reading, writing and pulling the cable may happen in any thread, under a
+    lock of the owner.
 
     Attributes:
         port: path that a driver opens; a link, because another terminal may be behind it after
-            the cable was out.
+            the cable was out. It exists only while plugged in.
 
     """
 
     def __init__(self, port: str | Path | None = None, name: str = 'port'):
+        """
+        Plug in.
+
+        Args:
+            port: path of the link to make; a link that is there already is replaced.
+            name: of the link in a temporary folder, where no ``port`` is given.
+
+        Raises:
+            OSError: the path cannot be made; one line that names it.
+
+        """
         self._folder = None if port else tempfile.mkdtemp(prefix='emulated_')
         self.port = str(port or Path(self._folder) / name)
-        self._device = self._line = None
+        self._device = self._line = -1
         self._waker, self._wake = os.pipe()
         os.set_blocking(self._wake, False)
         os.set_blocking(self._waker, False)
-        self.plug()
+        try:
+            self.plug()
+        except OSError:
+            self.close()
+            raise
 
     @property
     def plugged(self) -> bool:
         """Whether the port exists."""
-        return self._device is not None
+        return self._device >= 0
 
     @property
     def baud_rate(self) -> int:
         """Speed that the driver has set [bit/s]; 0 while unplugged."""
         return SPEEDS.get(termios.tcgetattr(self._line)[5], 0) if self.plugged else 0
 
-    def plug(self):
-        """Make the port."""
+    def plug(self) -> None:
+        """
+        Make the port; nothing if it is there.
+
+        Raises:
+            OSError: the path is taken by something else than a link, or cannot be made.
+
+        """
         if self.plugged:
             return
-        self._device, self._line = os.openpty()
-        tty.setraw(self._line)
-        os.set_blocking(self._device, False)
-        link = f'{self.port}.new'
-        Path(link).unlink(missing_ok=True)
-        os.symlink(os.ttyname(self._line), link)
-        os.replace(link, self.port)
+        link = Path(self.port)
+        if os.path.lexists(link) and not link.is_symlink():
+            raise OSError(f'{link}: cannot be made a port, it exists and is no link')
+        # The driver's end is kept open too: a serial device does not notice who listens.
+        device, line = os.openpty()
+        try:
+            tty.setraw(line)
+            os.set_blocking(device, False)
+            fresh = Path(f'{link}.new')
+            fresh.unlink(missing_ok=True)
+            fresh.symlink_to(os.ttyname(line))
+            fresh.replace(link)
+        except OSError as error:
+            os.close(device)
+            os.close(line)
+            raise OSError(f'{link}: cannot be made a port ({error.strerror})') from None
+        self._device, self._line = device, line
         self.interrupt()
 
-    def unplug(self):
-        """Take the port away, under the driver's hands."""
+    def unplug(self) -> None:
+        """Pull the cable: whoever has the port open gets an error or an end of file."""
         if not self.plugged:
             return
-        Path(self.port).unlink(missing_ok=True)
-        device, line = self._device, self._line
-        self._device = self._line = None
-        os.close(device)
+        device, line, self._device, self._line = self._device, self._line, -1, -1
+        link = Path(self.port)
+        if link.is_symlink() and os.readlink(link) == os.ttyname(line):
+            link.unlink()       # if it is still ours
         os.close(line)
+        os.close(device)
         self.interrupt()
 
-    def receive(self, timeout: float) -> bytes:
-        """Bytes from the driver; empty after ``timeout`` seconds or :meth:`interrupt`."""
-        watched = [self._waker] + ([self._device] if self.plugged else [])
-        ready, _, _ = select.select(watched, [], [], timeout)
-        if self._waker in ready:
-            os.read(self._waker, 4096)
-        if not self.plugged or self._device not in ready:
-            return b''
+    def wait(self, timeout: float) -> None:
+        """Return when bytes have come, after ``timeout`` seconds, or on :meth:`interrupt`."""
+        device = self._device
+        watched = [self._waker, device] if device >= 0 else [self._waker]
         try:
-            return os.read(self._device, 4096)
+            if self._waker in select.select(watched, [], [], max(0.0, timeout))[0]:
+                os.read(self._waker, CHUNK)
+        except OSError:
+            pass        # the cable was pulled at this moment
+
+    def read(self) -> bytes:
+        """What has come; empty if nothing, or if unplugged."""
+        try:
+            return os.read(self._device, CHUNK)
         except OSError:
             return b''
 
-    def send(self, data: bytes):
-        """Give bytes to the driver; lost when nobody reads, as on a wire."""
+    def write(self, data: bytes) -> None:
+        """Send; what finds no room is lost, as on a wire where nobody listens."""
         try:
-            if self.plugged:
-                os.write(self._device, data)
+            os.write(self._device, data)
         except OSError:
             pass
 
-    def interrupt(self):
-        """Let :meth:`receive` return in its thread."""
+    def interrupt(self) -> None:
+        """Let :meth:`wait` return in its thread."""
         try:
             os.write(self._wake, b'\0')
-        except (BlockingIOError, OSError):
+        except OSError:
             pass
 
-    def close(self):
-        """Remove port and folder."""
+    def close(self) -> None:
+        """Remove port and folder, for good."""
         self.unplug()
         for descriptor in (self._waker, self._wake):
             os.close(descriptor)

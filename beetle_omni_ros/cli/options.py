@@ -1,0 +1,59 @@
+"""What several subcommands share: options, exit statuses, checks of their input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import sys
+from typing import Annotated, Optional
+
+import typer
+
+from beetle_omni_ros.robot.schema import ParameterError
+
+UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130
+CONDITIONS = ('nominal', 'published')
+
+TaskOption = Annotated[str, typer.Option(
+    '--task', help='CSV file of poses, or waypoints, randomN (random100), lemniscate, hover, '
+                   'force, torque or payload.', metavar='TASK')]
+ConditionsOption = Annotated[str, typer.Option(
+    '--conditions', metavar='nominal|published',
+    help="The simulator as measured, or with the publication's randomisation drawn from --seed.")]
+SeedOption = Annotated[int, typer.Option(
+    '--seed', min=0, max=2**31 - 1, help='Of random poses and of everything random in the '
+                                         'simulation.')]
+RobotOption = Annotated[Optional[Path], typer.Option(
+    '--robot', metavar='FILE', help='What estimator and controller believe. '
+                                    'Default: the shipped params/robot.yaml.')]
+PlantOption = Annotated[Optional[Path], typer.Option(
+    '--plant', metavar='FILE', help='What is true in the simulation. Default: as --robot.')]
+PolicyOption = Annotated[Optional[Path], typer.Option(
+    '--policy', metavar='FILE', help="Another policy (ONNX) for the controller 'rl'.")]
+OtherRobotOption = Annotated[bool, typer.Option(
+    '--allow-other-robot', help='Fly a policy although it was trained for other robot '
+                                'parameters.')]
+JsonOption = Annotated[Optional[Path], typer.Option(
+    '--json', metavar='FILE', help='Write the results there as JSON.')]
+
+
+def fail(error: Exception | str, status: int) -> int:
+    """Print an error as one line on standard error; returns ``status``."""
+    print(f"beetle_omni: error: {' '.join(str(error).split())}", file=sys.stderr)
+    return status
+
+
+def check_flight(*, task, seed, conditions, bag, json_path, files):
+    """Refuse unusable input before anything long starts."""
+    from beetle_omni_ros.runs.json_file import check_writable
+    from beetle_omni_ros.runs.tasks import make_task
+    if conditions not in CONDITIONS:
+        raise ParameterError(f"--conditions '{conditions}': expected {' or '.join(CONDITIONS)}")
+    for file in files:
+        if file is not None and not file.is_file():
+            raise ParameterError(f'{file}: no such file')
+    make_task(task, seed)
+    if json_path:
+        check_writable(json_path)
+    if bag:
+        from beetle_omni_ros.runs.bag import check_new
+        check_new(bag)

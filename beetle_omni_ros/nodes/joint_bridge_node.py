@@ -1,0 +1,213 @@
+"""The tilt servos as a node: commands to the bus, measured angles from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+import time
+
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from beetle_omni_ros.drivers.servo_bus import ServoBus
+from beetle_omni_ros.drivers.servo_link import ServoBusError
+from beetle_omni_ros.drivers.servo_loop import Goal, ServoLoop
+from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.nodes import convert, health, qos, runner
+from beetle_omni_ros.nodes.joint_bridge_status import bus_status, servo_status
+from beetle_omni_ros.nodes.lifecycle_node import (
+    ACTIVE,
+    AUTOSTART,
+    INACTIVE,
+    LifecycleFlightNode,
+)
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
+from beetle_omni_ros.robot.schema import parameter
+
+COMMAND_AGE = 0.1   # [s] older commands are not written
+LOST_AFTER = 0.3    # [s] without obeying; a servo that is brought back at once is not lost
+LOOK_PERIOD = 0.05  # [s] between looks at what the bus's thread has to say
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointBridgeNodeParameters(ServoBusParameters):
+    """Parameters of joint_bridge_node: the bus, the robot, and how far it starts by itself."""
+
+    robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
+    servo_bus_file: str = parameter(
+        '', doc='servo file to start from; empty: the shipped params/servo_bus.yaml',
+        read_only=True)
+    autostart: str = parameter('none', choices=tuple(AUTOSTART), read_only=True,
+                               doc='transition to make without being asked, until it works')
+
+
+class JointBridgeNode(LifecycleFlightNode):
+    """Lifecycle node: configure checks the servos, activate gives them torque."""
+
+    real_time = True
+    refusals = (ServoBusError,)
+
+    def __init__(self):
+        """Wait to be configured; the port stays closed."""
+        super().__init__('joint_bridge_node', JointBridgeNodeParameters, 'params/servo_bus.yaml',
+                         'servo_bus_file', on_change=self._changed,
+                         changeable=('confirm_tilts', 'confirmed_tilts'))
+        self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
+        self._bus = self._loop = None
+        self._was_active = ''
+        self._latency, self._since = health.Distribution(), 'publication'
+        self._state = self.create_publisher(String, 'joint_bridge/state', qos.LATCHED)
+        self._told = ''
+        self._joints = self.create_publisher(JointState, 'joint_states', qos.SENSOR)
+        self.listen(JointState, 'command', convert.command, self._on_command, qos.COMMAND,
+                    max_age=COMMAND_AGE, stale_after=None, published=True)
+        self._bus_status = bus_status()
+        self.health.report('bus', lambda: self._bus_status(self.stage, self._told, self._bus,
+                                                           self._loop))
+        self.health.report('latency', self._latency_status)
+        for k, name in enumerate(JOINT_NAMES):
+            self.health.report(name, lambda k=k: servo_status(self._loop, k))
+            self.create_service(Trigger, f'~/reboot_{name}',
+                                lambda request, response, k=k: self._on_reboot([k], response))
+        self.create_service(Trigger, '~/reboot', lambda request, response: self._on_reboot(
+            None, response))
+        self.create_timer(LOOK_PERIOD, self.changed, clock=self.steady_clock)
+        self.start_by_itself(self.parameters.autostart)
+        self.changed()
+
+    # --- lifecycle ----------------------------------------------------------------------------
+
+    def configure(self):
+        """Open the port, check the servos and make their settings ours; then read angles."""
+        self._bus = ServoBus(self.parameters, self._travel, self.now)
+        self._bus.open()
+        self._bus.configure()
+        self._was_active = ''
+        self._loop = ServoLoop(self._bus, self._publish, self._on_written)
+        self._loop.start()
+
+    def activate(self):
+        """Turn the torque on where the servos stand."""
+        if self._loop.failure:
+            raise ServoBusError(f'{self._loop.failure}; clean up and configure again')
+        with self._loop.exclusive() as bus:
+            bus.enable()
+
+    def deactivate(self):
+        """Take the torque off."""
+        if self._bus.enabled:
+            self._was_active = 'no torque, deactivated'
+        with self._loop.exclusive() as bus:
+            confirmed = bus.disable()
+        if not confirmed:
+            self.get_logger().error('torque off is not confirmed by all servos; it is taken off '
+                                    'as soon as they can be reached')
+
+    def release(self):
+        """Take the torque off and close the port."""
+        loop, bus = self._loop, self._bus
+        self._loop = self._bus = None
+        if bus is None:
+            return
+        if bus.enabled:
+            self._was_active = 'no torque, the node was shut down'
+        if loop is not None:
+            loop.stop()
+            self._log(loop)
+        bus.close()
+        if loop is not None:    # else a refusal has said what there is to say
+            for line in bus.take_events():
+                self.get_logger().warning(line)
+
+    def close(self):
+        """Leave no torque behind."""
+        self.release()
+        self.changed()
+
+    def _changed(self, new):
+        self.parameters = new
+        if self._loop is not None:
+            with self._loop.exclusive() as bus:
+                bus.parameters = new
+
+    def _on_reboot(self, which, response):
+        if self._loop is None:
+            response.success, response.message = False, 'not configured'
+            return response
+        if which is None:
+            reports = self._loop.health()
+            which = [k for k, one in enumerate(reports) if one.errors and not one.torque] \
+                or list(range(len(reports)))
+        with self._loop.exclusive() as bus:
+            for k in which:
+                bus.reboot(int(self.parameters.ids[k]))
+        response.success = True
+        response.message = f"restarting {', '.join(JOINT_NAMES[k] for k in which)}"
+        return response
+
+    # --- the loop -----------------------------------------------------------------------------
+
+    def _on_command(self, command, published):
+        if self._loop is not None:
+            if math.isnan(published):
+                self._since, published = 'arrival', time.time()
+            left = COMMAND_AGE - max(0.0, self.now() - command.stamp)
+            self._loop.offer(Goal(command.tilt, published, time.monotonic() + left))
+
+    def _on_written(self, published):
+        self._latency.add(time.time() - published)
+
+    def _publish(self, readings, good):
+        if good.all():
+            self._joints.publish(convert.joint_message(
+                readings.stamp, readings.position, readings.velocity, readings.effort))
+        elif good.any():
+            self._joints.publish(convert.joint_message(
+                readings.stamp, readings.position[good], readings.velocity[good],
+                readings.effort[good], [n for n, is_good in zip(JOINT_NAMES, good) if is_good]))
+
+    # --- what it says -------------------------------------------------------------------------
+
+    def changed(self):
+        """Log what the thread has to say; tell the state when it is another."""
+        if self._loop is not None:
+            self._log(self._loop)
+        text = self._state_text()
+        if text != self._told:
+            if text.startswith('lost') and not self._was_active:
+                self.get_logger().error(text)
+            else:
+                self.get_logger().info(text)
+            self._told = text
+            self._state.publish(String(data=text))
+
+    def _log(self, loop):
+        for line in loop.take_events():
+            self.get_logger().warning(line)
+
+    def _state_text(self):
+        if self.stage == ACTIVE and self._loop is not None:
+            lost = self._loop.lost(LOST_AFTER)
+            return f'lost: {lost}' if lost else 'ready'
+        if self.refusal:
+            return f'waiting: {self.refusal}'
+        if self._was_active:
+            return f'lost: {self._was_active}'
+        return 'waiting: no torque, not activated' if self.stage == INACTIVE \
+            else 'waiting: not configured'
+
+    def _latency_status(self):
+        times = self._latency
+        return health.OK, f'{self._since} of command to its last byte written', {
+            'median_ms': 1e3 * times.quantile(0.5), 'p99_ms': 1e3 * times.quantile(0.99),
+            'max_ms': 1e3 * times.max, 'count': times.count}
+
+
+def main(args=None):
+    """Run the node."""
+    runner.main(JointBridgeNode, args)
+
+
+if __name__ == '__main__':
+    main()

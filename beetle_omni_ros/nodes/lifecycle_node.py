@@ -1,0 +1,135 @@
+"""A flight node with the states of ROS 2: unconfigured, inactive, active, finalized."""
+
+from __future__ import annotations
+
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+
+from beetle_omni_ros.nodes.node import FlightNode
+
+UNCONFIGURED, INACTIVE, ACTIVE = 'unconfigured', 'inactive', 'active'
+# autostart -> the state in which it has done its work
+AUTOSTART = {'none': '', 'configure': INACTIVE, 'activate': ACTIVE}
+RETRY = 1.0     # [s] between attempts to start by itself
+
+
+class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
+    """
+    Base of a node that opens a device when configured and powers it when activated.
+
+    A subclass overrides ``configure``, ``activate``, ``deactivate`` and ``release``. The first
+    two refuse with an exception of ``refusals``, whose text goes to the log and to
+    :attr:`refusal`; the node is then in the state that it came from.
+
+    Attributes:
+        refusal: why the last transition was refused; '' after one that was not.
+
+    """
+
+    refusals: tuple[type[Exception], ...] = ()
+
+    def __init__(self, *args, **kwargs):
+        """Take the arguments of FlightNode."""
+        FlightNode.__init__(self, *args, **kwargs)
+        LifecycleNodeMixin.__init__(self)
+        self.refusal = ''
+        self._goal = ''
+        self._start_timer = None
+        # rclpy lets an impossible transition end the process.
+        self._answer_change = self._service_change_state.callback
+        self._service_change_state.callback = self._on_change_state
+
+    def configure(self) -> None:
+        """Open the device; whatever was opened when it raises, :meth:`release` closes."""
+
+    def activate(self) -> None:
+        """Power the device; when it raises, nothing has power."""
+
+    def deactivate(self) -> None:
+        """Take the power off."""
+
+    def release(self) -> None:
+        """Take the power off and close the device; in any state, more than once."""
+
+    def changed(self) -> None:
+        """React to a transition, done or refused."""
+
+    @property
+    def stage(self) -> str:
+        """Name of the present state."""
+        return self._state_machine.current_state[1]
+
+    def start_by_itself(self, autostart: str) -> None:
+        """Go to the state that ``autostart`` names, trying once a second until it works."""
+        self._goal = AUTOSTART[autostart]
+        if self._goal:
+            self._start_timer = self.create_timer(RETRY, self._try_to_start,
+                                                  clock=self.steady_clock)
+
+    def _try_to_start(self):
+        if self.stage == UNCONFIGURED:
+            self.trigger_configure()
+        if self.stage == INACTIVE and self._goal == ACTIVE:
+            self.trigger_activate()
+        if self.stage not in (UNCONFIGURED, INACTIVE) or self.stage == self._goal:
+            self._start_timer.cancel()
+        self.changed()
+
+    # --- called by rclpy ----------------------------------------------------------------------
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open."""
+        return self._attempt('configure', self.configure, self.release)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Power."""
+        return self._attempt('activate', self.activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take the power off; the operator has decided, no more starts by itself."""
+        return self._attempt('deactivate', self._ordered(self.deactivate))
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close."""
+        return self._attempt('clean up', self._ordered(self.release))
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close for good."""
+        return self._attempt('shut down', self._ordered(self.release))
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close after a mistake in the code; it can be configured again."""
+        self.release()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _ordered(self, action):
+        def act():
+            if self._start_timer is not None:
+                self._start_timer.cancel()
+            action()
+        return act
+
+    def _attempt(self, what, action, undo=lambda: None):
+        before, self.refusal = self.refusal, ''
+        try:
+            action()
+        except self.refusals as error:
+            undo()
+            self.refusal = ' '.join(str(error).split())
+            if self.refusal != before:      # attempts are repeated, lines are not
+                self.get_logger().error(f'cannot {what}: {self.refusal}')
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self.get_logger().fatal(f'cannot {what}: {type(error).__name__}: {error}')
+            raise
+        return TransitionCallbackReturn.SUCCESS
+
+    def _on_change_state(self, request, response):
+        try:
+            self._answer_change(request, response)
+        except Exception as error:      # rclpy does not export the class
+            if 'RCLError' not in type(error).__name__:
+                raise
+            self.get_logger().warning(f'refused: no such transition from {self.stage}')
+            response.success = False
+        self.changed()
+        return response

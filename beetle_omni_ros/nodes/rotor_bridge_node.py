@@ -1,0 +1,169 @@
+"""The motor board as a node: thrusts to the rotors, battery and rotor speeds back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+import time
+
+from sensor_msgs.msg import BatteryState, JointState
+from std_msgs.msg import String
+
+from beetle_omni_ros.drivers.motor_board import MotorBoard
+from beetle_omni_ros.drivers.motor_board_arming import Arming, FLIES
+from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.serial_port import SerialPortError
+from beetle_omni_ros.nodes import convert, qos, runner
+from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.nodes.rotor_bridge_report import RotorBridgeReport
+from beetle_omni_ros.nodes.target_stream import TargetStream
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import parameter
+
+RPM = math.pi / 30      # [rad/s]
+POLL_CYCLES = 2         # the board tells its rotors' speeds 100 times a second
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotorBridgeNodeParameters(MotorBoardParameters):
+    """Parameters of rotor_bridge_node: the driver's own and the robot."""
+
+    robot_file: str = parameter(
+        '', doc='robot file with the rotor map; empty: the shipped one', read_only=True)
+    motor_board_file: str = parameter(
+        '', doc='file to start from; empty: the shipped params/motor_board.yaml', read_only=True)
+
+
+class RotorBridgeNode(FlightNode):
+    """
+    Executes the thrusts of command; publishes battery_state, rotor_states and its own state.
+
+    It arms the motor board when the supervisor takes off, and disarms it when the supervisor does,
+    stops, or when this process ends. rotor_bridge/state (latched) is 'ready', 'waiting: WHY' or
+    'lost: WHY'.
+    """
+
+    real_time = True
+
+    def __init__(self):
+        """Begin disarmed, and look for the board."""
+        super().__init__('rotor_bridge_node', RotorBridgeNodeParameters,
+                         'params/motor_board.yaml', 'motor_board_file')
+        given = self.parameters
+        robot = RobotParameters.load(given.robot_file or None)
+        self._cells = robot.battery.cells
+        self._period = 1 / given.target_rate
+        self._board = MotorBoard(given, robot, clock=self.now)
+        self._arming = Arming(self._board)
+        self._stream = TargetStream(self._period)
+        self._command = None
+        self._state = self._absent = ''
+        self._looked = self._next_try = time.monotonic()
+        self._cycle = 0
+        self._states = self.create_publisher(String, 'rotor_bridge/state', qos.LATCHED)
+        self._batteries = self.create_publisher(BatteryState, 'battery_state', qos.SENSOR)
+        self._rotors = self.create_publisher(JointState, 'rotor_states', qos.SENSOR)
+        self._report = RotorBridgeReport(self.health, self._arming, self._stream)
+        self.listen(JointState, 'command', convert.command, self._on_command, qos.COMMAND,
+                    max_age=given.stamp_age_limit, stale_after=None, published=True)
+        self.create_subscription(String, 'supervisor/state', self._on_supervisor, qos.LATCHED)
+        self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
+
+    def _on_command(self, command, published):
+        self._command = command
+        if not self._send():
+            return
+        self._timer.reset()     # again in a period, unless a newer one comes first
+        age = self.now() - command.stamp
+        if math.isnan(published):
+            self._stream.answered(age, 'the stamp of the command', age)
+        else:
+            self._stream.answered(time.time() - published, 'the publication of the command', age)
+
+    def _on_supervisor(self, message):
+        self._arming.follow(message.data)
+        self._tell()
+
+    def _on_timer(self):
+        now = time.monotonic()
+        self._open(now)
+        self._arming.update(now - self._looked)
+        self._looked = now
+        self._send()
+        self._cycle += 1
+        if self._cycle % POLL_CYCLES == 0:
+            self._poll()
+        self._tell()
+
+    def _open(self, now):
+        """Open the port; once open, the driver itself finds it again."""
+        if self._absent is None or now < self._next_try:
+            return
+        self._next_try = now + self.parameters.reconnect_period
+        try:
+            self._board.open()
+        except SerialPortError as error:
+            if str(error) != self._absent:
+                self._absent = str(error)
+                self.get_logger().warning(f'{error}; looking for it')
+        else:
+            self._absent = None
+
+    def _send(self):
+        """Send the newest thrusts while flying; whether they are on their way."""
+        command = self._command
+        if self._arming.phase != FLIES or command is None \
+                or self.now() - command.stamp > self.parameters.stamp_age_limit:
+            self._stream.rest()
+            return False
+        sent = self._board.send(command.thrust, command.stamp)
+        self._stream.add(sent, time.monotonic())
+        return sent.sent
+
+    def _poll(self):
+        update = self._board.poll()
+        self._report.update(update)
+        if update.battery is not None:
+            battery = update.battery
+            self._batteries.publish(convert.battery_message(
+                battery.stamp, battery.voltage, battery.current, self._cells))
+        if update.rotors is not None:
+            self._rotors.publish(convert.rotor_message(
+                update.rotors.stamp, RPM * update.rotors.rpm))
+        for event in update.events:
+            self._log(*event)
+
+    def _log(self, level, text):
+        # One call for each severity: rclpy ties a severity to the line of the call.
+        logger = self.get_logger()
+        if level == 'error':
+            logger.error(text)
+        elif level == 'warning':
+            logger.warning(text)
+        else:
+            logger.info(text)
+
+    def _tell(self):
+        text = self._arming.text
+        if self._absent and text.startswith('waiting'):
+            text = f'waiting: {self._absent}'       # says why the port is away
+        if text != self._state:
+            if text.startswith('lost'):
+                self._log('error', f'motor board: {text}')
+            self._state = text
+            self._states.publish(String(data=text))
+
+    def close(self):
+        """Disarm."""
+        self._arming.end()
+        self._states.publish(String(data=self._arming.text))
+        self._board.close()
+
+
+def main(args=None):
+    """Run the node."""
+    runner.main(RotorBridgeNode, args)
+
+
+if __name__ == '__main__':
+    main()

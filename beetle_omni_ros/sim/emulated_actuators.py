@@ -1,0 +1,147 @@
+"""Servo bus and motor board, emulated to the byte, as the actuators of a simulated robot."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import ceil
+
+import numpy as np
+
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim.command_link import ROUNDING
+from beetle_omni_ros.sim.emulated import fault_switches
+from beetle_omni_ros.sim.emulated.fault_switches import BoardFaultSwitches, ServoFaultSwitches
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
+from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
+from beetle_omni_ros.sim.readings import Drive, Frame
+from beetle_omni_ros.sim.simulator import Simulator
+
+
+class EmulatedActuators:
+    """
+    Couples the devices with the simulator: their goals move it, they measure what it does.
+
+    The devices live in real time, so :meth:`step` is called once a tick of real time. What they
+    tell at a call acts the conditions' command delay later. A command that answers the
+    IMU sample of one tick and reaches them before the next one so acts when it would on the
+    direct path.
+
+    Attributes:
+        bus: the servos, `gimbal1` to `gimbal4`.
+        board: the motor board.
+
+    """
+
+    def __init__(self, simulator: Simulator, bus: EmulatedServoBus, board: EmulatedMotorBoard):
+        """
+        Take over.
+
+        Args:
+            simulator: of the true robot.
+            bus: four servos, without a motion of their own; closed by :meth:`close`.
+            board: likewise.
+
+        """
+        self.bus, self.board = bus, board
+        self._simulator = simulator
+        delays = simulator.conditions
+        self._tilts = _line(delays.tilt_command_delay, simulator.tick,
+                            lambda: (np.zeros(4), [False] * 4))
+        self._thrusts = _line(delays.thrust_command_delay, simulator.tick, lambda: np.zeros(4))
+        self._held: dict[int, float] = {}
+        self._servo_faults, self._board_faults = ServoFaultSwitches(), BoardFaultSwitches()
+        truth = simulator.truth
+        bus.set_state(truth.tilt, truth.tilt_velocity, np.zeros(4))
+        board.set_rotors(truth.thrust)
+        board.set_battery(simulator.voltage, simulator.current)
+
+    def __enter__(self) -> EmulatedActuators:
+        """Return itself; it works since it was made."""
+        return self
+
+    def __exit__(self, *_) -> None:
+        """Close."""
+        self.close()
+
+    def close(self) -> None:
+        """Switch both devices off and remove their ports."""
+        self.bus.close()
+        self.board.close()
+
+    def step(self) -> Frame:
+        """Advance the simulator by one tick."""
+        goals, powered, stopped = self.bus.drive()
+        if any(stopped) or self._held:
+            self._hold(goals, stopped)
+        self._tilts.append((np.array(goals), powered))
+        self._thrusts.append(self.board.thrust_targets)
+        tilt, powered = self._tilts[0]
+        frame = self._simulator.step(Drive(tilt, powered, self._thrusts[0]))
+        self._tell(frame, powered)
+        return frame
+
+    def _hold(self, goals, stopped):
+        """
+        Let servos that their watchdog has stopped stay where they are.
+
+        By their own measure they would move to where that errs, and by their past goals
+        to where these are.
+        """
+        for joint, stop in enumerate(stopped):
+            if not stop:
+                self._held.pop(joint, None)
+                continue
+            if joint not in self._held:
+                held = self._held[joint] = float(self._simulator.truth.tilt[joint])
+                for tilt, _ in self._tilts:
+                    tilt[joint] = held
+            goals[joint] = self._held[joint]
+
+    def _tell(self, frame, powered):
+        """Let the devices measure; the current of a servo without torque is zero."""
+        joints, pack, simulator = frame.joints, frame.battery, self._simulator
+        self.bus.set_state(joints.position, joints.velocity, joints.effort * powered)
+        voltage, current = simulator.voltage, simulator.current
+        self.board.set_battery(voltage, current,
+                               (pack.voltage - voltage, -pack.current - current))
+        self.board.set_rotors(frame.truth.thrust)
+
+    def set_faults(self, servo: ServoFaultSwitches, board: BoardFaultSwitches) -> None:
+        """
+        Switch faults on and off; events that are set happen now.
+
+        Raises:
+            ParameterError: a servo or rotor that is none, and nothing is changed then; or a port
+                whose path is taken when it is plugged in again.
+
+        """
+        fault_switches.check_servo_faults(servo, self.bus)
+        fault_switches.check_board_faults(board)
+        try:
+            fault_switches.set_servo_faults(servo, self.bus)
+            fault_switches.set_board_faults(board, self.board)
+        except OSError as error:
+            raise ParameterError(str(error)) from None
+        self._servo_faults, self._board_faults = servo, board
+
+    @property
+    def faults(self) -> list[str]:
+        """Faults that are on, as texts such as 'servo silent [2]'."""
+        return [f'{device} {text}' for device, faults in
+                (('servo', self._servo_faults), ('board', self._board_faults))
+                for text in fault_switches.switched_on(faults)]
+
+    def status(self) -> dict[str, object]:
+        """What the devices are doing and have refused, for diagnostics."""
+        bus, board = self.bus, self.board
+        return {'servo_port': bus.port, 'board_port': board.port, 'armed': board.armed,
+                'torque': [bool(on) for on in bus.torque_enabled],
+                'stopped': [bool(on) for on in bus.stopped],
+                'servo refused': bus.network.refusals,
+                **{f'board refused: {reason}': count for reason, count in board.refused.items()}}
+
+
+def _line(delay, tick, make):
+    """A queue whose first entry is ``delay`` [s], rounded up to ticks, older than its last."""
+    length = 1 + max(0, ceil(delay / tick - ROUNDING))
+    return deque((make() for _ in range(length)), maxlen=length)

@@ -1,0 +1,57 @@
+"""What the tests of bring-up share: limits, quick looks, findings by name."""
+
+from dataclasses import replace
+
+from board_bench import QUICK
+from servo_bench import PATIENT
+
+from beetle_omni_ros.bringup.board import check_board
+from beetle_omni_ros.bringup.limits import CheckLimits
+from beetle_omni_ros.bringup.servos import check_servos
+from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+LIMITS, ROBOT = CheckLimits.load(), RobotParameters.load()
+__all__ = ['QUICK', 'LIMITS', 'ROBOT']
+
+
+def named(findings):
+    """Item -> finding; every item stands there once, and what is not well has a remedy."""
+    found = {finding.item: finding for finding in findings}
+    assert len(found) == len(findings), [finding.item for finding in findings]
+    for finding in findings:
+        assert bool(finding.remedy) == (finding.level != 'ok'), finding
+        assert finding.found and '\n' not in finding.found + finding.remedy, finding
+    return found
+
+
+def patiently(look, condition, attempts=8):
+    """
+    Look again until ``condition(found)``, at most so often; return what was found last.
+
+    Emulated devices live in threads of this process: on a busy machine they may have had no
+    turn while one look lasted.
+    """
+    for _ in range(attempts):
+        found = look()
+        if condition(found):
+            break
+    return found
+
+
+def levels(found, *, without='ok'):
+    """Item -> level, of what is not well."""
+    return {item: finding.level for item, finding in found.items() if finding.level != without}
+
+
+def servos(port, heard=None, places=None, **changes):
+    """Look at a bus; item -> finding. ``places``: sys_root, proc_root."""
+    parameters = replace(ServoBusParameters.load(), port=port, timing=PATIENT, **changes)
+    return named(check_servos(parameters, ROBOT.joints, LIMITS, heard, **(places or {})))
+
+
+def board(port, heard=None, seconds=1.2, places=None, **changes):
+    """Look at a motor board; item -> finding."""
+    parameters = replace(MotorBoardParameters.load(), port=port, **changes)
+    return named(check_board(parameters, ROBOT, LIMITS, seconds, heard, **(places or {})))

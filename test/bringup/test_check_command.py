@@ -1,0 +1,120 @@
+"""`beetle_omni check` from the command line: table, JSON, exit status, one-line refusals."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip('dynamixel_sdk')
+pytest.importorskip('pymavlink')
+
+from looks import patiently, QUICK
+from servo_bench import JOINTS
+
+from beetle_omni_ros import cli
+from beetle_omni_ros.bringup import servos
+from beetle_omni_ros.bringup.command import run_check
+from beetle_omni_ros.bringup.heard import Heard, Status
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
+from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
+
+PATIENT = """/**/joint_bridge_node:
+  ros__parameters:
+    port: /dev/nothing
+    ids: [1, 2, 3, 4]
+    signs: [1, 1, 1, 1]
+    zeros: [2048, 2048, 2048, 2048]
+    torque_per_current: 0.671
+    timing: {reply: 0.05}
+"""
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """Servo bus, motor board, and the arguments that lead to them."""
+    file = tmp_path / 'bus.yaml'
+    file.write_text(PATIENT)
+    with EmulatedServoBus(motion=JOINTS) as bus, EmulatedMotorBoard(parameters=QUICK) as board:
+        yield bus, board, ['check', '--servo-bus', str(file), '--servo-port', bus.port,
+                           '--board-port', board.port, '--seconds', '1']
+
+
+def checked(arguments, path):
+    """Run the command; return its exit status and JSON."""
+    status = cli.main([*arguments, '--json', str(path)])
+    return status, json.loads(path.read_text())
+
+
+def test_a_good_robot_ends_with_status_0(robot, tmp_path, capsys):
+    _, _, arguments = robot
+    status, result = patiently(
+        lambda: checked([*arguments, '--skip', 'ros'], tmp_path / 'result.json'),
+        lambda answer: answer[0] == 0)
+    assert status == 0 and result['ok']
+    assert {row['part'] for row in result['findings']} == {'servos', 'board'}
+    assert {row['level'] for row in result['findings']} <= {'ok', 'warn'}
+    assert set(result['findings'][0]) == {'part', 'item', 'level', 'found', 'remedy', 'values'}
+    assert result['meta']['skipped'] == ['ros']
+    out = capsys.readouterr().out
+    assert 'gimbal4' in out and 'not looked at: ros' in out and '0 failed' in out
+
+
+def test_a_fault_ends_with_status_1(robot, tmp_path, capsys, monkeypatch):
+    bus, _, arguments = robot
+    monkeypatch.setattr(servos, 'OTHER_IDS', ())
+    bus.servos[1]['Baud Rate'] = 1
+    status, result = checked([*arguments, '--skip', 'ros', '--skip', 'board'],
+                             tmp_path / 'result.json')
+    assert status == 1 and not result['ok']
+    (bad,) = [row for row in result['findings'] if row['level'] == 'fail']
+    assert bad['item'] == 'gimbal2' and '57600' in bad['remedy']
+    assert '1 failed' in capsys.readouterr().out
+
+
+def test_without_ros_the_rest_is_looked_at(robot, tmp_path, monkeypatch):
+    _, _, arguments = robot
+    for name in [name for name in sys.modules if name.startswith('beetle_omni_ros.nodes')]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, 'rclpy', None)
+    monkeypatch.setitem(sys.modules, 'diagnostic_msgs', None)
+    monkeypatch.setitem(sys.modules, 'diagnostic_msgs.msg', None)
+    status, result = checked([*arguments, '--skip', 'board'], tmp_path / 'result.json')
+    assert status == 1
+    assert [row['item'] for row in result['findings'] if row['part'] == 'servos']
+    (ros,) = [row for row in result['findings'] if row['part'] == 'ros']
+    assert 'not installed' in ros['found'] and '[ros]' in ros['remedy']
+
+
+def test_a_port_that_the_bridge_has_is_not_opened(robot, tmp_path):
+    bus, _, _ = robot
+    heard = Heard(0, 1.0, {}, {'joint_bridge': 'ready'},
+                  {'joint_bridge_node: gimbal2': Status(2, 'overload', {})})
+    path, told = tmp_path / 'result.json', []
+    bus.network.handle = lambda packet, *_: told.append(packet) or []
+    bridge = subprocess.Popen([sys.executable, '-c', 'import sys; f = open(sys.argv[1], "rb", 0); '
+                               'print("open", flush=True); sys.stdin.read()', bus.port],
+                              stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    try:
+        bridge.stdout.readline()
+        status = run_check(listen=lambda _: heard, servo_port=bus.port, skip=('board',),
+                           json_path=path)
+    finally:
+        bridge.communicate()
+    rows = {row['item']: row for row in json.loads(path.read_text())['findings']}
+    assert status == 1 and not told
+    assert rows['servo port']['level'] == rows['joint_bridge state']['level'] == 'ok'
+    assert str(bridge.pid) in rows['servo port']['found']
+    assert rows['joint_bridge gimbal2']['level'] == 'fail'
+    assert rows['joint_bridge gimbal2']['part'] == 'servos'
+
+
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (['--skip', 'rotors'], 'servos, board, ros'), (['--servo-bus', 'none.yaml'], 'none.yaml'),
+    (['--motor-board', 'none.yaml'], 'none.yaml'), (['--robot', 'none.yaml'], 'none.yaml'),
+    (['--seconds', '0'], '--seconds'), (['--json', 'no/folder.json'], 'folder.json'),
+    (['--nonsense'], '--nonsense')])
+def test_unusable_input_ends_with_status_2_and_one_line(capsys, arguments, named):
+    assert cli.main(['check', *arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert named in line

@@ -1,0 +1,159 @@
+"""A port is judged before it is opened: absent, forbidden, taken, slow, or well."""
+
+import grp
+import os
+import pwd
+import subprocess
+import sys
+
+import pytest
+
+from beetle_omni_ros.bringup import port as room
+from beetle_omni_ros.bringup.port import holders, latency_finding, port_finding
+
+
+@pytest.fixture
+def terminal(tmp_path):
+    """Path of a link to a pseudo-terminal."""
+    device, line = os.openpty()
+    link = tmp_path / 'beetle_servos'
+    link.symlink_to(os.ttyname(line))
+    yield str(link)
+    os.close(device)
+    os.close(line)
+
+
+@pytest.fixture
+def sys_root(tmp_path):
+    """A sysfs with one FTDI adapter, ttyUSB0, laid out as the kernel does."""
+    usb = tmp_path / 'sys/devices/usb1/1-2'
+    tty = usb / '1-2:1.0/ttyUSB0'
+    tty.mkdir(parents=True)
+    for name, text in {'idVendor': '0403', 'idProduct': '6014', 'manufacturer': 'FTDI',
+                       'product': 'USB <-> Serial', 'serial': 'FT4THV5O'}.items():
+        (usb / name).write_text(text + '\n')
+    (tty / 'latency_timer').write_text('16\n')
+    for folder in ('class/tty/ttyUSB0', 'bus/usb-serial/devices'):
+        (tmp_path / 'sys' / folder).mkdir(parents=True)
+    (tmp_path / 'sys/class/tty/ttyUSB0/device').symlink_to(tty)
+    (tmp_path / 'sys/bus/usb-serial/devices/ttyUSB0').symlink_to(tty)
+    return tmp_path / 'sys'
+
+
+def test_a_port_that_is_free_is_well(terminal):
+    finding = port_finding('port', terminal)
+    assert finding.level == 'ok'
+    assert terminal in finding.found and os.path.realpath(terminal) in finding.found
+
+
+def test_an_absent_port_names_those_that_are_there(tmp_path, sys_root):
+    finding = port_finding('port', '/dev/beetle_servos', sys_root)
+    assert finding.level == 'fail' and '/dev/beetle_servos: no such port' in finding.found
+    assert '/dev/ttyUSB0: FTDI USB <-> Serial (0403:6014, serial FT4THV5O)' in finding.remedy
+    finding = port_finding('port', '/dev/beetle_servos', tmp_path / 'empty')
+    assert 'no USB serial port is there' in finding.remedy
+
+
+def test_a_link_to_nothing_and_a_file_are_no_ports(tmp_path):
+    (tmp_path / 'link').symlink_to('/dev/ttyUSB77')
+    assert '/dev/ttyUSB77' in port_finding('port', str(tmp_path / 'link')).found
+    (tmp_path / 'file').touch()
+    for path in (tmp_path, tmp_path / 'file'):
+        finding = port_finding('port', str(path))
+        assert finding.level == 'fail' and 'no serial port' in finding.found
+
+
+def as_group(monkeypatch, name, members, mode):
+    """Let a port belong to group ``name`` with these members, and not let us use it."""
+    real = os.stat
+    monkeypatch.setattr(room.os, 'access', lambda *_: False)
+    monkeypatch.setattr(room.grp, 'getgrgid', lambda _: (name, 'x', 20, members))
+    monkeypatch.setattr(room.grp, 'getgrnam', lambda _: grp.struct_group(
+        (name, 'x', 20, members)))
+
+    def stat(path, **options):
+        found = real(path, **options)
+        return os.stat_result((0o20000 | mode, *found[1:]), {'st_rdev': found.st_rdev})
+    monkeypatch.setattr(room.os, 'stat', stat)
+
+
+@pytest.mark.parametrize(('group', 'joined', 'mode', 'remedy'), [
+    ('dialout', False, 0o660, 'sudo usermod -aG dialout {user}'),
+    ('dialout', True, 0o660, 'log out and in again'),
+    ('dialout', False, 0o600, 'udev rule'),
+    ('root', False, 0o660, 'udev rule')])
+def test_a_port_without_permission_says_how_to_get_it(terminal, monkeypatch, group, joined, mode,
+                                                      remedy):
+    user = pwd.getpwuid(os.geteuid()).pw_name
+    as_group(monkeypatch, group, [user] if joined else [], mode)
+    finding = port_finding('port', terminal)
+    assert finding.level == 'fail' and f'no permission for {user}' in finding.found
+    assert group in finding.found and remedy.format(user=user) in finding.remedy
+
+
+def as_nobody(function):
+    """Run in a child that is not root; return the text that it made."""
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            if os.geteuid() == 0:
+                os.setgroups([])
+                os.setgid(65534)
+                os.setuid(65534)
+            os.write(write, function().encode())
+        finally:
+            os._exit(0)
+    os.close(write)
+    os.waitpid(child, 0)
+    with os.fdopen(read) as pipe:
+        return pipe.read()
+
+
+def test_a_port_that_the_system_forbids_is_refused(terminal):
+    path = os.path.realpath(terminal)
+    os.chmod(path, 0)
+    found = as_nobody(lambda: port_finding('port', path).found)
+    assert 'no permission' in found and 'c---------' in found
+
+
+def other_process(program, *arguments):
+    """Start Python on a program that says a line once it is ready and waits."""
+    process = subprocess.Popen([sys.executable, '-c', program, *arguments], text=True,
+                               stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    return process, process.stdout.readline().strip()
+
+
+def test_the_process_that_has_the_port_is_named(terminal):
+    process, _ = other_process('import sys; f = open(sys.argv[1], "rb", 0); '
+                               'print("open", flush=True); sys.stdin.read()', terminal)
+    try:
+        assert [pid for pid, _ in holders(terminal)] == [process.pid]
+        finding = port_finding('port', terminal)
+    finally:
+        process.communicate()
+    assert finding.level == 'fail' and f'used by process {process.pid}' in finding.found
+    assert finding.values['holders'] == 1
+    assert port_finding('port', terminal).level == 'ok'
+
+
+def test_the_device_behind_a_pseudo_terminal_does_not_count():
+    process, name = other_process('import os, sys; a, b = os.openpty(); '
+                                  'print(os.ttyname(b), flush=True); sys.stdin.read()')
+    try:
+        assert holders(name) == []
+    finally:
+        process.communicate()
+
+
+def test_modem_manager_is_recognised():
+    assert 'ModemManager' in room._free([(7, '/usr/sbin/ModemManager')])
+
+
+def test_the_latency_timer_is_read_where_there_is_one(sys_root):
+    finding = latency_finding('timer', '/dev/ttyUSB0', 1, sys_root)
+    assert finding.level == 'fail' and finding.values == {'latency_timer_ms': 16}
+    assert 'latency_timer' in finding.remedy
+    (sys_root / 'bus/usb-serial/devices/ttyUSB0/latency_timer').write_text('1\n')
+    assert latency_finding('timer', '/dev/ttyUSB0', 1, sys_root).level == 'ok'
+    assert latency_finding('timer', '/dev/ttyACM0', 1, sys_root).level == 'ok'

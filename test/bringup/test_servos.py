@@ -1,0 +1,153 @@
+"""Bring-up of the servo bus finds each fault, says what to do, and changes nothing."""
+
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip('dynamixel_sdk')
+pytest.importorskip('pymavlink')
+
+from looks import levels, patiently, servos
+from servo_bench import JOINTS, running
+
+from beetle_omni_ros.bringup import servos as room
+from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
+
+NAMES = [f'gimbal{k}' for k in (1, 2, 3, 4)]
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    """Few reads and few ids are enough here."""
+    monkeypatch.setattr(room, 'ROUNDS', 5)
+    monkeypatch.setattr(room, 'OTHER_IDS', (1, 7))
+
+
+def test_a_good_bus_is_well_and_its_numbers_are_told():
+    with EmulatedServoBus(motion=JOINTS) as emulated:
+        found = servos(emulated.port)
+    assert levels(found) == {}
+    assert list(found) == ['servo port', 'servo port latency timer', 'servo bus', *NAMES]
+    assert found['gimbal3'].values == pytest.approx({
+        'id': 3, 'model': 1210, 'firmware': 52, 'baud_rate': 1_000_000, 'supply_V': 12.0,
+        'temperature_C': 35.0, 'position_rad': 0.0})
+    assert found['servo bus'].values['asked'] == 20
+
+
+def test_nothing_is_written():
+    with EmulatedServoBus(motion=JOINTS) as emulated:
+        emulated.set_state(np.full(4, 0.5), np.zeros(4), np.zeros(4))
+        emulated.faults.silent = {4}
+        network, told = emulated.network, []
+        handle = network.handle
+        network.handle = lambda packet, *rest: told.append(packet) or handle(packet, *rest)
+        servos(emulated.port)
+    assert told and {packet.instruction for packet in told} == {1, 2}    # ping and read
+
+
+def test_torque_that_somebody_left_on_stays_on_and_is_told():
+    with running() as (bus, emulated):
+        bus._link.close()       # the driver is gone, the guard is not in use
+        found = servos(emulated.port)
+        assert emulated.torque_enabled.all()
+    assert levels(found) == {f'{name} torque': 'warn' for name in NAMES}
+
+
+def test_a_servo_at_another_baud_rate_is_found():
+    with EmulatedServoBus(motion=JOINTS) as emulated:
+        emulated.servos[1]['Baud Rate'] = 1
+        found = servos(emulated.port)
+    assert levels(found) == {'gimbal2': 'fail'}
+    assert 'does not answer' in found['gimbal2'].found
+    assert 'id 2 answers at 57600 bit/s' in found['gimbal2'].remedy
+
+
+def test_a_servo_with_another_id_is_found():
+    with EmulatedServoBus((1, 2, 7, 4), motion=JOINTS) as emulated:
+        found = servos(emulated.port)
+    assert levels(found) == {'gimbal3': 'fail'}
+    assert 'id 7 at 1000000 bit/s' in found['gimbal3'].remedy
+
+
+def test_a_missing_servo_and_an_empty_bus():
+    with EmulatedServoBus(motion=JOINTS) as emulated:
+        emulated.faults.silent = {4}
+        found = servos(emulated.port)
+        assert levels(found) == {'gimbal4': 'fail'}
+        assert 'connector' in found['gimbal4'].remedy
+        emulated.faults.silent = {1, 2, 3, 4}
+        found = servos(emulated.port)
+    assert list(found)[2:] == ['servo bus'] and levels(found) == {'servo bus': 'fail'}
+    assert 'supply' in found['servo bus'].remedy
+
+
+def test_old_firmware_and_another_model_are_told():
+    with EmulatedServoBus(motion=JOINTS, firmware=44) as emulated:
+        emulated.servos[0]['Model Number'] = 1060
+        found = servos(emulated.port)
+    assert levels(found) == {'gimbal1': 'fail'} | {f'{name} firmware': 'warn' for name in NAMES}
+    assert 'model 1060' in found['gimbal1'].found
+
+
+@pytest.mark.parametrize(('volts', 'level'), [(6.0, 'fail'), (9.0, 'warn'), (13.5, 'fail')])
+def test_a_wrong_supply_is_told(volts, level):
+    with EmulatedServoBus(motion=JOINTS) as emulated:
+        emulated.faults.supply_voltage = volts
+        found = patiently(lambda: servos(emulated.port), lambda found: 'gimbal4 supply' in found)
+    assert levels(found) == {f'{name} supply': level for name in NAMES}
+
+
+def test_a_servo_that_has_shut_down_is_told():
+    with running(reboot_after_overload=False) as (bus, emulated):
+        bus._link.close()
+        emulated.servos[2].trip(0x20)
+        found = servos(emulated.port)
+    assert found['gimbal3'].level == 'fail' and 'overload' in found['gimbal3'].found
+    assert 'reboot' in found['gimbal3'].remedy
+    assert 'gimbal3 torque' not in found
+
+
+def test_a_hot_servo_is_told():
+    with EmulatedServoBus(motion=JOINTS) as emulated:
+        emulated.servos[3]['Temperature Limit'] = 50    # and so it is at 60
+        emulated.faults.overheated = {4}
+        found = patiently(lambda: servos(emulated.port),
+                          lambda found: 'gimbal4 temperature' in found)
+    assert levels(found) == {'gimbal4': 'fail', 'gimbal4 temperature': 'warn'}
+
+
+def test_an_ambiguous_turn_is_told_unless_it_is_confirmed():
+    angles = np.array([0.0, 2.8, 0.0, -1.0])
+    with EmulatedServoBus(motion=JOINTS) as emulated:
+        emulated.set_state(angles, np.zeros(4), np.zeros(4))
+        found = servos(emulated.port)
+        assert levels(found) == {'gimbal2 turn': 'fail'}
+        assert '-3.48 or +2.80 rad' in found['gimbal2 turn'].found
+        assert '2.32 rad' in found['gimbal2 turn'].remedy
+        found = servos(emulated.port, confirm_tilts=True, confirmed_tilts=[0, -3, 0, 0])
+    assert levels(found)['gimbal2 turn'] == 'warn'
+    assert '-3.48 rad' in found['gimbal2 turn'].found
+
+
+def test_spoilt_answers_are_counted():
+    with EmulatedServoBus(motion=JOINTS) as emulated:
+        emulated.faults.bad_crc = 0.4
+        found = servos(emulated.port)
+    assert found['servo bus'].level == 'fail'
+    assert found['servo bus'].values['missing'] > 2
+
+
+def test_an_absent_port_ends_the_list():
+    (finding,) = servos('/dev/no_servos').values()
+    assert finding.item == 'servo port' and finding.level == 'fail'
+
+
+def test_without_the_sdk_the_extra_is_named(monkeypatch):
+    for name in ('servo_link', 'servo_port'):
+        monkeypatch.delitem(sys.modules, f'beetle_omni_ros.drivers.{name}')
+    with EmulatedServoBus(motion=JOINTS) as emulated:
+        monkeypatch.setitem(sys.modules, 'dynamixel_sdk', None)
+        found = servos(emulated.port)
+    assert levels(found) == {'servo bus': 'fail'}
+    assert "'beetle_omni_ros[hardware]'" in found['servo bus'].remedy

@@ -1,0 +1,135 @@
+"""What was heard of ROS is judged: rates, ages, clocks, units, twins, bridges."""
+
+from looks import levels, LIMITS, named, ROBOT
+import numpy as np
+import pytest
+
+from beetle_omni_ros.bringup.finding import Finding
+from beetle_omni_ros.bringup.heard import Heard, Status, Stream
+from beetle_omni_ros.bringup.reported import bridge_findings
+from beetle_omni_ros.bringup.topics import check_topics
+
+
+def stream(rate, age, jitter=0.001, size=9.81, seconds=3.0, seed=0):
+    """A topic at an even rate."""
+    rng = np.random.default_rng(seed)
+    arrivals = 100.0 + np.arange(0, seconds, 1 / rate)
+    return Stream(arrivals=list(arrivals), ages=list(age + jitter * rng.random(len(arrivals))),
+                  sizes=list(size + 0.01 * rng.normal(size=len(arrivals))), publishers=['driver'])
+
+
+def heard(**streams):
+    """Both sensors as they should be, or replaced by name."""
+    made = {'mocap': stream(100, 0.010), 'imu': stream(200, 0.001)} | streams
+    names = {'mocap': 'mocap/pose', 'imu': 'imu/data_raw', 'joints': 'joint_states',
+             'battery': 'battery_state'}
+    return Heard(5, 3.0, {names[key]: value for key, value in made.items()})
+
+
+def judged(**streams):
+    return named(check_topics(heard(**streams), LIMITS, ROBOT.gravity))
+
+
+def test_good_sensors_without_bridges_are_well():
+    found = judged()
+    assert levels(found) == {}
+    assert found['mocap/pose rate'].values['rate_Hz'] == pytest.approx(100)
+    assert 'joint_bridge_node does not run' in found['joint_states'].found
+
+
+def test_a_sensor_that_nobody_publishes_fails_with_the_domain():
+    found = judged(mocap=Stream())
+    assert levels(found) == {'mocap/pose': 'fail'}
+    assert 'ROS domain 5' in found['mocap/pose'].found
+
+
+def test_silence_and_another_type_are_told_apart():
+    found = judged(mocap=Stream(publishers=['vrpn']), imu=Stream(other_types=['a/msg/Imu']))
+    assert 'although vrpn publishes it' in found['mocap/pose'].found
+    assert 'published as a/msg/Imu' in found['imu/data_raw'].found
+
+
+@pytest.mark.parametrize(('rate', 'level'), [(100, 'ok'), (90, 'warn'), (50, 'fail'),
+                                             (240, 'warn')])
+def test_rates_are_judged(rate, level):
+    finding = judged(mocap=stream(rate, 0.01))['mocap/pose rate']
+    assert finding.level == level and f'{rate}.0 Hz' in finding.found
+
+
+def test_a_battery_may_be_told_slowly_or_often():
+    for rate in (10, 50):
+        assert levels(judged(battery=stream(rate, 0.001))) == {}
+    assert levels(judged(battery=stream(5, 0.001))) == {'battery_state rate': 'fail'}
+
+
+def test_a_pause_is_told():
+    paused = stream(100, 0.01)
+    paused.arrivals[200:] = [t + 0.15 for t in paused.arrivals[200:]]
+    assert levels(judged(mocap=paused)) == {'mocap/pose rate': 'warn'}
+
+
+@pytest.mark.parametrize(('age', 'jitter', 'level', 'said'), [
+    (0.010, 0.004, 'ok', ''), (0.050, 0.001, 'warn', 'not synchronised'),
+    (0.050, 0.100, 'warn', 'buffers'), (3600.0, 0.01, 'fail', 'not synchronised'),
+    (0.150, 0.300, 'fail', 'buffers'), (-0.020, 0.001, 'fail', 'not synchronised')])
+def test_ages_tell_latency_from_clocks(age, jitter, level, said):
+    finding = judged(mocap=stream(100, age, jitter))['mocap/pose age']
+    assert finding.level == level and said in finding.remedy
+    assert ('in the future' in finding.found) == (age < 0)
+
+
+def test_one_early_stamp_gives_a_fast_clock_away():
+    late = stream(200, 0.02, 0.001)
+    late.ages[17] = -0.002
+    assert levels(judged(imu=late)) == {'imu/data_raw age': 'fail'}
+
+
+def test_units_twins_frozen_and_broken_messages_are_told():
+    in_g = judged(imu=stream(200, 0.001, size=1.0))
+    assert levels(in_g) == {'imu/data_raw specific force': 'warn'}
+    assert 'unit is g' in in_g['imu/data_raw specific force'].remedy
+    twins = stream(100, 0.01)
+    twins.publishers = ['sim_node', 'vrpn']
+    assert levels(judged(mocap=twins)) == {'mocap/pose publishers': 'fail'}
+    frozen = stream(100, 0.01)
+    frozen.sizes = [1.0] * len(frozen.sizes)
+    assert levels(judged(mocap=frozen)) == {'mocap/pose content': 'fail'}
+    broken = stream(200, 0.001)
+    broken.refused['specific force is not finite'] = 7
+    found = judged(imu=broken)['imu/data_raw content']
+    assert found.level == 'fail' and '7 of 600' in found.found
+
+
+def running(state='ready', level=0):
+    """What is heard of the joint bridge and of its topic."""
+    made = heard(joints=stream(200, 0.002))
+    made.states['joint_bridge'] = state
+    made.diagnostics = {
+        'joint_bridge_node: gimbal1': Status(level, 'overload', {'voltage': '11.9'}),
+        'joint_bridge_node: inputs': Status(2, 'command silent', {}),
+        'rl_node: compute': Status(1, '', {})}
+    return made
+
+
+def test_a_running_bridge_is_judged_by_what_it_reports():
+    found = named(check_topics(running(level=2), LIMITS, ROBOT.gravity))
+    assert levels(found) == {'joint_bridge gimbal1': 'fail'}
+    assert found['joint_bridge gimbal1'].values == {'voltage': '11.9'}
+    assert found['joint_states rate'].level == 'ok'
+    for state, level in (('waiting: turn lost', 'warn'), ('lost: port away', 'fail')):
+        found = named(check_topics(running(state), LIMITS, ROBOT.gravity))
+        assert levels(found) == {'joint_bridge state': level}
+        assert found['joint_bridge state'].found == state
+
+
+def test_a_port_that_a_bridge_has_is_left_to_it():
+    busy = Finding('servo port', 'fail', 'p: used by process 5 (x)', 'stop it', {'holders': 1})
+    port, state, gimbal = bridge_findings(busy, 'joint_bridge', running())
+    assert [port.level, state.level, gimbal.level] == ['ok'] * 3
+    assert 'joint_bridge_node reports' in port.found
+    told = named(check_topics(running(), LIMITS, ROBOT.gravity, frozenset({'joint_bridge'})))
+    assert 'joint_bridge state' not in told
+    for nobody in (None, heard()):
+        assert bridge_findings(busy, 'joint_bridge', nobody) == [busy]
+    absent = Finding('servo port', 'fail', 'p: no such port', 'plug it in')
+    assert bridge_findings(absent, 'joint_bridge', running()) == [absent]

@@ -1,0 +1,237 @@
+"""When the board is armed, disarmed and given up: the rule alone, on a board of cardboard."""
+
+from dataclasses import dataclass
+
+import pytest
+
+pytest.importorskip('pymavlink')
+pytest.importorskip('serial')
+
+from board_bench import connected, until
+
+from beetle_omni_ros.drivers.motor_board_arming import Arming, PATIENCE, STEP
+from beetle_omni_ros.drivers.motor_board_messages import BoardStatus, CommandResult
+
+CYCLE = 0.005
+DISARMED = BoardStatus(0.0, 'disarmed', 'none', (), 1)
+ARMED = BoardStatus(0.0, 'armed', 'none', (), 1)
+
+
+@dataclass
+class Command:
+    """An arm or disarm command; ``result`` is None as long as nobody has answered."""
+
+    arm: bool
+    result: CommandResult | None = None
+
+
+class Cardboard:
+    """A board that answers when the test says so."""
+
+    def __init__(self):
+        self.ready, self.status, self.commands = '', DISARMED, []
+        self.connected = True
+
+    def start_arm(self):
+        return self._start(Command(True))
+
+    def start_disarm(self):
+        return self._start(Command(False))
+
+    def _start(self, command):
+        self.commands.append(command)
+        return command
+
+    def answer(self, accepted=True, reason=''):
+        """Answer the newest command."""
+        command = self.commands[-1]
+        command.result = CommandResult(accepted, reason, 1)
+        if accepted:
+            self.status = ARMED if command.arm else DISARMED
+
+    @property
+    def asked(self):
+        """What was asked last: True arm, False disarm."""
+        return self.commands[-1].arm if self.commands else None
+
+
+@pytest.fixture
+def bench():
+    board = Cardboard()
+    return board, Arming(board)
+
+
+def in_flight(bench):
+    """Let it arm and fly."""
+    board, arming = bench
+    arming.follow('disarmed')
+    board.answer()
+    arming.update(CYCLE)
+    arming.follow('takeoff')
+    assert arming.phase == 'arms' and board.asked is True
+    arming.update(CYCLE)
+    assert arming.phase == 'arms'
+    board.answer()
+    arming.update(CYCLE)
+    assert (arming.phase, arming.text) == ('flies', 'ready')
+    return board, arming
+
+
+def test_it_waits_for_the_board_and_for_the_supervisor_and_says_for_which(bench):
+    board, arming = bench
+    board.ready, board.status = 'port is away', None
+    assert arming.text == 'waiting: port is away'
+    board.ready, board.status = '', BoardStatus(0.0, 'disarmed', 'none',
+                                                ('battery low', 'saturated'), 1)
+    assert arming.text == 'waiting: battery low'
+    board.status = DISARMED
+    assert arming.text == 'waiting: nothing heard of the supervisor'
+    arming.follow('disarmed')
+    assert arming.text == 'waiting: disarming is not confirmed yet'
+    board.answer()
+    arming.update(CYCLE)
+    assert arming.text == 'ready'
+
+
+@pytest.mark.parametrize('stop', ['disarmed', 'emergency_stop'])
+def test_it_flies_with_the_supervisor_and_disarms_with_it_until_that_is_confirmed(bench, stop):
+    board, arming = in_flight(bench)
+    for state in ('flying:nmpc', 'fallback', 'landing'):
+        arming.follow(state)
+        arming.update(CYCLE)
+        assert arming.phase == 'flies'
+    asked = len(board.commands)
+    arming.follow(stop)
+    assert arming.phase == 'rests' and board.asked is False and len(board.commands) == asked + 1
+    arming.update(CYCLE)
+    assert len(board.commands) == asked + 1     # an answer may still come
+    board.answer(False, 'no acknowledgement to 5 attempts')
+    arming.update(CYCLE)
+    assert len(board.commands) == asked + 2 and board.asked is False
+    board.answer()
+    arming.update(CYCLE)
+    arming.update(CYCLE)
+    assert len(board.commands) == asked + 2
+
+
+def test_a_refusal_to_arm_is_told_and_not_tried_again(bench):
+    board, arming = bench
+    arming.follow('disarmed')
+    arming.follow('takeoff')
+    board.answer(False, 'refused by the board: battery low')
+    arming.update(CYCLE)
+    assert arming.text == 'lost: not armed: refused by the board: battery low'
+    assert board.asked is False
+    board.answer()
+    for _ in range(100):
+        arming.update(CYCLE)
+    assert board.asked is False
+    arming.follow('disarmed')
+    board.answer()
+    arming.update(CYCLE)
+    assert arming.text == 'ready'
+
+
+@pytest.mark.parametrize(('status', 'why'), [
+    (BoardStatus(0.0, 'boot', 'none', (), 1), 'restarted'),
+    (BoardStatus(0.0, 'disarmed', 'none', (), 1), 'restarted'),
+    (BoardStatus(0.0, 'disarmed', 'watchdog reset', (), 1), 'restarted (watchdog reset)'),
+    (BoardStatus(0.0, 'disarmed', 'no target for too long', (), 1),
+     'disarmed (no target for too long)'),
+    (None, 'restarted')])
+def test_a_board_that_stopped_in_flight_is_lost_until_the_supervisor_is_disarmed(
+        bench, status, why):
+    board, arming = in_flight(bench)
+    board.status = status
+    arming.update(CYCLE)
+    assert arming.text == f'lost: {why}' and board.asked is False
+    board.status = ARMED        # an old message, or somebody else: it is disarmed again
+    board.answer()
+    board.status = ARMED
+    asked = len(board.commands)
+    arming.update(CYCLE)
+    assert len(board.commands) == asked + 1 and board.asked is False
+    for state in ('flying:nmpc', 'emergency_stop'):
+        arming.follow(state)
+        board.answer()
+        arming.update(CYCLE)
+        assert arming.text == f'lost: {why}' and board.asked is False
+    arming.follow('disarmed')
+    board.answer()
+    arming.update(CYCLE)
+    assert arming.text == 'ready'
+    arming.follow('takeoff')
+    assert board.asked is True
+
+
+@pytest.mark.parametrize(('connected', 'text'), [
+    (True, 'silent: nothing heard of the board'), (False, 'lost: nothing heard of the board')])
+def test_a_board_that_is_not_heard_is_told_after_patience_and_a_pause_of_our_own_is_no_silence(
+        bench, connected, text):
+    board, arming = in_flight(bench)
+    board.connected = connected
+    for _ in range(20):     # held up again and again, but heard in between
+        board.ready = 'nothing heard of the board'
+        arming.update(10.0)
+        assert arming.phase == 'flies'
+        board.ready = ''
+        arming.update(CYCLE)
+    board.ready = 'nothing heard of the board'
+    for _ in range(round(PATIENCE / STEP) - 1):
+        arming.update(10.0)
+    assert arming.phase == 'flies'
+    arming.update(10.0)
+    assert arming.text == text
+    assert board.asked is connected     # one that may still fly is not disarmed
+    board.ready = ''
+    arming.update(CYCLE)
+    assert arming.text == ('ready' if connected else text)
+
+
+@pytest.mark.parametrize('states', [['flying:nmpc'], ['disarmed', 'emergency_stop', 'takeoff']])
+def test_it_never_arms_in_the_middle_of_a_flight(bench, states):
+    board, arming = bench
+    for state in states:
+        arming.follow(state)
+    assert arming.text == 'lost: the supervisor was not disarmed before'
+    assert board.asked is False
+
+
+def test_a_board_that_it_finds_armed_is_disarmed(bench):
+    board, arming = bench
+    board.status = ARMED
+    arming.update(CYCLE)
+    assert board.asked is False
+
+
+def test_an_answer_that_the_board_contradicts_at_once_is_no_flight(bench):
+    board, arming = bench
+    arming.follow('disarmed')
+    arming.follow('takeoff')
+    board.answer()
+    board.status = BoardStatus(0.0, 'disarmed', 'heartbeat of the host lost', (), 1)
+    for _ in range(round(PATIENCE / CYCLE) + 1):
+        assert arming.phase != 'flies'
+        arming.update(CYCLE)
+    assert arming.text == 'lost: disarmed (heartbeat of the host lost)'
+
+
+def test_the_real_driver_and_board_follow_it():
+    with connected() as (emulated, board):
+        arming = Arming(board)
+
+        def reaches(condition):
+            return until(lambda: arming.update(CYCLE) or condition())
+
+        arming.follow('disarmed')
+        assert reaches(lambda: arming.text == 'ready')
+        arming.follow('takeoff')
+        assert reaches(lambda: arming.phase == 'flies') and emulated.armed
+        emulated.reboot()
+        assert reaches(lambda: arming.text == 'lost: restarted')
+        arming.follow('disarmed')
+        assert reaches(lambda: arming.text == 'ready')
+        arming.follow('takeoff')
+        assert reaches(lambda: arming.phase == 'flies')
+        arming.follow('emergency_stop')
+        assert reaches(lambda: not emulated.armed)

@@ -1,0 +1,228 @@
+"""The bus's thread: goals at once, never two transactions at a time, an even pace."""
+
+from threading import Event, Lock, Thread
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.drivers.servo_loop import Goal, PERIOD, ServoLoop
+from beetle_omni_ros.drivers.servo_pace import READ_AFTER, ServoPace
+
+FOREVER = float('inf')
+VALID = np.ones(4, bool)
+
+
+class FakeBus:
+    """Keeps what was written; checks that it is never used by two at a time."""
+
+    def __init__(self):
+        self.parameters = SimpleNamespace(port='/dev/none')
+        self.enabled = self.connected = True
+        self.obeying, self.valid = VALID, VALID
+        self.goals, self.closed = [], False
+        self.during_read = lambda: None
+        self._busy = Lock()
+
+    def _use(self, action=lambda: None):
+        assert self._busy.acquire(blocking=False), 'two transactions at a time'
+        try:
+            time.sleep(0)
+            return action()
+        finally:
+            self._busy.release()
+
+    def write_goals(self, tilt):
+        self._use(lambda: self.goals.append(float(tilt[0])))
+        return self.enabled
+
+    def read(self):
+        self._use()
+        self.during_read()
+        return SimpleNamespace(valid=self.valid)
+
+    def upkeep(self):
+        self._use()
+
+    def take_events(self):
+        return []
+
+    def health(self):
+        return [SimpleNamespace(name=f'gimbal{k}', message='') for k in (1, 2, 3, 4)]
+
+    def close(self):
+        self.closed = True
+
+
+class Clock:
+    """A clock that tests move."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+def make(**options):
+    bus, clock, seen = FakeBus(), Clock(), []
+    loop = ServoLoop(bus, lambda readings, good: seen.append(good), clock=clock, **options)
+    return loop, bus, clock, seen
+
+
+def goal(number, expires=FOREVER):
+    return Goal(np.full(4, float(number)), published=float(number), expires=expires)
+
+
+def wait_for(condition, limit=10.0):
+    end = time.monotonic() + limit
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.001)
+
+
+def test_goals_between_cycles_are_written_at_once():
+    published = []
+    loop, bus, _, _ = make(on_written=published.append)
+    loop.offer(goal(1))
+    loop.offer(goal(2))
+    assert bus.goals == [1, 2] == published
+
+
+def test_goals_that_come_during_a_transaction_follow_it_and_only_the_newest():
+    loop, bus, _, _ = make()
+    bus.during_read = lambda: (loop.offer(goal(1)), loop.offer(goal(2)), bus.goals.append('read'))
+    loop._lock.acquire()
+    loop._cycle()
+    loop._lock.release()
+    assert bus.goals == ['read', 2]
+
+
+def test_goals_are_repeated_in_a_cycle_that_brought_none_until_they_are_too_old():
+    loop, bus, clock, _ = make()
+    loop.offer(goal(1, expires=clock.now + 0.1))
+    loop._cycle()
+    assert bus.goals == [1], 'written since the last cycle'
+    loop._cycle()
+    assert bus.goals == [1, 1]
+    clock.now += 0.2
+    loop._cycle()
+    assert bus.goals == [1, 1]
+    loop.offer(goal(2, expires=clock.now - 0.01))
+    assert bus.goals == [1, 1] and loop.stale == 1
+
+
+def test_readings_are_handed_out_with_who_is_valid_and_obeys():
+    loop, bus, _, seen = make()
+    bus.valid = np.array([True, True, False, True])
+    bus.obeying = np.array([False, True, True, True])
+    loop._cycle()
+    bus.enabled = False     # then none obeys, and all angles count
+    loop._cycle()
+    assert seen[0].tolist() == [False, True, False, True]
+    assert seen[1].tolist() == [True, True, False, True]
+    assert loop.incomplete == 2 and loop.cycles == 2
+
+
+def test_a_servo_is_lost_when_it_has_not_obeyed_for_long_enough():
+    loop, bus, clock, _ = make()
+    bus.obeying = np.array([True, False, True, True])
+    clock.now += 0.2
+    loop._cycle()
+    assert not loop.lost(0.3)
+    clock.now += 0.2
+    loop._cycle()
+    assert 'gimbal2' in loop.lost(0.3) and 'gimbal1' not in loop.lost(0.3)
+    bus.connected = False
+    assert loop.lost(0.3) == '/dev/none: no connection'
+    bus.connected, bus.obeying = True, VALID
+    loop._cycle()
+    assert not loop.lost(0.3)
+
+
+def test_many_threads_offer_goals_and_none_is_left_over():
+    bus = FakeBus()
+    loop = ServoLoop(bus, lambda *_: None)
+    loop.start()
+
+    def offer(first):
+        for k in range(200):
+            loop.offer(goal(first + k))
+
+    threads = [Thread(target=offer, args=(1000 * n,)) for n in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    loop.offer(goal(-1))
+    wait_for(lambda: bus.goals[-1] == -1)
+    with loop.exclusive() as mine:
+        count = loop.cycles
+        assert mine is bus
+        loop.offer(goal(-2))
+        assert bus.goals[-1] == -1, 'the bus is ours'
+    wait_for(lambda: loop.cycles > count + 3)
+    assert bus.goals[-1] == -2
+    loop.stop()
+    assert not loop._thread.is_alive() and not loop.failure and not bus.closed
+
+
+def test_a_mistake_in_the_thread_closes_the_bus_and_is_told():
+    bus, seen = FakeBus(), Event()
+
+    def fail(readings, good):
+        seen.set()
+        raise ValueError('no such thing')
+
+    loop = ServoLoop(bus, fail)
+    loop.start()
+    wait_for(lambda: bus.closed)
+    assert seen.is_set() and 'ValueError: no such thing' in loop.lost(0.3)
+    assert loop.take_events() == [loop.failure] and loop.take_events() == []
+    loop.stop()
+
+
+# --- the pace ---------------------------------------------------------------------------------
+
+def run(pace, now, cycles, goals=None, late=lambda k: 0.0):
+    """Run cycles on a made-up clock; return when each began."""
+    began = []
+    for k in range(cycles):
+        due = now + pace.wait(now)
+        while goals and goals[0] <= due:
+            pace.goals_came(goals.pop(0))
+        now = due + late(k)
+        pace.begin(now)
+        began.append(now)
+    return np.array(began)
+
+
+def test_cycles_are_even_and_late_ones_are_made_up_for():
+    pace = ServoPace(PERIOD)
+    pace.start(10.0)
+    began = run(pace, 10.0, 101, late=lambda k: 0.004 if k % 10 == 5 else 0.0)
+    assert pace.missed == 0
+    assert began[-1] - began[0] == pytest.approx(100 * PERIOD)
+
+
+def test_a_period_without_a_cycle_is_missed_and_not_made_up_for():
+    pace = ServoPace(PERIOD)
+    pace.start(10.0)
+    run(pace, 10.0, 20, late=lambda k: 2.5 * PERIOD if k == 10 else 0.0)
+    assert pace.missed == 2
+    pace.start(20.0)    # after the bus was used for something else
+    run(pace, 20.0, 5)
+    assert pace.missed == 2
+
+
+@pytest.mark.parametrize('every', [PERIOD, 2 * PERIOD])
+@pytest.mark.parametrize('phase', [0.0, 0.0011, 0.0024, 0.0049])
+def test_the_phase_glides_to_where_goals_find_the_bus_free(every, phase):
+    pace = ServoPace(PERIOD)
+    pace.start(10.0)
+    goals = list(10.0 + phase + np.arange(0, 5, every))
+    began = run(pace, 10.0, 800, goals=list(goals))
+    assert pace.missed == 0
+    assert np.abs(np.diff(began) - PERIOD).max() <= 0.0101 * PERIOD
+    assert ((began[-1] - phase - 10.0) % PERIOD) == pytest.approx(READ_AFTER, abs=2e-4)

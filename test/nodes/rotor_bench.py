@@ -1,0 +1,143 @@
+"""rotor_bridge_node as a process, an emulated board in this one, and whoever commands it."""
+
+from contextlib import contextmanager
+from dataclasses import replace
+import threading
+import time
+
+import numpy as np
+from sensor_msgs.msg import BatteryState, JointState
+from std_msgs.msg import String
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.nodes import convert, domain, qos
+from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes.operator import Operator
+from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
+
+NODE = 'rotor_bridge_node'
+QUICK = replace(EmulatedBoardParameters.load(), boot_time=0.05, throttle_low_time=0.2,
+                reception_rate=10.0)
+HOVER = np.array([7.0, 7.5, 8.0, 8.5])
+START, SOON = 60, 10    # s; a busy test machine must not look like a fault
+
+
+class Commander(Operator):
+    """
+    Stands for the supervisor, and hears what the bridge says.
+
+    Attributes:
+        thrust: what a thread of its own commands; None: nothing.
+        period: between two commands [s].
+        age: of their stamps [s].
+        stamps: of the commands sent.
+
+    """
+
+    def __init__(self, number):
+        super().__init__(number)
+        node = self._node
+        self.told, self.batteries, self.rotors = [], [], []
+        self.thrust, self.period, self.age, self.stamps = None, 0.01, 0.0, []
+        self.supervised = ''
+        self._supervisor = node.create_publisher(String, 'supervisor/state', qos.LATCHED)
+        self._commands = node.create_publisher(JointState, 'command', qos.COMMAND)
+        node.create_subscription(String, 'rotor_bridge/state',
+                                 lambda m: self.told.append(m.data), qos.LATCHED)
+        node.create_subscription(BatteryState, 'battery_state', self.batteries.append, qos.SENSOR)
+        node.create_subscription(JointState, 'rotor_states', self.rotors.append, qos.SENSOR)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._command, daemon=True)
+        self._thread.start()
+
+    def _command(self):
+        while not self._stop.wait(self.period):
+            thrust = self.thrust
+            if thrust is not None:
+                stamp = time.time() - self.age
+                self._commands.publish(convert.command_message(
+                    Command(stamp, np.zeros(4), thrust)))
+                self.stamps.append(stamp)
+
+    def supervise(self, state):
+        """Say what the supervisor says."""
+        self.supervised = state
+        self._supervisor.publish(String(data=state))
+
+    @property
+    def bridge(self):
+        """What the bridge said last."""
+        return self.told[-1] if self.told else ''
+
+    def reaches(self, state, timeout=SOON):
+        """Wait until the bridge says it."""
+        return self.wait(lambda: self.bridge.startswith(state), timeout)
+
+    def told_in_diagnostics(self, status, key, condition, timeout=SOON):
+        """Wait until a value of the bridge's diagnostics meets a condition."""
+        return self.wait(lambda: condition(self.values(f'{NODE}: {status}').get(key, '')),
+                         timeout)
+
+    def close(self):
+        """Say nothing more."""
+        self._stop.set()
+        self._thread.join()
+        super().close()
+
+
+class Bench:
+    """One board, one bridge, one commander."""
+
+    def __init__(self, board, graph, commander):
+        self.board, self.graph, self.commander = board, graph, commander
+
+    def take_off(self):
+        """From rest to rotors that turn as commanded."""
+        commander, board = self.commander, self.board
+        assert commander.reaches('ready'), (commander.told, self.log)
+        commander.supervise('takeoff')
+        assert commander.wait(lambda: board.armed, SOON), (commander.told, self.log)
+        commander.thrust = HOVER
+        assert commander.wait(lambda: self.follows(), SOON), (commander.told, self.log)
+
+    def follows(self, thrust=HOVER):
+        """Whether the rotors strive for these thrusts within 0.1 %."""
+        return np.allclose(self.board.thrust_targets, thrust, rtol=1e-3, atol=0)
+
+    def rest(self):
+        """Back to disarmed, nothing wrong, whatever happened."""
+        board, commander = self.board, self.commander
+        board.faults = type(board.faults)()
+        board.on_target = None
+        board.plug()
+        board.set_battery(25.2, 0.0)
+        commander.thrust, commander.period, commander.age = None, 0.01, 0.0
+        flew, told = commander.supervised != 'disarmed', len(commander.told)
+        commander.supervise('disarmed')
+        # The 'ready' of the flight is not yet that of the ground.
+        return commander.wait(lambda: not flew or len(commander.told) > told, SOON) \
+            and commander.reaches('ready') and not board.armed
+
+    @property
+    def log(self):
+        """What the bridge has printed, and how it ended."""
+        return self.graph.log(NODE).read_text(), self.graph.dead()
+
+
+@contextmanager
+def bench(folder, **parameters):
+    """Start a bridge; without a parameter ``port``, on an emulated board."""
+    with domain.reserved() as number, EmulatedMotorBoard(parameters=QUICK) as board:
+        patient = {'port': board.port, 'reconnect_period': 0.1, 'silence': 1.0}
+        graph = Graph({NODE: {**patient, **parameters}}, folder, number, composed=False)
+        commander = None
+        try:
+            graph.start()
+            commander = Commander(number)
+            commander.supervise('disarmed')
+            yield Bench(board, graph, commander)
+        finally:
+            graph.stop()
+            if commander:
+                commander.close()

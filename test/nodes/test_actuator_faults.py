@@ -1,0 +1,173 @@
+"""
+Faults of servos and motor board in flight: what the robot does, who says why, what is left on.
+
+The whole graph flies through both bridges. Faults are switched on in the emulated devices by
+sim_node's parameters; what the rotors and servos really do is read from the simulator.
+"""
+
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from std_srvs.srv import Trigger
+from witness import PATIENT, READY, Witness
+
+from beetle_omni_ros.nodes.actuators import bridged, BRIDGES
+from beetle_omni_ros.nodes.graph import BRIDGES_COMPOSED, Graph
+
+FLYING = 'flying:nmpc'
+DEVICES = 'sim_node: devices'
+
+
+class Mechanic(Witness):
+    """A witness who breaks and mends the simulated devices."""
+
+    def __init__(self, domain):
+        super().__init__(domain)
+        self._client = AsyncParameterClient(self._node, 'sim_node')
+
+    def set(self, name, value):
+        """Set a parameter of sim_node."""
+        assert self.wait(self._client.services_are_ready, 10), 'sim_node is not there'
+        future = self._client.set_parameters([Parameter(name, value=value)])
+        assert self.wait(future.done, 5), 'sim_node does not answer'
+        result = future.result().results[0]
+        assert result.successful, result.reason
+
+    def device(self, key):
+        """What the simulator says about its devices, fresh; a number or a text."""
+        self.diagnostics.pop(DEVICES, None)
+        assert self.wait(lambda: DEVICES in self.diagnostics, 5), 'sim_node is silent'
+        return self.values(DEVICES)[key]
+
+    def start(self):
+        """Arm, as soon as the bridges are ready, and wait until the controller flies."""
+        assert self.wait(lambda: not self.waits_for(BRIDGES), 20), self.waits_for(BRIDGES)
+        self.take_off(lambda: self.state == FLYING)
+
+    def count(self, node, status, key):
+        """A counter of a bridge's diagnostics; 0 while it is not there."""
+        return int(self.values(f'{node}: {status}').get(key, 0))
+
+    def ask(self, service):
+        """Call a service of joint_bridge_node."""
+        client = self._node.create_client(Trigger, f'joint_bridge_node/{service}')
+        assert self.wait(client.service_is_ready, 5)
+        future = client.call_async(Trigger.Request())
+        assert self.wait(future.done, 5)
+        return future.result().success
+
+
+@pytest.fixture
+def robot(ros_domain, tmp_path):
+    """Graph and mechanic of a robot in the air."""
+    parameters = {'sim_node': {}, 'ekf_node': {}, 'nmpc_node': {}, 'supervisor_node': PATIENT}
+    for node, values in bridged(tmp_path, {}).items():
+        parameters[node] = {**parameters.get(node, {}), **values}
+    graph, mechanic = Graph(parameters, tmp_path, ros_domain), None
+    try:
+        graph.start()
+        mechanic = Mechanic(ros_domain)
+        assert mechanic.wait(lambda: mechanic.ready, READY), graph.dead()
+        mechanic.start()
+        yield graph, mechanic
+    finally:
+        stubborn = graph.stop()
+        if mechanic:
+            mechanic.close()
+    assert not stubborn
+
+
+# parameters of sim_node, switched on and off again; bridge, status and counter that tell of it
+BEARABLE = [
+    ({'servo_faults.bad_crc': 0.05}, {'servo_faults.bad_crc': 0.0}, 'joint', 'bus', 'corrupt'),
+    ({'servo_faults.dropped': 0.05}, {'servo_faults.dropped': 0.0}, 'joint', 'bus', 'unanswered'),
+    ({'servo_faults.delayed': 0.03}, {'servo_faults.delayed': 0.0}, 'joint', 'bus', 'unanswered'),
+    ({'servo_faults.supply_voltage': 14.5}, {'servo_faults.supply_voltage': 12.0}, 'joint',
+     'bus', 'cycles'),
+    ({'servo_faults.expire_watchdog': 3}, {}, 'joint', 'bus', 'cycles'),
+    ({'board_faults.corrupt_out': 0.1}, {'board_faults.corrupt_out': 0.0}, 'rotor', 'board',
+     'bad_crc'),
+    ({'board_faults.corrupt_in': 0.1}, {'board_faults.corrupt_in': 0.0}, 'rotor', 'board',
+     'board bad_crc'),
+    ({'board_faults.drop_out': 0.1}, {'board_faults.drop_out': 0.0}, 'rotor', 'board', 'lost'),
+    ({'board_faults.drop_in': 0.1}, {'board_faults.drop_in': 0.0}, 'rotor', 'board',
+     'board lost'),
+    ({'board_faults.delay_in': 0.01, 'board_faults.delay_out': 0.01},
+     {'board_faults.delay_in': 0.0, 'board_faults.delay_out': 0.0}, 'rotor', 'board', 'cycles'),
+    ({'board_faults.voltage_sag': 1.5}, {'board_faults.voltage_sag': 0.0}, 'rotor', 'board',
+     'cycles'),
+]
+
+
+def test_faults_that_drivers_bear_do_not_end_a_flight(robot):
+    graph, mechanic = robot
+    for switched, mended, bridge, status, counter in BEARABLE:
+        where = f'{bridge}_bridge_node', status, counter
+        before = mechanic.count(*where)
+        for name, value in switched.items():
+            mechanic.set(name, value)
+        assert mechanic.stays_in_the_air(1.0), switched
+        assert mechanic.wait(lambda w=where, n=before: mechanic.count(*w) > n, 10), switched
+        for name, value in mended.items():
+            mechanic.set(name, value)
+        assert mechanic.state == FLYING, (switched, mechanic.states)
+    assert mechanic.wait(lambda: np.linalg.norm(mechanic.truth.velocity) < 0.1, 10)
+    assert not graph.dead()
+
+
+# fault, mended; what joint_bridge_node or rotor_bridge_node says; whether it needs a reboot
+LANDING = [
+    ('servo_faults.silent', [2], [], 'lost: gimbal2', False),
+    ('servo_faults.overload', [1], [], 'lost: gimbal1', True),
+    ('servo_faults.overheated', [3], [], 'lost: gimbal3', True),
+    ('servo_faults.unplugged', True, False, 'lost: ', False),
+    ('board_faults.mute', True, False, 'silent: nothing heard', False),
+]
+
+
+def test_what_does_not_obey_or_is_not_heard_ends_the_flight_with_a_landing(robot):
+    graph, mechanic = robot
+    for name, value, mended, text, reboot in LANDING:
+        said = []
+        mechanic.set(name, value)
+        assert mechanic.wait(lambda s=said: s.extend(mechanic.bridges.values())
+                             or mechanic.state == 'landing', 5), (name, mechanic.states)
+        assert any(line.startswith(text) for line in said), (name, set(said))
+        sinking = []
+        assert mechanic.wait(lambda s=sinking: s.append(mechanic.truth.velocity[2])
+                             or mechanic.state in ('disarmed', 'emergency_stop'), 30), name
+        assert mechanic.state == 'disarmed' and min(sinking) > -1.0, (name, min(sinking))
+        assert mechanic.wait(lambda: mechanic.device('armed') == 'False', 5), name
+        mechanic.set(name, mended)
+        if reboot:
+            assert mechanic.ask('reboot')
+        mechanic.start()
+    assert not graph.dead()
+
+
+def rests(mechanic):
+    """Whether no rotor may turn and nothing tells it to."""
+    return mechanic.device('armed') == 'False' and not np.any(mechanic.last_command[1].thrust)
+
+
+@pytest.mark.parametrize('fault', ['reboot', 'hang', 'unplugged'])
+def test_a_board_that_stopped_is_not_armed_again_in_the_fall_or_after_it(robot, fault):
+    graph, mechanic = robot
+    mechanic.set(f'board_faults.{fault}', True)
+    assert mechanic.wait(lambda: mechanic.state == 'emergency_stop', 5), mechanic.states
+    if fault == 'unplugged':
+        mechanic.set('board_faults.unplugged', False)
+    assert 'rotor_bridge_node lost' in graph.log('composed').read_text()
+    assert mechanic.wait(lambda: rests(mechanic), 10)
+    mechanic.spin(1.5)
+    assert rests(mechanic)
+    assert not graph.dead()
+
+
+def test_nothing_is_left_on_when_the_bridges_are_killed(robot):
+    graph, mechanic = robot
+    graph.kill(BRIDGES_COMPOSED)
+    assert mechanic.wait(lambda: mechanic.device('armed') == 'False', 10)
+    assert mechanic.wait(lambda: 'True' not in mechanic.device('torque'), 10)
+    assert mechanic.wait(lambda: mechanic.state in ('landing', 'disarmed', 'emergency_stop'), 5)

@@ -1,0 +1,50 @@
+"""The time of publication reaches the callback, under either executor."""
+
+import math
+import time
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import String
+
+from beetle_omni_ros.nodes import qos, runner
+from beetle_omni_ros.nodes.arrival import with_publication
+
+PATIENCE = 20           # s
+
+
+@pytest.mark.parametrize('make', [runner.make_executor, SingleThreadedExecutor])
+def test_a_callback_gets_the_time_at_which_its_message_was_published(make, ros_domain):
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, domain_id=ros_domain,
+               signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node('listener', context=context)
+    executor = make(context=context)
+    executor.add_node(node)
+    heard = []
+    node.create_subscription(String, 'word', with_publication(
+        lambda message, published: heard.append((message.data, published))), qos.COMMAND)
+    publisher = node.create_publisher(String, 'word', qos.COMMAND)
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while not heard and time.monotonic() < deadline:
+            before = time.time()
+            publisher.publish(String(data='now'))
+            after = time.time()
+            executor.spin_once(timeout_sec=0.2)
+        assert heard[0][0] == 'now'
+        assert before - 1e-3 <= heard[0][1] <= after + 1e-3
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def test_a_middleware_that_tells_no_time_gives_nan():
+    heard = []
+    take = with_publication(lambda message, published: heard.append(published))
+    take('message', {'source_timestamp': 0})
+    take(('message', {}))
+    take('message', {'source_timestamp': 2_500_000_000})
+    assert math.isnan(heard[0]) and math.isnan(heard[1]) and heard[2] == 2.5

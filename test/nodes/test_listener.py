@@ -1,0 +1,118 @@
+"""`beetle_omni check` hears real publishers: rates, ages, twins, wrong types, bridges."""
+
+import threading
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped
+import numpy as np
+import pytest
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import String
+
+from beetle_omni_ros.bringup.limits import CheckLimits
+from beetle_omni_ros.bringup.topics import check_topics
+from beetle_omni_ros.nodes import convert, qos
+from beetle_omni_ros.nodes.listener import listen
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+
+UPRIGHT = np.array([0, 0, 0, 1.0])
+
+
+class Reading:
+    """An IMU at rest."""
+
+    def __init__(self, stamp, rng):
+        self.stamp, self.angular_velocity = stamp, np.zeros(3)
+        self.specific_force = np.array([0, 0, 9.81]) + 0.01 * rng.normal(size=3)
+
+
+class Drivers:
+    """MoCap, IMU and joint bridge in a thread, the IMU with a clock that is 50 ms ahead."""
+
+    def __init__(self, domain):
+        self.context = rclpy.Context()
+        rclpy.init(args=[], context=self.context, domain_id=domain,
+                   signal_handler_options=SignalHandlerOptions.NO)
+        self.node = node = rclpy.create_node('vrpn', context=self.context)
+        self.twin = rclpy.create_node('sim_node', context=self.context)
+        self.mocap = node.create_publisher(PoseStamped, 'mocap/pose', qos.SENSOR)
+        self.other = self.twin.create_publisher(PoseStamped, 'mocap/pose', qos.SENSOR)
+        self.imu = node.create_publisher(Imu, 'imu/data_raw', qos.SENSOR)
+        self.wrong = node.create_publisher(String, 'battery_state', qos.SENSOR)
+        self.joints = node.create_publisher(JointState, 'joint_states', qos.SENSOR)
+        self.state = node.create_publisher(String, 'joint_bridge/state', qos.LATCHED)
+        self.diagnostics = node.create_publisher(DiagnosticArray, 'diagnostics', qos.EVENT)
+        self.state.publish(String(data='ready'))
+        self.stop = threading.Event()
+        self.thread = threading.Thread(target=self.run, daemon=True)
+
+    def run(self):
+        """Publish at 200 and 100 Hz until told to stop."""
+        rng, due = np.random.default_rng(0), time.monotonic()
+        for k in range(10**6):
+            if self.stop.is_set():
+                return
+            now = time.time()
+            self.imu.publish(convert.imu_message(Reading(now + 0.05, rng)))
+            if k % 2 == 0:
+                self.mocap.publish(convert.pose_message(now - 0.008, rng.normal(size=3), UPRIGHT))
+                self.joints.publish(JointState(name=['gimbal1'], position=[0.0]))
+            if k % 100 == 0:
+                self.diagnostics.publish(DiagnosticArray(status=[DiagnosticStatus(
+                    level=DiagnosticStatus.ERROR, name='joint_bridge_node: gimbal2',
+                    message='overload', values=[KeyValue(key='voltage', value='11.9')])]))
+            due += 0.005
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def __enter__(self):
+        """Publish."""
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_):
+        """Leave the graph."""
+        self.stop.set()
+        self.thread.join()
+        self.twin.destroy_node()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+def test_what_real_publishers_send_is_heard_and_judged(ros_domain):
+    with Drivers(ros_domain):
+        for _ in range(5):      # discovery takes its time on a busy machine
+            heard = listen(3.0)
+            if heard.streams['imu/data_raw'].rate and heard.of_bridge('joint_bridge'):
+                break
+    assert heard.domain == ros_domain
+    imu, mocap = heard.streams['imu/data_raw'], heard.streams['mocap/pose']
+    assert imu.rate == pytest.approx(2 * mocap.rate, rel=0.1)
+    assert -0.05 <= imu.freshest < 0 <= 0.008 <= mocap.freshest
+    assert np.mean(imu.sizes) == pytest.approx(9.81, abs=0.05)
+    assert sorted(mocap.publishers) == ['sim_node', 'vrpn'] and imu.publishers == ['vrpn']
+    assert heard.streams['battery_state'].other_types == ['std_msgs/msg/String']
+    assert heard.streams['joint_states'].refused.total() > 1
+    assert heard.states == {'joint_bridge': 'ready'}
+    found = {finding.item: finding for finding in check_topics(
+        heard, CheckLimits.load(), RobotParameters.load().gravity)}
+    assert {item for item, finding in found.items() if finding.level == 'fail'} >= {
+        'imu/data_raw age', 'mocap/pose publishers', 'joint_states content',
+        'joint_bridge gimbal2'}
+    assert found['joint_bridge gimbal2'].values == {'voltage': '11.9'}
+
+
+def test_an_empty_graph_and_a_namespace(ros_domain):
+    heard = listen(0.2, 'robot1')
+    assert not heard.runs('joint_bridge') and not heard.streams['mocap/pose'].arrivals
+    with Drivers(ros_domain):
+        assert not listen(1.0, 'robot1').streams['imu/data_raw'].arrivals
+
+
+def test_an_impossible_namespace_is_refused_in_one_line(ros_domain):
+    with pytest.raises(ParameterError, match="namespace 'a b'") as caught:
+        listen(0.1, 'a b')
+    assert '\n' not in str(caught.value)

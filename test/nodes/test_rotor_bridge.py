@@ -1,0 +1,300 @@
+"""rotor_bridge_node as a real process against the emulated motor board, faults included."""
+
+import math
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('pymavlink')
+pytest.importorskip('serial')
+
+from rotor_bench import bench, HOVER, NODE, QUICK, SOON, START
+from std_msgs.msg import String
+
+from beetle_omni_ros.nodes import qos
+from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes.operator import Operator
+
+
+@pytest.fixture(scope='module')
+def shared(tmp_path_factory):
+    """One process for all tests that leave it alive."""
+    with bench(tmp_path_factory.mktemp('bridge')) as made:
+        assert made.commander.reaches('ready', START), made.log
+        yield made
+
+
+@pytest.fixture
+def bridge(shared):
+    """Process and board at rest, nothing wrong."""
+    assert shared.rest(), (shared.commander.told, shared.log)
+    shared.commander.told[:-1] = []
+    yield shared
+    assert not shared.graph.dead()
+
+
+@pytest.fixture
+def flying(bridge):
+    """The same with turning rotors."""
+    bridge.take_off()
+    return bridge
+
+
+def test_it_arms_at_takeoff_follows_the_thrusts_and_disarms_with_the_supervisor(bridge):
+    board, commander = bridge.board, bridge.commander
+    commander.thrust = np.zeros(4)
+    commander.spin(0.2)
+    assert not board.armed and not board.refused      # nothing is sent before it is armed
+    bridge.take_off()
+    for state, thrust in (('flying:nmpc', [3.0, 12.0, 0.5, 20.0]), ('landing', [9, 9, 1, 0])):
+        commander.supervise(state)
+        commander.thrust = np.array(thrust, dtype=float)
+        assert commander.wait(lambda thrust=thrust: bridge.follows(thrust), SOON)
+    commander.supervise('disarmed')
+    assert commander.wait(lambda: not board.armed, SOON) and not board.commands.any()
+    assert commander.wait(lambda: 'waiting: throttle not low' in commander.told
+                          and commander.bridge == 'ready', SOON), commander.told
+    assert not any(text.startswith('lost') for text in commander.told)
+
+
+def test_thrusts_arrive_at_a_sagging_battery(flying):
+    board, commander = flying.board, flying.commander
+    board.set_battery(22.7, 40.0)
+    assert commander.wait(lambda: flying.follows(), SOON)
+    assert commander.told_in_diagnostics('board', 'voltage_V', lambda v: v == '22.7')
+    commander.thrust = np.array([7.0, 7.0, 7.0, 22.0])
+    assert commander.told_in_diagnostics('rotor4', 'saturated', lambda n: n and int(n) > 0)
+    assert commander.values(f'{NODE}: rotor1')['saturated'] == '0'
+
+
+def test_an_emergency_stop_disarms(flying):
+    flying.commander.supervise('emergency_stop')
+    assert flying.commander.wait(lambda: not flying.board.armed, SOON)
+    assert flying.board._firmware._stop_reason == 1     # asked by the host
+
+
+def test_a_low_battery_refuses_arming_with_the_reason(bridge):
+    board, commander = bridge.board, bridge.commander
+    board.set_battery(20.0, 0.0)
+    assert commander.reaches('waiting: battery low')
+    commander.supervise('takeoff')
+    assert commander.reaches('lost: not armed: refused by the board: battery low')
+    board.set_battery(25.0, 0.0)
+    commander.thrust = HOVER
+    commander.spin(0.3)
+    assert not board.armed and not board.commands.any()
+
+
+def test_each_command_is_repeated_but_a_stream_that_stops_stops_the_rotors(flying):
+    board, commander = flying.board, flying.commander
+    commander.period = 0.06
+    arrivals = []
+    board.on_target = lambda now, values: arrivals.append((now, values[0]))
+    assert commander.wait(lambda: len(arrivals) > 60, SOON)
+    stamps = [stamp for _, stamp in arrivals]
+    assert stamps == sorted(stamps) and len(stamps) > 3 * len(set(stamps))
+    commander.thrust = None
+    # 100 ms after the last new target, however often it was repeated.
+    assert commander.wait(lambda: not board.commands.any(), SOON)
+    newest = next(now for now, stamp in arrivals if stamp == arrivals[-1][1])
+    assert board._firmware.timeouts and board._firmware._target_at == newest
+    commander.spin(0.2)
+    count = len(arrivals)
+    commander.spin(0.2)
+    assert len(arrivals) == count and commander.bridge == 'ready'
+    commander.thrust = HOVER
+    assert commander.wait(lambda: flying.follows(), SOON)
+
+
+def test_old_commands_are_not_sent(flying):
+    board, commander = flying.board, flying.commander
+    commander.age, arrivals = 0.2, []
+    assert commander.wait(lambda: not board.commands.any(), SOON)
+    commander.spin(0.2)
+    board.on_target = lambda now, values: arrivals.append(values)
+    commander.spin(0.2)
+    assert not arrivals and not board.commands.any()
+    assert commander.told_in_diagnostics('inputs', 'command rejected: stale stamp',
+                                         lambda n: n and int(n) > 5)
+
+
+def test_a_stream_that_stays_away_disarms_and_is_not_armed_again_in_this_flight(flying):
+    board, commander = flying.board, flying.commander
+    commander.thrust = None
+    assert commander.reaches('lost: disarmed (no target for too long)')
+    commander.thrust = HOVER
+    commander.spin(0.3)
+    assert not board.armed
+
+
+@pytest.mark.parametrize(('fault', 'why'), [
+    (lambda board: board.reboot(), 'lost: restarted'),
+    (lambda board: board.hang(), 'lost: restarted (watchdog reset)'),
+    (lambda board: board.unplug(), 'lost: {port}: port is away')])
+def test_a_lost_board_stays_disarmed_until_the_supervisor_was(flying, fault, why):
+    board, commander = flying.board, flying.commander
+    fault(board)
+    assert commander.reaches(why.format(port=board.port)), commander.told
+    assert commander.wait(lambda: not board.armed and not board.commands.any(), SOON)
+    board.plug()
+    commander.spin(0.3)         # the supervisor goes on, and the board could be armed again
+    assert commander.bridge.startswith('lost') and not board.armed
+    commander.supervise('emergency_stop')
+    commander.spin(0.1)
+    assert commander.bridge.startswith('lost')
+    commander.thrust = None
+    commander.supervise('disarmed')
+    assert commander.reaches('ready'), commander.told
+    flying.take_off()
+
+
+def test_a_board_that_is_not_heard_keeps_its_targets_until_the_supervisor_is_down(flying):
+    board, commander = flying.board, flying.commander
+    board.faults.mute = True
+    assert commander.reaches('silent: nothing heard of the board'), commander.told
+    commander.spin(0.3)
+    assert board.armed and board.commands.all()
+    commander.thrust = None
+    commander.supervise('disarmed')
+    assert commander.wait(lambda: not board.armed, SOON)
+    board.faults.mute = False
+    assert commander.reaches('ready'), commander.told
+
+
+@pytest.mark.parametrize('faults', [
+    {'corrupt_in': 0.05, 'corrupt_out': 0.05}, {'drop_in': 0.05, 'drop_out': 0.05},
+    {'delay_in': 0.01, 'delay_out': 0.01}])
+def test_a_poor_link_is_flown_through(flying, faults):
+    board, commander = flying.board, flying.commander
+    for name, value in faults.items():
+        setattr(board.faults, name, value)
+    if 'corrupt_in' in faults:
+        for key in ('bad_crc', 'board bad_crc'):
+            assert commander.told_in_diagnostics('board', key, lambda n: n and int(n) > 0)
+    elif 'drop_in' in faults:
+        for key in ('lost', 'board lost'):
+            assert commander.told_in_diagnostics('board', key, lambda n: n and int(n) > 0)
+    else:
+        commander.spin(0.5)
+    assert board.armed and commander.wait(lambda: flying.follows(), SOON)
+    assert commander.told == ['ready']
+
+
+def test_battery_and_rotor_speeds_are_published_in_our_units_and_signs(bridge):
+    board, commander = bridge.board, bridge.commander
+    board.set_battery(23.456, 12.34)
+    board.set_rotors(np.array([1.0, 4.0, 9.0, 0.0]), np.array([30.0, 40.0, 50.0, 60.0]))
+    assert commander.wait(lambda: commander.batteries and math.isclose(
+        commander.batteries[-1].current, -12.34, rel_tol=1e-5), SOON)
+    battery = commander.batteries[-1]
+    assert battery.voltage == pytest.approx(23.456) and battery.present
+    assert len(battery.cell_voltage) == 6
+    speeds = np.array([2700, 5400, 8100, 0]) * math.tau / 60
+    assert commander.wait(lambda: np.allclose(commander.rotors[-1].velocity, speeds), SOON)
+    rotors = commander.rotors[-1]
+    assert rotors.name == ['rotor1', 'rotor2', 'rotor3', 'rotor4']
+    assert not len(rotors.position) and not len(rotors.effort)
+    for message in (battery, rotors):
+        stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        assert -SOON < stamp - time.time() <= 0.001
+    before = len(commander.batteries), len(commander.rotors)
+    assert commander.wait(lambda: len(commander.batteries) > before[0] + 10
+                          and len(commander.rotors) > before[1] + 20, SOON)
+    board._thrust = None        # rotors follow at once again
+
+
+def test_diagnostics_tell_link_clock_latency_and_a_failed_esc(flying):
+    board, commander = flying.board, flying.commander
+    board.faults.failed_escs = (3,)
+    assert commander.told_in_diagnostics('rotor3', 'failures', lambda text: 'offline' in text)
+    assert commander.diagnostics[f'{NODE}: rotor3'].level == b'\x02'
+    assert commander.diagnostics[f'{NODE}: rotor1'].level == b'\x00'
+    assert commander.told_in_diagnostics('latency', 'count', lambda n: n and int(n) > 20)
+    assert commander.diagnostics[f'{NODE}: latency'].message.startswith(
+        'from the publication of the command')
+    assert 0 < float(commander.values(f'{NODE}: latency')['median_ms']) < 1000
+    values = commander.values(f'{NODE}: board')
+    assert int(values['cycles']) > 20 and float(values['clock_uncertainty_ms']) < 1000
+    assert values['armed'] == '1' and 'ESC failure' in values['conditions']
+    assert commander.bridge == 'ready' and board.armed
+
+
+def test_a_bridge_that_is_killed_leaves_no_rotor_turning_and_its_successor_does_not_arm(tmp_path):
+    with bench(tmp_path) as made:
+        board, commander = made.board, made.commander
+        assert commander.reaches('ready', START), made.log
+        made.take_off()
+        arrivals = []
+        board.on_target = lambda now, values: arrivals.append(now)
+        assert commander.wait(lambda: arrivals, SOON)
+        made.graph.kill(NODE)
+        looked, turning = time.monotonic(), 0.0
+        while board.commands.any():
+            turning, looked = looked, time.monotonic()
+            time.sleep(0.001)
+        # They turned when asked at `turning` or later, however busy this computer is.
+        assert turning < arrivals[-1] + QUICK.target_timeout
+        assert commander.wait(lambda: not board.armed, SOON)
+        commander.supervise('flying:nmpc')
+        made.graph.start_process(NODE)
+        assert commander.reaches('lost: the supervisor was not disarmed before', START), made.log
+        assert not board.armed and not board.commands.any()
+
+
+def test_a_bridge_that_is_told_to_end_disarms_and_says_so(tmp_path):
+    with bench(tmp_path) as made:
+        board, commander = made.board, made.commander
+        assert commander.reaches('ready', START), made.log
+        made.take_off()
+        process = made.graph.processes[NODE]
+        os.kill(process.pid, signal.SIGTERM)
+        assert commander.reaches('lost: the bridge has stopped')
+        assert process.wait(SOON) == 0
+        assert not board.armed and not board.commands.any()
+        assert board._firmware._stop_reason == 1        # asked by the host
+        assert '[ERROR]' not in made.log[0], made.log
+
+
+def test_a_port_that_is_absent_is_waited_for_and_named(tmp_path):
+    port = tmp_path / 'motor_board'
+    with bench(tmp_path, port=str(port)) as made:
+        commander = made.commander
+        assert commander.reaches(f'waiting: {port}: cannot be opened (no such device', START)
+        assert commander.told_in_diagnostics('board', 'phase', lambda phase: phase == 'rests')
+        commander.supervise('takeoff')
+        # Whether it has heard of 'disarmed' before is for the middleware to decide.
+        assert commander.reaches('lost: '), commander.told
+        commander.supervise('disarmed')
+        os.symlink(made.board.port, port)
+        assert commander.reaches('ready'), (commander.told, made.log)
+        made.take_off()
+        assert made.log[0].count('cannot be opened') == 1
+
+
+def test_supervisor_node_refuses_to_arm_in_the_words_of_the_bridges(ros_domain, tmp_path):
+    graph = Graph({'supervisor_node': {}}, tmp_path, ros_domain, composed=False)
+    operator = None
+    try:
+        graph.start()
+        operator = Operator(ros_domain)
+        bridges = {name: operator._node.create_publisher(String, f'{name}_bridge/state',
+                                                         qos.LATCHED)
+                   for name in ('joint', 'rotor')}
+        assert operator.wait(lambda: operator.state == 'disarmed', START), graph.dead()
+        for name, text, answer in (
+                ('rotor', 'waiting: battery low', 'rotor_bridge_node waiting: battery low'),
+                ('joint', 'lost: gimbal3 silent', 'joint_bridge_node lost: gimbal3 silent; '
+                                                  'rotor_bridge_node waiting: battery low'),
+                ('rotor', 'ready', 'joint_bridge_node lost: gimbal3 silent')):
+            bridges[name].publish(String(data=text))
+            assert operator.wait(lambda answer=answer: operator.call('arm') == (
+                False, f'arm refused: {answer}'), SOON), operator.call('arm')
+        bridges['joint'].publish(String(data='ready'))
+        assert operator.wait(lambda: 'no fresh state estimate' in operator.call('arm')[1], SOON)
+    finally:
+        graph.stop()
+        if operator:
+            operator.close()

@@ -1,0 +1,205 @@
+"""The real robot's drivers fly the simulated one through the emulated devices, in real time."""
+
+from dataclasses import replace
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('dynamixel_sdk')
+pytest.importorskip('pymavlink')
+
+from board_bench import driver, QUICK
+from servo_bench import PATIENT, SHIPPED
+from sim_robots import HIGH, ROBOT, WORLD
+
+from beetle_omni_ros.drivers.servo_bus import ServoBus
+from beetle_omni_ros.sim.emulated.fault_switches import (
+    BoardFaultSwitches,
+    ServoFaultSwitches,
+)
+from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
+from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
+from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
+from beetle_omni_ros.sim.simulator import Simulator
+
+HOVER = np.full(4, ROBOT.hover_thrust)
+TICK = 0.005
+
+
+class Flight:
+    """Simulator, devices, drivers and a bridge's loop, all in one thread but the devices'."""
+
+    def __init__(self):
+        self.simulator = Simulator(ROBOT, WORLD)
+        self.simulator.reset(HIGH)
+        self.actuators = EmulatedActuators(
+            self.simulator, EmulatedServoBus(reboot_time=0.05),
+            EmulatedMotorBoard(ROBOT, QUICK))
+        self.bus = ServoBus(replace(SHIPPED, port=self.actuators.bus.port, guard=False,
+                                    timing=PATIENT, reboot_after_overload=False), ROBOT.joints)
+        self.board = driver(self.actuators.board.port)
+        self.tilt, self.thrust = np.zeros(4), HOVER
+        self.readings = self.reports = None
+        self.told = {}
+
+    def __enter__(self):
+        """Torque on and armed."""
+        self.bus.open()
+        self.bus.configure()
+        self.bus.enable()
+        self.board.open()
+        assert self.board.wait_ready(3.0) == ''
+        result = self.board.arm()
+        assert result.accepted, result
+        return self
+
+    def __exit__(self, *_):
+        """Off."""
+        self.bus.close()
+        self.board.close()
+        self.actuators.close()
+
+    def cycle(self):
+        """Do what happens in 5 ms."""
+        began = time.monotonic()
+        self.frame = self.actuators.step()
+        self.bus.write_goals(self.tilt)
+        if self.thrust is not None:
+            self.board.send(self.thrust, time.time())
+        self.readings, self.reports = self.bus.read(), self.bus.poll_health()
+        update = self.board.poll()
+        for name in ('battery', 'rotors', 'status'):
+            news = getattr(update, name)
+            if news is not None:
+                self.told[name] = news
+        time.sleep(max(0.0, began + TICK - time.monotonic()))
+
+    def run(self, seconds):
+        """Fly so many seconds."""
+        for _ in range(round(seconds / TICK)):
+            self.cycle()
+        return self
+
+    def until(self, condition, seconds=3.0):
+        """Fly until something is so."""
+        for _ in range(round(seconds / TICK)):
+            self.cycle()
+            if condition():
+                return self
+        raise AssertionError(f'not within {seconds} s: tilt {self.simulator.truth.tilt}, thrust '
+                             f'{self.simulator.truth.thrust}, {self.reports}')
+
+    def switch(self, servo=None, board=None):
+        """Set faults."""
+        self.actuators.set_faults(ServoFaultSwitches(**servo or {}),
+                                  BoardFaultSwitches(**board or {}))
+
+    @property
+    def truth(self):
+        return self.simulator.truth
+
+
+@pytest.fixture
+def flight():
+    """A robot that hovers, 20 m up."""
+    with Flight() as made:
+        made.until(lambda: np.allclose(made.truth.thrust, HOVER, rtol=0.02), 3.0)
+        yield made
+
+
+def test_thrusts_and_tilts_arrive_and_what_they_do_is_measured(flight):
+    flight.tilt = np.array([0.3, -0.3, 0.3, -0.3])
+    flight.run(0.7)
+    np.testing.assert_allclose(flight.truth.thrust, HOVER, rtol=0.01)
+    np.testing.assert_allclose(flight.truth.tilt, flight.tilt, atol=0.07)   # bent by the module
+    np.testing.assert_allclose(flight.readings.position, flight.truth.tilt, atol=0.05)
+    assert flight.told['battery'].voltage == pytest.approx(flight.simulator.voltage, abs=0.1)
+    assert -flight.told['battery'].current == pytest.approx(flight.simulator.current, abs=1.0)
+    rpm = QUICK.rpm_at_1_newton * np.sqrt(ROBOT.hover_thrust)
+    np.testing.assert_allclose(flight.told['rotors'].rpm, rpm, rtol=0.02)
+
+
+def test_rotors_stop_when_targets_cease_and_come_back_with_them(flight):
+    flight.thrust = None
+    flight.until(lambda: flight.truth.thrust.max() < 0.2 * HOVER[0], 1.0)
+    assert flight.actuators.board.armed
+    flight.thrust = HOVER
+    flight.until(lambda: flight.truth.thrust.min() > 0.9 * HOVER[0], 1.0)
+
+
+def test_torque_off_frees_the_joints_and_torque_on_holds_them_where_they_are(flight):
+    flight.tilt = np.full(4, 0.4)
+    flight.until(lambda: np.all(flight.truth.tilt > 0.35))
+    assert flight.bus.disable()
+    flight.tilt = np.full(4, -1.0)
+    flight.run(0.2)
+    assert np.all(flight.truth.tilt > 0.0) and np.all(flight.readings.effort == 0)
+    flight.tilt = flight.truth.tilt
+    flight.bus.enable()
+    flight.run(0.2)
+    np.testing.assert_allclose(flight.truth.tilt, flight.tilt, atol=0.15)
+
+
+def test_an_overloaded_servo_goes_limp_and_the_others_keep_their_angles(flight):
+    flight.switch({'overload': np.array([2.0])})
+    flight.until(lambda: 'overload' in str(flight.reports[1]))
+    flight.tilt = np.full(4, 0.8 * -np.sign(flight.truth.tilt[1]))
+    flight.until(lambda: np.all(np.abs(flight.truth.tilt - flight.tilt)[[0, 2, 3]] < 0.15))
+    assert abs(flight.truth.tilt[1] - flight.tilt[1]) > 0.4
+    assert flight.actuators.bus.torque_enabled.tolist() == [True, False, True, True]
+
+
+def test_an_expired_watchdog_is_cleared_and_the_flight_goes_on(flight):
+    flight.switch({'expire_watchdog': 3})
+    assert flight.actuators.bus.stopped.tolist() == [False, False, True, False]
+    flight.tilt = np.full(4, 0.4)
+    flight.until(lambda: np.all(flight.truth.tilt > 0.3))
+    assert not flight.actuators.bus.stopped.any()
+
+
+def test_a_failed_esc_stops_its_rotor_alone(flight):
+    flight.switch(board={'failed_escs': np.array([4.0])})
+    flight.until(lambda: flight.truth.thrust[3] < 0.1)
+    np.testing.assert_allclose(flight.truth.thrust[:3], HOVER[:3], rtol=0.02)
+
+
+def test_a_sagging_pack_is_told_and_the_thrust_kept(flight):
+    before = flight.told['battery'].voltage
+    flight.switch(board={'voltage_sag': 2.0})
+    flight.run(0.6)
+    assert flight.told['battery'].voltage == pytest.approx(before - 2.0, abs=0.2)
+    np.testing.assert_allclose(flight.truth.thrust, HOVER, rtol=0.02)
+
+
+@pytest.mark.parametrize('event', ['reboot', 'hang'])
+def test_a_board_that_restarts_stops_the_rotors_and_stays_disarmed(flight, event):
+    flight.switch(board={event: True})
+    flight.until(lambda: flight.truth.thrust.max() < 0.2 * HOVER[0])
+    flight.run(0.3)
+    assert not flight.actuators.board.armed and flight.truth.thrust.max() < 0.2
+
+
+def test_without_the_boards_cable_the_rotors_stop(flight):
+    flight.switch(board={'unplugged': True})
+    flight.until(lambda: flight.truth.thrust.max() < 0.2 * HOVER[0])
+
+
+def test_without_the_servos_cable_the_joints_hold(flight):
+    flight.tilt = np.full(4, 0.4)
+    flight.until(lambda: np.all(flight.truth.tilt > 0.35))
+    flight.switch({'unplugged': True})
+    flight.tilt = np.full(4, -0.4)
+    flight.run(0.4)
+    assert flight.actuators.bus.stopped.all()
+    assert np.all(flight.truth.tilt > 0.25) and not flight.readings.valid.any()
+    flight.switch()
+    flight.until(lambda: np.all(flight.truth.tilt < -0.3))
+
+
+def test_a_lossy_bus_still_flies(flight):
+    flight.switch({'bad_crc': 0.05, 'dropped': 0.05, 'delayed': 0.05},
+                  {'corrupt_in': 0.05, 'drop_in': 0.05, 'corrupt_out': 0.05, 'drop_out': 0.05})
+    flight.tilt = np.full(4, 0.3)
+    flight.until(lambda: np.all(flight.truth.tilt > 0.25))
+    np.testing.assert_allclose(flight.truth.thrust, HOVER, rtol=0.05)
