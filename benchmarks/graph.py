@@ -10,19 +10,26 @@ but the bridges in one process, and prints for each
   the arrival of the command that answers it at the actuators, in the simulator's callback.
 
 With the bridges the devices are emulated in the simulator's process, and the latency ends with the
-last byte of the command to the motor board; the bridges' own numbers stand beside it.
+last byte of the command to the motor board; the bridges' own numbers stand beside it. What the
+machine itself holds up is told by a bare timer: a process of the same priority that does nothing
+but sleep for 5 ms, while the flight goes on.
 """
 
 import argparse
+from contextlib import contextmanager
 import json
 from pathlib import Path
+import signal
+import subprocess
 import sys
 import tempfile
+import time
 
 from rich.console import Console
 from rich.table import Table
 
 from beetle_omni_ros.nodes.fly import run_fly
+from beetle_omni_ros.nodes.runner import run_before_others
 
 # name -> (composed, actuators, targets)
 ARRANGEMENTS = {
@@ -37,7 +44,9 @@ ROWS = {'cpu_percent': 'CPU of all nodes [%]', 'latency_median_ms': 'latency, me
         'servos_cycles': 'servo bus: cycles', 'servos_missed_cycles': 'missed',
         'servos_latency_p99_ms': 'command to last byte, 99 % [ms]',
         'motor_board_cycles': 'motor board: cycles', 'motor_board_missed_cycles': 'missed',
-        'motor_board_latency_p99_ms': 'command to last byte, 99 % [ms]'}
+        'motor_board_latency_p99_ms': 'command to last byte, 99 % [ms]',
+        'bare_cycles': 'bare timer: cycles', 'bare_missed_cycles': 'missed'}
+PERIOD = 0.005     # s
 POSES = ['0,0,1,0,0,0', '0.5,0,1,30,0,0', '0,0.5,1.2,0,-25,45']
 POSE_SECONDS = 8
 
@@ -49,11 +58,41 @@ def measure(folder: Path, name: str, seconds: float) -> dict:
     task, result = folder / 'poses.csv', folder / 'result.json'
     task.write_text('\n'.join(['x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg', *rows]) + '\n')
     result.unlink(missing_ok=True)
-    status = run_fly(task=str(task), composed=composed, actuators=actuators, json_path=result,
-                     console=Console(quiet=True))
+    with bare_timer() as counted:
+        status = run_fly(task=str(task), composed=composed, actuators=actuators, json_path=result,
+                         console=Console(quiet=True))
     if status or not result.exists():
         sys.exit(f'flight with {name} failed (status {status})')
-    return json.loads(result.read_text())['meta']['graph']
+    return {**json.loads(result.read_text())['meta']['graph'], **counted}
+
+
+@contextmanager
+def bare_timer():
+    """Run a bare timer in a process of its own; its counts are in the dict afterwards."""
+    process = subprocess.Popen([sys.executable, __file__, '--bare-timer'],
+                               stdout=subprocess.PIPE, text=True)
+    counted = {}
+    try:
+        yield counted
+    finally:
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=10)
+    counted.update(json.loads(output))
+
+
+def sleep_on():
+    """Be that timer until SIGINT; what is late by more than half a period is missed."""
+    run_before_others()
+    due, cycles, missed = time.monotonic() + PERIOD, 0, 0
+    try:
+        while True:
+            time.sleep(max(0.0, due - time.monotonic()))
+            cycles += 1
+            skipped = round(max(0.0, time.monotonic() - due) / PERIOD)
+            missed += skipped
+            due += (1 + skipped) * PERIOD
+    except KeyboardInterrupt:
+        print(json.dumps({'bare_cycles': cycles, 'bare_missed_cycles': missed}))
 
 
 def main():
@@ -61,7 +100,10 @@ def main():
     arguments = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     arguments.add_argument('--seconds', type=float, default=24, help='flight time of each')
     arguments.add_argument('--json', type=Path, help='file for the numbers')
+    arguments.add_argument('--bare-timer', action='store_true', help=argparse.SUPPRESS)
     given = arguments.parse_args()
+    if given.bare_timer:
+        return sleep_on()
     table = Table('', *ARRANGEMENTS)
     measured = {}
     with tempfile.TemporaryDirectory() as folder:

@@ -80,7 +80,7 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
         # Alone in its process a node shares the processor as any other: real-time processes
         # that wait for one another have held up the simulator for a third of a second.
         if len(nodes) > 1 and any(getattr(node, 'real_time', False) for node in nodes):
-            _run_before_others()
+            run_before_others()
         executor.spin_until_future_complete(_stop_on_signal(), FOREVER)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -147,7 +147,7 @@ def _stop_on_signal() -> Future:
     return stop
 
 
-def _run_before_others():
+def run_before_others():
     """
     Give every thread so far real-time priority, where the system allows it.
 
