@@ -19,7 +19,7 @@ class RotorBridgeReport:
         self._arming, self._stream = arming, stream
         self._update: BoardUpdate | None = None
         self._battery = self._rotors = None
-        self._saturated = stream.saturated.copy()
+        self._saturated, self._missed = stream.saturated.copy(), 0
         reports.report('board', self._board_status)
         reports.report('latency', self._latency_status)
         for k in range(4):
@@ -35,8 +35,11 @@ class RotorBridgeReport:
         arming, stream, text = self._arming, self._stream, self._arming.text
         values = {'phase': arming.phase, 'cycles': stream.cycles, 'missed_cycles': stream.missed}
         values.update((f'not sent: {reason}', n) for reason, n in stream.unsent.items())
+        missed, self._missed = stream.missed - self._missed, stream.missed
         level = health.ERROR if arming.phase == LOST else \
-            health.WARN if text.startswith('waiting') or stream.missed else health.OK
+            health.OK if text == 'ready' and not missed else health.WARN
+        if missed and text == 'ready':
+            text = f'{missed} cycles missed'
         update = self._update
         if update is None:
             return level, text, values
