@@ -5,13 +5,15 @@ Each driver runs at 200 Hz in this process against its emulated device in a proc
 "to last byte" is the time from the call that takes a command until its last byte is written,
 "to rotor target" until the emulated board has it; CPU is that of this process, the driver's own
 threads included. --faults adds what each fault of the servo bus costs, --wire lets the servos'
-answers take the time of 1 Mbit/s.
+answers take the time of 1 Mbit/s. Where it is permitted, all run with the lowest real-time
+priority, as the nodes do.
 """
 
 import argparse
 from dataclasses import replace
 import json
 import multiprocessing
+import os
 from pathlib import Path
 import sys
 import time
@@ -210,6 +212,10 @@ def main():
     arguments.add_argument('--faults', action='store_true', help='the servo bus with each fault')
     arguments.add_argument('--json', type=Path, help='file for the numbers')
     given = arguments.parse_args()
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except (OSError, AttributeError):
+        print('without real-time priority: not permitted here')
     found = {'motor board': measure_board(given.seconds),
              **measure_servos(given.seconds, given.wire, given.faults)}
     for title, numbers in found.items():
