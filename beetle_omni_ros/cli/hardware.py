@@ -20,7 +20,8 @@ ParamsOption = Annotated[Optional[Path], typer.Option(
 
 
 def joint(logs: Annotated[list[Path], typer.Argument(
-              metavar='LOG.csv', help='Response log, see docs/identification.md.')],
+              metavar='LOG', help='Response log (CSV) or recorded run (bag), see '
+                                  'docs/identification.md.')],
           validate: Annotated[Optional[list[Path]], typer.Option(
               '--validate', metavar='LOG.csv...', help='Further logs, which only judge.')] = None,
           robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,

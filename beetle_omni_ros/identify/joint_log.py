@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros.identify.csv_table import LogError, missing, read_table
+from beetle_omni_ros.identify.joint_bag import is_bag, read_bag_response
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
 JOINTS = (1, 2, 3, 4)
@@ -120,15 +121,21 @@ class JointLog:
 
 def read_joint_log(path: str | Path) -> JointLog:
     """
-    Read a response log and refuse what cannot be identified from.
+    Read a response log, CSV or recorded run, and refuse what cannot be identified from.
 
     Raises:
         LogError: naming the file, the row or column, and what was expected.
 
     """
+    if is_bag(Path(path)):
+        t, measured, command = read_bag_response(Path(path))
+        _check_times(path, t, np.arange(1, len(t) + 1))
+        for k, position, wanted in zip(JOINTS, measured, command, strict=True):
+            _check_angles(path, k, position, wanted)
+        return JointLog(Path(path).name, t, JOINTS, measured, command)
     table = read_table(path, _wanted, HEADER)
     t = table.columns['t_s']
-    _check_times(table, t)
+    _check_times(table.path, t, table.rows)
     joints = tuple(k for k in JOINTS if f'q{k}_rad' in table.columns)
     measured = np.stack([table.columns[f'q{k}_rad'] for k in joints])
     command = np.stack([table.columns.get(f'command{k}_rad', table.columns.get('command_rad'))
@@ -159,14 +166,13 @@ def _wanted(header):
     return names + [f'command{k}_rad' for k in joints]
 
 
-def _check_times(table, t):
-    path = table.path
+def _check_times(path, t, rows):
     if len(t) < LEAST_SAMPLES:
         raise LogError(f'{path}: {len(t)} rows are too few; expected at least {LEAST_SAMPLES}')
     steps = np.diff(t)
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0)) + 1
-        raise LogError(f'{path}: row {table.rows[k]}, column t_s: {t[k]:g} s does not come after '
+        raise LogError(f'{path}: row {rows[k]}, column t_s: {t[k]:g} s does not come after '
                        f'{t[k - 1]:g} s; expected increasing times')
     period = float(np.median(steps))
     if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
@@ -177,7 +183,7 @@ def _check_times(table, t):
                        f'{LEAST_DURATION:g} s')
     if steps.max() > LONGEST_GAP:
         k = int(np.argmax(steps)) + 1
-        raise LogError(f'{path}: row {table.rows[k]}: {steps.max():.2f} s without a sample; '
+        raise LogError(f'{path}: row {rows[k]}: {steps.max():.2f} s without a sample; '
                        f'expected gaps below {LONGEST_GAP:g} s (split the log there)')
 
 

@@ -1,0 +1,55 @@
+"""A recorded run as a response log: the same rows as a CSV file of it would have."""
+
+import numpy as np
+import pytest
+from servo_logs import sweep
+
+from beetle_omni_ros.identify import joint_bag
+from beetle_omni_ros.identify.csv_table import LogError
+from beetle_omni_ros.identify.joint_log import read_joint_log
+from beetle_omni_ros.runs.bag import BagWriter
+
+
+def recorded(folder, t, command, sent=None, joints=True):
+    """Write a bag in which joint feedback and commands come at ``t``; commands where ``sent``."""
+    with BagWriter(folder) as bag:
+        for k, (now, wanted) in enumerate(zip(t.tolist(), command.tolist())):
+            if sent is None or sent[k]:
+                bag.write_command(now - 0.003, np.array([wanted, -wanted, 0.5 * wanted, wanted]),
+                                  np.full(4, 7.0), received=now - 0.001)
+            if joints:
+                bag.write_joints(now, 0.9 * np.array([wanted, -wanted, 0.5 * wanted, wanted]),
+                                 np.zeros(4))
+    return folder
+
+
+def test_each_feedback_stands_beside_the_command_that_came_last_before_it(tmp_path):
+    t, command = sweep(duration=3.0)
+    log = read_joint_log(recorded(tmp_path / 'bag', t + 5.0, command))
+    assert log.joints == (1, 2, 3, 4)
+    assert np.allclose(log.t, t, atol=1e-6)
+    assert np.allclose(log.command, np.outer([1, -1, 0.5, 1], command), atol=1e-9)
+    assert np.allclose(log.measured, 0.9 * log.command, atol=1e-9)
+
+
+def test_the_longest_stretch_with_commands_counts_and_of_it_the_liveliest_part(
+        tmp_path, monkeypatch):
+    monkeypatch.setattr(joint_bag, 'LONGEST', 2.5)
+    t, command = sweep(duration=9.0)
+    command = np.where((t > 5.0) & (t < 7.5), command, 0.05 * command)
+    sent = (t < 1.0) | (t > 2.0)
+    log = read_joint_log(recorded(tmp_path / 'bag', t, command, sent))
+    assert log.t[-1] - log.t[0] == pytest.approx(2.5, abs=0.02)
+    assert np.abs(log.command[0]).max() == pytest.approx(np.abs(command).max())
+
+
+@pytest.mark.parametrize(('made', 'said'), [
+    ({'joints': False}, 'no joint_states in this bag'),
+    ({'sent': np.zeros(300, dtype=bool)}, 'no command in this bag')])
+def test_a_bag_without_servos_is_refused_in_one_line(tmp_path, made, said):
+    t, command = sweep(duration=3.0)
+    with pytest.raises(LogError, match=said) as error:
+        read_joint_log(recorded(tmp_path / 'bag', t, command, **made))
+    assert '\n' not in str(error.value)
+    with pytest.raises(LogError):
+        read_joint_log(tmp_path)
