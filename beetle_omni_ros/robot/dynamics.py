@@ -98,9 +98,10 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
         torque_ratio=rotors.torque_to_thrust_ratio, tilt_rate=_given(tilt_rate, 4),
         thrust_rate=_given(thrust_rate, 4), spin=tuple(map(float, rotors.spin)),
         position=position, voltage_ratio=voltage_ratio)
-    for name, values in (robot.effects if effects is None else effects).items():
-        if CATALOGUE[name].apply is not None:
-            CATALOGUE[name].apply(terms, **values)
+    effects = robot.effects if effects is None else effects
+    for name, effect in CATALOGUE.items():
+        if name in effects and effect.apply is not None:
+            effect.apply(terms, **effects[name])
     force, torque = 0, terms.torque
     for i in range(4):
         rotor_force = terms.thrust[i] * terms.thrust_directions[i] + terms.rotor_forces[i]

@@ -25,7 +25,9 @@ from beetle_omni_ros.robot.effects_actuator import ACTUATOR, SENSOR
 from beetle_omni_ros.robot.effects_body import BODY
 from beetle_omni_ros.robot.schema import ParameterError
 
-CATALOGUE: dict[str, Effect] = {**BODY, **ACTUATOR, **SENSOR}
+# In the order in which they act together: the true tilt first, for it turns the thrusts.
+CATALOGUE: dict[str, Effect] = {'joint_offset': ACTUATOR['joint_offset'], **BODY, **ACTUATOR,
+                                **SENSOR}
 
 __all__ = ['CATALOGUE', 'command_delays', 'Effect', 'EffectParameter', 'ServoTerms', 'settings',
            'Terms', 'validated']
