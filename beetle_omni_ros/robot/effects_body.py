@@ -32,10 +32,16 @@ def _moved(centre, shift):
 def _module_reaction(terms, module_inertia, mass_moment):
     shift = 0
     for i in range(4):
-        terms.torque = terms.torque - module_inertia * terms.tilt_acceleration[i] \
-            * terms.tilt_axes[i]
-        # The module's centre of mass hangs below the joint axis: it moves against the thrust.
-        shift = shift - mass_moment / terms.mass * (terms.thrust_directions[i] - UP)
+        rate, acceleration = terms.tilt_rate[i], terms.tilt_acceleration[i]
+        n, e = terms.thrust_directions[i], terms.tilt_axes[i]
+        terms.torque = terms.torque - module_inertia * acceleration * e
+        # The module's centre of mass hangs below the joint axis: it moves against the thrust,
+        # and pushes back on the axis as it is accelerated.
+        shift = shift - mass_moment / terms.mass * (n - UP)
+        sideways = ca.cross(e, n)
+        terms.rotor_forces[i] = terms.rotor_forces[i] + mass_moment * (
+            acceleration * sideways - rate * rate * n
+            + 2 * rate * ca.cross(terms.angular_velocity, sideways))
     terms.centre_of_mass = _moved(terms.centre_of_mass, shift)
 
 
@@ -142,7 +148,8 @@ BODY: dict[str, Effect] = {
     'module_reaction': Effect(
         'body', {'module_inertia': EffectParameter('kg m^2', 0.0, 0.0, 0.1, 1e-4, 2e-5),
                  'mass_moment': EffectParameter('kg m', 0.0, 0.0, 1.0, 2e-3, 3e-4, 0.0)},
-        "servo torque J q'' on the body; centre of mass moved by -moment / m (t(q) - t(0)); "
+        "servo torque J q'' on the body; centre of mass moved by -moment / m (t(q) - t(0)), "
+        "moment (n'' + 2 w x n') pushed back; "
         'multibody section of the robot file', 'fast tilting, turned attitudes',
         ('centre_of_mass', 'inertia'), 'the same attitude with tilts turned by 180 deg',
         _module_reaction),

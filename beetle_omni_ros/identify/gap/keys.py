@@ -67,8 +67,7 @@ class Key:
     @property
     def groups(self) -> str:
         """Channel groups that depend on it."""
-        return 'BJ' if self.effect == 'module_reaction' else \
-            'B' if self.body else GROUPS[self.effect]
+        return 'B' if self.body else GROUPS[self.effect]
 
 
 def _own(robot: RobotParameters) -> dict[str, float | np.ndarray]:

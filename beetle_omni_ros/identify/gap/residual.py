@@ -45,12 +45,16 @@ class FlightModel:
         keys: by name.
         p: parameters.
 
+    Attributes:
+        modules: share of the file's tilting modules in the model, 0 or 1; fits vary it around.
+
     """
 
     def __init__(self, flight: Flight, robot: RobotParameters, body: BodyModel,
                  keys: dict[str, Key], p: GapParameters):
         """Prepare signals and servo windows."""
         self.flight, self.robot, self.keys, self.p, self._body = flight, robot, keys, p, body
+        self.modules = 0.0
         self.signals = Signals(flight, robot, p)
         self.filters = {'B': low_pass(p.body_edge, p.body_every, p.grid),
                         'A': low_pass(p.world_edge, p.world_every, p.grid),
@@ -84,7 +88,7 @@ class FlightModel:
         return {'velocity': velocity, 'quaternion': quaternion, 'rate': rate, 'tilt': tilt,
                 'thrust': thrust, 'tilt_rate': tilt_rate, 'tilt_acceleration': tilt_acceleration,
                 'thrust_rate': thrust_rate, 'position': position, 'voltage': s.voltage,
-                'modules': np.full(len(s.t), theta.get('modules.share', 0.0))}
+                'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0))}
 
     def residual(self, theta: dict[str, float], groups: str = 'BAWJ') -> dict[str, np.ndarray]:
         """Group -> (M, channels) measured minus expected."""
@@ -138,7 +142,8 @@ class FlightModel:
         # One more edge than steps in each window: the mean across windows is dropped.
         full = [np.concatenate([t, t[-1:]]).reshape(*shape, 4)[:, :-1].transpose(1, 0, 2)
                 for t in targets]
-        runs = simulate(self.robot.joints, windows, np.array(full), sets, self._own)
+        runs = simulate(self.robot.joints, windows, np.array(full), sets,
+                        {**self._own, 'modules': self.modules})
         residuals = []
         for theta, run in zip(sets, runs, strict=True):
             angle = self.signals.joints(theta)[3][first:first + len(measured)]
@@ -197,8 +202,6 @@ class FlightModel:
             smooth = -self.filters['B'](exact)
             for k, name in enumerate(body):
                 made['B'][:, :, names.index(name)] = smooth[:, :, k]
-        if 'module_reaction.module_inertia' in names and 'J' in made:
-            pass    # the servo's answer to its module's inertia is in its identified inertia
         signal = [name for name in names if not self.keys[name].body]
         now = self.residual(theta, 'BAW')
         for name in signal:

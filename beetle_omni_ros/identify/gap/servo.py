@@ -54,7 +54,8 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
         windows: of one flight.
         targets: (P, K, W, 4) [rad] for each set.
         sets: of deviations by key name.
-        base: values of the robot file's own effects: coulomb, stiction, deflection.
+        base: values of the robot file's own effects: coulomb, stiction, deflection; share of its
+            modules.
 
     Returns:
         (P, M, W, 4) positions [rad] after the run-in.
@@ -73,7 +74,7 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
     coulomb = base['coulomb'] + column('joint_friction.coulomb', lambda x: max(x, 0.0))
     stiction = base['stiction'] + column('joint_friction.stiction', lambda x: max(x, 0.0))
     soft = base['deflection'] + column('joint_deflection.deflection_per_newton')
-    share = column('modules.share')
+    share = base['modules'] + column('modules.share')
     damping = 0.5 * h * kd / joint.inertia
     keep, gain = (1 - damping) / (1 + damping), h / joint.inertia / (1 + damping)
     sliding, holding = coulomb * gain, np.maximum(stiction, coulomb) * gain
