@@ -109,7 +109,7 @@ class Search:
             trials = self._step(state, cost, [t.candidate for t in found.accepted])
             for trial in trials:
                 found.trials[trial.candidate.label] = trial
-            best = self._judge(trials, state, cost, floor, found.accepted)
+            best = self._judge(trials, cost, floor, [t.candidate for t in found.accepted])
             if best is None or len(found.accepted) >= self.p.most_effects:
                 break
             found.accepted.append(best)
@@ -214,10 +214,10 @@ class Search:
                 best = Trial(c, gain, self.problem._moved(theta, names, step)), point
         return best
 
-    def _judge(self, trials, state, cost, floor, accepted):
+    def _judge(self, trials, cost, floor, accepted):
         """The first trial that passes every gate; the others get their reason."""
         chosen, p = None, self.p
-        names_taken = {(t.candidate.name, t.candidate.member) for t in accepted}
+        names_taken = {(c.name, c.member) for c in accepted}
         for trial in trials:
             c = trial.candidate
             need = p.least_gain + p.parameter_price * (len(c.keys) - 1)
