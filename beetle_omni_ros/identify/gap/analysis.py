@@ -220,25 +220,39 @@ def _falsify(a):
     """Free runs before, after and with a placebo, on the flights that judge."""
     found, noise = a.found, a.problem.noise
     judges = a.models[1]
-    a.runs['before'] = [free_runs(m, found.base, noise) for m in judges]
+    plain = _plain(a, found.base)
+    a.runs['before'] = [free_runs(m, plain, noise) for m in judges]
     if found.accepted:
+        keys = {n for t in found.accepted for n in t.candidate.keys}
+        named = {**_plain(a, found.theta), **{n: found.theta[n] for n in keys}}
         a.runs['after'] = [free_runs(m, found.theta, noise) for m in judges]
+        a.runs['effects_alone'] = [free_runs(m, named, noise) for m in judges]
         a.runs['placebo'] = [free_runs(m, _placebo(a), noise) for m in judges]
     else:
-        a.runs['after'] = a.runs['placebo'] = a.runs['before']
+        for name in ('after', 'effects_alone', 'placebo'):
+            a.runs[name] = a.runs['before']
     # No floor is higher than what the model reached on the flights that it was fitted to.
-    own = [free_runs(a.models[0][0], found.theta, noise)] if a.held_out else a.runs['after']
+    own = [free_runs(a.models[0][0], found.theta, noise)]
     reached = np.sqrt(np.mean([(run.error**2).mean(axis=1) for run in own], axis=0))
     floors = np.minimum(np.mean([run.floor for run in own], axis=0), np.maximum(reached, 1e-4))
     for h, horizon in enumerate(HORIZONS):
         values = {name: gap(runs, h, floors=floors) for name, runs in a.runs.items()}
         a.gaps[horizon] = {**values, 'closure': closure(values['before'], values['after']),
-                           'placebo_closure': closure(values['before'], values['placebo'])}
+                           'placebo_closure': closure(values['before'], values['placebo']),
+                           'closure_of_effects_alone': closure(values['before'],
+                                                               values['effects_alone'])}
     for regime in np.unique(np.concatenate([run.regime for run in a.runs['before']])):
         before, after = (gap(a.runs[name], JUDGED, regime, floors)
                          for name in ('before', 'after'))
         a.regimes[str(regime)] = {'before': before, 'after': after,
                                   'worse': bool(after > WORSE * before)}
+
+
+def _plain(a, theta):
+    """The robot file's own numbers, with the sensors and the bus as they were found."""
+    return {name: x for name, x in theta.items() if not a.keys[name].body
+            and a.keys[name].effect not in ('rotor_lag', 'joint_bandwidth', 'modules')
+            and name in a.problem.beliefs}
 
 
 def closure(before: float, after: float) -> float | None:

@@ -12,6 +12,7 @@ from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 MODEL_ERROR = 0.005     # of a value: no form is exact
+BUS_DELAY = 0.002       # [s] that commands may differ by, when asking what could be seen
 LEAST_SCALE = 0.3       # of the variance, where a floor made the data look noisier than they are
 
 
@@ -71,8 +72,9 @@ def visibility(problem: Problem, state: State, always: list[str],
     data = s.T @ s
     keys, index = problem.keys, state.index
     base = np.array([index[name] for name in always])
+    # Where a belief says nothing within a range, a realistic effect may well lie outside.
     prior = np.array([problem.beliefs[name].slope(state.theta.get(name, 0.0))**2
-                      for name in always])
+                      if not name.startswith('base.') else BUS_DELAY**-2 for name in always])
 
     def left(own, also):
         """Information on ``own`` beside what is believed and ``also``."""

@@ -145,8 +145,8 @@ def tolerances(p: GapParameters) -> dict[str, Belief]:
         made[f'position.offset[{k}]'] = p.tolerance_position
     beliefs = {name: Belief(deviation) for name, deviation in made.items()}
     reach, nominal = p.command_delay_range, p.command_delay
-    beliefs['base.delay'] = Belief(5e-4, nominal, reach / 2, 0.02)
-    beliefs['base.split'] = Belief(5e-4, reach, reach, 0.005)
+    beliefs['base.delay'] = Belief(5e-4, nominal, reach / 2, 0.003)
+    beliefs['base.split'] = Belief(5e-4, reach, reach, 0.004)
     return beliefs
 
 

@@ -65,11 +65,31 @@ class FlightModel:
         self._starts = np.arange(0, count - self._length + 1, self._length) \
             + round(p.servo_warm_up / p.grid)
         self._loads: np.ndarray | None = None
+        self._mask = self._trusted()
         own = robot.effects
         self._own = {'coulomb': own.get('joint_friction', {}).get('coulomb', 0.0),
                      'stiction': own.get('joint_friction', {}).get('stiction', 0.0),
                      'deflection': own.get('joint_deflection', {}).get(
                          'deflection_per_newton', 0.0)}
+
+    def _trusted(self):
+        """(M,) 0 for body samples at the rotors' limit for the present voltage, or on the floor."""
+        s, p = self.signals, self.p
+        bad = s.pose({})[0][:, 2] < p.contact_height
+        rows = sorted(self.robot.rotors.map, key=lambda row: row.voltage)
+        if rows:
+            volts = s.voltage * self.robot.battery.full_voltage
+            most = np.interp(volts, [row.voltage for row in rows],
+                             [row.thrust_max for row in rows])
+            asked = self.flight.command[np.clip(np.searchsorted(
+                self.flight.command_t, s.t) - 1, 0, None), 4:].max(axis=1)
+            bad |= asked > p.limit_margin * most
+        # A rotor remembers for some of its time constants.
+        memory = round(5 * self.robot.rotors.time_constant / p.grid)
+        spread = np.convolve(bad, np.ones(memory))[:len(bad)] > 0
+        near = self.filters['B'].margin
+        wide = np.convolve(spread, np.ones(2 * near + 1), 'same') > 0
+        return (~wide[self.filters['B'].centres(len(s.t))]).astype(float)
 
     def times(self, group: str) -> np.ndarray:
         """(M,) times of a group's samples [s], relative to the flight's start."""
@@ -96,7 +116,8 @@ class FlightModel:
         if 'B' in groups:
             force, _, turning = self.signals.imu(theta)
             expected = self._body(self.inputs(theta), theta)
-            made['B'] = self.filters['B'](np.concatenate([force, turning], axis=1) - expected)
+            made['B'] = self._mask[:, None] * self.filters['B'](
+                np.concatenate([force, turning], axis=1) - expected)
         if 'A' in groups:
             made['A'] = self._world(theta)
         if 'W' in groups:
@@ -199,7 +220,7 @@ class FlightModel:
         body = [name for name in names if self.keys[name].body]
         if body:
             exact = self._body.derivatives(self.inputs(theta), theta, tuple(body))
-            smooth = -self.filters['B'](exact)
+            smooth = -self._mask[:, None, None] * self.filters['B'](exact)
             for k, name in enumerate(body):
                 made['B'][:, :, names.index(name)] = smooth[:, :, k]
         signal = [name for name in names if not self.keys[name].body]

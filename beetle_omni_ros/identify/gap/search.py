@@ -237,8 +237,7 @@ class Search:
             else:
                 self._cross_validate(trial, accepted)
                 sure = trial.cross[0] > 3 * trial.cross[1] and trial.positive >= 0.7
-                if trial.cross[0] < 0.3 * trial.gain or trial.cross[0] < 2 * trial.cross[1] \
-                        or trial.positive < 0.55:
+                if not self._holds(trial):
                     trial.reason = 'does not hold on data left out'
                 elif trial.share < p.least_share and not (
                         sure and trial.share > p.weak_share):
@@ -246,6 +245,12 @@ class Search:
                 else:
                     chosen = trial
         return chosen
+
+    @staticmethod
+    def _holds(trial):
+        """Whether blocks that were left out agree."""
+        return trial.cross[0] >= 0.3 * trial.gain and trial.cross[0] >= 2 * trial.cross[1] \
+            and trial.positive >= 0.55
 
     def _at_bound(self, trial):
         keys = self.problem.keys
@@ -277,7 +282,9 @@ class Search:
             for b, (h, g, chi2) in enumerate(per):
                 step, _, _ = problem.solve(at.theta, names, loose, total[0] - h, total[1] - g,
                                            total[2] - chi2)
-                held[b] += sign * (chi2 + 2 * g @ step + step @ h @ step)
+                belief = problem.prior(problem._moved(at.theta, names, step), loose)
+                held[b] += sign * (chi2 + 2 * g @ step + step @ h @ step
+                                   + belief / problem.blocks)
         error = float(held.std(ddof=1) * np.sqrt(len(held))) if len(held) > 1 else np.inf
         trial.cross = float(held.sum()), error
         trial.positive = float((held > 0).mean())
@@ -322,8 +329,11 @@ class Search:
             for other in self._step(start, without, others):
                 if other.candidate.name == own.name and other.candidate.member == own.member:
                     continue
-                if other.refined and other.gain > gain - margin and other.candidate.large_enough(
-                        self.problem.keys, other.theta) and not self._at_bound(other):
+                if not (other.refined and other.gain > gain - margin) or self._at_bound(other) \
+                        or not other.candidate.large_enough(self.problem.keys, other.theta):
+                    continue
+                self._cross_validate(other, others)
+                if self._holds(other):
                     near.append(other)
             trial.gain = gain
             found.rivals[own.label] = near
