@@ -132,13 +132,11 @@ def grids(made: dict) -> list[Grid]:
             member = effect.get('rotor') or effect.get('joint')
             name = ' or '.join(effect['names']) + (f' {member}' if member else '')
             for k, (parameter, entry) in enumerate(effect['parameters'].items()):
-                rows.append([name if k == 0 else '', parameter, _numbers(entry['value']),
-                             _spans(entry.get('interval')), entry['unit'],
-                             f"{effect['evidence']['delta_bic']:.0f}" if k == 0 else '',
-                             f"{effect['evidence']['cv_gain_se']:.1f}" if k == 0 else ''])
+                rows.append([name if k == 0 else '', f"{parameter} [{entry['unit']}]",
+                             _numbers(entry['value']), _spans(entry.get('interval')),
+                             f"{effect['evidence']['delta_bic']:.0f}" if k == 0 else ''])
         title = 'Effects' if made['effects'] else 'Explains a part only, not accepted'
-        tables.append(Grid(title, ['effect', 'parameter', 'value', '95 % interval', 'unit',
-                                   'delta BIC', 'unseen gain / s.e.'], rows))
+        tables.append(Grid(title, ['effect', 'parameter', 'value', '95 %', 'delta BIC'], rows))
     if made['horizons']:
         flights = 'held-out flights' if made['held_out'] else 'the fitted flights'
         rows = [[h, *(_cell(v[k]) for k in ('before', 'after', 'effects_alone', 'placebo',
@@ -162,8 +160,8 @@ def _evidence(rows, most):
                            if r.get('rotor') or r.get('joint') else ''),
               f"{r['evidence']['delta_chi2']:.0f}", _cell(r['sigma_of_realistic_size']),
               'accepted' if r['accepted'] else r['reason']] for r in rows[:most]]
-    return Grid('Candidates, after the last step', ['entry', 'explains (chi2)',
-                                                    'a realistic size: sigma', 'why not'], shown)
+    return Grid('Candidates, after the last step', ['entry', 'chi2', 'visible [sigma]',
+                                                    'why not'], shown)
 
 
 def _cell(value):
