@@ -220,17 +220,19 @@ def _falsify(a):
     """Free runs before, after and with a placebo, on the flights that judge."""
     found, noise = a.found, a.problem.noise
     judges = a.models[1]
-    plain = _plain(a, found.base)
-    a.runs['before'] = [free_runs(m, plain, noise) for m in judges]
-    if found.accepted:
-        keys = {n for t in found.accepted for n in t.candidate.keys}
-        named = {**_plain(a, found.theta), **{n: found.theta[n] for n in keys}}
-        a.runs['after'] = [free_runs(m, found.theta, noise) for m in judges]
-        a.runs['effects_alone'] = [free_runs(m, named, noise) for m in judges]
-        a.runs['placebo'] = [free_runs(m, _placebo(a), noise) for m in judges]
-    else:
-        for name in ('after', 'effects_alone', 'placebo'):
-            a.runs[name] = a.runs['before']
+    keys = {n for t in found.accepted for n in t.candidate.keys}
+    # The same robot, with its tolerances as found, without and with what was named ...
+    points = {'before': {n: x for n, x in found.theta.items() if n not in keys},
+              'after': found.theta}
+    # ... and the robot file as it is, and with nothing but what was named.
+    plain = _plain(a, found.theta, keys)
+    points |= {'file': plain, 'effects_alone': {**plain, **{n: found.theta[n] for n in keys}},
+               'placebo': _placebo(a)}
+    for name, theta in points.items():
+        if found.accepted or name in ('before', 'file'):
+            a.runs[name] = [free_runs(m, theta, noise) for m in judges]
+    for name, same in (('after', 'before'), ('placebo', 'before'), ('effects_alone', 'file')):
+        a.runs.setdefault(name, a.runs[same])
     # No floor is higher than what the model reached on the flights that it was fitted to.
     own = [free_runs(a.models[0][0], found.theta, noise)]
     reached = np.sqrt(np.mean([(run.error**2).mean(axis=1) for run in own], axis=0))
@@ -239,7 +241,7 @@ def _falsify(a):
         values = {name: gap(runs, h, floors=floors) for name, runs in a.runs.items()}
         a.gaps[horizon] = {**values, 'closure': closure(values['before'], values['after']),
                            'placebo_closure': closure(values['before'], values['placebo']),
-                           'closure_of_effects_alone': closure(values['before'],
+                           'closure_of_effects_alone': closure(values['file'],
                                                                values['effects_alone'])}
     for regime in np.unique(np.concatenate([run.regime for run in a.runs['before']])):
         before, after = (gap(a.runs[name], JUDGED, regime, floors)
@@ -248,11 +250,11 @@ def _falsify(a):
                                   'worse': bool(after > WORSE * before)}
 
 
-def _plain(a, theta):
+def _plain(a, theta, named):
     """The robot file's own numbers, with the sensors and the bus as they were found."""
     return {name: x for name, x in theta.items() if not a.keys[name].body
             and a.keys[name].effect not in ('rotor_lag', 'joint_bandwidth', 'modules')
-            and name in a.problem.beliefs}
+            and name in a.problem.beliefs and name not in named}
 
 
 def closure(before: float, after: float) -> float | None:

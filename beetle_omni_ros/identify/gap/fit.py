@@ -13,6 +13,7 @@ from beetle_omni_ros.identify.gap.residual import FlightModel
 
 CURVED = ('delay', 'split', 'rotation', 'time_constant', 'kp', 'kd', 'velocity_limit',
           'effort_limit', 'coulomb', 'stiction', 'gap', 'thrust_max', 'deflection_per_newton')
+TIMES = ('delay', 'split')
 HALVINGS = 4
 RIDGE = 1e-9
 
@@ -92,6 +93,11 @@ class Problem:
         slopes = [m.slopes(theta, names) for m in self.models]
         self._raw = [(r, s, names, theta) for r, s in zip(raw, slopes, strict=True)]
         return self._whitened()
+
+    def renew(self, theta: dict[str, float]) -> None:
+        """Take the residual at a point nearby; slopes stay those of the last :meth:`state`."""
+        self._raw = [(m.residual(theta), old[1], old[2], theta)
+                     for m, old in zip(self.models, self._raw, strict=True)]
 
     def _whitened(self):
         r = np.concatenate([self.noise.whiten(raw) for raw, *_ in self._raw])
@@ -191,9 +197,10 @@ class Problem:
         """
         theta, r = dict(state.theta), state.r
         slopes, cost = state.slopes, float(r @ r) + self.prior(theta, free)
-        curved = [name for name in names if self.keys[name].parameter in CURVED
-                  and name not in self.beliefs or name in free
-                  and self.keys[name].parameter in CURVED]
+        timing = any(self.keys[name].parameter in TIMES for name in free)
+        curved = [name for name in names if self.keys[name].parameter in CURVED and (
+            name not in self.beliefs or name in free
+            or timing and self.keys[name].parameter in TIMES)]
         now = State(theta, r, slopes, state.names)
         for iteration in range(iterations):
             step, _, _ = self.linear_step(now, names, free)

@@ -28,6 +28,7 @@ CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torq
             'J': ('joint_1', 'joint_2', 'joint_3', 'joint_4')}
 UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate': 'rad/s',
          'joint': 'rad'}
+THIN = 2        # grid points to each at which the body's equations are evaluated
 STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
          'kp': 0.01, 'kd': 0.01, 'velocity_limit': 0.01, 'effort_limit': 0.01, 'coulomb': 5e-4,
          'stiction': 5e-4, 'deflection_per_newton': 1e-4, 'gap': 1e-3, 'thrust_max': 0.01,
@@ -56,7 +57,7 @@ class FlightModel:
         self.flight, self.robot, self.keys, self.p, self._body = flight, robot, keys, p, body
         self.modules = 0.0
         self.signals = Signals(flight, robot, p)
-        self.filters = {'B': low_pass(p.body_edge, p.body_every, p.grid),
+        self.filters = {'B': low_pass(p.body_edge, p.body_every, THIN * p.grid),
                         'A': low_pass(p.world_edge, p.world_every, p.grid),
                         'W': low_pass(p.rate_edge, p.rate_every, p.grid),
                         'J': low_pass(p.joint_edge, p.joint_every, p.grid)}
@@ -87,16 +88,17 @@ class FlightModel:
         # A rotor remembers for some of its time constants.
         memory = round(5 * self.robot.rotors.time_constant / p.grid)
         spread = np.convolve(bad, np.ones(memory))[:len(bad)] > 0
-        near = self.filters['B'].margin
+        near = THIN * self.filters['B'].margin
         wide = np.convolve(spread, np.ones(2 * near + 1), 'same') > 0
-        return (~wide[self.filters['B'].centres(len(s.t))]).astype(float)
+        return (~wide[::THIN][self.filters['B'].centres(-(-len(s.t) // THIN))]).astype(float)
 
     def times(self, group: str) -> np.ndarray:
         """(M,) times of a group's samples [s], relative to the flight's start."""
         if group == 'J':
             first, count = self._starts[0], self._length * len(self._starts)
             return self.signals.t[first + self.filters['J'].centres(count)]
-        return self.signals.t[self.filters[group].centres(len(self.signals.t))]
+        t = self.signals.t[::THIN] if group == 'B' else self.signals.t
+        return t[self.filters[group].centres(len(t))]
 
     def inputs(self, theta: dict[str, float]) -> dict[str, np.ndarray]:
         """Series (N, width) that the body's equations take."""
@@ -110,14 +112,17 @@ class FlightModel:
                 'thrust_rate': thrust_rate, 'position': position, 'voltage': s.voltage,
                 'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0))}
 
+    def _thinned(self, theta):
+        return {name: values[::THIN] for name, values in self.inputs(theta).items()}
+
     def residual(self, theta: dict[str, float], groups: str = 'BAWJ') -> dict[str, np.ndarray]:
         """Group -> (M, channels) measured minus expected."""
         made = {}
         if 'B' in groups:
             force, _, turning = self.signals.imu(theta)
-            expected = self._body(self.inputs(theta), theta)
+            expected = self._body(self._thinned(theta), theta)
             made['B'] = self._mask[:, None] * self.filters['B'](
-                np.concatenate([force, turning], axis=1) - expected)
+                np.concatenate([force, turning], axis=1)[::THIN] - expected)
         if 'A' in groups:
             made['A'] = self._world(theta)
         if 'W' in groups:
@@ -219,7 +224,7 @@ class FlightModel:
                 for group, channels in CHANNELS.items()}
         body = [name for name in names if self.keys[name].body]
         if body:
-            exact = self._body.derivatives(self.inputs(theta), theta, tuple(body))
+            exact = self._body.derivatives(self._thinned(theta), theta, tuple(body))
             smooth = -self._mask[:, None, None] * self.filters['B'](exact)
             for k, name in enumerate(body):
                 made['B'][:, :, names.index(name)] = smooth[:, :, k]

@@ -14,7 +14,11 @@ from beetle_omni_ros.identify.gap.keys import SHAPES
 REFINED = 5             # candidates of each step that are fitted, not only estimated
 PROMISING = 0.25        # of the best linear gain
 PROMISING_CURVED = 0.1  # likewise, of those that a straight line cannot judge
+MOST_TURNS = 3          # of fresh slopes, while a fit runs away from them
+FAR = 0.2               # typical sizes of a curved number
 WIDE = 4.0              # typical sizes, within which anything is sought
+COMMANDS = ('command_latency', 'joint_command_latency', 'rotor_dead_time')
+SENSORS = ('imu_filter_lag.delay', 'mocap_time_offset.delay', 'joint_feedback_delay.delay')
 
 
 @dataclass
@@ -136,13 +140,26 @@ class Search:
 
     def _settle(self, theta, accepted):
         """Noise and fit in turn, and fresh slopes of everything at the point reached."""
+        problem = self.problem
+        at = dict(theta)
         if theta:
-            self.problem.state(theta, self.names)
-        state = self.problem.learn_noise(self.wide)
-        state, _ = self._refit(state, accepted)
-        self.problem.state(state.theta, self.names)
-        state = self.problem.learn_noise(self.wide, 2)
+            problem.state(theta, self.names)
+        state = problem.learn_noise(self.wide)
+        for _ in range(MOST_TURNS):
+            state, _ = self._refit(state, accepted)
+            if not self._far(at, state.theta):
+                problem.renew(state.theta)
+                break
+            at = dict(state.theta)
+            problem.state(at, self.names)
+            state = problem.learn_noise(self.wide, 2)
+        state = problem.learn_noise(self.wide, 2)
         return self._refit(state, accepted, 2)
+
+    def _far(self, a, b):
+        """Whether slopes taken at one point are of little use at the other."""
+        return any(abs(a.get(name, 0.0) - b.get(name, 0.0)) > FAR * self.problem.keys[
+            name].typical for name in {*a, *b} if self.problem.keys[name].parameter in CURVED)
 
     def _floor(self, state):
         """Objective of a straight-line fit of everything at once."""
@@ -166,10 +183,12 @@ class Search:
                 trial, point = self._elsewhere(state, cost, c, names, free)
             else:
                 index = [state.index[name] for name in names]
-                step, reached, _ = problem.solve(state.theta, names, free | set(c.keys),
+                theta = _handed_over(state.theta, c)
+                step, reached, _ = problem.solve(theta, names, free | set(c.keys),
                                                  h[np.ix_(index, index)], g[index], chi2)
-                trial = Trial(c, cost - reached, problem._moved(state.theta, names, step))
-                point = state
+                trial = Trial(c, cost - reached, problem._moved(theta, names, step))
+                point = state if theta is state.theta else State(
+                    theta, problem.residual(theta), state.slopes, state.names)
             trials.append(trial)
             points[c.label] = point
         trials.sort(key=lambda t: -t.gain)
@@ -337,3 +356,24 @@ class Search:
                     near.append(other)
             trial.gain = gain
             found.rivals[own.label] = near
+
+
+def _handed_over(theta, candidate):
+    """
+    The same delays, with what the bus was blamed for in the candidate's own number.
+
+    Otherwise a fit that starts with half the delay in a number that it need not leave would
+    stay there, for the data cannot tell the two apart.
+    """
+    key = f'{candidate.name}.delay'
+    if candidate.name not in COMMANDS or theta.get(key):
+        return theta
+    # All sensors late by the same is all commands early by it: an exact gauge.
+    late = float(np.mean([theta.get(name, 0.0) for name in SENSORS]))
+    made = {**theta, **{name: theta.get(name, 0.0) - late for name in SENSORS}}
+    delay, split = theta.get('base.delay', 0.0) + late, theta.get('base.split', 0.0)
+    own, delay, split = {
+        'command_latency': (delay, 0.0, split),
+        'joint_command_latency': (split, delay - split / 2, 0.0),
+        'rotor_dead_time': (-split, delay + split / 2, 0.0)}[candidate.name]
+    return {**made, key: own, 'base.delay': delay, 'base.split': split}

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.fit import Problem, State
-from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel
+from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel, THIN
 from beetle_omni_ros.identify.gap.signals import matrices
 
 RIDGE = 3.0             # of a whitened and scaled regression
@@ -124,7 +124,11 @@ def _whitened(problem, model, group, channel, columns):
     if group == 'J':
         first, count = model._starts[0], model._length * len(model._starts)
         columns = columns[first:first + count]
+    elif group == 'B':
+        columns = columns[::THIN]
     smooth = model.filters[group](columns)
+    if group == 'B':
+        smooth = model._mask[:, None] * smooth
     tap = problem.noise.taps[group][channel]
     return lfilter(tap, 1.0, smooth, axis=0)[len(tap) - 1:] / problem.noise.sigma[group][channel]
 
