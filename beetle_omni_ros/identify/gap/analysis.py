@@ -270,6 +270,5 @@ def _placebo(a) -> dict[str, float]:
     for trial in a.found.accepted:
         for name in trial.candidate.keys:
             key = a.keys[name]
-            theta[name] = float(np.clip(-theta[name], max(key.low, -0.5) if key.relative
-                                        else key.low, key.high))
+            theta[name] = float(np.clip(-theta[name], key.low, key.high))
     return theta

@@ -69,7 +69,7 @@ class BodyModel:
         made = []
         for key in found:
             symbol = self._p[self._index[key.name]]
-            made.append(key.base * (1 + symbol) if key.relative else key.base + symbol)
+            made.append(key.base * ca.exp(symbol) if key.relative else key.base + symbol)
         return made[0] if found[0].index is None else tuple(made)
 
     @cached_property

@@ -85,16 +85,16 @@ def _starts(name, keys, models):
     if name == 'joint_velocity_limit':
         met = max(np.abs(m.signals.joints({})[1]).max() for m in models)
         base = keys['joint_velocity_limit.velocity_limit'].base
-        return tuple((part * met / base - 1,) for part in (0.95, 0.8)
+        return tuple((float(np.log(part * met / base)),) for part in (0.95, 0.8)
                      if part * met < 0.95 * base)
     if name == 'joint_torque_limit':
         asked = max(np.quantile(np.abs(_errors(m)), 0.999) for m in models) * joint.kp
         base = keys['joint_torque_limit.effort_limit'].base
-        return tuple((part * asked / base - 1,) for part in (0.9, 0.6)
+        return tuple((float(np.log(part * asked / base)),) for part in (0.9, 0.6)
                      if part * asked < 0.98 * base)
     asked = max(np.quantile(m.flight.command[:, 4:], 0.999) for m in models)
     base = keys['thrust_saturation.thrust_max'].base
-    return tuple((part * asked / base - 1,) for part in (0.95, 0.8)
+    return tuple((float(np.log(part * asked / base)),) for part in (0.95, 0.8)
                  if part * asked < 1.2 * base)
 
 

@@ -1,8 +1,9 @@
 """
 The numbers of a fit: every scalar of every catalogue entry, and what else robots differ by.
 
-A fit works with deviations from what the robot file says: absolute ones, or parts of the file's
-own number where the catalogue's neutral value is that number. A key is 'effect.parameter' or
+A fit works with deviations from what the robot file says: differences, or logarithms of ratios
+for masses, gains and the like: mass, inertia and thrust scale together without a trace in motion,
+and in logarithms that is a straight line. A key is 'effect.parameter' or
 'effect.parameter[index]'.
 """
 
@@ -18,6 +19,7 @@ from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 SHAPES = ('cosine_share', 'exponential_share', 'spin_up_share')
+SMALLEST = 0.02         # ratio to the file's own number
 GROUPS = {  # signal-layer entries -> channel groups in which they show
     'rotor_lag': 'B', 'rotor_dead_time': 'B', 'thrust_saturation': 'B', 'command_latency': 'BJ',
     'joint_command_latency': 'J', 'joint_bandwidth': 'J', 'joint_velocity_limit': 'J',
@@ -39,7 +41,7 @@ class Key:
         parameter: its name there.
         index: within a vector, or None.
         base: value that the robot file has.
-        relative: whether a deviation is a part of ``base``.
+        relative: whether a deviation is the logarithm of a ratio to ``base``.
         low: smallest deviation.
         high: largest.
         typical: realistic deviation.
@@ -62,7 +64,11 @@ class Key:
 
     def value(self, deviation: float) -> float:
         """Catalogue value of a deviation."""
-        return self.base * (1 + deviation) if self.relative else self.base + deviation
+        return self.base * math.exp(deviation) if self.relative else self.base + deviation
+
+    def width(self, deviation: float, half: float) -> float:
+        """Half width in the catalogue's unit of one in deviations."""
+        return half * abs(self.value(deviation)) if self.relative else half
 
     @property
     def groups(self) -> str:
@@ -85,12 +91,13 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
     for name, effect in CATALOGUE.items():
         for parameter, spec in effect.parameters.items():
             neutral = np.atleast_1d(np.array(spec.neutral, dtype=float))
-            relative = bool(np.isnan(neutral).any())
+            absent = bool(np.isnan(neutral).any())
+            relative = absent or parameter == 'scale'
             base = np.atleast_1d(np.array(robot.effects.get(name, {}).get(
-                parameter, own.get(parameter) if relative else spec.neutral), dtype=float))
+                parameter, own.get(parameter) if absent else spec.neutral), dtype=float))
             scalar = np.ndim(spec.neutral) == 0
             for k, value in enumerate(base):
-                low, high = (b / value - 1 if relative else b - value
+                low, high = (math.log(max(b / value, SMALLEST)) if relative else b - value
                              for b in (spec.low, spec.high))
                 text = f'{name}.{parameter}' + ('' if scalar else f'[{k}]')
                 keys[text] = Key(text, name, parameter, None if scalar else k, float(value),

@@ -81,7 +81,7 @@ def parameters(a: Analysis, name: str, free: tuple[str, ...], theta: dict[str, f
         values = [key.value(theta.get(key.name, 0.0)) for key in keys]
         entry = {'value': values if len(values) > 1 else values[0], 'unit': spec.unit}
         if with_intervals:
-            widths = [a.widths.get(key.name, 0.0) * (abs(key.base) if key.relative else 1.0)
+            widths = [key.width(theta.get(key.name, 0.0), a.widths.get(key.name, 0.0))
                       if key.name in free else 0.0 for key in keys]
             spans = [[v - w, v + w] for v, w in zip(values, widths, strict=True)]
             entry['interval'] = spans if len(spans) > 1 else spans[0]

@@ -65,12 +65,10 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
         return np.array([made(values.get(name, 0.0)) for values in sets])[:, None, None]
 
     h = windows.step
-    kp = joint.kp * column('joint_bandwidth.kp', lambda x: 1 + max(x, -0.95))
-    kd = joint.kd * column('joint_bandwidth.kd', lambda x: 1 + max(x, -0.95))
-    speed = joint.velocity_limit * column('joint_velocity_limit.velocity_limit',
-                                          lambda x: 1 + max(x, -0.98))
-    effort = joint.effort_limit * column('joint_torque_limit.effort_limit',
-                                         lambda x: 1 + max(x, -0.999))
+    kp = joint.kp * column('joint_bandwidth.kp', np.exp)
+    kd = joint.kd * column('joint_bandwidth.kd', np.exp)
+    speed = joint.velocity_limit * column('joint_velocity_limit.velocity_limit', np.exp)
+    effort = joint.effort_limit * column('joint_torque_limit.effort_limit', np.exp)
     coulomb = base['coulomb'] + column('joint_friction.coulomb', lambda x: max(x, 0.0))
     stiction = base['stiction'] + column('joint_friction.stiction', lambda x: max(x, 0.0))
     soft = base['deflection'] + column('joint_deflection.deflection_per_newton')

@@ -161,9 +161,9 @@ class Signals:
         def make():
             rotors, h = self.robot.rotors, FINE / 2
             # The file's own limit cuts no earlier than commands are: it is the command's.
-            most = rotors.thrust_max * (1 + limit) if limit else np.inf
+            most = rotors.thrust_max * np.exp(limit) if limit else np.inf
             asked = np.clip(self._command[:, 4:], rotors.thrust_min, most)
-            tau = rotors.time_constant * (1 + max(lag, -0.97))
+            tau = rotors.time_constant * np.exp(lag)
             begin = self._fine[0] - 0.9
             count = round((self.t[-1] - begin) / h) + 2
             edges = begin + h * np.arange(count + 1)
