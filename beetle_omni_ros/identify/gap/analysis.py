@@ -167,20 +167,22 @@ def hidden(a: Analysis, p: GapParameters) -> list[str]:
 def _decide(a, p):
     found, count = a.found, len(a.problem.time)
     before, after, floor = found.cost
-    excess, left = before - floor, after - floor
+    # Everything at once also fits some noise: a chi2 of one for each number without a belief.
+    floor += sum(name not in a.problem.beliefs for name in found.state.names)
+    left = max(after - floor, 0.0)
+    explained = (before - after) / max(before - after + left, 1e-9)
     out_of_sight = hidden(a, p)
     share = len(out_of_sight) / max(len({label.partition(' ')[0].partition('[')[0]
                                          for label in a.visible}), 1)
-    repeatable = a.rest.gain if a.rest.positive >= 0.6 else 0.0
+    repeats = _repeats(a.rest, p)
     sets = [[t, *found.rivals.get(t.candidate.label, [])] for t in found.accepted]
     names = [len({t.candidate.name for t in members}) for members in sets]
     if found.accepted:
-        open_left = max(left if found.explained < p.enough else 0.0,
-                        repeatable if repeatable > p.remainder_share * excess else 0.0)
-        if open_left > p.least_remainder * count:
+        part = a.rest.gain / max(before - after, 1e-9)
+        if left > p.least_left and explained < p.enough or repeats and part > p.remainder_share:
             a.verdict, a.partial = 'unknown', list(found.accepted)
             a.reason = (f'{found.accepted[0].candidate.name} and its like explain '
-                        f'{found.explained:.0%} of the excess only; the rest is '
+                        f'{explained:.0%} of what known effects could; the rest is '
                         f'{a.rest.text}')
             found.accepted.clear()
         elif max(names) >= p.crowd or (share > p.most_hidden and max(names) > 1):
@@ -188,8 +190,8 @@ def _decide(a, p):
             a.reason = f'these flights cannot tell {max(names)} explanations apart'
         else:
             a.verdict = 'named_set' if max(names) > 1 else 'named'
-            a.reason = f'explains {found.explained:.1%} of what known effects could explain'
-    elif repeatable > p.least_remainder * count or left > 3 * p.least_remainder * count:
+            a.reason = f'explains {explained:.1%} of what known effects could explain'
+    elif repeats or left > 0.05 * count:
         a.verdict, a.reason = 'unknown', a.rest.text
     elif share > p.most_hidden:
         a.verdict = 'not_decidable'
@@ -198,6 +200,15 @@ def _decide(a, p):
     else:
         a.verdict, a.reason = 'no_gap', 'what is left is noise and manufacturing tolerance'
     a.experiment = _experiment(a, sets if found.accepted else [], out_of_sight)
+
+
+def _repeats(rest, p):
+    """Whether what is left repeats, and is more than tolerances leave behind."""
+    force = max(rest.size[f'force_{axis}'] for axis in 'xyz')
+    torque = max(rest.size[f'torque_{axis}'] for axis in 'xyz')
+    joint = max(rest.size[f'joint_{k}'] for k in range(1, 5))
+    return rest.gain > p.least_remainder and rest.positive >= 0.7 and (
+        force > p.least_force or torque > p.least_torque or joint > p.least_joint)
 
 
 def _experiment(a, sets, out_of_sight):

@@ -48,6 +48,7 @@ class FlightModel:
 
     Attributes:
         modules: share of the file's tilting modules in the model, 0 or 1; fits vary it around.
+        trusted: (N,) grid points away from the floor and the rotors' limits.
 
     """
 
@@ -88,6 +89,7 @@ class FlightModel:
         # A rotor remembers for some of its time constants.
         memory = round(5 * self.robot.rotors.time_constant / p.grid)
         spread = np.convolve(bad, np.ones(memory))[:len(bad)] > 0
+        self.trusted = ~spread
         near = THIN * self.filters['B'].margin
         wide = np.convolve(spread, np.ones(2 * near + 1), 'same') > 0
         return (~wide[::THIN][self.filters['B'].centres(-(-len(s.t) // THIN))]).astype(float)

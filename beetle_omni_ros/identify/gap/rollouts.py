@@ -50,6 +50,8 @@ def free_runs(model: FlightModel, theta: dict[str, float], noise: Noise) -> Runs
     s, h = model.signals, model.p.grid
     steps, between = round(HORIZONS[-1] / h), round(EVERY / h)
     starts = np.arange(0, len(s.t) - steps - 2, between)
+    fine = np.array([model.trusted[k:k + steps + 1].all() for k in starts])
+    starts = starts[fine] if fine.any() else starts
     inputs = model.inputs(theta)
     grid = starts[:, None] + np.arange(steps + 1)
     tilt, rate = _tilts(model, theta, starts, steps)

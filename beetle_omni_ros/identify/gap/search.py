@@ -16,6 +16,7 @@ PROMISING = 0.25        # of the best linear gain
 PROMISING_CURVED = 0.1  # likewise, of those that a straight line cannot judge
 MOST_TURNS = 3          # of fresh slopes, while a fit runs away from them
 FAR = 0.2               # typical sizes of a curved number
+LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
 WIDE = 4.0              # typical sizes, within which anything is sought
 COMMANDS = ('command_latency', 'joint_command_latency', 'rotor_dead_time')
 SENSORS = ('imu_filter_lag.delay', 'mocap_time_offset.delay', 'joint_feedback_delay.delay')
@@ -33,6 +34,7 @@ class Trial:
         refined: whether fitted, else a straight line's estimate.
         cross: gain on blocks left out, and its standard error.
         positive: part of the blocks that gain.
+        without_best: gain on blocks left out but for the best: one event is no effect.
         share: of what was left unexplained.
         reason: why not accepted, '' if it was.
 
@@ -44,6 +46,7 @@ class Trial:
     refined: bool = False
     cross: tuple[float, float] = (0.0, 1.0)
     positive: float = 0.0
+    without_best: float = 0.0
     share: float = 0.0
     reason: str = ''
 
@@ -268,8 +271,9 @@ class Search:
     @staticmethod
     def _holds(trial):
         """Whether blocks that were left out agree."""
-        return trial.cross[0] >= 0.3 * trial.gain and trial.cross[0] >= 2 * trial.cross[1] \
-            and trial.positive >= 0.55
+        sure = trial.cross[0] >= 2 * trial.cross[1] or trial.positive >= 0.85
+        return sure and trial.cross[0] >= 0.3 * trial.gain and trial.positive >= 0.55 \
+            and trial.without_best >= max(0.05 * trial.cross[0], LEAST_ELSEWHERE)
 
     def _at_bound(self, trial):
         keys = self.problem.keys
@@ -307,6 +311,7 @@ class Search:
         error = float(held.std(ddof=1) * np.sqrt(len(held))) if len(held) > 1 else np.inf
         trial.cross = float(held.sum()), error
         trial.positive = float((held > 0).mean())
+        trial.without_best = float(held.sum() - held.max()) if len(held) > 1 else 0.0
 
     def _prune(self, found, state, cost):
         """Drop what later steps have made superfluous."""

@@ -26,6 +26,7 @@ class Remainder:
         channels: (name, gain) of those that gain, most first.
         terms: (feature, gain) that describe it best, most first.
         frame: 'world', 'body', 'rotor' or 'joint'.
+        size: channel -> root mean square of what repeats, in the channel's unit.
 
     """
 
@@ -34,6 +35,7 @@ class Remainder:
     channels: list[tuple[str, float]]
     terms: list[tuple[str, float]]
     frame: str
+    size: dict[str, float]
 
     @property
     def text(self) -> str:
@@ -93,6 +95,7 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
         columns.append(np.stack(list(made.values()), axis=1))
     gains, total = {}, np.zeros(problem.blocks)
     best: dict[str, float] = {}
+    size: dict[str, float] = {}
     channel = 0
     fitted = state.slopes[:, [state.index[n] for n in names]]
     for group, taps in problem.noise.taps.items():
@@ -101,11 +104,13 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
             channel += 1
             if group in 'AW':
                 continue
-            x = np.concatenate([_whitened(problem, model, group, k, made)
-                                for model, made in zip(problem.models, columns, strict=True)])
-            held, scores = _cross(x, fitted[rows], state.r[rows], problem.block[rows],
-                                  problem.blocks)
+            both = [_whitened(problem, model, group, k, made)
+                    for model, made in zip(problem.models, columns, strict=True)]
+            x, smooth = (np.concatenate([pair[i] for pair in both]) for i in (0, 1))
+            held, scores, weights = _cross(x, fitted[rows], state.r[rows], problem.block[rows],
+                                           problem.blocks)
             name = CHANNELS[group][k]
+            size[name] = float(np.sqrt(((smooth @ weights)**2).mean()))
             gains[name] = float(held.sum())
             if held.sum() > 0:
                 total += held
@@ -115,11 +120,11 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
     terms = sorted(best.items(), key=lambda lg: -lg[1])[:TERMS_SHOWN]
     frame = terms[0][0].partition(':')[0] if terms else 'body'
     return Remainder(float(total.sum()), float((total > 0).mean()), channels,
-                     [(label.partition(': ')[2], g) for label, g in terms], frame)
+                     [(label.partition(': ')[2], g) for label, g in terms], frame, size)
 
 
 def _whitened(problem, model, group, channel, columns):
-    """Features as they would appear in one channel's whitened residual."""
+    """Features as they would appear in one channel's residual, whitened and not."""
 
     if group == 'J':
         first, count = model._starts[0], model._length * len(model._starts)
@@ -130,11 +135,18 @@ def _whitened(problem, model, group, channel, columns):
     if group == 'B':
         smooth = model._mask[:, None] * smooth
     tap = problem.noise.taps[group][channel]
-    return lfilter(tap, 1.0, smooth, axis=0)[len(tap) - 1:] / problem.noise.sigma[group][channel]
+    white = lfilter(tap, 1.0, smooth, axis=0)[len(tap) - 1:] / problem.noise.sigma[group][channel]
+    return white, smooth[len(tap) - 1:]
 
 
 def _cross(x, fitted, r, block, blocks):
-    """Gain of chi2 on each block by a ridge regression on the others; score of each feature."""
+    """
+    A ridge regression, judged on blocks left out.
+
+    Returns:
+        gain of chi2 on each block, score of each feature, weights of the whole fit.
+
+    """
     scale = np.sqrt((x**2).mean(axis=0)) + 1e-12
     x = x / scale
     used = (fitted**2).sum(axis=0) > 1e-6
@@ -152,4 +164,6 @@ def _cross(x, fitted, r, block, blocks):
         held[b] = 2 * g[b] @ w - w @ h[b] @ w
     scores = np.zeros(len(weight))
     scores[weight > 0.05] = all_g**2 / np.maximum(np.diag(all_h), 1e-9)
-    return held, scores
+    weights = np.zeros(len(weight))
+    weights[weight > 0.05] = np.linalg.solve(all_h + ridge, all_g)
+    return held, scores, weights / scale
