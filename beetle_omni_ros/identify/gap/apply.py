@@ -30,6 +30,8 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
     parts += [(effect, name, found) for effect in named
               for name, found in effect.get('also', {}).items()]
     for effect, name, parameters in parts:
+        if not is_read(name):
+            continue
         entry = CATALOGUE[name]
         member = effect.get('rotor') or effect.get('joint')
         values = effects.setdefault(name, {})
@@ -46,10 +48,19 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
     return effects
 
 
+def is_read(name: str) -> bool:
+    """Whether anything reads the effect from a robot file; sensors' own are for their drivers."""
+    entry = CATALOGUE[name]
+    return bool(entry.apply or entry.servo or entry.settings) or name in (
+        'command_latency', 'joint_command_latency', 'rotor_dead_time')
+
+
 def write_corrected(path: Path, results: dict, robot: RobotParameters,
                     base: Path | None) -> None:
     """
     Write a robot file that extends the believed one by the named effects.
+
+    Effects of sensors, which nothing reads from a robot file, stand under ``provenance`` only.
 
     Args:
         path: to write.

@@ -14,6 +14,7 @@ from beetle_omni_ros.identify.gap.residual import FlightModel
 CURVED = ('delay', 'split', 'rotation', 'time_constant', 'kp', 'kd', 'velocity_limit',
           'effort_limit', 'coulomb', 'stiction', 'gap', 'thrust_max', 'deflection_per_newton')
 TIMES = ('delay', 'split')
+LEAST_BLOCKS = 6        # of all flights together
 HALVINGS = 4
 RIDGE = 1e-9
 
@@ -70,7 +71,8 @@ class Problem:
     def _label(self):
         blocks, where, flights, times, first = [], [], [], [], 0
         for k, model in enumerate(self.models):
-            pieces = max(1, round(model.flight.duration / self.p.block))
+            pieces = max(round(model.flight.duration / self.p.block),
+                         -(-LEAST_BLOCKS // len(self.models)))
             counts = {g: len(model.times(g)) for g in self.noise.taps}
             for c, (group, _, index) in enumerate(self.noise.places(counts)):
                 t = model.times(group)[index]
