@@ -126,14 +126,23 @@ def _given(value, size):
     return ca.DM.zeros(size) if value is None else value
 
 
-def servo_acceleration(robot: RobotParameters, tilt, tilt_rate, target, thrust=0.0, joint=0):
+def gyroscopic_load(robot: RobotParameters, angular_velocity, tilt, thrust, joint: int):
+    """Torque of a spinning rotor on its tilt joint for each N m s of its momentum in hover."""
+    n = thrust_direction(robot.rotors.arm_yaw[joint], tilt)
+    speed = ca.sqrt(ca.fmax(thrust, 0) / robot.hover_thrust + 1e-9)
+    return -float(robot.rotors.spin[joint]) * speed * ca.dot(
+        ca.DM(robot.tilt_axes[joint]), ca.cross(angular_velocity, n))
+
+
+def servo_acceleration(robot: RobotParameters, tilt, tilt_rate, target, thrust=0.0, joint=0,
+                       gyroscopic=0.0):
     """
     Second-order tilt servo within its torque and rate limits, [rad/s^2].
 
     J q'' = Kp (q* - q) - Kd q', torque clipped to the effort limit, plus what the robot
     file's effects add; at the rate limit the servo no longer accelerates outward.
     """
-    terms = ServoTerms(target, tilt, tilt_rate, thrust, 0.0)
+    terms = ServoTerms(target, tilt, tilt_rate, thrust, 0.0, gyroscopic)
     for name, values in robot.effects.items():
         if CATALOGUE[name].servo is not None:
             CATALOGUE[name].servo(terms, joint, **values)
@@ -151,7 +160,8 @@ def derivative(robot: RobotParameters, x, u, d):
     thrust_target = ca.fmin(ca.fmax(u[THRUST_COMMAND], robot.rotors.thrust_min),
                             robot.rotors.thrust_max)
     tilt_acceleration = ca.vertcat(*[
-        servo_acceleration(robot, x[TILT][i], x[TILT_RATE][i], target[i], x[THRUST][i], i)
+        servo_acceleration(robot, x[TILT][i], x[TILT_RATE][i], target[i], x[THRUST][i], i,
+                           gyroscopic_load(robot, x[RATE], x[TILT][i], x[THRUST][i], i))
         for i in range(4)])
     thrust_rate = (thrust_target - x[THRUST]) / robot.rotors.time_constant
     acceleration, angular_acceleration = rigid_body(

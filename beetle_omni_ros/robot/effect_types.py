@@ -110,6 +110,8 @@ class ServoTerms:
         tilt_rate: [rad/s].
         thrust: of the joint's rotor [N].
         torque: added to the servo's own [N m].
+        gyroscopic: what the rotor's spin puts on the joint for each N m s of its angular
+            momentum in hover [rad/s], or 0 where nobody knows the body's rate.
 
     """
 
@@ -118,6 +120,7 @@ class ServoTerms:
     tilt_rate: ca.SX
     thrust: ca.SX
     torque: ca.SX
+    gyroscopic: ca.SX | float = 0.0
 
 
 @dataclass(frozen=True)

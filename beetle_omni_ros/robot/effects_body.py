@@ -111,7 +111,13 @@ def _ground_effect(terms, exponential_share=0.0, **values):
     terms.thrust = terms.thrust * ca.vertcat(*scale)
 
 
-def _propeller_gyroscopic_torque(terms, angular_momentum_at_hover, spin_up_share=1.0):
+def _gyroscopic_load(servo, joint, angular_momentum_at_hover, spin_up_share=1.0,
+                     joint_share=0.0):
+    servo.torque = servo.torque + joint_share * angular_momentum_at_hover * servo.gyroscopic
+
+
+def _propeller_gyroscopic_torque(terms, angular_momentum_at_hover, spin_up_share=1.0,
+                                 joint_share=0.0):
     speeds = terms.rotor_speeds()
     for i in range(4):
         momentum = angular_momentum_at_hover * terms.spin[i] * speeds[i]
@@ -207,10 +213,13 @@ BODY: dict[str, Effect] = {
     'propeller_gyroscopic_torque': Effect(
         'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, -1.0, 1.0, 0.066,
                                                               0.008),
-                 'spin_up_share': EffectParameter('1', 1.0, 0.0, 1.0, default=1.0)},
-        "-(w + q' e) x h s n - h' s n with h ~ sqrt(f): the propellers' angular momentum",
+                 'spin_up_share': EffectParameter('1', 1.0, 0.0, 1.0, default=1.0),
+                 'joint_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0)},
+        "-(w + q' e) x h s n - h' s n with h ~ sqrt(f): the propellers' angular momentum; the "
+        'part about the tilt axis loads the servo where joint_share is 1',
         'fast turns and fast tilting', ('inertia', 'rotor_acceleration_torque', 'rotor_lag'),
-        'fast tilting by internal force at rest', _propeller_gyroscopic_torque),
+        'fast tilting by internal force at rest', _propeller_gyroscopic_torque,
+        _gyroscopic_load),
     'rotor_acceleration_torque': Effect(
         'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, -1.0, 1.0, 0.066,
                                                               0.008)},

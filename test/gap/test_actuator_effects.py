@@ -112,3 +112,14 @@ def test_play_behind_the_encoder_turns_the_true_tilt_only():
     assert np.array_equal(tight[3], loose[3])
     apart = np.abs(tight[0] - loose[0])
     assert 0.008 < apart.max() < 0.011
+
+
+def test_a_spinning_rotor_loads_its_joint_as_euler_says():
+    """Turning the momentum takes a torque, which the servo gives about its axis."""
+    made = model(MOTION.flight())
+    load, t = made._spin_load(), made.signals.t
+    speed = np.sqrt(MOTION.thrust / (ROBOT.mass * ROBOT.gravity / 4))
+    for i, axis in enumerate(ROBOT.tilt_axes):
+        momentum = ROBOT.rotors.spin[i] * speed[:, i:i + 1] * MOTION.normals[:, i]
+        expected = -np.cross(MOTION.rate, momentum) @ axis
+        assert np.allclose(load[:, i], np.interp(t, MOTION.t, expected), atol=5e-3)

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 MOTION = Motion(5)
-NEUTRAL = {group: values for group, values in model(MOTION.flight()).residual({}).items()}
+NEUTRAL = dict(model(MOTION.flight()).residual({}).items())
 
 
 def readings():

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.candidates import Candidate, candidates
-from beetle_omni_ros.identify.gap.certainty import deviations, visibility, Visibility
+from beetle_omni_ros.identify.gap.candidates import candidates
+from beetle_omni_ros.identify.gap.certainty import deviations, Visibility, visibility
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, Key, tolerances

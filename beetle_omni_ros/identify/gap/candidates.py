@@ -18,7 +18,8 @@ FORMS = {'tilt_thrust_loss': [{'tilt_thrust_loss.cosine_share': 0.0},
          'ground_effect': [{'ground_effect.exponential_share': 0.0},
                            {'ground_effect.exponential_share': 1.0}],
          'propeller_gyroscopic_torque': [{'propeller_gyroscopic_torque.spin_up_share': 0.0},
-                                         {'propeller_gyroscopic_torque.spin_up_share': -1.0}]}
+                                         {'propeller_gyroscopic_torque.spin_up_share': -1.0},
+                                         {'propeller_gyroscopic_torque.joint_share': 1.0}]}
 
 
 @dataclass(frozen=True)

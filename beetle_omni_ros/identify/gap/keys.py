@@ -18,7 +18,7 @@ from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-SHAPES = ('cosine_share', 'exponential_share', 'spin_up_share')
+SHAPES = ('cosine_share', 'exponential_share', 'spin_up_share', 'joint_share')
 SMALLEST = 0.02         # ratio to the file's own number
 GROUPS = {  # signal-layer entries -> channel groups in which they show
     'rotor_lag': 'B', 'rotor_dead_time': 'B', 'thrust_saturation': 'B', 'command_latency': 'BJ',
@@ -73,6 +73,8 @@ class Key:
     @property
     def groups(self) -> str:
         """Channel groups that depend on it."""
+        if self.effect == 'propeller_gyroscopic_torque':
+            return 'BJ'
         return 'B' if self.body else GROUPS[self.effect]
 
 

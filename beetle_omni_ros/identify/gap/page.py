@@ -48,7 +48,7 @@ def gap_page(a: Analysis, made: dict) -> str:
                 section('What these flights could show', 'Standard deviations by which an effect '
                         'of realistic size would stand out, alone and beside the entry that it '
                         'is most like. Below 5 it could not be told.', html(_visible(made))),
-                section('Tolerances', "What this robot differs by within what any robot does; "
+                section('Tolerances', 'What this robot differs by within what any robot does; '
                         'carried along, not named and not written.', html(_tolerances(made)))]
     word = WORDS[made['verdict']]
     named = ', '.join(' or '.join(e['names']) for e in made['effects'])

@@ -18,7 +18,7 @@ from beetle_omni_ros.identify.gap.filters import low_pass
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import Key
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.servo import simulate, Windows
+from beetle_omni_ros.identify.gap.servo import GYROSCOPIC, simulate, Windows
 from beetle_omni_ros.identify.gap.signals import matrices, Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -32,7 +32,8 @@ THIN = 2        # grid points to each at which the body's equations are evaluate
 STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
          'kp': 0.01, 'kd': 0.01, 'velocity_limit': 0.01, 'effort_limit': 0.01, 'coulomb': 5e-4,
          'stiction': 5e-4, 'deflection_per_newton': 1e-4, 'gap': 1e-3, 'thrust_max': 0.01,
-         'share': 0.05, 'split': 1e-3}
+         'share': 0.05, 'split': 1e-3,
+         'angular_momentum_at_hover': 5e-3}
 
 
 class FlightModel:
@@ -72,7 +73,9 @@ class FlightModel:
         self._own = {'coulomb': own.get('joint_friction', {}).get('coulomb', 0.0),
                      'stiction': own.get('joint_friction', {}).get('stiction', 0.0),
                      'deflection': own.get('joint_deflection', {}).get(
-                         'deflection_per_newton', 0.0)}
+                         'deflection_per_newton', 0.0),
+                     'momentum': own.get(GYROSCOPIC, {}).get('angular_momentum_at_hover', 0.0),
+                     'joint_share': own.get(GYROSCOPIC, {}).get('joint_share', 0.0)}
 
     def _trusted(self):
         """(M,) 0 for body samples at the rotors' limit for the present voltage, or on the floor."""
@@ -197,7 +200,8 @@ class FlightModel:
         thrust, _ = s.thrust({})
         load = self._module_load()
         windows = Windows(tilt[at], rate[at], thrust[index].transpose(1, 0, 2),
-                          load[index].transpose(1, 0, 2), p.servo_step, skip, per)
+                          load[index].transpose(1, 0, 2),
+                          self._spin_load()[index].transpose(1, 0, 2), p.servo_step, skip, per)
         return windows, edges
 
     def _module_load(self):
@@ -220,6 +224,18 @@ class FlightModel:
             load[:, i] = pull - module.inertia[0] * turning @ axis
         return load
 
+    def _spin_load(self):
+        """Torque of each rotor on its joint for each N m s of momentum in hover (N, 4) [rad/s]."""
+        tilt, rate = self.signals.joints({})[0], self.signals.imu({})[1]
+        thrust, robot = self.signals.thrust({})[0], self.robot
+        load = np.empty_like(tilt)
+        for i, axis in enumerate(robot.tilt_axes):
+            level = np.cross(axis, [0.0, 0.0, 1.0])
+            normal = np.cos(tilt[:, i:i + 1]) * [0.0, 0.0, 1.0] + np.sin(tilt[:, i:i + 1]) * level
+            speed = np.sqrt(np.maximum(thrust[:, i], 0) / robot.hover_thrust)
+            load[:, i] = -robot.rotors.spin[i] * speed * (np.cross(rate, normal) @ axis)
+        return load
+
     def slopes(self, theta: dict[str, float], names: list[str]) -> dict[str, np.ndarray]:
         """Group -> (M, channels, len(names)): derivative of the residual by each key."""
         made = {group: np.zeros((len(self.times(group)), len(channels), len(names)))
@@ -240,7 +256,7 @@ class FlightModel:
                 moved = self.residual({**theta, name: theta.get(name, 0.0) + h}, groups)
                 for group, values in moved.items():
                     made[group][:, :, names.index(name)] = (values - now[group]) / h
-        turning = [name for name in signal if 'J' in self.keys[name].groups]
+        turning = [name for name in names if 'J' in self.keys[name].groups]
         if turning:
             sets, sizes = [theta], []
             for name in turning:

@@ -291,7 +291,7 @@ class Search:
         free = self._free(accepted)
         with_it = list(dict.fromkeys([*self._involved(accepted), *c.keys]))
         without = [name for name in with_it if name not in c.keys or name in problem.beliefs]
-        zero = {n: 0.0 for n in c.keys}
+        zero = dict.fromkeys(c.keys, 0.0)
         other = State({**point.theta, **zero}, problem.residual({**point.theta, **zero}),
                       point.slopes, point.names)
         held = np.zeros(problem.blocks)
@@ -343,7 +343,7 @@ class Search:
         for trial in found.accepted:
             others = [t.candidate for t in found.accepted if t is not trial]
             own = trial.candidate
-            zero = {n: 0.0 for n in own.keys}
+            zero = dict.fromkeys(own.keys, 0.0)
             theta = {**state.theta, **zero}
             start = State(theta, self.problem.residual(theta), state.slopes, state.names)
             start, without = self._refit(start, others, 2)

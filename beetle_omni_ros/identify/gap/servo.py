@@ -16,6 +16,7 @@ import numpy as np
 
 from beetle_omni_ros.robot.parameters import JointParameters
 
+GYROSCOPIC = 'propeller_gyroscopic_torque'
 CREEP = 0.02    # [rad/s] below which stiction counts as standing
 
 
@@ -29,6 +30,7 @@ class Windows:
         start_rate: (W, 4) [rad/s].
         thrust: (K, W, 4) [N] of each joint's rotor, a value for each step.
         load: (K, W, 4) [N m] torque that motion and gravity put on the joint, for share 1.
+        spin: (K, W, 4) [rad/s] torque of the spinning rotor, for each N m s of its momentum.
         step: [s].
         skip: steps of run-in.
         every: steps from one sample to the next.
@@ -39,6 +41,7 @@ class Windows:
     start_rate: np.ndarray
     thrust: np.ndarray
     load: np.ndarray
+    spin: np.ndarray
     step: float
     skip: int
     every: int
@@ -73,10 +76,13 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
     stiction = base['stiction'] + column('joint_friction.stiction', lambda x: max(x, 0.0))
     soft = base['deflection'] + column('joint_deflection.deflection_per_newton')
     share = base['modules'] + column('modules.share')
+    momentum = (base['momentum'] + column(f'{GYROSCOPIC}.angular_momentum_at_hover')) * (
+        base['joint_share'] + column(f'{GYROSCOPIC}.joint_share'))
     damping = 0.5 * h * kd / joint.inertia
     keep, gain = (1 - damping) / (1 + damping), h / joint.inertia / (1 + damping)
     sliding, holding = coulomb * gain, np.maximum(stiction, coulomb) * gain
     rubs, bends, loaded = sliding.any() or holding.any(), soft.any(), share.any()
+    spins = momentum.any()
     # The clip of the torque matters only where the largest error could meet it.
     reach = kp * np.abs(targets - windows.start).max() * 1.5 + kd * speed
     weak, kick = bool((effort < reach).any()), h * effort / joint.inertia
@@ -97,6 +103,8 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
         force = stiff * error
         if loaded:
             force += gain * share * windows.load[k]
+        if spins:
+            force += gain * momentum * windows.spin[k]
         if weak:
             change = (keep - 1) * v + force
             new = v + np.minimum(np.maximum(change, -kick), kick)

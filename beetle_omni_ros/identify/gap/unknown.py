@@ -125,7 +125,6 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
 
 def _whitened(problem, model, group, channel, columns):
     """Features as they would appear in one channel's residual, whitened and not."""
-
     if group == 'J':
         first, count = model._starts[0], model._length * len(model._starts)
         columns = columns[first:first + count]
