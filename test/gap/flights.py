@@ -82,7 +82,8 @@ class Motion:
         shift = P.command_delay + STEP / 2       # held: half a step late on average
         # What acts at t was sent before; times of sending, for what must act when.
         return Flight('made', 0.0, self.t[-1], self.t + imu_delay,
-                      imu, self.t[::2] + pose_delay, pose, self.t + joint_delay, self.tilt, self.t - shift,
+                      imu, self.t[::2] + pose_delay, pose, self.t + joint_delay, self.tilt,
+                      self.t - shift,
                       np.concatenate([self.tilt_command, thrust], axis=1), self.t,
                       self.voltage[:, None])
 
@@ -100,6 +101,7 @@ def solved(made, names, groups, base=None, start=None, iterations=3):
         made: FlightModel.
         names: of keys.
         groups: that count, such as 'BA'.
+        iterations: of Gauss and Newton.
         base: group -> residual that the formulas leave without any effect.
         start: deviations to begin with.
 

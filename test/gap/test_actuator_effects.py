@@ -6,6 +6,8 @@ from flights import KEYS, model, Motion, ROBOT, solved, STEP
 import numpy as np
 import pytest
 
+from beetle_omni_ros.identify.gap.loads import spin_load
+
 MOTION = Motion(9, 12.0)
 FINE = 1e-4
 JOINT = ROBOT.joints
@@ -117,7 +119,7 @@ def test_play_behind_the_encoder_turns_the_true_tilt_only():
 def test_a_spinning_rotor_loads_its_joint_as_euler_says():
     """Turning the momentum takes a torque, which the servo gives about its axis."""
     made = model(MOTION.flight())
-    load, t = made._spin_load(), made.signals.t
+    load, t = spin_load(made.signals), made.signals.t
     speed = np.sqrt(MOTION.thrust / (ROBOT.mass * ROBOT.gravity / 4))
     for i, axis in enumerate(ROBOT.tilt_axes):
         momentum = ROBOT.rotors.spin[i] * speed[:, i:i + 1] * MOTION.normals[:, i]

@@ -16,7 +16,8 @@ from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, Key, toleran
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel
 from beetle_omni_ros.identify.gap.rollouts import free_runs, gap, HORIZONS, regimes_at, Runs
-from beetle_omni_ros.identify.gap.search import Found, Search, Trial
+from beetle_omni_ros.identify.gap.search import Search
+from beetle_omni_ros.identify.gap.trial import Found, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters

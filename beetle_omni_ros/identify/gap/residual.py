@@ -17,6 +17,7 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.filters import low_pass
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import Key
+from beetle_omni_ros.identify.gap.loads import module_load, spin_load
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.servo import GYROSCOPIC, simulate, Windows
 from beetle_omni_ros.identify.gap.signals import matrices, Signals
@@ -78,7 +79,7 @@ class FlightModel:
                      'joint_share': own.get(GYROSCOPIC, {}).get('joint_share', 0.0)}
 
     def _trusted(self):
-        """(M,) 0 for body samples at the rotors' limit for the present voltage, or on the floor."""
+        """(M,) 0 for body samples at the rotors' limit for the voltage, or on the floor."""
         s, p = self.signals, self.p
         bad = s.pose({})[0][:, 2] < p.contact_height
         rows = sorted(self.robot.rotors.map, key=lambda row: row.voltage)
@@ -198,43 +199,12 @@ class FlightModel:
         middle = edges[:, :-1] + p.servo_step / 2
         index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
         thrust, _ = s.thrust({})
-        load = self._module_load()
+        load = module_load(self.signals)
         windows = Windows(tilt[at], rate[at], thrust[index].transpose(1, 0, 2),
                           load[index].transpose(1, 0, 2),
-                          self._spin_load()[index].transpose(1, 0, 2), p.servo_step, skip, per)
+                          spin_load(self.signals)[index].transpose(1, 0, 2), p.servo_step, skip,
+                          per)
         return windows, edges
-
-    def _module_load(self):
-        """Torque of gravity and motion on each joint, from the file's modules (N, 4) [N m]."""
-        tilt = self.signals.joints({})[0]
-        load = np.zeros_like(tilt)
-        parts = self.robot.multibody
-        if parts is None or 'module_reaction' in self.robot.effects:
-            return load
-        force, rate, turning = self.signals.imu({})
-        module = parts.module
-        outward, _, up = module.centre_of_mass
-        for i, axis in enumerate(self.robot.tilt_axes):
-            level = np.cross(axis, [0.0, 0.0, 1.0])
-            normal = np.cos(tilt[:, i:i + 1]) * [0.0, 0.0, 1.0] + np.sin(tilt[:, i:i + 1]) * level
-            place = self.robot.rotors.positions[i] + (outward - module.rotor_offset) * axis \
-                + up * normal
-            felt = force + np.cross(turning, place) + np.cross(rate, np.cross(rate, place))
-            pull = -module.mass * up * np.cross(normal, felt) @ axis
-            load[:, i] = pull - module.inertia[0] * turning @ axis
-        return load
-
-    def _spin_load(self):
-        """Torque of each rotor on its joint for each N m s of momentum in hover (N, 4) [rad/s]."""
-        tilt, rate = self.signals.joints({})[0], self.signals.imu({})[1]
-        thrust, robot = self.signals.thrust({})[0], self.robot
-        load = np.empty_like(tilt)
-        for i, axis in enumerate(robot.tilt_axes):
-            level = np.cross(axis, [0.0, 0.0, 1.0])
-            normal = np.cos(tilt[:, i:i + 1]) * [0.0, 0.0, 1.0] + np.sin(tilt[:, i:i + 1]) * level
-            speed = np.sqrt(np.maximum(thrust[:, i], 0) / robot.hover_thrust)
-            load[:, i] = -robot.rotors.spin[i] * speed * (np.cross(rate, normal) @ axis)
-        return load
 
     def slopes(self, theta: dict[str, float], names: list[str]) -> dict[str, np.ndarray]:
         """Group -> (M, channels, len(names)): derivative of the residual by each key."""

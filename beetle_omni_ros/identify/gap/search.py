@@ -1,15 +1,16 @@
-"""Forward addition and backward removal of catalogue entries, each step judged on unseen blocks."""
+"""Forward addition and backward removal of entries, each step judged on unseen blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
+from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.keys import SHAPES
+from beetle_omni_ros.identify.gap.trial import Found, Trial
 
 REFINED = 5             # candidates of each step that are fitted, not only estimated
 PROMISING = 0.25        # of the best linear gain
@@ -18,69 +19,7 @@ MOST_TURNS = 3          # of fresh slopes, while a fit runs away from them
 FAR = 0.2               # typical sizes of a curved number
 LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
 WIDE = 4.0              # typical sizes, within which anything is sought
-COMMANDS = ('command_latency', 'joint_command_latency', 'rotor_dead_time')
-SENSORS = ('imu_filter_lag.delay', 'mocap_time_offset.delay', 'joint_feedback_delay.delay')
 
-
-@dataclass
-class Trial:
-    """
-    One candidate joined to the model.
-
-    Attributes:
-        candidate: which.
-        gain: of the objective.
-        theta: all numbers with it.
-        refined: whether fitted, else a straight line's estimate.
-        cross: gain on blocks left out, and its standard error.
-        positive: part of the blocks that gain.
-        without_best: gain on blocks left out but for the best: one event is no effect.
-        share: of what was left unexplained.
-        reason: why not accepted, '' if it was.
-
-    """
-
-    candidate: Candidate
-    gain: float
-    theta: dict[str, float]
-    refined: bool = False
-    cross: tuple[float, float] = (0.0, 1.0)
-    positive: float = 0.0
-    without_best: float = 0.0
-    share: float = 0.0
-    reason: str = ''
-
-
-@dataclass
-class Found:
-    """
-    What a search found.
-
-    Attributes:
-        accepted: steps, in the order of acceptance.
-        trials: label -> last trial of every candidate.
-        rivals: label of an accepted candidate -> trials that explain as much.
-        base: numbers of the fit without effects.
-        theta: of the final fit.
-        state: there, with the slopes of all keys.
-        cost: objective of base, final, and everything (straight line).
-        rest: whatever is left unexplained.
-
-    """
-
-    accepted: list[Trial] = field(default_factory=list)
-    trials: dict[str, Trial] = field(default_factory=dict)
-    rivals: dict[str, list[Trial]] = field(default_factory=dict)
-    base: dict[str, float] = field(default_factory=dict)
-    theta: dict[str, float] = field(default_factory=dict)
-    state: State | None = None
-    cost: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    @property
-    def explained(self) -> float:
-        """Part of the explainable excess that the accepted entries explain."""
-        before, after, floor = self.cost
-        return (before - after) / max(before - floor, 1e-9)
 
 
 class Search:
@@ -186,7 +125,7 @@ class Search:
                 trial, point = self._elsewhere(state, cost, c, names, free)
             else:
                 index = [state.index[name] for name in names]
-                theta = _handed_over(state.theta, c)
+                theta = handed_over(state.theta, c)
                 step, reached, _ = problem.solve(theta, names, free | set(c.keys),
                                                  h[np.ix_(index, index)], g[index], chi2)
                 trial = Trial(c, cost - reached, problem._moved(theta, names, step))
@@ -361,24 +300,3 @@ class Search:
                     near.append(other)
             trial.gain = gain
             found.rivals[own.label] = near
-
-
-def _handed_over(theta, candidate):
-    """
-    The same delays, with what the bus was blamed for in the candidate's own number.
-
-    Otherwise a fit that starts with half the delay in a number that it need not leave would
-    stay there, for the data cannot tell the two apart.
-    """
-    key = f'{candidate.name}.delay'
-    if candidate.name not in COMMANDS or theta.get(key):
-        return theta
-    # All sensors late by the same is all commands early by it: an exact gauge.
-    late = float(np.mean([theta.get(name, 0.0) for name in SENSORS]))
-    made = {**theta, **{name: theta.get(name, 0.0) - late for name in SENSORS}}
-    delay, split = theta.get('base.delay', 0.0) + late, theta.get('base.split', 0.0)
-    own, delay, split = {
-        'command_latency': (delay, 0.0, split),
-        'joint_command_latency': (split, delay - split / 2, 0.0),
-        'rotor_dead_time': (-split, delay + split / 2, 0.0)}[candidate.name]
-    return {**made, key: own, 'base.delay': delay, 'base.split': split}

@@ -58,9 +58,11 @@ class Signals:
         pad = 0.5
         self._fine = np.arange(EDGE - pad, self.t[-1] + pad + FINE / 2, FINE)
         self._lead = round(pad / FINE)
-        self._imu = _spread(flight.imu_t, flight.imu)
-        self._pose = CubicSpline(*_spread(flight.pose_t, flight.pose))
-        self._joint = CubicSpline(*_spread(flight.joint_t, flight.joint))
+        # Not straight lines: between two readings those would halve the noise's power, and a fit
+        # would shift the IMU to where that pays.
+        self._imu = CubicSpline(*_filled(*_spread(flight.imu_t, flight.imu)))
+        self._pose = CubicSpline(*_filled(*_spread(flight.pose_t, flight.pose)))
+        self._joint = CubicSpline(*_filled(*_spread(flight.joint_t, flight.joint)))
         self._command_t, command = _spread(flight.command_t, flight.command)
         self._command = command
         limit = robot.joints.position_limit
@@ -96,10 +98,8 @@ class Signals:
         values = np.array([theta.get(name, 0.0) for name in names])
 
         def make():
-            t, raw = self._imu
-            at = self._fine + values[0]
-            fine = np.stack([np.interp(at, t, raw[:, k]) for k in range(6)], axis=1)
-            fine = fine - values[1:7]
+            fine = self._imu(np.clip(self._fine + values[0], self.flight.imu_t[0],
+                                     self.flight.imu_t[-1])) - values[1:7]
             force, rate = (self._smooth(fine[:, part], SMOOTH_IMU)
                            for part in (slice(0, 3), slice(3, 6)))
             turning = self._smooth(fine[:, 3:], SMOOTH_IMU, 1)
@@ -192,6 +192,17 @@ def _spread(t, values):
             keep.append(k)
             last = at
     return t[keep], values[keep]
+
+
+def _filled(t, values):
+    """Straight lines across gaps, where a spline would swing."""
+    usual = np.median(np.diff(t))
+    gaps = np.flatnonzero(np.diff(t) > 2.5 * usual)
+    if not len(gaps):
+        return t, values
+    more = np.concatenate([np.arange(t[k] + usual, t[k + 1] - usual / 2, usual) for k in gaps])
+    at = np.sort(np.concatenate([t, more]))
+    return at, np.stack([np.interp(at, t, column) for column in values.T], axis=1)
 
 
 def _integral(t, values):

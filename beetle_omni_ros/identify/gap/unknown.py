@@ -1,4 +1,4 @@
-"""What no catalogue entry explains: is it repeatable, in which frame, on what does it depend?"""
+"""What no catalogue entry explains: whether it repeats, and what it goes with."""
 
 from __future__ import annotations
 
