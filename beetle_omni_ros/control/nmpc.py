@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import logging
 
 import numpy as np
@@ -44,7 +45,8 @@ class NmpcController:
 
     def __init__(self, robot: RobotParameters, parameters: NmpcParameters | None = None):
         """Build or load the solver; the first time takes some seconds of compilation."""
-        p = self._parameters = parameters or NmpcParameters.load()
+        robot, p = _with_delays(robot, parameters or NmpcParameters.load())
+        self._parameters = p
         self._robot = robot
         problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag, p.horizon.change_time)
         intervals = p.horizon.intervals
@@ -136,6 +138,27 @@ class NmpcController:
                 'force_estimate_N': float(np.linalg.norm(d[model.FORCE])),
                 'torque_estimate_Nm': float(np.linalg.norm(d[model.TORQUE])),
                 'servo_offset_rad': float(np.max(np.abs(d[model.TILT_OFFSET])))}
+
+
+def _with_delays(robot, parameters):
+    """
+    Put the robot file's command delays into the model that the problem is built from.
+
+    What delays all commands is predicted across; what delays tilts or thrusts alone, the
+    horizon has as a longer lag of theirs, and so are a servo's changed gains.
+    """
+    tilt, thrust = robot.command_delays
+    common, settings, model_of = min(tilt, thrust), robot.effects, parameters.model
+    if robot.effects.keys() & {'command_latency', 'joint_command_latency', 'rotor_dead_time'}:
+        lag = robot.rotors.time_constant + max(thrust - common, 0.0)
+        robot = replace(robot, rotors=replace(robot.rotors, time_constant=lag), effects={
+            name: values for name, values in settings.items() if name != 'rotor_lag'})
+    servo = model_of.servo_lag
+    if 'joint_bandwidth' in settings:
+        servo = robot.joints.kd / robot.joints.kp
+    return robot, replace(parameters, model=replace(
+        model_of, servo_lag=max(servo + tilt - common, 1e-3),
+        command_delay=max(model_of.command_delay + common, 0.0)))
 
 
 def _finite(state):
