@@ -30,7 +30,7 @@ class PoseController:
     PERIOD = 0.010      # [s]
     LEAD = 0.06         # [s] of the thrust, against the rotors' lag
     WANDER = 0.55       # [N] of the null space
-    JUMP = 2.2          # [N] of the null space, in a new direction from time to time
+    JUMP = 1.5          # [N] of the null space, in a new direction from time to time
     JUMP_PAUSE = (1.5, 5.0)  # [s]
     LEAST_VECTOR = 0.8  # [N] below this a thrust's direction says nothing
     FASTEST_TILT = 20.0  # [rad/s] of commanded tilts
@@ -82,7 +82,7 @@ class PoseController:
         at, moving, pushed, facing, turning = reference
         g, dt = self.gains, self.PERIOD
         error = at - position
-        self._sum = np.clip(self._sum + error * dt, -1.5, 1.5)
+        self._sum = np.clip(self._sum + error * dt, -2.5, 2.5)
         wanted = (pushed + g.position * error + g.velocity * (moving - velocity)
                   + g.sum * self._sum)
         wanted[2] += self._gravity
