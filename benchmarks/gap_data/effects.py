@@ -63,7 +63,8 @@ def inject(name: str, robot: Robot, hidden: Hidden, size: float, shape: str,
 
     Args:
         name: in ``CATALOGUE`` or ``OUTSIDE``.
-        robot, hidden: changed.
+        robot: changed.
+        hidden: changed.
         size: in the effect's own unit, signed, see ``campaign.yaml``.
         shape: 'plain' or one of ``SHAPES``.
         rng: for directions and which rotor or joint.

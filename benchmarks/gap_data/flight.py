@@ -53,10 +53,13 @@ def fly(robot: Robot, hidden: Hidden, *, kind: str, duration: float, seed: int,
     Fly one course; a lost flight is tried again, calmer.
 
     Args:
-        robot, hidden: what is true.
-        kind, duration: of the course, see :func:`gap_data.courses.make_course`.
+        robot: what is true.
+        hidden: the effects.
+        kind: of the course, see :func:`gap_data.courses.make_course`.
+        duration: [s].
         seed: of this flight alone.
-        multibody, gust: difficulty.
+        multibody: which description of the robot.
+        gust: whether a coloured wrench pushes.
         conditions: 'nominal' or 'published' latencies of the controller's state.
         command_age: [s] from a command's stamp until the actuators execute it.
 

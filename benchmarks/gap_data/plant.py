@@ -5,7 +5,6 @@ from __future__ import annotations
 from math import cos, exp, sin
 
 import mujoco
-import numpy as np
 
 from gap_data.hidden import Hidden, Snapshot
 from gap_data.mjcf import model_xml
@@ -34,13 +33,17 @@ class Plant:
         Put the robot into the air.
 
         Args:
-            robot, hidden: what is true.
+            robot: what is true.
+            hidden: the effects.
             multibody: which description.
-            position: (3,) [m]; quaternion: (4,) w x y z.
-            tilt, thrust: (4,) [rad], [N] at the start.
+            position: (3,) [m].
+            quaternion: (4,) w x y z.
+            tilt: (4,) [rad] at the start.
+            thrust: (4,) [N] at the start.
             charge: of the pack, 0 to 1.
             command_age: [s] from a command's stamp until it acts.
-            velocity, rate: (3,) [m/s] in world, [rad/s] in base_link.
+            velocity: (3,) [m/s] in world.
+            rate: (3,) [rad/s] in base_link.
 
         """
         self.robot, self.hidden, self.multibody = robot, hidden, multibody

@@ -54,7 +54,8 @@ def measure(truth: Truth, hidden: Hidden, numbers: dict, rng: np.random.Generato
     settings = numbers['sensors']
     commands = np.column_stack([truth.command_t, truth.command_tilt, truth.command_thrust])
     return Recording(
-        _imu(truth, hidden, settings, rng, noise, shape), _mocap(truth, hidden, settings, rng, noise),
+        _imu(truth, hidden, settings, rng, noise, shape),
+        _mocap(truth, hidden, settings, rng, noise),
         _joints(truth, hidden, settings, rng, noise), _battery(truth, numbers['battery'], rng),
         commands, truth.course.targets,
         {'imu': 0.001, 'mocap': 0.010, 'joints': 0.010, 'battery': 0.002, 'commands': 0.001})
@@ -84,7 +85,9 @@ def low_pass(signal: np.ndarray, delay: float, step: float, shape: str) -> np.nd
     Second-order filter along time with a given group delay at low frequency.
 
     Args:
-        signal: (N, k); delay: [s]; step: [s] between rows.
+        signal: (N, k).
+        delay: [s].
+        step: [s] between rows.
         shape: 'plain' Bessel (nearly the same delay at all frequencies) or 'butterworth'.
 
     """

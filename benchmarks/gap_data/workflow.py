@@ -42,12 +42,14 @@ class Workflow:
         text: 'package.module:function', a name in ``BASELINES``, or a command in which
             ``{runs} {holdout} {robot} {apply} {json} {page}`` are replaced by paths.
         timeout: [s] for a case.
+        version: of its code; answers of another one are not kept for this.
 
     """
 
     name: str
     text: str
     timeout: float = 300.0
+    version: str = ''
 
     @classmethod
     def parse(cls, text: str, timeout: float = 300.0) -> Workflow:
@@ -66,7 +68,7 @@ class Workflow:
 
     def key(self) -> str:
         """Folder name of its answers."""
-        return f'{self.name}_{hashlib.sha256(self.text.encode()).hexdigest()[:8]}'
+        return f'{self.name}_{_digest(self.text + self.version)}'
 
     def arguments(self, case: Path, output: Path) -> list[str]:
         """The command for a case."""
@@ -80,6 +82,10 @@ class Workflow:
                                                             for k, v in paths.items()}))
         return [sys.executable, '-m', 'gap_data.entry', self.text, *runs, '--holdout', *held,
                 *(word for key, path in paths.items() for word in (f'--{key}', path))]
+
+
+def _digest(text):
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 def run_workflow(workflow: Workflow, case: Path) -> dict:
