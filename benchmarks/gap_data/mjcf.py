@@ -57,7 +57,8 @@ def model_xml(robot: Robot, *, multibody: bool, imu_position=(0.0, 0.0, 0.0),
     return f"""<mujoco>
   <compiler angle="radian" autolimits="false" inertiafromgeom="false"/>
   <option timestep="{numbers['step']}" integrator="RK4"
-          gravity="0 0 {-numbers['robot']['gravity']}" cone="elliptic" solver="Newton" iterations="20" tolerance="1e-10">
+          gravity="0 0 {-numbers['robot']['gravity']}"
+          solver="Newton" iterations="20" tolerance="1e-10">
     <flag contact="disable"/>
   </option>
   <worldbody>
