@@ -21,7 +21,7 @@ TOPICS = {'mocap/pose': 'geometry_msgs/msg/PoseStamped', 'imu/data_raw': 'sensor
           'command': 'sensor_msgs/msg/JointState',
           'target_pose': 'geometry_msgs/msg/PoseStamped'}
 DAMAGES = ('missing_imu', 'missing_mocap', 'missing_command', 'missing_joints', 'clock_jump',
-           'duplicates', 'cut', 'gaps', 'other_robot')
+           'duplicates', 'cut', 'gaps')
 
 
 def write_bag(path: str | Path, recording: Recording, *, epoch: float,

@@ -42,7 +42,9 @@ def model_xml(robot: Robot, *, multibody: bool, imu_position=(0.0, 0.0, 0.0),
             position (3,) [m]; its mass is taken from the body's.
 
     """
-    loss = f' frictionloss="{FRICTION_SWITCH}"' if friction else ''
+    # MuJoCo's dry friction creeps; hard enough that it creeps by micrometres of the rim only
+    loss = (f' frictionloss="{FRICTION_SWITCH}" solreffriction="0.002 1" '
+            'solimpfriction="0.9999 0.9999 0.001"' if friction else '')
     loose, taken = _loose_mass(slosh)
     inside, outside = (_modules(robot, loss), '') if multibody else ('', _shafts(robot, loss))
     inertial = _main_inertial(robot, taken) if multibody else _rigid_inertial(robot, taken)
