@@ -1,9 +1,9 @@
 """Every hidden effect appears with the right sign and the size that its label says."""
 
+from gap_data.cases import Case, load_settings
 from gap_data.effects import CATALOGUE, inject, OUTSIDE, SHAPES
 from gap_data.hidden import Hidden, Snapshot
 from gap_data.make import build
-from gap_data.cases import Case, load_settings
 from gap_data.plant import Plant
 from gap_data.truth import Robot
 import numpy as np
