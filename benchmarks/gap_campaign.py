@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from dataclasses import replace
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -74,7 +75,9 @@ def choose_workflows(given: argparse.Namespace) -> list[Workflow]:
     if not given.no_baselines:
         texts = texts + [name for name in BASELINES if name not in texts]
     # kept answers of the package are those of its code as it stands
-    version, plain = code_key([PACKAGE]), code_key([HERE / 'gap_data' / 'baselines'])
+    told = hashlib.sha256(given.robot.read_bytes()).hexdigest()
+    version, plain = (code_key([root]) + told
+                      for root in (PACKAGE, HERE / 'gap_data' / 'baselines'))
     return [replace(w, version=plain if w.text in BASELINES.values() else version)
             for w in (Workflow.parse(text, given.timeout) for text in texts)]
 
@@ -92,13 +95,13 @@ def main(arguments: list[str] | None = None) -> int:
     given = parse(arguments)
     console = Console(stderr=True)
     try:
-        workflows = choose_workflows(given)
         settings = load_settings()
         if given.set not in settings['sets']:
             raise WorkflowError(f"--set '{given.set}': expected one of "
                                 f"{', '.join(settings['sets'])}")
         if not given.robot.is_file():
             raise WorkflowError(f"--robot '{given.robot}': no such file")
+        workflows = choose_workflows(given)
         from beetle_omni_ros.comparison.sweep import check_backend, workers
         check_backend(given.backend)
     except ValueError as error:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import joblib
 
-from gap_data.cases import Case
+from gap_data.cases import Case, load_settings
 from gap_data.flight import LostFlight
 from gap_data.judge import judge
 from gap_data.make import make_case, ROBOT_FILE
@@ -49,7 +49,7 @@ def run_campaign(cases: list[Case], workflows: list[Workflow], folder: Path, *,
         if results is None:
             done(case, 'flights', None, False)
             continue
-        label = json.loads((sealed / f'{case.key()}.json').read_text())
+        label = open_label(case, sealed)
         for workflow in workflows:
             run, kept = results[workflow.name]
             result = judged[workflow.name][order[case.key()]] = judge(label, run)
@@ -57,6 +57,16 @@ def run_campaign(cases: list[Case], workflows: list[Workflow], folder: Path, *,
         if not workflows:
             done(case, 'flights', None, False)
     return {name: [found[k] for k in sorted(found)] for name, found in judged.items()}
+
+
+def open_label(case: Case, sealed: Path) -> dict:
+    """A sealed label, with what counts as right beside the hidden effects."""
+    label = json.loads((sealed / f'{case.key()}.json').read_text())
+    hover = (load_settings()['undecidable'].get(case.effects[0][0])
+             if case.kind == 'undecidable' else None)
+    return {**label, 'allowed': case.allowed(), 'accept': case.accept(),
+            'sets': hover['set'] if hover else [],
+            'name_is_right': bool(hover and hover['name_is_right'])}
 
 
 def _unordered(calls) -> Iterator:

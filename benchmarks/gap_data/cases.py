@@ -75,6 +75,13 @@ class Case:
         text = json.dumps(asdict(self), sort_keys=True) + fingerprint()
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
+    def accept(self) -> tuple[str, ...]:
+        """Verdicts that are right without a name."""
+        if self.damage:
+            return DAMAGED[self.damage][1]
+        return {'none': ('no_gap',), 'outside': ('unknown',), 'undecidable': ('not_decidable',),
+                'short': ('not_decidable', 'no_gap', 'bad_data')}.get(self.kind, ())
+
     def allowed(self) -> tuple[str, ...]:
         """Names that are not wrong beside the hidden effects."""
         names = [c for name, _, _ in self.effects for c in COMPANIONS.get(name, ())]

@@ -40,7 +40,7 @@ def judge(label: dict, run: dict) -> dict:
     Everything that the score counts about one case.
 
     Args:
-        label: as :func:`gap_data.make.make_case` seals it.
+        label: of :func:`gap_data.campaign.open_label`.
         run: of :func:`gap_data.workflow.run_workflow`.
 
     """
@@ -105,7 +105,8 @@ def _right(judged, label):
     if kind == 'none':
         return not judged['wrong'] and judged['verdict'] in ('no_gap', 'named', 'named_set')
     if kind == 'undecidable':
-        return judged['accepted_verdict'] or judged['set_right']
+        by_name = label.get('name_is_right') and all(judged['named']) and not judged['wrong']
+        return judged['accepted_verdict'] or judged['set_right'] or by_name
     if kind in ('short', 'damaged'):
         # never a name out of noise, never a traceback
         quiet = not judged['wrong'] and not judged['crashed']

@@ -12,7 +12,7 @@ import tempfile
 import numpy as np
 
 from gap_data.bags import DAMAGES, write_bag
-from gap_data.cases import Case, DAMAGED, load_settings
+from gap_data.cases import Case
 from gap_data.courses import Course
 from gap_data.effects import CATALOGUE, inject
 from gap_data.flight import COLUMNS, fly, Truth
@@ -55,6 +55,8 @@ def make_case(case: Case, folder: Path, sealed: Path, robot_file: Path = ROBOT_F
     """
     target, label = folder / case.key(), sealed / f'{case.key()}.json'
     if target.is_dir() and label.is_file():
+        if (target / 'robot.yaml').read_text() != _told(robot_file, case):
+            (target / 'robot.yaml').write_text(_told(robot_file, case))
         return target
     for place in (folder, sealed):
         place.mkdir(parents=True, exist_ok=True)
@@ -66,9 +68,7 @@ def make_case(case: Case, folder: Path, sealed: Path, robot_file: Path = ROBOT_F
         for k, name in enumerate(names):
             _make_flight(case, k, work / name)
         (work / 'robot.yaml').write_text(_told(robot_file, case))
-        _write(label, {'case': asdict(case), 'effects': effects, 'allowed': case.allowed(),
-                       'accept': DAMAGED[case.damage][1] if case.damage else _accept(case),
-                       'sets': _undecided(case)})
+        _write(label, {'case': asdict(case), 'effects': effects})
         if target.is_dir():
             shutil.rmtree(target)
         os.replace(work, target)
@@ -116,17 +116,6 @@ def _told(robot_file, case):
     if case.damage == 'broken_robot':
         return '\n'.join(line for line in text.splitlines() if not line.startswith('mass:')) + '\n'
     return text
-
-
-def _accept(case):
-    """Verdicts that are right without a name."""
-    return {'none': ('no_gap',), 'outside': ('unknown',), 'undecidable': ('not_decidable',),
-            'short': ('not_decidable', 'no_gap', 'bad_data')}.get(case.kind, ())
-
-
-def _undecided(case):
-    return load_settings()['undecidable'].get(case.effects[0][0], []) \
-        if case.kind == 'undecidable' else []
 
 
 def _write(path, content):

@@ -183,3 +183,10 @@ def test_workflows_are_understood_from_the_command_line():
     for wrong in ('tool --json x', 'tool {runs}'):
         with pytest.raises(WorkflowError):
             Workflow.parse(wrong)
+
+
+def test_hover_may_be_named_where_force_and_torque_decide():
+    hover = label(ROTOR, kind='undecidable', accept=('not_decidable',)) | {'name_is_right': True}
+    entry = {'value': 0.9, 'interval': (0.89, 0.91), 'parameter': 'scale', 'rotor': 2}
+    assert judge(hover, run(effect(ROTOR['name'], **entry)))['right']
+    assert not judge(hover, run(effect(ROTOR['name'], **entry), effect('mass')))['right']
