@@ -55,10 +55,10 @@ def rotor_dead_time(robot, hidden, size, shape, rng):
 
 
 def thrust_saturation(robot, hidden, size, shape, rng):
-    """Rotors give at most 14 N - ``size``; plain: a corner; soft: rounded over 0.4 N."""
-    hidden.thrust_ceiling = 14.0 - size
+    """Rotors give at most 15 N - ``size``; plain: a corner; soft: rounded over 0.4 N."""
+    hidden.thrust_ceiling = 15.0 - size
     hidden.ceiling_softness = 0.4 if shape == 'soft' else 0.0
-    return {'thrust_max': 14.0 - size}
+    return {'thrust_max': 15.0 - size}
 
 
 def command_latency(robot, hidden, size, shape, rng):
