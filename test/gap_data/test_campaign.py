@@ -31,6 +31,10 @@ def run_gap(runs, holdout, robot, apply, json_path, page, console):
     return 0
 def noisy(**_):
     raise RuntimeError('a bug')
+class Unusable(ValueError):
+    pass
+def complain(**_):
+    raise Unusable('bag: nothing in it')
 def refuse(**_):
     print('bag: nothing in it', file=sys.stderr)
     return 2
@@ -123,8 +127,10 @@ def test_a_bug_in_the_workflow_is_counted_and_does_not_stop_the_campaign(folder,
     case = make_case(SMALL, folder / 'flights', folder / 'sealed')
     crashed = run_workflow(Workflow('x', f'{name}:noisy'), case)
     assert crashed['traceback'] and crashed['answer'] is None
-    refused = run_workflow(Workflow('x', f'{name}:refuse'), case)
-    assert refused['status'] == 2 and refused['message'] == 'bag: nothing in it'
+    for way in ('refuse', 'complain'):
+        refused = run_workflow(Workflow('x', f'{name}:{way}'), case)
+        assert refused['status'] == 2 and refused['message'] == 'bag: nothing in it'
+        assert not refused['traceback']
     endless = f'{sys.executable} -c "import time; time.sleep(60)" {{runs}} {{json}}'
     assert run_workflow(Workflow('x', endless, timeout=0.5), case)['status'] == 124
 
