@@ -33,7 +33,7 @@ class PoseController:
     JUMP = 1.5          # [N] of the null space, in a new direction from time to time
     JUMP_PAUSE = (1.5, 5.0)  # [s]
     LEAST_VECTOR = 0.8  # [N] below this a thrust's direction says nothing
-    FASTEST_TILT = 20.0  # [rad/s] of commanded tilts
+    FASTEST_TILT = 8.0  # [rad/s] of commanded tilts, below what the servos can
 
     def __init__(self, robot: Robot, rng: np.random.Generator, lively: bool):
         self.gains = Gains(rng)

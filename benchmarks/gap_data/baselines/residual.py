@@ -114,7 +114,8 @@ def _held(log, columns, delay):
 
 
 def _thrust(log, model, p):
-    delay = AGE + p['rotor_dead_time'][0] + p['command_latency'][0]
+    # the recursion takes a sample as held before it: half a sample early
+    delay = AGE + p['rotor_dead_time'][0] + p['command_latency'][0] + 0.5 / GRID
     held = _held(log, slice(5, 9), delay)
     pole = np.exp(-1 / GRID / (model.lag + p['rotor_lag'][0]))
     thrust = lfilter([1 - pole], [1, -pole], held - held[0], axis=0) + held[0]
@@ -126,8 +127,9 @@ def _thrust(log, model, p):
 def _servo(log, model, p, thrust):
     inertia, kp, kd = model.joint
     stiff, damp = kp * (1 + p['joint_bandwidth'][0]), kd * (1 + p['joint_bandwidth'][1])
+    # the recursion holds each sample until the next: half a sample late
     held = _held(log, slice(1, 5), AGE + p['joint_command_latency'][0]
-                 + p['command_latency'][0])
+                 + p['command_latency'][0] - 0.5 / GRID)
     held = held + p['joint_deflection'][0] * thrust
     held = held - p['joint_friction'][0] / kp * np.tanh(np.gradient(held, 1 / GRID, axis=0) / 0.05)
     step = expm(np.array([[0, 1, 0], [-stiff / inertia, -damp / inertia, stiff / inertia],
