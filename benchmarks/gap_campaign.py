@@ -13,6 +13,7 @@ import argparse
 from collections import Counter
 from dataclasses import replace
 import hashlib
+import importlib.util
 import json
 import os
 from pathlib import Path
@@ -23,11 +24,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 HERE = Path(__file__).resolve().parent
-for place in (HERE, HERE.parent):  # also for the workers and for the workflow's process
-    if str(place) not in sys.path:
-        sys.path.insert(0, str(place))
-os.environ['PYTHONPATH'] = os.pathsep.join(
-    [str(HERE), str(HERE.parent), *filter(None, [os.environ.get('PYTHONPATH')])])
+PLACES = [str(HERE), str(HERE.parent)]
+sys.path.extend(place for place in PLACES if place not in sys.path)
 
 from gap_data.campaign import code_key, make_report, run_campaign  # noqa: E402
 from gap_data.cases import load_settings, make_cases  # noqa: E402
@@ -78,8 +76,24 @@ def choose_workflows(given: argparse.Namespace) -> list[Workflow]:
     told = hashlib.sha256(given.robot.read_bytes()).hexdigest()
     version, plain = (code_key([root]) + told
                       for root in (PACKAGE, HERE / 'gap_data' / 'baselines'))
+    workflows = [Workflow.parse(text, given.timeout) for text in texts]
+    for workflow in workflows:
+        check_exists(workflow)
     return [replace(w, version=plain if w.text in BASELINES.values() else version)
-            for w in (Workflow.parse(text, given.timeout) for text in texts)]
+            for w in workflows]
+
+
+def check_exists(workflow: Workflow) -> None:
+    """Refuse a Python workflow that is not there, before any flight is made."""
+    module = workflow.text.partition(':')[0]
+    if '{' in workflow.text:
+        return
+    try:
+        found = importlib.util.find_spec(module)
+    except ModuleNotFoundError:
+        found = None
+    if found is None:
+        raise WorkflowError(f"--workflow '{workflow.text}': no module {module}")
 
 
 def select(cases, only: str | None):
@@ -94,6 +108,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a campaign and write report.json, report.html and report.md."""
     given = parse(arguments)
     console = Console(stderr=True)
+    # for the workers and for the workflow's process
+    before = os.environ.get('PYTHONPATH', '').split(os.pathsep)
+    os.environ['PYTHONPATH'] = os.pathsep.join(
+        filter(None, [*before, *(place for place in PLACES if place not in before)]))
     try:
         settings = load_settings()
         if given.set not in settings['sets']:

@@ -156,3 +156,31 @@ def test_a_baseline_finds_a_large_effect(tmp_path):
     for file in Path(made / 'fit_1').glob('*.mcap'):
         file.write_bytes(b'')
     assert run_workflow(Workflow.parse('bic'), made)['answer']['verdict'] == 'bad_data'
+
+
+def test_the_command_refuses_what_it_cannot_run(capsys, monkeypatch):
+    import gap_campaign
+    monkeypatch.setenv('PYTHONPATH', '')
+    for arguments, text in ((['--set', 'huge'], "--set 'huge'"),
+                            (['--robot', 'nowhere.yaml'], 'no such file'),
+                            (['--workflow', 'no.such:thing'], 'no module no.such'),
+                            (['--backend', 'mars'], 'expected processes or ray')):
+        more = [] if '--workflow' in arguments else ['--workflow', 'bic']
+        assert gap_campaign.main([*more, *arguments, '--cases', '0']) == 2
+        assert text in ' '.join(capsys.readouterr().err.split())
+
+
+def test_the_command_makes_flights_and_a_report(tmp_path, stub, monkeypatch, capsys):
+    import gap_campaign
+    name = stub([])
+    monkeypatch.syspath_prepend(os.environ['PYTHONPATH'].split(os.pathsep)[0])
+    settings = load_settings()
+    settings['flights']['duration'] = 2.0
+    settings['sets']['test'] = {'clean': {'none': 2}}
+    monkeypatch.setattr(gap_campaign, 'load_settings', lambda: settings)
+    assert gap_campaign.main(['--set', 'test', '--workflow', f'quiet={name}:run_gap', '--jobs',
+                              '1', '--no-baselines', '--folder', str(tmp_path)]) == 0
+    report = json.loads((tmp_path / 'report.json').read_text())
+    assert [j['right'] for j in report['cases']['quiet']] == [True, True]
+    assert 'none: false alarm' in capsys.readouterr().out
+    assert (tmp_path / 'report.html').is_file() and (tmp_path / 'report.md').is_file()
