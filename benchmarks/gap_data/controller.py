@@ -32,6 +32,7 @@ class PoseController:
     WANDER = 0.55       # [N] of the null space
     JUMP = 1.5          # [N] of the null space, in a new direction from time to time
     JUMP_PAUSE = (1.5, 5.0)  # [s]
+    JUMP_STEP = 0.18    # [rad] of a tilt at once when the null space jumps: work for the servos
     LEAST_VECTOR = 0.8  # [N] below this a thrust's direction says nothing
     FASTEST_TILT = 8.0  # [rad/s] of commanded tilts, below what the servos can
 
@@ -99,13 +100,14 @@ class PoseController:
 
     def _allocate(self, t, force, torque):
         speed, phase = self._wander
+        most = self.FASTEST_TILT * self.PERIOD
         if self._lively and t >= self._next_jump:
+            most = self.JUMP_STEP
             self._jump = self.JUMP * self._rng.uniform(-1, 1, 2)
             self._next_jump = t + self._rng.uniform(*self.JUMP_PAUSE)
         wander = self._jump + self.WANDER * np.sin(speed * t + phase).sum(axis=1)
         vectors = self._inverse @ np.concatenate([force, torque]) + self._null @ wander
         thrust = np.empty(4)
-        most = self.FASTEST_TILT * self.PERIOD
         for i in range(4):
             side, up = vectors[2 * i], vectors[2 * i + 1]
             size = hypot(side, up)

@@ -88,9 +88,9 @@ def joint_velocity_limit(robot, hidden, size, shape, rng):
 
 
 def joint_torque_limit(robot, hidden, size, shape, rng):
-    """Servos give at most 0.12 N m - ``size``."""
-    robot.effort_limit = np.full(4, 0.12 - size)
-    return {'effort_limit': 0.12 - size}
+    """Servos give at most 0.04 N m - ``size``."""
+    robot.effort_limit = np.full(4, 0.04 - size)
+    return {'effort_limit': 0.04 - size}
 
 
 def joint_friction(robot, hidden, size, shape, rng):
