@@ -157,10 +157,22 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     meta = {'set': given.set, 'seed': given.seed, 'cases': len(cases), 'lost': tally['lost'],
             'command_age': given.command_age, 'code': code_key([PACKAGE]),
-            'command': shlex.join(['python', 'benchmarks/gap_campaign.py',
-                                   *(sys.argv[1:] if arguments is None else arguments)])}
+            'command': command_of(given)}
     write(make_report(judged, meta), (given.output or folder).resolve())
     return 0
+
+
+def command_of(given: argparse.Namespace) -> str:
+    """What makes the same numbers again, without the folders of this computer."""
+    words = ['python', 'benchmarks/gap_campaign.py', '--set', given.set, '--seed',
+             str(given.seed)]
+    for option in ('cases', 'only', 'command_age'):
+        value = getattr(given, option)
+        if value is not None and value != load_numbers().get(option):
+            words += ['--' + option.replace('_', '-'), str(value)]
+    for text in given.workflow or []:
+        words += ['--workflow', text]
+    return shlex.join(words + ['--no-baselines'] * given.no_baselines)
 
 
 def write(report: dict, output: Path) -> None:

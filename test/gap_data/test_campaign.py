@@ -182,5 +182,6 @@ def test_the_command_makes_flights_and_a_report(tmp_path, stub, monkeypatch, cap
                               '1', '--no-baselines', '--folder', str(tmp_path)]) == 0
     report = json.loads((tmp_path / 'report.json').read_text())
     assert [j['right'] for j in report['cases']['quiet']] == [True, True]
+    assert str(tmp_path) not in json.dumps(report['meta'])
     assert 'none: false alarm' in capsys.readouterr().out
     assert (tmp_path / 'report.html').is_file() and (tmp_path / 'report.md').is_file()
