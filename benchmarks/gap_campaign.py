@@ -21,11 +21,16 @@ import shlex
 import sys
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 HERE = Path(__file__).resolve().parent
 PLACES = [str(HERE), str(HERE.parent)]
-sys.path.extend(place for place in PLACES if place not in sys.path)
+if __name__ == '__main__':
+    sys.path[:0] = PLACES  # this tree's package, whatever is installed
+else:
+    sys.path.extend(place for place in PLACES if place not in sys.path)
 
 from gap_data.campaign import code_key, make_report, run_campaign  # noqa: E402
 from gap_data.cases import load_settings, make_cases  # noqa: E402
@@ -181,15 +186,14 @@ def write(report: dict, output: Path) -> None:
     (output / 'report.json').write_text(json.dumps(report, indent=1))
     (output / 'report.html').write_text(html(report))
     (output / 'report.md').write_text(markdown(report))
-    from rich.table import Table
     names = list(report['workflows'])
     for difficulty in ('clean', 'hard'):
         table = Table('', 'target', *names, title=f'{difficulty} flights')
         for rows in zip(*(report['workflows'][n]['criteria'][difficulty] for n in names)):
             if rows[0]['count'] or any(r['count'] for r in rows):
-                table.add_row(rows[0]['name'], target(rows[0]), *(
+                table.add_row(escape(rows[0]['name']), target(rows[0]), *(
                     f'[{ {True: "green", False: "red", None: "white"}[r["reached"]]}]'
-                    f'{number(r).replace("[", chr(92) + "[")}[/]' for r in rows))
+                    f'{escape(number(r))}[/]' for r in rows))
         if table.row_count:
             Console().print(table)
     print(f'{output}/report.html, report.md, report.json')
