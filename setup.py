@@ -89,6 +89,7 @@ TEST = [
     'hypothesis>=6.100',
     'onnx>=1.16',
     'pytest>=8',
+    'pytest-rerunfailures>=14',
     'pytest-timeout>=2.2',
 ]
 
