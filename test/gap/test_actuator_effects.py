@@ -119,7 +119,7 @@ def test_play_behind_the_encoder_turns_the_true_tilt_only():
 def test_a_spinning_rotor_loads_its_joint_as_euler_says():
     """Turning the momentum takes a torque, which the servo gives about its axis."""
     made = model(MOTION.flight())
-    load, t = spin_load(made.signals), made.signals.t
+    load, t = spin_load(made.signals, {}), made.signals.t
     speed = np.sqrt(MOTION.thrust / (ROBOT.mass * ROBOT.gravity / 4))
     for i, axis in enumerate(ROBOT.tilt_axes):
         momentum = ROBOT.rotors.spin[i] * speed[:, i:i + 1] * MOTION.normals[:, i]

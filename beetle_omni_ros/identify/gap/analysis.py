@@ -205,11 +205,10 @@ def _decide(a, p):
 
 def _repeats(rest, p):
     """Whether what is left repeats, and is more than tolerances leave behind."""
-    force = max(rest.size[f'force_{axis}'] for axis in 'xyz')
-    torque = max(rest.size[f'torque_{axis}'] for axis in 'xyz')
-    joint = max(rest.size[f'joint_{k}'] for k in range(1, 5))
-    return rest.gain > p.least_remainder and rest.positive >= 0.7 and (
-        force > p.least_force or torque > p.least_torque or joint > p.least_joint)
+    limits = {'force': p.least_force, 'torque': p.least_torque, 'joint': p.least_joint}
+    large = [name for name, gain in rest.channels if gain > p.least_channel
+             and rest.size[name] > limits[name.partition('_')[0]]]
+    return rest.gain > p.least_remainder and rest.positive >= 0.7 and bool(large)
 
 
 def _experiment(a, sets, out_of_sight):

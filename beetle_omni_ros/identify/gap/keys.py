@@ -25,7 +25,7 @@ GROUPS = {  # signal-layer entries -> channel groups in which they show
     'joint_command_latency': 'J', 'joint_bandwidth': 'J', 'joint_velocity_limit': 'J',
     'joint_torque_limit': 'J', 'joint_friction': 'J', 'joint_deflection': 'J',
     'joint_backlash': 'B', 'joint_feedback_delay': 'BJ', 'mocap_time_offset': 'AW',
-    'imu_filter_lag': 'BAW', 'imu_accelerometer_bias': 'BA', 'imu_gyroscope_bias': 'BW',
+    'imu_filter_lag': 'BAWJ', 'imu_accelerometer_bias': 'BA', 'imu_gyroscope_bias': 'BW',
     'imu_misalignment': 'BAW', 'imu_lever_arm': 'BA', 'mocap_misalignment': 'AW',
     'base': 'BJ', 'modules': 'BJ'}
 
@@ -153,6 +153,7 @@ def tolerances(p: GapParameters) -> dict[str, Belief]:
     for k in range(12):
         made[f'position.offset[{k}]'] = p.tolerance_position
     beliefs = {name: Belief(deviation) for name, deviation in made.items()}
+    beliefs['imu_filter_lag.delay'] = Belief(p.tolerance_delay, 0.0, p.imu_averaging, 0.002)
     reach, nominal = p.command_delay_range, p.command_delay
     beliefs['base.delay'] = Belief(5e-4, nominal, reach / 2, 0.003)
     beliefs['base.split'] = Belief(5e-4, reach, reach, 0.004)

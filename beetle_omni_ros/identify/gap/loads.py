@@ -7,14 +7,14 @@ import numpy as np
 from beetle_omni_ros.identify.gap.signals import Signals
 
 
-def module_load(signals: Signals) -> np.ndarray:
+def module_load(signals: Signals, theta: dict[str, float]) -> np.ndarray:
     """Torque of gravity and motion on each joint, from the file's modules (N, 4) [N m]."""
-    robot, tilt = signals.robot, signals.joints({})[0]
+    robot, tilt = signals.robot, signals.joints(theta)[0]
     load = np.zeros_like(tilt)
     parts = robot.multibody
     if parts is None or 'module_reaction' in robot.effects:
         return load
-    force, rate, turning = signals.imu({})
+    force, rate, turning = signals.imu(theta)
     module = parts.module
     outward, _, up = module.centre_of_mass
     for i, axis in enumerate(robot.tilt_axes):
@@ -28,10 +28,10 @@ def module_load(signals: Signals) -> np.ndarray:
     return load
 
 
-def spin_load(signals: Signals) -> np.ndarray:
+def spin_load(signals: Signals, theta: dict[str, float]) -> np.ndarray:
     """Torque of each rotor on its joint for each N m s of momentum in hover (N, 4) [rad/s]."""
-    tilt, rate = signals.joints({})[0], signals.imu({})[1]
-    thrust, robot = signals.thrust({})[0], signals.robot
+    tilt, rate = signals.joints(theta)[0], signals.imu(theta)[1]
+    thrust, robot = signals.thrust(theta)[0], signals.robot
     load = np.empty_like(tilt)
     for i, axis in enumerate(robot.tilt_axes):
         level = np.cross(axis, [0.0, 0.0, 1.0])

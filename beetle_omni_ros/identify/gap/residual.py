@@ -29,6 +29,7 @@ CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torq
             'J': ('joint_1', 'joint_2', 'joint_3', 'joint_4')}
 UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate': 'rad/s',
          'joint': 'rad'}
+TIMING = ('imu_filter_lag.delay', 'joint_feedback_delay.delay')     # of what loads the joints
 THIN = 2        # grid points to each at which the body's equations are evaluated
 STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
          'kp': 0.01, 'kd': 0.01, 'velocity_limit': 0.01, 'effort_limit': 0.01, 'coulomb': 5e-4,
@@ -68,7 +69,7 @@ class FlightModel:
         count = len(self.signals.t) - round(p.servo_warm_up / p.grid) - 1
         self._starts = np.arange(0, count - self._length + 1, self._length) \
             + round(p.servo_warm_up / p.grid)
-        self._loads: np.ndarray | None = None
+        self._made: dict[tuple, tuple] = {}
         self._mask = self._trusted()
         own = robot.effects
         self._own = {'coulomb': own.get('joint_friction', {}).get('coulomb', 0.0),
@@ -162,47 +163,50 @@ class FlightModel:
 
     def _joints(self, sets):
         """Encoders less simulated servos, [(M, 4)] for each set."""
-        raw = self.signals.joints(sets[0])[3]
-        first = self._starts[0]
-        measured = raw[first:first + self._length * len(self._starts)]
-        windows, edges = self._windows()
-        targets = []
-        for theta in sets:
-            delay = self.signals.delays(theta)[0]
-            targets.append(self.signals.tilt_targets(edges.ravel(), delay))
-        shape = edges.shape
-        # One more edge than steps in each window: the mean across windows is dropped.
-        full = [np.concatenate([t, t[-1:]]).reshape(*shape, 4)[:, :-1].transpose(1, 0, 2)
-                for t in targets]
-        runs = simulate(self.robot.joints, windows, np.array(full), sets,
-                        {**self._own, 'modules': self.modules})
-        residuals = []
-        for theta, run in zip(sets, runs, strict=True):
-            angle = self.signals.joints(theta)[3][first:first + len(measured)]
-            model = run.transpose(1, 0, 2).reshape(-1, 4)
-            residuals.append(self.filters['J'](angle - model))
+        first, count = self._starts[0], self._length * len(self._starts)
+        groups: dict[tuple, list[int]] = {}
+        for k, theta in enumerate(sets):
+            groups.setdefault(tuple(theta.get(name, 0.0) for name in TIMING), []).append(k)
+        residuals: list = [None] * len(sets)
+        for members in groups.values():
+            windows, edges = self._windows(sets[members[0]])
+            targets = []
+            for k in members:
+                t = self.signals.tilt_targets(edges.ravel(), self.signals.delays(sets[k])[0])
+                # One more edge than steps in each window: the mean across windows is dropped.
+                targets.append(np.concatenate([t, t[-1:]]).reshape(*edges.shape, 4)[
+                    :, :-1].transpose(1, 0, 2))
+            runs = simulate(self.robot.joints, windows, np.array(targets),
+                            [sets[k] for k in members], {**self._own, 'modules': self.modules})
+            for k, run in zip(members, runs, strict=True):
+                angle = self.signals.joints(sets[k])[3][first:first + count]
+                residuals[k] = self.filters['J'](angle - run.transpose(1, 0, 2).reshape(-1, 4))
         return residuals
 
-    def _windows(self):
-        if self._loads is None:
-            self._loads = self._make_windows()
-        return self._loads
+    def _windows(self, theta):
+        timing = {name: theta.get(name, 0.0) for name in TIMING}
+        key = tuple(timing.values())
+        if key not in self._made:
+            if len(self._made) > 3:
+                del self._made[next(iter(self._made))]
+            self._made[key] = self._make_windows(timing)
+        return self._made[key]
 
-    def _make_windows(self):
+    def _make_windows(self, theta):
         p, s = self.p, self.signals
         per = round(p.grid / p.servo_step)
         skip, count = round(p.servo_warm_up / p.servo_step), round(p.servo_window / p.servo_step)
         begins = s.t[self._starts] - skip * p.servo_step
         edges = begins[:, None] + p.servo_step * np.arange(skip + count + 1)
-        tilt, rate, _, _ = s.joints({})
+        tilt, rate, _, _ = s.joints(theta)
         at = self._starts - round(p.servo_warm_up / p.grid)
         middle = edges[:, :-1] + p.servo_step / 2
         index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
         thrust, _ = s.thrust({})
-        load = module_load(self.signals)
+        load = module_load(s, theta)
         windows = Windows(tilt[at], rate[at], thrust[index].transpose(1, 0, 2),
                           load[index].transpose(1, 0, 2),
-                          spin_load(self.signals)[index].transpose(1, 0, 2), p.servo_step, skip,
+                          spin_load(s, theta)[index].transpose(1, 0, 2), p.servo_step, skip,
                           per)
         return windows, edges
 

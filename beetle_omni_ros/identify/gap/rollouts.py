@@ -109,8 +109,8 @@ def _tilts(model, theta, starts, steps):
     edges = s.t[starts][:, None] + p.servo_step * np.arange(count + 1)
     index = np.clip(np.rint((edges[:, :-1] - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
     windows = Windows(tilt[starts], rate[starts], s.thrust(theta)[0][index].transpose(1, 0, 2),
-                      module_load(s)[index].transpose(1, 0, 2),
-                      spin_load(s)[index].transpose(1, 0, 2), p.servo_step, 0, per)
+                      module_load(s, theta)[index].transpose(1, 0, 2),
+                      spin_load(s, theta)[index].transpose(1, 0, 2), p.servo_step, 0, per)
     targets = s.tilt_targets(edges.ravel(), s.delays(theta)[0])
     targets = np.concatenate([targets, targets[-1:]]).reshape(*edges.shape, 4)[:, :-1]
     run = simulate(model.robot.joints, windows, targets.transpose(1, 0, 2)[None], [theta],

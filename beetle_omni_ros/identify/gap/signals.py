@@ -13,6 +13,9 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 
 FINE = 0.005            # [s] grid on which measurements are smoothed
 SMOOTH_IMU, SMOOTH_JOINT, SMOOTH_POSE = 22.0, 20.0, 6.0     # [Hz] of the model's inputs
+# The IMU's clock is everybody's: what it is late by, all else is early by. Shifting the IMU itself
+# would sample its noise elsewhere, which changes chi2 by more than a delay is worth.
+IMU_LAG = 'imu_filter_lag.delay'
 EDGE = 1.0              # [s] at both ends that smoothing and history need
 
 
@@ -92,51 +95,51 @@ class Signals:
 
     def imu(self, theta):
         """Specific force, rates and their derivative (N, 3) each, of base_link."""
-        names = ['imu_filter_lag.delay', *(f'{e}[{k}]' for e in (
+        names = [f'{e}[{k}]' for e in (
             'imu_accelerometer_bias.bias', 'imu_gyroscope_bias.bias',
-            'imu_misalignment.rotation', 'imu_lever_arm.offset') for k in range(3))]
+            'imu_misalignment.rotation', 'imu_lever_arm.offset') for k in range(3)]
         values = np.array([theta.get(name, 0.0) for name in names])
 
         def make():
-            fine = self._imu(np.clip(self._fine + values[0], self.flight.imu_t[0],
-                                     self.flight.imu_t[-1])) - values[1:7]
+            fine = self._imu(np.clip(self._fine, self.flight.imu_t[0],
+                                     self.flight.imu_t[-1])) - values[:6]
             force, rate = (self._smooth(fine[:, part], SMOOTH_IMU)
                            for part in (slice(0, 3), slice(3, 6)))
             turning = self._smooth(fine[:, 3:], SMOOTH_IMU, 1)
-            if values[7:10].any():
-                rotation = turn(values[7:10]).T
+            if values[6:9].any():
+                rotation = turn(values[6:9]).T
                 force, rate, turning = force @ rotation, rate @ rotation, turning @ rotation
-            if values[10:].any():
-                lever = values[10:]
+            if values[9:].any():
+                lever = values[9:]
                 force = force - np.cross(turning, lever) - np.cross(rate, np.cross(rate, lever))
             return force, rate, turning
         return self._cached('imu', theta, names, make)
 
     def pose(self, theta):
         """Position (N, 3) raw, quaternion (N, 4), velocity (N, 3) in world."""
-        names = ['mocap_time_offset.delay', *(f'mocap_misalignment.rotation[{k}]'
+        names = ['mocap_time_offset.delay', IMU_LAG, *(f'mocap_misalignment.rotation[{k}]'
                                               for k in range(3))]
         values = [theta.get(name, 0.0) for name in names]
 
         def make():
-            fine = self._pose(np.clip(self._fine + values[0], self.flight.pose_t[0],
+            fine = self._pose(np.clip(self._fine + values[0] - values[1], self.flight.pose_t[0],
                                       self.flight.pose_t[-1]))
             position = fine[self._lead::self._ratio][:len(self.t), :3]
             velocity = self._smooth(fine[:, :3], SMOOTH_POSE, 1)
             quaternion = self._smooth(fine[:, 3:], 10.0)
             quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
-            if any(values[1:]):
-                quaternion = _times(quaternion, -np.array(values[1:]))
+            if any(values[2:]):
+                quaternion = _times(quaternion, -np.array(values[2:]))
             return position, quaternion, velocity
         return self._cached('pose', theta, names, make)
 
     def joints(self, theta):
         """Angle, rate, acceleration (N, 4) of the tilts, and the raw reading (N, 4)."""
-        names = ['joint_feedback_delay.delay', 'joint_backlash.gap']
-        delay, gap = (theta.get(name, 0.0) for name in names)
+        names = ['joint_feedback_delay.delay', 'joint_backlash.gap', IMU_LAG]
+        delay, gap, late = (theta.get(name, 0.0) for name in names)
 
         def make():
-            fine = self._joint(np.clip(self._fine + delay, self.flight.joint_t[0],
+            fine = self._joint(np.clip(self._fine + delay - late, self.flight.joint_t[0],
                                        self.flight.joint_t[-1]))
             raw = fine[self._lead::self._ratio][:len(self.t)]
             if gap > 0:
@@ -147,7 +150,8 @@ class Signals:
     def delays(self, theta):
         """Delays of tilt and thrust commands [s]."""
         split, common = theta.get('base.split', 0.0), theta.get('base.delay', 0.0)
-        common += self.p.command_delay + theta.get('command_latency.delay', 0.0)
+        common += self.p.command_delay + theta.get('command_latency.delay', 0.0) \
+            + theta.get(IMU_LAG, 0.0)
         tilt, thrust = self.robot.command_delays
         return (tilt + common + split / 2 + theta.get('joint_command_latency.delay', 0.0),
                 thrust + common - split / 2 + theta.get('rotor_dead_time.delay', 0.0))
