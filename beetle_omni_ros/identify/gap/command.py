@@ -98,7 +98,7 @@ def _analysed(runs, holdout, robot, p, progress):
     if not holdout and len(fitted) > LEAST_FITTED:
         fitted, judging = fitted[:-1], fitted[-1:]
     a = analyse(fitted, judging, robot, p, progress)
-    a.findings = findings
+    a.findings = [*findings, *a.findings]
     return a
 
 

@@ -133,8 +133,15 @@ class Belief:
         return (0.0 if -self.below < x < self.above else 1 / self.deviation) + 1 / self.inner
 
 
-def tolerances(p: GapParameters) -> dict[str, Belief]:
-    """Keys that every robot differs by, with the belief that it is by little."""
+def tolerances(p: GapParameters, coarse: bool = False) -> dict[str, Belief]:
+    """
+    Keys that every robot differs by, with the belief that it is by little.
+
+    Args:
+        p: parameters.
+        coarse: whether the sensors are of the kind whose stamps hide their latency.
+
+    """
     made = {'mass.mass': p.tolerance_mass, 'thrust_coefficient.scale': p.tolerance_thrust,
             'torque_coefficient.torque_to_thrust_ratio': p.tolerance_torque_ratio,
             'rotor_lag.time_constant': p.tolerance_lag, 'joint_bandwidth.kp': p.tolerance_lag,
@@ -157,6 +164,11 @@ def tolerances(p: GapParameters) -> dict[str, Belief]:
     reach, nominal = p.command_delay_range, p.command_delay
     beliefs['base.delay'] = Belief(5e-4, nominal, reach / 2, 0.003)
     beliefs['base.split'] = Belief(5e-4, reach, reach, 0.004)
+    if coarse:
+        imu, joint = p.coarse_latency
+        beliefs['imu_filter_lag.delay'] = Belief(p.tolerance_delay, 0.0, imu, imu)
+        beliefs['joint_feedback_delay.delay'] = Belief(p.tolerance_delay, 0.0, joint, joint)
+        beliefs['base.split'] = Belief(5e-4, reach, reach, reach)
     return beliefs
 
 
