@@ -290,5 +290,7 @@ def _placebo(a) -> dict[str, float]:
     for trial in a.found.accepted:
         for name in trial.candidate.keys:
             key = a.keys[name]
-            theta[name] = float(np.clip(-theta[name], key.low, key.high))
+            # The equations bear a drag that pushes; a servo would not bear negative friction.
+            theta[name] = -theta[name] if key.body else float(
+                np.clip(-theta[name], key.low, key.high))
     return theta

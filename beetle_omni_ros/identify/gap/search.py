@@ -15,7 +15,7 @@ from beetle_omni_ros.identify.gap.trial import Found, Trial
 REFINED = 5             # candidates of each step that are fitted, not only estimated
 PROMISING = 0.25        # of the best linear gain
 PROMISING_CURVED = 0.1  # likewise, of those that a straight line cannot judge
-MOST_TURNS = 8          # of fresh slopes, while a fit runs away from them
+MOST_TURNS = 4          # of fresh slopes, while a fit runs away from them
 FAR = 0.2               # typical sizes of a curved number
 LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
 WIDE = 4.0              # typical sizes, within which anything is sought
