@@ -12,7 +12,7 @@ unexport LD_LIBRARY_PATH
 endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONHOME VIRTUAL_ENV
 
-.PHONY: help setup setup-train fly test lint evaluate compare report clean
+.PHONY: help setup setup-train fly test lint evaluate compare gap report clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1|/p' Makefile | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -40,6 +40,10 @@ evaluate: setup  ## 100 random poses, in one process and faster than real time
 compare: setup  ## every experiment for RL and NMPC, to docs/comparison/; goes on where it was left
 	@mkdir -p docs/comparison runs_out
 	$(TOOL) compare --output docs/comparison --cache runs_out/comparison $(ARGS)
+
+gap: setup  ## hide effects in the plant, fly, find and add them, fly better; to runs_out/gap/
+	@mkdir -p runs_out
+	.venv/bin/python benchmarks/gap_demo.py --output runs_out/gap $(ARGS)
 
 report: setup  ## one HTML page about the runs in runs_out/ (or RUNS='DIR...')
 	@runs='$(RUNS)'; for bag in runs_out/*/metadata.yaml; do \

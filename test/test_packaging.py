@@ -19,6 +19,7 @@ from beetle_omni_ros.control.policy import PolicyParameters
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -37,7 +38,8 @@ KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-r
        'casadi': 'casadi-pip', 'serial': 'python3-serial', 'PIL': 'python3-pil'}
 PARAMETER_CLASSES = {
     'check.yaml': CheckLimits, 'ekf.yaml': EkfParameters,
-    'emulated_board.yaml': EmulatedBoardParameters, 'hover.yaml': HoverParameters,
+    'emulated_board.yaml': EmulatedBoardParameters, 'gap.yaml': GapParameters,
+    'hover.yaml': HoverParameters,
     'motor_board.yaml': MotorBoardParameters,
     'nmpc.yaml': NmpcParameters,
     'nmpc_published.yaml': NmpcParameters, 'rl.yaml': PolicyParameters,

@@ -14,7 +14,7 @@ import typer
 from typer.main import get_command
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.cli import flights, hardware, training
+from beetle_omni_ros.cli import flights, gaps, hardware, training
 from beetle_omni_ros.cli.options import fail, INTERRUPTED, UNUSABLE
 from beetle_omni_ros.robot.resources import PACKAGE
 from beetle_omni_ros.robot.schema import ParameterError
@@ -27,8 +27,8 @@ HELP = {'help_option_names': ['-h', '--help']}
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, context_settings=HELP,
                   help='Fly, evaluate and report on the tiltable quadrotor.')
-for command in (flights.fly, flights.evaluate, flights.compare, flights.report, training.train,
-                hardware.check):
+for command in (flights.fly, flights.evaluate, flights.compare, flights.report, gaps.gap,
+                training.train, hardware.check):
     app.command()(command)
 identify = typer.Typer(no_args_is_help=True, context_settings=HELP,
                        help='Fit the actuator models from measured data.')
@@ -51,6 +51,9 @@ def _common(version: Annotated[bool, typer.Option(
 
 def main(args: list[str] | None = None) -> int:
     """Run the command and return its exit status."""
+    args = list(sys.argv[1:] if args is None else args)
+    if args[:1] == ['gap']:
+        args = ['gap', *gaps.spread(args[1:])]
     try:
         status = get_command(app).main(args=args, prog_name='beetle_omni', standalone_mode=False)
         return status if isinstance(status, int) else 0

@@ -69,7 +69,7 @@ def sweep(flights: list[Flight], *, store: Store, backend: str = 'processes',
             done(flight, kept, True)
     missing = [flight for flight in flights if flight not in results]
     if missing:
-        with _workers(backend, jobs, address):
+        with workers(backend, jobs, address):
             for flight, result in _fly_all(missing):
                 store.save(flight, result)
                 results[flight] = result
@@ -101,7 +101,7 @@ def _fly_numbered(k, flight, task, code):
 
 
 @contextmanager
-def _workers(backend, jobs, address):
+def workers(backend, jobs, address):
     """Set joblib up; numerical libraries in workers keep to one thread each."""
     if backend == 'processes':
         with joblib.parallel_config('loky', n_jobs=jobs or -1, inner_max_num_threads=1):

@@ -22,6 +22,7 @@ from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
+SHORT = 0.002           # [s] nearer to an end of a span a command changes there
 HISTORY = 64        # states and commands kept, far more than any latency needs
 
 
@@ -72,8 +73,7 @@ class DisturbanceEstimator:
         present = self.observe(state)
         if self._delay == 0:
             return present
-        return self._advance(present, self._input(state.stamp, self._delay), self.disturbance,
-                             self._delay)
+        return self._flown(present, state.stamp, self._delay)
 
     def observe(self, state: State) -> np.ndarray:
         """Take in one state estimate; returns the (25,) full state at its stamp."""
@@ -84,8 +84,7 @@ class DisturbanceEstimator:
         if self._state is None or not 0 < step <= LONGEST_STEP:
             present = self._restart(state)
         else:
-            predicted = self._advance(self._state, self._input(self._stamp, step),
-                                      self.disturbance, step)
+            predicted = self._flown(self._state, self._stamp, step)
             self._learn(state, predicted, step)
             present = self._measured(state, predicted)
             self._correct_tilt(state, present, step)
@@ -104,6 +103,17 @@ class DisturbanceEstimator:
         present[:13] = np.concatenate([state.position, state.velocity, state.quaternion,
                                        state.angular_velocity])
         return present
+
+    def _flown(self, state, start, duration):
+        """(25,) state after a time span, in which commands may change."""
+        end = start + duration
+        changes = [at for command in self._commands
+                   if start + SHORT < (at := command.stamp + self._delay) < end - SHORT]
+        for until in (*changes, end):
+            state = self._advance(state, self._input(start, until - start), self.disturbance,
+                                  until - start)
+            start = until
+        return state
 
     def _input(self, start, duration):
         """Command (8,) that acts on the robot around the middle of a time span."""

@@ -97,9 +97,12 @@ def _interval(robot, servo_lag, rotor_lag, x, u, d, h):
 
     def body_derivative(body, time):
         angle, thrust = actuators(time)
+        rates = {'tilt_rate': (tilt_target - angle) / servo_lag, 'position': body[:3]}
+        if rotor_lag:
+            rates['thrust_rate'] = (u[4:] - thrust) / robot.rotors.time_constant
         acceleration, angular_acceleration = dynamics.rigid_body(
             robot, body[3:6], body[6:10], body[10:13], angle, thrust,
-            d[dynamics.FORCE], d[dynamics.TORQUE])
+            d[dynamics.FORCE], d[dynamics.TORQUE], **rates)
         return ca.vertcat(body[3:6], acceleration,
                           dynamics.quaternion_rate(body[6:10], body[10:13]),
                           angular_acceleration)

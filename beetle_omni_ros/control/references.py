@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
+from beetle_omni_ros.control.effect_wrench import EffectWrench
 from beetle_omni_ros.control.ocp import REFERENCE_SIZE
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 
+FIRST_ROUNDS = 3        # of allocation under effects for a new target; afterwards each plan is one
 DIFFERENCE_STEP = 1e-3  # [s] for the reference's acceleration
 TILT, THRUST, TILT_LEAD, THRUST_LEAD = (slice(13, 17), slice(17, 21), slice(21, 25),
                                         slice(25, 29))
@@ -40,6 +42,9 @@ class ReferencePlanner:
         """See the class."""
         self._times, self._unwind = times, unwind
         self._allocator = Allocator(robot)
+        self._effects = EffectWrench(robot, self._allocator, len(times))
+        self._beside = np.zeros((2, len(times), 3))     # force and torque of the effects, per node
+        self._target: Target | None = None
         self._inertia = np.asarray(robot.inertia)
         length = np.diff(times)[:, None]
         self._tilt_lead = 1 / -np.expm1(-length / servo_lag)
@@ -57,11 +62,22 @@ class ReferencePlanner:
             disturbance: (10,) as in :mod:`robot.dynamics`.
 
         """
+        if not self._effects.needed:
+            return self._once(target, start, tilt, disturbance)
+        rounds = 1 if target is self._target else FIRST_ROUNDS
+        self._target = target
+        for _ in range(rounds):
+            references = self._once(target, start, tilt, disturbance)
+            self._beside = np.stack(self._effects(references))
+        return references
+
+    def _once(self, target, start, tilt, disturbance):
         references = np.zeros((len(self._times), REFERENCE_SIZE))
         if isinstance(target, PoseTarget):
+            force, torque = self._beside[:, 0]
             allocation = self._allocator.hover(target.quaternion, tilt,
-                                               -disturbance[model.FORCE],
-                                               -disturbance[model.TORQUE])
+                                               -disturbance[model.FORCE] - force,
+                                               -disturbance[model.TORQUE] - torque)
             references[:, 0:3] = target.position
             references[:, 6:10] = rotations.normalized(target.quaternion)
             references[:, TILT] = self._unwound(allocation.tilt, tilt)
@@ -81,9 +97,9 @@ class ReferencePlanner:
         rate = now.angular_velocity
         acceleration = (ahead.velocity - now.velocity) / DIFFERENCE_STEP
         angular_acceleration = (ahead.angular_velocity - rate) / DIFFERENCE_STEP
-        force = self._allocator.mass * acceleration - disturbance[model.FORCE]
-        torque = self._inertia * angular_acceleration \
-            + np.cross(rate, self._inertia * rate) - disturbance[model.TORQUE]
+        force = self._allocator.mass * acceleration - disturbance[model.FORCE] - self._beside[0]
+        torque = self._inertia * angular_acceleration + np.cross(rate, self._inertia * rate) \
+            - disturbance[model.TORQUE] - self._beside[1]
         references[:, 0:3], references[:, 3:6] = now.position, now.velocity
         references[:, 6:10], references[:, 10:13] = now.quaternion, rate
         for k, quaternion in enumerate(now.quaternion):

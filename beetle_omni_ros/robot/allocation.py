@@ -53,6 +53,7 @@ class Allocator:
         matrix: (6, 8) from the interleaved components u to (force, torque) in base_link.
         inverse: (8, 6) its pseudo-inverse.
         mass: the mass that the hover wrench carries [kg].
+        weight: (3,) force in world that holds it against gravity and steady wind [N].
         tilt_limit: travel of the joints to each side [rad].
 
     """
@@ -64,7 +65,7 @@ class Allocator:
         scale = np.full(ROTORS, effects.get('thrust_coefficient', {}).get('scale', 1.0)) \
             * np.asarray(effects.get('rotor_thrust_coefficient', {}).get('scale', 1.0))
         self.mass = effects.get('mass', {}).get('mass', robot.mass)
-        self._weight = np.array([0.0, 0.0, self.mass * robot.gravity]) \
+        self.weight = np.array([0.0, 0.0, self.mass * robot.gravity]) \
             - np.asarray(effects.get('wind', {}).get('force', (0.0, 0.0, 0.0)))
         self.matrix = np.zeros((6, 2 * ROTORS))
         up = np.array([0.0, 0.0, 1.0])
@@ -140,7 +141,7 @@ class Allocator:
             extra_torque_body: (3,) in base_link [N m].
 
         """
-        force = self._weight if extra_force_world is None else self._weight + extra_force_world
+        force = self.weight if extra_force_world is None else self.weight + extra_force_world
         torque = np.zeros(3) if extra_torque_body is None else extra_torque_body
         return self.allocate(force @ rotations.matrix(quaternion), torque, present_tilt)
 

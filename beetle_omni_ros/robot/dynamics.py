@@ -12,7 +12,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.robot.effects import CATALOGUE, Terms
+from beetle_omni_ros.robot.effects import CATALOGUE, ServoTerms, Terms
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 # Slices of the full state (25): world position [m] and velocity [m/s], attitude (x, y, z, w) body
@@ -52,7 +52,9 @@ def thrust_direction(arm_yaw: float, tilt):
 
 
 def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, tilt, thrust,
-               force_world=None, torque_body=None, tilt_acceleration=None, effects=None):
+               force_world=None, torque_body=None, tilt_acceleration=None, effects=None, *,
+               tilt_rate=None, thrust_rate=None, position=None, voltage_ratio=None,
+               rotor_positions=None):
     """
     Newton-Euler equations of the robot as one rigid body.
 
@@ -71,12 +73,18 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
         torque_body: (3,) external torque in body [N m].
         tilt_acceleration: (4,) of the joints [rad/s^2], for effects that react to it.
         effects: name -> parameter -> value or symbol, in place of the robot file's.
+        tilt_rate: (4,) of the joints [rad/s], for effects that need it.
+        thrust_rate: (4,) [N/s], likewise.
+        position: (3,) in world [m], likewise; without it there is no ground.
+        voltage_ratio: pack voltage over that of a full pack; without it there is no sag.
+        rotor_positions: (4, 3) in place of the robot file's [m].
 
     Returns:
         (3,) acceleration in world [m/s^2], (3,) angular acceleration in body [rad/s^2].
 
     """
     rotors = robot.rotors
+    places = rotors.positions if rotor_positions is None else rotor_positions
     terms = Terms(
         mass=robot.mass, inertia=ca.DM(robot.inertia), centre_of_mass=None,
         torque=_given(torque_body, 3), tilt=tilt, tilt_acceleration=_given(tilt_acceleration, 4),
@@ -84,11 +92,16 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
         thrust=thrust, velocity=velocity, angular_velocity=angular_velocity,
         rotation=rotation_matrix(quaternion),
         thrust_directions=[thrust_direction(rotors.arm_yaw[i], tilt[i]) for i in range(4)],
-        rotor_positions=[ca.DM(rotors.positions[i]) for i in range(4)],
+        rotor_positions=[ca.DM(places[i]) if rotor_positions is None else places[i, :].T
+                         for i in range(4)],
         hover_thrust=robot.hover_thrust, force_world=_given(force_world, 3), rotor_forces=[0] * 4,
-        torque_ratio=rotors.torque_to_thrust_ratio)
-    for name, values in (robot.effects if effects is None else effects).items():
-        CATALOGUE[name].apply(terms, **values)
+        torque_ratio=rotors.torque_to_thrust_ratio, tilt_rate=_given(tilt_rate, 4),
+        thrust_rate=_given(thrust_rate, 4), spin=tuple(map(float, rotors.spin)),
+        position=position, voltage_ratio=voltage_ratio)
+    effects = robot.effects if effects is None else effects
+    for name, effect in CATALOGUE.items():
+        if name in effects and effect.apply is not None:
+            effect.apply(terms, **effects[name])
     force, torque = 0, terms.torque
     for i in range(4):
         rotor_force = terms.thrust[i] * terms.thrust_directions[i] + terms.rotor_forces[i]
@@ -113,16 +126,29 @@ def _given(value, size):
     return ca.DM.zeros(size) if value is None else value
 
 
-def servo_acceleration(robot: RobotParameters, tilt, tilt_rate, target):
+def gyroscopic_load(robot: RobotParameters, angular_velocity, tilt, thrust, joint: int):
+    """Torque of a spinning rotor on its tilt joint for each N m s of its momentum in hover."""
+    n = thrust_direction(robot.rotors.arm_yaw[joint], tilt)
+    speed = ca.sqrt(ca.fmax(thrust, 0) / robot.hover_thrust + 1e-9)
+    return -float(robot.rotors.spin[joint]) * speed * ca.dot(
+        ca.DM(robot.tilt_axes[joint]), ca.cross(angular_velocity, n))
+
+
+def servo_acceleration(robot: RobotParameters, tilt, tilt_rate, target, thrust=0.0, joint=0,
+                       gyroscopic=0.0):
     """
     Second-order tilt servo within its torque and rate limits, [rad/s^2].
 
-    J q'' = Kp (q* - q) - Kd q', torque clipped to the effort limit; at the rate limit
-    the servo no longer accelerates outward.
+    J q'' = Kp (q* - q) - Kd q', torque clipped to the effort limit, plus what the robot
+    file's effects add; at the rate limit the servo no longer accelerates outward.
     """
+    terms = ServoTerms(target, tilt, tilt_rate, thrust, 0.0, gyroscopic)
+    for name, values in robot.effects.items():
+        if CATALOGUE[name].servo is not None:
+            CATALOGUE[name].servo(terms, joint, **values)
     joint = robot.joints
-    torque = joint.kp * (target - tilt) - joint.kd * tilt_rate
-    torque = ca.fmin(ca.fmax(torque, -joint.effort_limit), joint.effort_limit)
+    torque = joint.kp * (terms.target - tilt) - joint.kd * tilt_rate
+    torque = ca.fmin(ca.fmax(torque, -joint.effort_limit), joint.effort_limit) + terms.torque
     outward = ca.logic_and(ca.fabs(tilt_rate) >= joint.velocity_limit, torque * tilt_rate > 0)
     return ca.if_else(outward, 0, torque / joint.inertia)
 
@@ -133,14 +159,17 @@ def derivative(robot: RobotParameters, x, u, d):
     target = ca.fmin(ca.fmax(u[TILT_COMMAND], -limit), limit) + d[TILT_OFFSET]
     thrust_target = ca.fmin(ca.fmax(u[THRUST_COMMAND], robot.rotors.thrust_min),
                             robot.rotors.thrust_max)
+    tilt_acceleration = ca.vertcat(*[
+        servo_acceleration(robot, x[TILT][i], x[TILT_RATE][i], target[i], x[THRUST][i], i,
+                           gyroscopic_load(robot, x[RATE], x[TILT][i], x[THRUST][i], i))
+        for i in range(4)])
+    thrust_rate = (thrust_target - x[THRUST]) / robot.rotors.time_constant
     acceleration, angular_acceleration = rigid_body(
-        robot, x[VELOCITY], x[QUATERNION], x[RATE], x[TILT], x[THRUST], d[FORCE], d[TORQUE])
+        robot, x[VELOCITY], x[QUATERNION], x[RATE], x[TILT], x[THRUST], d[FORCE], d[TORQUE],
+        tilt_acceleration, tilt_rate=x[TILT_RATE], thrust_rate=thrust_rate, position=x[POSITION])
     return ca.vertcat(
         x[VELOCITY], acceleration, quaternion_rate(x[QUATERNION], x[RATE]), angular_acceleration,
-        x[TILT_RATE],
-        ca.vertcat(*[servo_acceleration(robot, x[TILT][i], x[TILT_RATE][i], target[i])
-                     for i in range(4)]),
-        (thrust_target - x[THRUST]) / robot.rotors.time_constant)
+        x[TILT_RATE], tilt_acceleration, thrust_rate)
 
 
 def full_model(robot: RobotParameters) -> ca.Function:

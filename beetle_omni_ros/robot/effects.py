@@ -1,192 +1,49 @@
 """
 The catalogue of named effects: what reality may add to the model.
 
-Each effect is declared once: its parameters with unit, neutral value (at which the
-effect vanishes) and physical range, and, for those of the body layer, the equation
-that the CasADi dynamics use. A robot file switches an effect on by naming it.
+Each effect is declared once: equation and source, its parameters with unit, neutral value (at
+which the effect vanishes), physical range, realistic magnitude and smallest size worth naming,
+what excites it, what it is confused with and what separates the two. A robot file switches an
+effect on by naming it. Its equation then acts where its kind says:
+
+- body effects and those of rotors on the body change the terms of the Newton-Euler equations,
+- joint effects change the servo's equation,
+- effects that only replace a number of the robot file (a lag, a gain, a limit) replace it when
+  the file is read, so that plant, NMPC and training all see the number,
+- delays of commands stand in :attr:`RobotParameters.command_delays`,
+- those of sensors are values that the gap finder fits and whoever reads the sensor may use.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from difflib import get_close_matches
 
-import casadi as ca
 import numpy as np
 
+from beetle_omni_ros.robot.effect_types import Effect, EffectParameter, ServoTerms, Terms
+from beetle_omni_ros.robot.effects_actuator import ACTUATOR, SENSOR
+from beetle_omni_ros.robot.effects_body import BODY
 from beetle_omni_ros.robot.schema import ParameterError
 
-_UP = ca.DM([0, 0, 1])
+# In the order in which they act together: the true tilt first, for it turns the thrusts.
+CATALOGUE: dict[str, Effect] = {'joint_offset': ACTUATOR['joint_offset'], **BODY, **ACTUATOR,
+                                **SENSOR}
+
+__all__ = ['CATALOGUE', 'command_delays', 'Effect', 'EffectParameter', 'ServoTerms', 'settings',
+           'Terms', 'validated']
 
 
-@dataclass(frozen=True)
-class EffectParameter:
-    """One number, or vector, of an effect: unit, value of no effect, legal range."""
-
-    unit: str
-    neutral: float | tuple[float, ...]
-    low: float
-    high: float
+def settings(effects: dict[str, dict]) -> dict[str, float]:
+    """Dotted keys of the robot file that checked effects replace, with the new values."""
+    return {key: effects[name][parameter] for name in effects
+            for parameter, key in CATALOGUE[name].settings.items()}
 
 
-@dataclass
-class Terms:
-    """
-    The forces of one instant while they are put together, CasADi expressions throughout.
-
-    Attributes:
-        mass: [kg].
-        inertia: (3,) diagonal about the centre of mass [kg m^2].
-        centre_of_mass: (3,) seen from base_link's origin [m], or None where it is the origin.
-        torque: (3,) torque added on the body, in base_link [N m].
-        tilt: (4,) tilt angles [rad].
-        tilt_acceleration: (4,) of the tilt joints [rad/s^2].
-        tilt_axes: list of four (3,) unit vectors in base_link, outward along the arms.
-        thrust: (4,) rotor thrusts after their lag [N].
-        velocity: (3,) of the centre of gravity in world [m/s].
-        angular_velocity: (3,) in base_link [rad/s].
-        rotation: (3, 3) body to world.
-        thrust_directions: list of four (3,) unit vectors in base_link.
-        rotor_positions: list of four (3,) [m] in base_link.
-        hover_thrust: of each rotor [N].
-        force_world: (3,) force added in world [N].
-        rotor_forces: list of four (3,) forces added at the rotors, in base_link [N].
-        torque_ratio: reaction torque for each newton [m].
-
-    """
-
-    mass: ca.SX
-    inertia: ca.SX
-    centre_of_mass: ca.SX | None
-    torque: ca.SX
-    tilt: ca.SX
-    tilt_acceleration: ca.SX
-    tilt_axes: list
-    thrust: ca.SX
-    velocity: ca.SX
-    angular_velocity: ca.SX
-    rotation: ca.SX
-    thrust_directions: list
-    rotor_positions: list
-    hover_thrust: float
-    force_world: ca.SX
-    rotor_forces: list
-    torque_ratio: ca.SX
-
-
-@dataclass(frozen=True)
-class Effect:
-    """
-    One catalogue entry.
-
-    Attributes:
-        layer: 'body', 'rotor', 'joint', 'timing' or 'sensor'.
-        parameters: name -> :class:`EffectParameter`.
-        apply: changes :class:`Terms` in place; called as apply(terms, **values).
-        source: where the equation comes from.
-
-    """
-
-    layer: str
-    parameters: dict[str, EffectParameter]
-    apply: Callable
-    source: str
-
-
-def _mass(terms, mass):
-    terms.mass = mass
-
-
-def _inertia(terms, inertia):
-    terms.inertia = _vector(inertia)
-
-
-def _centre_of_mass(terms, offset):
-    terms.centre_of_mass = _moved(terms.centre_of_mass, _vector(offset))
-
-
-def _module_reaction(terms, module_inertia, mass_moment):
-    shift = 0
-    for i in range(4):
-        terms.torque = terms.torque - module_inertia * terms.tilt_acceleration[i] \
-            * terms.tilt_axes[i]
-        # The module's centre of mass hangs below the joint axis: it moves against the thrust.
-        shift = shift - mass_moment / terms.mass * (terms.thrust_directions[i] - _UP)
-    terms.centre_of_mass = _moved(terms.centre_of_mass, shift)
-
-
-def _moved(centre, shift):
-    return shift if centre is None else centre + shift
-
-
-def _vector(values):
-    return ca.vertcat(*ca.vertsplit(ca.SX(ca.vertcat(*values)))) if isinstance(values, tuple) \
-        else values
-
-
-def _thrust_coefficient(terms, scale):
-    terms.thrust = scale * terms.thrust
-
-
-def _rotor_thrust_coefficient(terms, scale):
-    terms.thrust = ca.vertcat(*scale) * terms.thrust if isinstance(scale, tuple) \
-        else scale * terms.thrust
-
-
-def _torque_coefficient(terms, torque_to_thrust_ratio):
-    terms.torque_ratio = torque_to_thrust_ratio
-
-
-def _wind(terms, force):
-    terms.force_world = terms.force_world + _vector(force)
-
-
-def _body_drag(terms, coefficient):
-    speed = ca.sqrt(ca.sumsqr(terms.velocity) + 1e-12)
-    terms.force_world = terms.force_world - coefficient * speed * terms.velocity
-
-
-def _rotor_drag(terms, coefficient):
-    air_velocity = terms.rotation.T @ terms.velocity
-    for i in range(4):
-        n = terms.thrust_directions[i]
-        v = air_velocity + ca.cross(terms.angular_velocity, terms.rotor_positions[i])
-        in_plane = v - n * ca.dot(n, v)
-        speed_ratio = ca.sqrt(ca.fmax(terms.thrust[i], 0) / terms.hover_thrust + 1e-9)
-        terms.rotor_forces[i] = terms.rotor_forces[i] - coefficient / 4 * speed_ratio * in_plane
-
-
-CATALOGUE: dict[str, Effect] = {
-    'mass': Effect('body', {'mass': EffectParameter('kg', float('nan'), 0.05, 200)}, _mass,
-                   "m v' = F"),
-    'inertia': Effect(
-        'body', {'inertia': EffectParameter('kg m^2', (float('nan'),) * 3, 1e-5, 50)}, _inertia,
-        "I w' = tau - w x I w"),
-    'centre_of_mass': Effect(
-        'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2)}, _centre_of_mass,
-        'forces turn the body about its centre of mass, base_link moves with it'),
-    'module_reaction': Effect(
-        'body', {'module_inertia': EffectParameter('kg m^2', 0.0, 0.0, 0.1),
-                 'mass_moment': EffectParameter('kg m', 0.0, 0.0, 1.0)}, _module_reaction,
-        "servo torque J q'' on the body; centre of mass moved by -moment / m (t(q) - t(0))"),
-    'thrust_coefficient': Effect(
-        'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0)}, _thrust_coefficient,
-        'f = scale f*'),
-    'rotor_thrust_coefficient': Effect(
-        'body', {'scale': EffectParameter('1', (1.0,) * 4, 0.0, 2.0)}, _rotor_thrust_coefficient,
-        'f_i = scale_i f*_i'),
-    'torque_coefficient': Effect(
-        'body', {'torque_to_thrust_ratio': EffectParameter('m', float('nan'), 0.0, 0.2)},
-        _torque_coefficient, 'tau_i = -spin_i ratio f_i'),
-    'wind': Effect('body', {'force': EffectParameter('N', (0.0,) * 3, -100, 100)}, _wind,
-                   'constant force in world'),
-    'body_drag': Effect('body', {'coefficient': EffectParameter('N s^2/m^2', 0.0, 0.0, 5.0)},
-                        _body_drag, 'F = -c |v| v'),
-    'rotor_drag': Effect('body', {'coefficient': EffectParameter('N s/m', 0.0, 0.0, 5.0)},
-                         _rotor_drag,
-                         'H-force of Faessler et al. 2018, grows with rotor speed sqrt(f / f_h)'),
-}
+def command_delays(effects: dict[str, dict]) -> tuple[float, float]:
+    """Delays of tilt and of thrust commands [s] that checked effects add."""
+    common, tilt, thrust = (effects.get(name, {}).get('delay', 0.0) for name in (
+        'command_latency', 'joint_command_latency', 'rotor_dead_time'))
+    return common + tilt, common + thrust
 
 
 def validated(effects: dict | None) -> dict[str, dict]:
@@ -207,10 +64,11 @@ def validated(effects: dict | None) -> dict[str, dict]:
             hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(CATALOGUE)}"
             raise ParameterError(f'effects.{name}: unknown effect{hint}')
         entry = CATALOGUE[name]
-        if not isinstance(given, dict) or set(given) != set(entry.parameters):
+        needed = {key for key, spec in entry.parameters.items() if spec.default is None}
+        if not isinstance(given, dict) or not needed <= set(given) <= set(entry.parameters):
             expected = ', '.join(entry.parameters)
             raise ParameterError(f'effects.{name}: expected the keys {expected}, found {given!r}')
-        checked[name] = {key: _value(f'effects.{name}.{key}', spec, given[key])
+        checked[name] = {key: _value(f'effects.{name}.{key}', spec, given.get(key, spec.default))
                          for key, spec in entry.parameters.items()}
     return checked
 

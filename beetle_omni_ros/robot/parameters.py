@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import hashlib
 from pathlib import Path
 
@@ -160,8 +160,11 @@ class RobotParameters:
     provenance: dict = parameter({}, doc='where a written file comes from; free text')
 
     def __post_init__(self):
-        """Refuse effects that the catalogue does not know."""
+        """Refuse effects that the catalogue does not know; set the numbers that they replace."""
         object.__setattr__(self, 'effects', catalogue.validated(self.effects))
+        for key, value in catalogue.settings(self.effects).items():
+            part, name = key.split('.')
+            object.__setattr__(self, part, replace(getattr(self, part), **{name: value}))
         hover = self.mass * self.gravity / 4
         if hover > self.rotors.thrust_max:
             raise ParameterError(f'mass {self.mass:g} kg needs {hover:.1f} N a rotor to hover, '
@@ -187,6 +190,11 @@ class RobotParameters:
         """(4, 3) unit tilt axes in base_link, outward along the arms."""
         yaw = self.rotors.arm_yaw
         return np.stack([np.cos(yaw), np.sin(yaw), np.zeros(4)], axis=1)
+
+    @property
+    def command_delays(self) -> tuple[float, float]:
+        """Delays of tilt and of thrust commands [s] that the effects add."""
+        return catalogue.command_delays(self.effects)
 
     @property
     def hover_thrust(self) -> float:

@@ -15,8 +15,12 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 # The plant's modules turn and swing as bodies of their own, whatever the file says of them.
 BUILT_IN = ('mass', 'inertia', 'centre_of_mass', 'module_reaction', 'thrust_coefficient',
-            'rotor_thrust_coefficient', 'torque_coefficient')
-FORCES = ('wind', 'body_drag', 'rotor_drag')
+            'rotor_thrust_coefficient', 'torque_coefficient',
+            # numbers of the robot file that are replaced when it is read, and delays
+            'rotor_lag', 'thrust_saturation', 'joint_bandwidth', 'joint_velocity_limit',
+            'joint_torque_limit', 'command_latency', 'joint_command_latency', 'rotor_dead_time')
+FORCES = ('wind', 'body_drag', 'rotor_drag', 'tilt_thrust_loss', 'axial_inflow',
+          'ground_effect')
 
 
 def check_supported(robot: RobotParameters) -> None:
@@ -42,7 +46,14 @@ class MotionForces:
         self.wind = np.array(effects.get('wind', {}).get('force', (0.0,) * 3))
         self.body_drag = effects.get('body_drag', {}).get('coefficient', 0.0)
         self.rotor_drag = effects.get('rotor_drag', {}).get('coefficient', 0.0)
-        self.depends_on_motion = bool(self.body_drag or self.rotor_drag)
+        self.loss = effects.get('tilt_thrust_loss', {})
+        self.inflow = effects.get('axial_inflow', {}).get('per_rotor', 0.0)
+        self.ground = effects.get('ground_effect', {})
+        self._changes_thrust = bool(self.loss or self.inflow or self.ground)
+        self.depends_on_motion = bool(self.body_drag or self.rotor_drag or self._changes_thrust)
+        self._positions = robot.rotors.positions
+        self._reaction = -robot.rotors.spin * effects.get('torque_coefficient', {}).get(
+            'torque_to_thrust_ratio', robot.rotors.torque_to_thrust_ratio)
         self._hover_thrust = robot.hover_thrust
         # r x f for each rotor as a matrix, stacked (12, 3): np.cross is slow on small arrays.
         self._levers = np.concatenate([rotations.skew(r) for r in robot.rotors.positions])
@@ -51,7 +62,8 @@ class MotionForces:
         self._sideways = np.cross(axes, self._level)   # where a rotor at +90 deg points
 
     def __call__(self, rotation: np.ndarray, velocity: np.ndarray, angular_velocity: np.ndarray,
-                 tilt: np.ndarray, thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+                 tilt: np.ndarray, thrust: np.ndarray,
+                 height: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """
         Forces of one instant.
 
@@ -61,6 +73,7 @@ class MotionForces:
             angular_velocity: (3,) in base_link [rad/s].
             tilt: (4,) [rad].
             thrust: (4,) true thrusts [N].
+            height: of base_link above the floor [m].
 
         Returns:
             force (3,) in world [N] and torque (3,) in base_link [N m].
@@ -78,4 +91,27 @@ class MotionForces:
             drag = -0.25 * self.rotor_drag * speed_ratio[:, None] * in_plane
             force += rotation @ drag.sum(axis=0)
             torque -= drag.ravel() @ self._levers      # sum of r x f: each lever is skew
+        if self._changes_thrust:
+            normal = np.cos(tilt)[:, None] * self._level + np.sin(tilt)[:, None] * self._sideways
+            hub = rotation.T @ velocity - (self._levers @ angular_velocity).reshape(4, 3)
+            along = self._thrust_change(rotation, hub, normal, tilt, thrust, height)
+            change = along[:, None] * normal
+            force += rotation @ change.sum(axis=0)
+            torque += -change.ravel() @ self._levers + (self._reaction * along) @ normal
         return force, torque
+
+    def _thrust_change(self, rotation, hub, normal, tilt, thrust, height):
+        """(4,) what the effects add to each rotor's thrust [N]."""
+        part = np.ones(4)
+        if self.ground:
+            z = np.maximum(height + self._positions @ rotation[2], 0.08)
+            share = self.ground['exponential_share']
+            part *= 1 + self.ground['gain_at_0.25m'] * (normal @ rotation[2]) ** 2 * (
+                (1 - share) * (0.25 / z) ** 2 + share * np.exp(1 - z / 0.25))
+        if self.loss:
+            share = self.loss['cosine_share']
+            part *= 1 - self.loss['loss_at_60deg'] * (
+                (1 - share) * np.sin(tilt) ** 2 / 0.75 + share * 4 * np.sin(tilt / 2) ** 2)
+        lost = self.inflow * np.sqrt(np.maximum(thrust, 0) / self._hover_thrust) * (
+            hub * normal).sum(axis=1)
+        return (part - 1) * thrust - lost

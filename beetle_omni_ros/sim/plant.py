@@ -209,7 +209,7 @@ class Plant:
         force, torque = self._forces(
             rotations.matrix(rotations.multiply(self._qpos[XYZW], turn)),
             self._qvel[:3] + ahead * data.qacc[:3], self._qvel[3:6] + ahead * data.qacc[3:6],
-            self._tilt + ahead * self._rate, self._scale * thrust)
+            self._tilt + ahead * self._rate, self._scale * thrust, float(self._qpos[2]))
         applied[:3] = self._wrench[:3] + force
         applied[3:6] = self._wrench[3:] + torque
 

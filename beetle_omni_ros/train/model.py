@@ -99,7 +99,8 @@ def substep(robot: RobotParameters, duration: float) -> ca.Function:
     acceleration, angular_acceleration = model.rigid_body(
         robot, x[model.VELOCITY], x[model.QUATERNION], x[model.RATE], new_tilt,
         (thrust + new_thrust) / 2, wrench[:3], wrench[3:], (new_rate - rate) / h,
-        {name: effects[name] for name in order})
+        {name: effects[name] for name in order}, tilt_rate=new_rate,
+        thrust_rate=(new_thrust - thrust) / h, position=x[model.POSITION])
     velocity = x[model.VELOCITY] + h * acceleration
     angular_velocity = x[model.RATE] + h * angular_acceleration
     position = x[model.POSITION] + h * (x[model.VELOCITY] + velocity) / 2

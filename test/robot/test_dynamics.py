@@ -130,7 +130,10 @@ def with_effect(**effects):
 @pytest.mark.parametrize('name', list(CATALOGUE))
 def test_an_effect_at_its_neutral_value_changes_nothing(name):
     own = {'mass': ROBOT.mass, 'inertia': tuple(ROBOT.inertia),
-           'torque_to_thrust_ratio': ROBOT.rotors.torque_to_thrust_ratio}
+           'torque_to_thrust_ratio': ROBOT.rotors.torque_to_thrust_ratio,
+           'time_constant': ROBOT.rotors.time_constant, 'thrust_max': ROBOT.rotors.thrust_max,
+           **{key: getattr(ROBOT.joints, key) for key in ('kp', 'kd', 'velocity_limit',
+                                                          'effort_limit')}}
     values = {key: own.get(key, spec.neutral) for key, spec in CATALOGUE[name].parameters.items()}
     state = random_state(7)
     plain = model.body_acceleration(ROBOT)(*state)

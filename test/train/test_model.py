@@ -59,7 +59,7 @@ def finely(robot, x, u, step=1e-5):
         if robot.multibody else robot.effects
     linear, angular = dynamics.rigid_body(
         robot, state[3:6], state[6:10], state[10:13], tilt, thrust,
-        tilt_acceleration=(new_rate - rate) / step, effects=effects)
+        tilt_acceleration=(new_rate - rate) / step, effects=effects, tilt_rate=new_rate)
     velocity, turning = state[3:6] + step * linear, state[10:13] + step * angular
     quaternion = state[6:10] + step * dynamics.quaternion_rate(state[6:10], turning)
     after = ca.Function('fine', [state, command], [ca.vertcat(

@@ -1,0 +1,1 @@
+"""Where model and measurement disagree, and which named effect explains it."""

@@ -1,0 +1,296 @@
+"""From checked flights to a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from beetle_omni_ros.identify.gap.body import BodyModel
+from beetle_omni_ros.identify.gap.candidates import candidates
+from beetle_omni_ros.identify.gap.certainty import deviations, Visibility, visibility
+from beetle_omni_ros.identify.gap.fit import Problem
+from beetle_omni_ros.identify.gap.ingest import Flight
+from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, Key, tolerances
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel
+from beetle_omni_ros.identify.gap.rollouts import free_runs, gap, HORIZONS, regimes_at, Runs
+from beetle_omni_ros.identify.gap.search import Search
+from beetle_omni_ros.identify.gap.trial import Found, Trial
+from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
+from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+JUDGED = HORIZONS.index(0.5)
+AT_FLOOR = 1.1          # a gap below so much times the floor cannot be closed
+WORSE = 1.05            # a regime may get worse by this
+
+
+@dataclass
+class Analysis:
+    """
+    Everything that was found.
+
+    Attributes:
+        verdict: see INTERFACES.
+        reason: one sentence.
+        keys: by name.
+        found: the search.
+        widths: key -> half width of its 95 % interval, as deviation.
+        visible: label -> what the data could show.
+        rest: what is left.
+        where: channels and regimes by disagreement.
+        runs: 'before', 'after', 'placebo' -> free runs of the flights that judge.
+        gaps: horizon -> before, after, placebo, closure.
+        regimes: regime -> before and after at 0.5 s.
+        held_out: whether the flights that judge were not fitted.
+        problem: of the fit.
+        models: fitted; judging.
+        experiment: what to fly next, or None.
+        findings: remarks of the checks.
+
+    """
+
+    verdict: str = 'no_gap'
+    reason: str = ''
+    keys: dict[str, Key] = field(default_factory=dict)
+    found: Found = field(default_factory=Found)
+    widths: dict[str, float] = field(default_factory=dict)
+    visible: dict[str, Visibility] = field(default_factory=dict)
+    rest: Remainder | None = None
+    where: list[dict] = field(default_factory=list)
+    runs: dict[str, list[Runs]] = field(default_factory=dict)
+    gaps: dict[float, dict] = field(default_factory=dict)
+    regimes: dict[str, dict] = field(default_factory=dict)
+    held_out: bool = False
+    problem: Problem | None = None
+    models: tuple[list[FlightModel], list[FlightModel]] = field(default_factory=lambda: ([], []))
+    experiment: str | None = None
+    findings: list[str] = field(default_factory=list)
+    partial: list[Trial] = field(default_factory=list)
+
+    @property
+    def accepted(self) -> list[Trial]:
+        """Effects that are named, strongest first."""
+        return sorted(self.found.accepted, key=lambda t: -t.gain)
+
+
+def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
+            p: GapParameters, progress: Callable[[str], None] = lambda text: None) -> Analysis:
+    """
+    Find what explains the disagreement between flights and model.
+
+    Args:
+        fitted: flights that are fitted.
+        judging: flights that are not; empty: the fitted ones judge, too.
+        robot: as believed.
+        p: parameters.
+        progress: called with a short text at each stage.
+
+    """
+    a = Analysis(held_out=bool(judging))
+    a.keys = {**all_keys(robot), **extra_keys()}
+    body = BodyModel(robot, a.keys, _modules(robot))
+    models = [FlightModel(flight, robot, body, a.keys, p) for flight in fitted]
+    others = [FlightModel(flight, robot, body, a.keys, p) for flight in judging]
+    a.models = models, others or models
+    coarse = float(np.median([_pose_noise(flight) for flight in fitted])) > p.coarse_noise
+    if coarse:
+        a.findings.append('sensors are noisy: latencies within their usual range are not named')
+    beliefs = tolerances(p, coarse)
+    if robot.multibody is None or 'module_reaction' in robot.effects:
+        del beliefs['modules.share']
+    a.problem = Problem(models, a.keys, beliefs, p)
+    _choose_modules(a.problem, others)
+    tried = candidates(a.keys, models)
+    search = Search(a.problem, tried, progress)
+    a.found = search.run()
+    accepted = [t.candidate for t in a.found.accepted]
+    involved, free = search._involved(accepted), search._free(accepted)
+    progress('certainty')
+    a.widths = deviations(a.problem, a.found.state, involved, free)
+    a.visible = visibility(a.problem, a.found.state, search.always, tried)
+    a.rest = remainder(a.problem, a.found.state, involved)
+    a.where = _where(a)
+    _decide(a, p)
+    progress('free runs')
+    _falsify(a)
+    return a
+
+
+def _pose_noise(flight):
+    """Standard deviation of a MoCap reading [m], from what is no motion."""
+    third = np.diff(flight.pose[:, :3], 3, axis=0)
+    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20))
+
+
+def _modules(robot):
+    if robot.multibody is None:
+        return 0.0, 0.0
+    module = robot.multibody.module
+    depth = -float(module.centre_of_mass[2])
+    return float(module.inertia[0] + module.mass * depth**2), float(module.mass * depth)
+
+
+def _choose_modules(problem, others):
+    """Take the file's tilting modules into the model where the data have them."""
+    if 'modules.share' not in problem.beliefs:
+        return
+    costs = []
+    for share in (0.0, 1.0):
+        for model in [*problem.models, *others]:
+            model.modules = share
+        r = problem.residual({})
+        costs.append(float(np.minimum(r * r, 100.0).sum()))
+    for model in [*problem.models, *others]:
+        model.modules = float(np.argmin(costs))
+
+
+def _where(a):
+    """Channels and regimes, ranked by how far the model without effects is off."""
+    problem, rows = a.problem, []
+    r = problem.residual(a.found.base)
+    after = a.found.state.r
+    regimes = np.concatenate([regimes_at(m, problem.time[problem.flight == k])
+                              for k, m in enumerate(problem.models)])
+    names = [name for group in problem.noise.taps for name in CHANNELS[group]]
+    for channel, name in enumerate(names):
+        for regime in np.unique(regimes):
+            keep = (problem.where == channel) & (regimes == regime)
+            if keep.sum() >= 20:
+                rows.append({'channel': name, 'regime': str(regime),
+                             'excess': float(np.sqrt((r[keep]**2).mean())),
+                             'excess_after': float(np.sqrt((after[keep]**2).mean()))})
+    return sorted(rows, key=lambda row: -row['excess'])
+
+
+def hidden(a: Analysis, p: GapParameters) -> list[str]:
+    """Names of entries of which these data could not show a realistic size."""
+    best: dict[str, float] = {}
+    for label, seen in a.visible.items():
+        name = label.partition(' ')[0].partition('[')[0]
+        best[name] = max(best.get(name, 0.0), seen.sigma)
+    return [name for name, sigma in best.items() if sigma < p.decidable]
+
+
+def _decide(a, p):
+    found, count = a.found, len(a.problem.time)
+    before, after, floor = found.cost
+    # Everything at once also fits some noise: a chi2 of one for each number without a belief.
+    floor += sum(name not in a.problem.beliefs for name in found.state.names)
+    left = max(after - floor, 0.0)
+    explained = (before - after) / max(before - after + left, 1e-9)
+    out_of_sight = hidden(a, p)
+    share = len(out_of_sight) / max(len({label.partition(' ')[0].partition('[')[0]
+                                         for label in a.visible}), 1)
+    repeats = _repeats(a.rest, p)
+    sets = [[t, *found.rivals.get(t.candidate.label, [])] for t in found.accepted]
+    names = [len({t.candidate.name for t in members}) for members in sets]
+    if found.accepted:
+        part = a.rest.gain / max(before - after, 1e-9)
+        if left > p.least_left and explained < p.enough or repeats and part > p.remainder_share:
+            a.verdict, a.partial = 'unknown', list(found.accepted)
+            a.reason = (f'{found.accepted[0].candidate.name} and its like explain '
+                        f'{explained:.0%} of what known effects could; the rest is '
+                        f'{a.rest.text}')
+            found.accepted.clear()
+        elif max(names) >= p.crowd or (share > p.most_hidden and max(names) > 1):
+            a.verdict = 'not_decidable'
+            a.reason = f'these flights cannot tell {max(names)} explanations apart'
+        else:
+            a.verdict = 'named_set' if max(names) > 1 else 'named'
+            a.reason = f'explains {explained:.1%} of what known effects could explain'
+    elif repeats or left > 0.05 * count:
+        a.verdict, a.reason = 'unknown', a.rest.text
+    elif share > p.most_hidden:
+        a.verdict = 'not_decidable'
+        a.reason = (f'{len(out_of_sight)} known effects of realistic size would not show in '
+                    'these flights')
+    else:
+        a.verdict, a.reason = 'no_gap', 'what is left is noise and manufacturing tolerance'
+    a.experiment = _experiment(a, sets if found.accepted else [], out_of_sight)
+
+
+def _repeats(rest, p):
+    """Whether what is left repeats, and is more than tolerances leave behind."""
+    limits = {'force': p.least_force, 'torque': p.least_torque, 'joint': p.least_joint}
+    large = [name for name, gain in rest.channels if gain > p.least_channel
+             and rest.size[name] > limits[name.partition('_')[0]]]
+    return rest.gain > p.least_remainder and rest.positive >= 0.7 and bool(large)
+
+
+def _experiment(a, sets, out_of_sight):
+    if a.verdict in ('named_set', 'not_decidable') and sets:
+        members = max(sets, key=len)
+        others = sorted({t.candidate.name for t in members[1:]})
+        return (f'{CATALOGUE[members[0].candidate.name].separated_by} (separates '
+                f'{members[0].candidate.name} from {", ".join(others) or "the rest"})')
+    if a.verdict == 'not_decidable':
+        flights = list(dict.fromkeys(CATALOGUE[name].excited_by for name in out_of_sight))
+        tests = list(dict.fromkeys(CATALOGUE[name].separated_by for name in out_of_sight))
+        return (f'poses with large turns, tilts and translation ({"; ".join(flights[:5])}); '
+                f'best: {"; ".join(tests[:3])}')
+    if a.verdict == 'unknown':
+        return 'the same task three times over: what repeats is model, the rest is gusts'
+    return None
+
+
+def _falsify(a):
+    """Free runs before, after and with a placebo, on the flights that judge."""
+    found, noise = a.found, a.problem.noise
+    judges = a.models[1]
+    keys = {n for t in found.accepted for n in t.candidate.keys}
+    # The same robot, with its tolerances as found, without and with what was named ...
+    points = {'before': {n: x for n, x in found.theta.items() if n not in keys},
+              'after': found.theta}
+    # ... and the robot file as it is, and with nothing but what was named.
+    plain = _plain(a, found.theta, keys)
+    points |= {'file': plain, 'effects_alone': {**plain, **{n: found.theta[n] for n in keys}},
+               'placebo': _placebo(a)}
+    for name, theta in points.items():
+        if found.accepted or name in ('before', 'file'):
+            a.runs[name] = [free_runs(m, theta, noise) for m in judges]
+    for name, same in (('after', 'before'), ('placebo', 'before'), ('effects_alone', 'file')):
+        a.runs.setdefault(name, a.runs[same])
+    # No floor is higher than what the model reached on the flights that it was fitted to.
+    own = [free_runs(a.models[0][0], found.theta, noise)]
+    reached = np.sqrt(np.mean([(run.error**2).mean(axis=1) for run in own], axis=0))
+    floors = np.minimum(np.mean([run.floor for run in own], axis=0), np.maximum(reached, 1e-4))
+    for h, horizon in enumerate(HORIZONS):
+        values = {name: gap(runs, h, floors=floors) for name, runs in a.runs.items()}
+        a.gaps[horizon] = {**values, 'closure': closure(values['before'], values['after']),
+                           'placebo_closure': closure(values['before'], values['placebo']),
+                           'closure_of_effects_alone': closure(values['file'],
+                                                               values['effects_alone'])}
+    for regime in np.unique(np.concatenate([run.regime for run in a.runs['before']])):
+        before, after = (gap(a.runs[name], JUDGED, regime, floors)
+                         for name in ('before', 'after'))
+        a.regimes[str(regime)] = {'before': before, 'after': after,
+                                  'worse': bool(after > WORSE * before)}
+
+
+def _plain(a, theta, named):
+    """The robot file's own numbers, with the sensors and the bus as they were found."""
+    return {name: x for name, x in theta.items() if not a.keys[name].body
+            and a.keys[name].effect not in ('rotor_lag', 'joint_bandwidth', 'modules')
+            and name in a.problem.beliefs and name not in named}
+
+
+def closure(before: float, after: float) -> float | None:
+    """Part of the excess over the floor (1) that is gone; None where there was none."""
+    if not before > AT_FLOOR:
+        return None
+    return float(1 - max(after**2 - 1, 0.0) / (before**2 - 1))
+
+
+def _placebo(a) -> dict[str, float]:
+    """The same effects with the opposite sign: they must not help."""
+    theta = dict(a.found.theta)
+    for trial in a.found.accepted:
+        for name in trial.candidate.keys:
+            key = a.keys[name]
+            # The equations bear a drag that pushes; a servo would not bear negative friction.
+            theta[name] = -theta[name] if key.body else float(
+                np.clip(-theta[name], key.low, key.high))
+    return theta

@@ -1,0 +1,112 @@
+"""The body's equations with every effect's number as a symbol, over many samples at once."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from beetle_omni_ros.identify.gap.keys import Key
+from beetle_omni_ros.robot import dynamics
+from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+WIDTHS = {'velocity': 3, 'quaternion': 4, 'rate': 3, 'tilt': 4, 'thrust': 4, 'tilt_rate': 4,
+          'tilt_acceleration': 4, 'thrust_rate': 4, 'position': 3, 'voltage': 1, 'modules': 1}
+MODULES = 'module_reaction'
+
+
+class BodyModel:
+    """
+    Specific force and angular acceleration that the model expects of measured states.
+
+    Args:
+        robot: parameters with the effects that are believed.
+        keys: of the catalogue and the extra ones.
+        modules: module inertia [kg m^2] and mass moment [kg m] that the robot file implies.
+
+    Attributes:
+        names: of the keys that its parameter vector holds, in order.
+
+    """
+
+    def __init__(self, robot: RobotParameters, keys: dict[str, Key],
+                 modules: tuple[float, float]):
+        """See the class."""
+        self.names = [name for name, key in keys.items() if key.body]
+        self._index = {name: k for k, name in enumerate(self.names)}
+        self._p = p = ca.SX.sym('p', len(self.names))
+        self._x = x = {name: ca.SX.sym(name, width) for name, width in WIDTHS.items()}
+        effects: dict[str, dict] = {}
+        for name, effect in CATALOGUE.items():
+            if effect.apply is None:
+                continue
+            effects[name] = {parameter: self._symbol(keys, name, parameter)
+                             for parameter in effect.parameters}
+        if MODULES not in robot.effects:
+            share = x['modules']
+            own = effects[MODULES]
+            effects[MODULES] = {
+                'module_inertia': own['module_inertia'] + share * modules[0],
+                'mass_moment': own['mass_moment'] + share * modules[1]}
+        places = ca.SX(robot.rotors.positions)
+        for k in range(12):
+            places[k // 3, k % 3] += p[self._index[f'position.offset[{k}]']]
+        acceleration, turning = dynamics.rigid_body(
+            robot, x['velocity'], x['quaternion'], x['rate'], x['tilt'], x['thrust'],
+            tilt_acceleration=x['tilt_acceleration'], effects=effects, tilt_rate=x['tilt_rate'],
+            thrust_rate=x['thrust_rate'], position=x['position'], voltage_ratio=x['voltage'],
+            rotor_positions=places)
+        rotation = dynamics.rotation_matrix(x['quaternion'])
+        force = rotation.T @ (acceleration + ca.DM([0, 0, robot.gravity]))
+        self._out = ca.cse(ca.densify(ca.vertcat(force, turning)))
+        self._maps: dict = {}
+
+    def _symbol(self, keys, name, parameter):
+        found = [key for key in keys.values() if key.effect == name
+                 and key.parameter == parameter]
+        made = []
+        for key in found:
+            symbol = self._p[self._index[key.name]]
+            made.append(key.base * ca.exp(symbol) if key.relative else key.base + symbol)
+        return made[0] if found[0].index is None else tuple(made)
+
+    @cached_property
+    def _function(self):
+        return ca.Function('body', [*self._x.values(), self._p], [self._out])
+
+    def _mapped(self, what, count, make):
+        if (what, count) not in self._maps:
+            function = make()
+            self._maps[what, count] = function.map(
+                f'{function.name()}_{count}', 'serial', count, [len(WIDTHS)], [])
+        return self._maps[what, count]
+
+    def __call__(self, inputs: dict[str, np.ndarray], theta: dict[str, float]) -> np.ndarray:
+        """(N, 6) specific force [m/s^2] and angular acceleration [rad/s^2] of the samples."""
+        columns = self._columns(inputs)
+        mapped = self._mapped('', columns[0].shape[1], lambda: self._function)
+        return np.array(mapped(*columns, self._vector(theta))).T
+
+    def derivatives(self, inputs: dict[str, np.ndarray], theta: dict[str, float],
+                    names: tuple[str, ...]) -> np.ndarray:
+        """(N, 6, len(names)) exact derivatives by the named keys."""
+        columns = self._columns(inputs)
+        count = columns[0].shape[1]
+        chosen = [self._index[name] for name in names]
+
+        def make():
+            jacobian = ca.densify(ca.jacobian(self._out, self._p[chosen]))
+            return ca.Function('slopes', [*self._x.values(), self._p], [ca.cse(ca.vec(jacobian))])
+
+        mapped = self._mapped(names, count, make)
+        flat = np.array(mapped(*columns, self._vector(theta))).T
+        return flat.reshape(count, len(names), 6).transpose(0, 2, 1)
+
+    def _columns(self, inputs):
+        return [np.ascontiguousarray(inputs[name].reshape(-1, width).T)
+                for name, width in WIDTHS.items()]
+
+    def _vector(self, theta):
+        return np.array([theta.get(name, 0.0) for name in self.names])

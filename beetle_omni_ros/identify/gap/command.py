@@ -1,0 +1,125 @@
+"""`beetle_omni gap`: recorded flights in; verdict, numbers, page and corrected robot file out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from beetle_omni_ros.identify.gap.analysis import analyse, Analysis
+from beetle_omni_ros.identify.gap.apply import write_corrected
+from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
+from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log
+from beetle_omni_ros.identify.gap.page import gap_page
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.results import grids, results, WORDS
+from beetle_omni_ros.identify.robot_file import check_not_base, write_text
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.json_file import check_writable, write_json
+from beetle_omni_ros.runs.table import print_grids
+
+LEAST_FITTED = 2    # flights, above which the last one judges where nobody named one
+
+
+def run_gap(runs: list[Path], holdout: list[Path] = (), robot: Path | None = None,
+            apply: Path | None = None, json_path: Path | None = None, page: Path | None = None,
+            console: Console | None = None, parameters: Path | None = None) -> int:
+    """
+    Find where model and measurement disagree.
+
+    Args:
+        runs: rosbag2 folders that are fitted, or one joint log (CSV).
+        holdout: folders that judge; by default the last run, where there are three or more.
+        robot: file that is believed; default the shipped one.
+        apply: robot file to write, with the named effects.
+        json_path: file for the results.
+        page: HTML page to write.
+        console: where to print.
+        parameters: file with changes to params/gap.yaml.
+
+    Returns:
+        0; a verdict is no error.
+
+    Raises:
+        ParameterError, LogError: unusable robot file, log or output, in one line.
+
+    """
+    gap_results(runs, holdout, robot, apply, json_path, page, console, parameters)
+    return 0
+
+
+def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=None,
+                console=None, parameters=None) -> dict:
+    """Do as :func:`run_gap`, and return what it writes to JSON."""
+    console = console or Console()
+    runs, holdout = [Path(r) for r in runs], [Path(h) for h in holdout]
+    _check_outputs(apply, robot, json_path, page)
+    believed, p = RobotParameters.load(robot), GapParameters.load(parameters)
+    if any(run.suffix.lower() == '.csv' for run in runs):
+        made, html = analyse_joint_log(runs, holdout, believed, robot)
+    else:
+        meta = {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
+                'robot': str(robot) if robot else 'params/robot.yaml'}
+        with Progress(SpinnerColumn(), TextColumn('{task.description}'), TimeElapsedColumn(),
+                      console=console, transient=True) as bars:
+            bar = bars.add_task('reading')
+            a = _analysed(runs, holdout, believed, p,
+                          lambda text: bars.update(bar, description=text))
+        made = results(a, believed, p, meta)
+        html = gap_page(a, made) if page else ''
+    _print(console, made)
+    if json_path:
+        write_json(json_path, made)
+    if page:
+        write_text(page, html, 'page')
+    if apply:
+        if made['effects']:
+            write_corrected(apply, made, believed, robot)
+            console.print(f'corrected robot: {apply}', highlight=False)
+        else:
+            console.print('nothing is named: no robot file is written', highlight=False)
+    return made
+
+
+def _analysed(runs, holdout, robot, p, progress):
+    findings, flights = [], {}
+    for path in [*runs, *holdout]:
+        try:
+            flights[path] = load_flight(path, robot, p)
+            findings += flights[path].findings
+        except UnusableFlight as error:
+            findings.append(str(error))
+    fitted = [flights[r] for r in runs if r in flights]
+    judging = [flights[h] for h in holdout if h in flights]
+    if not fitted:
+        return Analysis('bad_data', findings[0] if findings else 'no run', findings=findings)
+    if not holdout and len(fitted) > LEAST_FITTED:
+        fitted, judging = fitted[:-1], fitted[-1:]
+    a = analyse(fitted, judging, robot, p, progress)
+    a.findings = [*findings, *a.findings]
+    return a
+
+
+def _check_outputs(apply, robot, json_path, page):
+    if apply:
+        check_not_base(apply, robot)
+    for path, what in ((json_path, 'result file'), (page, 'page'), (apply, 'parameter file')):
+        if path:
+            check_writable(path, what)
+
+
+def _print(console, made):
+    names = ', '.join(' or '.join(effect['names']) for effect in made['effects'])
+    console.print(f"{WORDS[made['verdict']]}{': ' + names if names else ''}", style='bold',
+                  highlight=False, markup=False)
+    console.print(made['reason'], highlight=False, markup=False)
+    for finding in made['findings']:
+        console.print(finding, style='dim', highlight=False, markup=False)
+    print_grids(grids(made), console)
+    if made['next_experiment']:
+        console.print(f"Next: {made['next_experiment']}", highlight=False, markup=False)
+
+
+__all__ = ['gap_results', 'ParameterError', 'run_gap']

@@ -1,0 +1,236 @@
+"""Fits of several flights together, by Gauss and Newton with beliefs beside the data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from beetle_omni_ros.identify.gap.keys import Belief, Key
+from beetle_omni_ros.identify.gap.noise import Noise
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.residual import FlightModel
+
+CURVED = ('delay', 'split', 'rotation', 'time_constant', 'kp', 'kd', 'velocity_limit',
+          'effort_limit', 'coulomb', 'stiction', 'gap', 'thrust_max', 'deflection_per_newton')
+TIMES = ('delay', 'split')
+LEAST_BLOCKS = 6        # of all flights together
+HALVINGS = 4
+RIDGE = 1e-9
+
+
+@dataclass
+class State:
+    """
+    Everything at one point.
+
+    Attributes:
+        theta: deviations by key name.
+        r: (n,) whitened residual of all flights.
+        slopes: (n, K) whitened, for ``names``.
+        names: of the columns.
+
+    """
+
+    theta: dict[str, float]
+    r: np.ndarray
+    slopes: np.ndarray
+    names: list[str]
+    index: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self):
+        """Index the columns."""
+        self.index = {name: k for k, name in enumerate(self.names)}
+
+
+class Problem:
+    """
+    The flights, what is believed, and the noise.
+
+    Args:
+        models: one for each flight.
+        keys: by name.
+        beliefs: of keys that always are free.
+        p: parameters.
+
+    Attributes:
+        noise: in force; change it by :meth:`learn_noise`.
+        block: (n,) number of the block that a whitened sample belongs to.
+        where: (n,) index of group and channel of a sample.
+
+    """
+
+    def __init__(self, models: list[FlightModel], keys: dict[str, Key],
+                 beliefs: dict[str, Belief], p: GapParameters):
+        """See the class."""
+        self.models, self.keys, self.beliefs, self.p = models, keys, beliefs, p
+        self.noise = Noise.white(p)
+        self._raw: list | None = None
+        self._label()
+
+    def _label(self):
+        blocks, where, flights, times, first = [], [], [], [], 0
+        for k, model in enumerate(self.models):
+            pieces = max(round(model.flight.duration / self.p.block),
+                         -(-LEAST_BLOCKS // len(self.models)))
+            counts = {g: len(model.times(g)) for g in self.noise.taps}
+            for c, (group, _, index) in enumerate(self.noise.places(counts)):
+                t = model.times(group)[index]
+                part = np.clip((t / model.flight.duration * pieces).astype(int), 0, pieces - 1)
+                blocks.append(first + part)
+                where.append(np.full(len(t), c))
+                flights.append(np.full(len(t), k))
+                times.append(t)
+            first += pieces
+        self.block, self.where = np.concatenate(blocks), np.concatenate(where)
+        self.flight, self.time, self.blocks = np.concatenate(flights), np.concatenate(times), first
+
+    def residual(self, theta: dict[str, float]) -> np.ndarray:
+        """(n,) whitened."""
+        return np.concatenate([self.noise.whiten(m.residual(theta)) for m in self.models])
+
+    def state(self, theta: dict[str, float], names: list[str]) -> State:
+        """Residual and slopes at a point."""
+        raw = [m.residual(theta) for m in self.models]
+        slopes = [m.slopes(theta, names) for m in self.models]
+        self._raw = [(r, s, names, theta) for r, s in zip(raw, slopes, strict=True)]
+        return self._whitened()
+
+    def renew(self, theta: dict[str, float]) -> None:
+        """Take the residual at a point nearby; slopes stay those of the last :meth:`state`."""
+        self._raw = [(m.residual(theta), old[1], old[2], theta)
+                     for m, old in zip(self.models, self._raw, strict=True)]
+
+    def _whitened(self):
+        r = np.concatenate([self.noise.whiten(raw) for raw, *_ in self._raw])
+        s = np.concatenate([self.noise.whiten(slopes) for _, slopes, *_ in self._raw])
+        return State(dict(self._raw[0][3]), r, s, list(self._raw[0][2]))
+
+    def learn_noise(self, wide: dict[str, float], rounds: int = 3) -> State:
+        """
+        Estimate the noise around a fit of everything, linear from the last state.
+
+        Args:
+            wide: key -> deviation within which numbers without a belief are sought.
+            rounds: of noise and fit.
+
+        Returns:
+            the last state, whitened anew.
+
+        """
+        names = self._raw[0][2]
+        state = self._whitened()
+        for _ in range(rounds):
+            step = self._solve_all(state, wide)
+            rest = []
+            for raw, slopes, *_ in self._raw:
+                rest.append({g: raw[g] + slopes[g] @ step for g in raw})
+            self.noise = Noise.of(rest, self.p)
+            self._label()
+            state = self._whitened()
+        assert len(names) == state.slopes.shape[1]
+        return state
+
+    def _solve_all(self, state, wide):
+        h, g = state.slopes.T @ state.slopes, state.slopes.T @ state.r
+        for k, name in enumerate(state.names):
+            x = state.theta.get(name, 0.0)
+            belief = self.beliefs.get(name)
+            if belief:
+                h[k, k] += belief.slope(x)**2
+                g[k] += belief.slope(x) * belief.residual(x)
+            else:
+                h[k, k] += wide.get(name, 1.0)**-2
+        return -np.linalg.solve(h, g)
+
+    def prior(self, theta: dict[str, float], free: frozenset[str] = frozenset()) -> float:
+        """Cost of straying from what is believed, of keys that are not ``free``."""
+        return sum(belief.residual(theta.get(name, 0.0))**2
+                   for name, belief in self.beliefs.items() if name not in free)
+
+    def linear_step(self, state: State, names: list[str], free: frozenset[str],
+                    rows: np.ndarray | None = None) -> tuple[np.ndarray, float, np.ndarray]:
+        """
+        The best change of the named keys if slopes were constant.
+
+        Args:
+            state: point, residual and slopes.
+            names: keys that may change.
+            free: of which nothing is believed.
+            rows: samples that count; default all.
+
+        Returns:
+            (K,) change, the objective expected after it, (K, K) normal matrix.
+
+        """
+        columns = [state.index[name] for name in names]
+        s = state.slopes[:, columns]
+        r = state.r
+        if rows is not None:
+            s, r = s[rows], r[rows]
+        h, g = s.T @ s, s.T @ r
+        return self.solve(state.theta, names, free, h, g, float(r @ r))
+
+    def solve(self, theta, names, free, h, g, chi2):
+        """Finish :meth:`linear_step` from the data's normal equations."""
+        h, g = h.copy(), g.copy()
+        for k, name in enumerate(names):
+            belief = self.beliefs.get(name)
+            if belief and name not in free:
+                x = theta.get(name, 0.0)
+                h[k, k] += belief.slope(x)**2
+                g[k] += belief.slope(x) * belief.residual(x)
+        scale = 1 / np.sqrt(np.maximum(np.diag(h), 1e-12))
+        scaled = h * scale[:, None] * scale + RIDGE * np.eye(len(names))
+        step = -scale * np.linalg.solve(scaled, scale * g)
+        cost = chi2 + self.prior(theta, free) + 2 * g @ step + step @ h @ step
+        return step, float(cost), h
+
+    def refine(self, state: State, names: list[str], free: frozenset[str],
+               iterations: int = 3) -> tuple[State, float]:
+        """
+        Fit the named keys.
+
+        Slopes of keys that act almost linearly are kept; those of curved ones are renewed.
+
+        Returns:
+            the point reached, and the objective there.
+
+        """
+        theta, r = dict(state.theta), state.r
+        slopes, cost = state.slopes, float(r @ r) + self.prior(theta, free)
+        timing = any(self.keys[name].parameter in TIMES for name in free)
+        curved = [name for name in names if self.keys[name].parameter in CURVED and (
+            name not in self.beliefs or name in free
+            or timing and self.keys[name].parameter in TIMES)]
+        now = State(theta, r, slopes, state.names)
+        for iteration in range(iterations):
+            step, _, _ = self.linear_step(now, names, free)
+            better = False
+            for halving in range(HALVINGS):
+                trial = self._moved(now.theta, names, 0.5**halving * step)
+                r = self.residual(trial)
+                new = float(r @ r) + self.prior(trial, free)
+                if new < cost - 1e-9:
+                    better = True
+                    break
+            if not better:
+                break
+            gain, cost = cost - new, new
+            slopes = now.slopes
+            if curved and iteration + 1 < iterations and gain > 0.5:
+                fresh = np.concatenate([self.noise.whiten(m.slopes(trial, curved))
+                                        for m in self.models])
+                slopes = slopes.copy()
+                slopes[:, [now.index[name] for name in curved]] = fresh
+            now = State(trial, r, slopes, now.names)
+            if gain < 0.5:
+                break
+        return now, cost
+
+    def _moved(self, theta, names, step):
+        moved = dict(theta)
+        for name, change in zip(names, step, strict=True):
+            key = self.keys[name]
+            moved[name] = float(np.clip(theta.get(name, 0.0) + change, key.low, key.high))
+        return moved

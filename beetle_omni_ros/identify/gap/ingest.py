@@ -1,0 +1,193 @@
+"""From a recording to a flight that can be judged, or the reason why it cannot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.identify.gap.bags import NEEDED, read_recording, Recording
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.bag_reader import BagError
+
+SETTLE = 1.0            # [s] after take-off that are not looked at
+LIFTED = 0.8            # of the weight: commanded thrust that flies
+MOST_DUPLICATES = 0.05
+CLOCK_JUMP = 0.5        # [s] that a stamp may go back
+SPREAD = 0.4            # by which measured and commanded specific force may differ
+
+
+class UnusableFlight(ValueError):
+    """A recording cannot be judged; the text says why, in one line."""
+
+
+@dataclass
+class Flight:
+    """
+    One contiguous piece of flight.
+
+    Attributes:
+        name: of the recording.
+        start: of the piece [s]; all times below are relative to it.
+        duration: [s].
+        imu_t, imu: (N,) and (N, 6) specific force [m/s^2], rates [rad/s].
+        pose_t, pose: (N,) and (N, 7) position [m] and quaternion xyzw, sign-continuous.
+        joint_t, joint: (N,) and (N, 4) [rad].
+        command_t, command: (N,) and (N, 8) [rad], [N].
+        battery_t, battery: (N,) and (N, 1) [V], perhaps empty.
+        findings: what the checks noticed.
+
+    """
+
+    name: str
+    start: float
+    duration: float
+    imu_t: np.ndarray
+    imu: np.ndarray
+    pose_t: np.ndarray
+    pose: np.ndarray
+    joint_t: np.ndarray
+    joint: np.ndarray
+    command_t: np.ndarray
+    command: np.ndarray
+    battery_t: np.ndarray
+    battery: np.ndarray
+    findings: list[str] = field(default_factory=list)
+
+
+def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters) -> Flight:
+    """
+    Read and check one recording.
+
+    Raises:
+        UnusableFlight: naming the recording and what is wrong with it.
+
+    """
+    try:
+        recording = read_recording(path)
+    except BagError as error:
+        raise UnusableFlight(str(error)) from None
+    return prepare(recording, robot, p)
+
+
+def prepare(recording: Recording, robot: RobotParameters, p: GapParameters) -> Flight:
+    """
+    Check a recording and cut the flight out of it; see :func:`load_flight`.
+
+    Raises:
+        UnusableFlight: naming the recording and what is wrong with it.
+
+    """
+    name = recording.name
+    missing = [topic for topic in NEEDED if len(recording.times[topic]) < 50]
+    if missing:
+        counts = ', '.join(f'{topic} ({len(recording.times[topic])} messages)'
+                           for topic in missing)
+        raise UnusableFlight(f'{name}: missing or nearly empty: {counts}')
+    findings = list(recording.warnings)
+    series = {topic: _in_order(name, topic, recording, findings) for topic in recording.times}
+    begin, end = _flown(name, recording, series, robot)
+    begin, end = _without_gaps(name, series, begin, end, p, findings)
+    if end - begin < p.least_duration:
+        raise UnusableFlight(f'{name}: {max(end - begin, 0.0):.1f} s of usable flight, '
+                             f'{p.least_duration:g} s are needed')
+    cut = {}
+    for topic, (t, values) in series.items():
+        keep = (t > begin - 1.0) & (t < end + 0.5)
+        cut[topic] = t[keep] - begin, values[keep]
+    pose = cut['mocap/pose'][1].copy()
+    pose[:, 3:] = _continuous(pose[:, 3:])
+    flight = Flight(name, begin, end - begin, *cut['imu/data_raw'], cut['mocap/pose'][0], pose,
+                    *cut['joint_states'], *cut['command'], *cut['battery_state'],
+                    findings=findings)
+    _check_robot(flight, robot)
+    return flight
+
+
+def _in_order(name, topic, recording, findings):
+    """Stamps ascending, each once; a clock that jumped is refused."""
+    t, values = recording.times[topic], recording.values[topic]
+    fine = np.isfinite(t) & np.isfinite(values).all(axis=1)
+    if not fine.all():
+        findings.append(f'{name}: {topic}: {int((~fine).sum())} messages hold no numbers')
+        t, values = t[fine], values[fine]
+    if len(t) < 2:
+        return t, values
+    steps = np.diff(t)
+    if steps.min() < -CLOCK_JUMP:
+        where = int(np.argmin(steps))
+        raise UnusableFlight(f'{name}: {topic}: the clock jumps back by {-steps.min():.2f} s at '
+                             f'stamp {t[where]:.3f} s')
+    t, first = np.unique(t, return_index=True)
+    lost = len(values) - len(first)
+    if lost > MOST_DUPLICATES * len(values) and topic in NEEDED:
+        raise UnusableFlight(f'{name}: {topic}: {lost} of {len(values)} stamps occur twice')
+    if lost > 2:
+        findings.append(f'{name}: {topic}: {lost} stamps occur twice')
+    return t, values[first]
+
+
+def _flown(name, recording, series, robot):
+    """First and last moment of the flight that is looked at."""
+    t, command = series['command']
+    lifted = command[:, 4:].sum(axis=1) > LIFTED * robot.mass * robot.gravity
+    if lifted.mean() < 0.2:
+        raise UnusableFlight(f'{name}: the robot does not fly: commanded thrust is above '
+                             f'{LIFTED:g} of its weight in {lifted.mean():.0%} of the time')
+    begin = t[np.argmax(lifted)]
+    height, when = series['mocap/pose'][1][:, 2], series['mocap/pose'][0]
+    if begin > when[0] + 0.3:       # the take-off was recorded
+        risen = when[(when > begin) & (height > height[0] + 0.15)]
+        begin = (risen[0] if len(risen) else begin) + SETTLE
+        flying = [at for at, state in recording.states if state.startswith('flying')]
+        if flying and when[0] - 1 < flying[0] < when[-1]:
+            begin = max(begin, flying[0])
+    else:
+        begin = begin + 0.1
+    return begin, t[len(lifted) - 1 - np.argmax(lifted[::-1])]
+
+
+def _without_gaps(name, series, begin, end, p, findings):
+    """The longest piece in which no topic is silent for long."""
+    breaks, lost = [], 0.0
+    for topic in NEEDED:
+        t = series[topic][0]
+        begin, end = max(begin, t[0]), min(end, t[-1])
+    for topic in NEEDED:
+        t = series[topic][0]
+        inside = t[(t >= begin) & (t <= end)]
+        for k in np.flatnonzero(np.diff(inside) > p.longest_gap):
+            breaks.append((inside[k], inside[k + 1]))
+            lost += inside[k + 1] - inside[k]
+            findings.append(f'{name}: {topic}: silent for {inside[k + 1] - inside[k]:.2f} s at '
+                            f'{inside[k] - begin:.1f} s')
+    if lost > p.most_lost * max(end - begin, 1e-9) and lost > 1.0:
+        raise UnusableFlight(f'{name}: {findings[-1].split(": ", 1)[1]}; {lost:.1f} s of '
+                             f'{end - begin:.1f} s are missing in all')
+    edges = [begin, *(x for gap in sorted(breaks) for x in gap), end]
+    pieces = [(edges[k], edges[k + 1]) for k in range(0, len(edges), 2)]
+    return max(pieces, key=lambda piece: piece[1] - piece[0])
+
+
+def _continuous(quaternion):
+    """Quaternions without changes of sign, normalised."""
+    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    unit = quaternion / np.where(norm > 1e-6, norm, 1.0)
+    turn = np.sign((unit[1:] * unit[:-1]).sum(axis=1))
+    turn[turn == 0] = 1
+    return unit * np.concatenate([[1.0], np.cumprod(turn)])[:, None]
+
+
+def _check_robot(flight, robot):
+    """A robot file that is of another robot altogether."""
+    total = np.median(np.linalg.norm(flight.imu[:, :3], axis=1))
+    if total < 0.3 * robot.gravity:
+        raise UnusableFlight(f'{flight.name}: imu/data_raw: specific force is {total:.2f} m/s^2, '
+                             f'near {robot.gravity:.2f} m/s^2 expected')
+    asked = np.median(flight.command[:, 4:].sum(axis=1)) / robot.mass
+    # Thrusts also work against each other, so only far too little is impossible.
+    if asked < (1 - SPREAD) * total or asked > 3 * total:
+        raise UnusableFlight(f'{flight.name}: the robot file does not fit: commanded thrust over '
+                             f'its mass is {asked:.1f} m/s^2, the IMU measures {total:.1f} m/s^2')

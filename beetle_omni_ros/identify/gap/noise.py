@@ -1,0 +1,101 @@
+"""Coloured noise of the residual's channels, estimated from the residual itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
+
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.residual import CHANNELS
+
+
+@dataclass(frozen=True)
+class Noise:
+    """
+    An autoregression for each channel, the same in all flights.
+
+    Attributes:
+        taps: group -> (channels, order + 1) prediction-error filters, first entry 1.
+        sigma: group -> (channels,) standard deviation of what cannot be predicted.
+
+    """
+
+    taps: dict[str, np.ndarray]
+    sigma: dict[str, np.ndarray]
+
+    @classmethod
+    def white(cls, p: GapParameters) -> Noise:
+        """The floors, before anything is known."""
+        floors = _floors(p)
+        return cls({g: np.ones((len(c), 1)) for g, c in CHANNELS.items()},
+                   {g: 3 * floors[g] for g in CHANNELS})
+
+    @classmethod
+    def of(cls, residuals: list[dict[str, np.ndarray]], p: GapParameters) -> Noise:
+        """
+        Estimate from the residuals of several flights, by group.
+
+        A channel is never believed to be quieter than its floor: no model is that good.
+        """
+        taps, sigma, floors = {}, {}, _floors(p)
+        for group, channels in CHANNELS.items():
+            order = p.body_order if group == 'B' else p.other_order
+            rows, levels = [], []
+            for k in range(len(channels)):
+                series = [r[group][:, k] for r in residuals]
+                filtered, level = _autoregression(series, order)
+                white = level / np.sqrt(_gain(filtered))
+                rows.append(filtered)
+                levels.append(level * max(1.0, floors[group][k] / max(white, 1e-12)))
+            taps[group], sigma[group] = np.array(rows), np.array(levels)
+        return cls(taps, sigma)
+
+    def whiten(self, residual: dict[str, np.ndarray]) -> np.ndarray:
+        """(n,) or (n, K) whitened samples of one flight's residual or slopes, groups in a row."""
+        parts = []
+        for group, taps in self.taps.items():
+            values = residual[group]
+            order = taps.shape[1] - 1
+            for k, tap in enumerate(taps):
+                filtered = lfilter(tap, 1.0, values[:, k], axis=0)[order:]
+                parts.append(filtered / self.sigma[group][k])
+        return np.concatenate(parts)
+
+    def places(self, counts: dict[str, int]) -> list[tuple[str, int, np.ndarray]]:
+        """(group, channel, sample indices) in the order of :meth:`whiten`."""
+        made = []
+        for group, taps in self.taps.items():
+            for k in range(len(taps)):
+                made.append((group, k, np.arange(taps.shape[1] - 1, counts[group])))
+        return made
+
+
+def _floors(p):
+    force, torque, world, rate, joint = p.floors
+    return {'B': np.array([force] * 3 + [torque] * 3), 'A': np.full(3, world),
+            'W': np.full(3, rate), 'J': np.full(4, joint)}
+
+
+def _autoregression(series, order):
+    """Prediction-error filter (order + 1,) and its error's standard deviation."""
+    correlation, count = np.zeros(order + 1), 0
+    for x in series:
+        for lag in range(order + 1):
+            correlation[lag] += x[lag:] @ x[:len(x) - lag]
+        count += len(x)
+    correlation /= max(count, 1)
+    if correlation[0] < 1e-20:
+        return np.eye(1, order + 1)[0], 1e-10
+    correlation[0] *= 1.0 + 1e-6
+    a = solve_toeplitz(correlation[:-1], correlation[1:])
+    taps = np.concatenate([[1.0], -a])
+    return taps, float(np.sqrt(max(taps @ correlation, 1e-20)))
+
+
+def _gain(taps):
+    """Variance of the coloured series for unit variance of what drives it."""
+    response = np.fft.rfft(taps, 512)
+    return float(np.mean(1 / np.maximum(np.abs(response)**2, 1e-9)))

@@ -1,0 +1,126 @@
+"""The HTML page by which a person can judge the verdict."""
+
+from __future__ import annotations
+
+from html import escape
+
+import matplotlib
+from matplotlib.figure import Figure
+import numpy as np
+
+from beetle_omni_ros.identify.gap.analysis import Analysis, JUDGED
+from beetle_omni_ros.identify.gap.residual import CHANNELS, UNITS
+from beetle_omni_ros.identify.gap.results import _evidence, grids, WORDS
+from beetle_omni_ros.identify.gap.rollouts import STATES
+from beetle_omni_ros.identify.gap.rollouts import UNITS as STATE_UNITS
+from beetle_omni_ros.identify.page import page
+from beetle_omni_ros.runs.figures import COLOURS, FAINT, legend, line, panels, STYLE, svg
+from beetle_omni_ros.runs.report_page import section
+from beetle_omni_ros.runs.table import Grid, html
+
+BARS = 16
+BEFORE, AFTER = COLOURS[1], COLOURS[0]
+
+
+def gap_page(a: Analysis, made: dict) -> str:
+    """
+    One self-contained page.
+
+    Args:
+        a: the analysis.
+        made: its results.
+
+    """
+    notes = [made['reason'], *([f'Next: {made["next_experiment"]}']
+                               if made['next_experiment'] else []), *made['findings']]
+    sections = []
+    if a.problem is not None:
+        with matplotlib.rc_context(STYLE):
+            sections = [
+                section('Residuals', 'Measured minus expected, whitened: 1 is one standard '
+                        'deviation of the noise. First flight.', svg(_residuals(a), 'residuals')),
+                section('Free runs', 'Error half a second after each measured state, with the '
+                        'file as it was and with the effects; dashed: noise alone.',
+                        svg(_runs(a), 'free runs')),
+                section('Evidence', 'How much of chi2 each entry explains beside what is '
+                        'accepted, in the last step.', svg(_bars(a), 'evidence')
+                        + html(_evidence(made['candidates'], 60))),
+                section('What these flights could show', 'Standard deviations by which an effect '
+                        'of realistic size would stand out, alone and beside the entry that it '
+                        'is most like. Below 5 it could not be told.', html(_visible(made))),
+                section('Tolerances', 'What this robot differs by within what any robot does; '
+                        'carried along, not named and not written.', html(_tolerances(made)))]
+    word = WORDS[made['verdict']]
+    named = ', '.join(' or '.join(e['names']) for e in made['effects'])
+    return page('Gap', f'{word}{": " + named if named else ""}; '
+                f'{escape(", ".join(made["meta"]["runs"]))}', grids(made)[:3], notes, sections)
+
+
+def _residuals(a) -> Figure:
+    problem = a.problem
+    before, after = problem.residual(a.found.base), a.found.state.r
+    names = [n for g in problem.noise.taps for n in CHANNELS[g]]
+    figure, axes = panels(8, 2, height=1.2, sharex=True)
+    for k, (axis, name) in enumerate(zip(axes.T.ravel(), names, strict=False)):
+        rows = (problem.where == k) & (problem.flight == 0)
+        t = problem.time[rows]
+        line(axis, t, before[rows], color=BEFORE, lw=0.7, label='without the effects')
+        line(axis, t, after[rows], color=AFTER, lw=0.7, label='with them')
+        unit = UNITS[name.rpartition('_')[0]]
+        axis.set_title(f'{name} [{unit} over its noise]')
+    for axis in axes[-1]:
+        axis.set_xlabel('time [s]')
+    legend(figure, axes[0, 0])
+    return figure
+
+
+def _runs(a) -> Figure:
+    figure, axes = panels(len(STATES), 1, height=1.4, sharex=True)
+    for k, (axis, state) in enumerate(zip(axes[:, 0], STATES, strict=True)):
+        for name, colour, label in (('before', BEFORE, 'file as it was'),
+                                    ('after', AFTER, 'with the effects')):
+            error = np.concatenate([run.error[JUDGED][:, k] for run in a.runs[name]])
+            axis.plot(error, color=colour, lw=1.0, label=label)
+        axis.axhline(a.runs['before'][0].floor[JUDGED][k], color=FAINT, ls='--', lw=0.9)
+        axis.set_ylabel(f'{state} [{STATE_UNITS[state]}]')
+        axis.set_ylim(bottom=0)
+    axes[-1, 0].set_xlabel('start of the run, every 0.5 s')
+    legend(figure, axes[0, 0])
+    return figure
+
+
+def _bars(a) -> Figure:
+    best = sorted(a.found.trials.values(), key=lambda t: -t.gain)[:BARS]
+    taken = {t.candidate.label for t in a.found.accepted}
+    gains = {t.candidate.label: t.gain for t in best}
+    gains |= {t.candidate.label: t.gain for t in a.found.accepted}
+    figure, axes = panels(1, 1, height=0.24 * len(gains) + 0.6)
+    axis, names = axes[0, 0], sorted(gains, key=lambda n: gains[n])
+    axis.barh(names, [max(gains[n], 0.5) for n in names],
+              color=[AFTER if n in taken else FAINT for n in names], height=0.6)
+    axis.set_xscale('log')
+    axis.set_xlabel('explained chi2')
+    axis.grid(axis='y', visible=False)
+    return figure
+
+
+def _visible(made):
+    rows, seen = [], set()
+    for row in sorted(made['candidates'], key=lambda r: r['sigma_of_realistic_size'] or 1e9):
+        sigma = row['sigma_of_realistic_size']
+        member = row.get('rotor') or row.get('joint')
+        key = row['name'], member
+        if sigma is None or key in seen:
+            continue
+        seen.add(key)
+        rivals = row['sigma_beside_rivals']
+        worst = min(rivals, key=rivals.get) if rivals else None
+        rows.append([row['name'] + (f' {member}' if member else ''), f'{sigma:.1f}',
+                     f'{rivals[worst]:.1f} beside {worst}' if worst else ''])
+    return Grid('', ['entry', 'alone', 'beside its worst rival'], rows)
+
+
+def _tolerances(made):
+    rows = [[name, f'{100 * e["deviation"]:.2f} %' if e['relative'] else f'{e["deviation"]:.2g}']
+            for name, e in made['tolerances'].items()]
+    return Grid('', ['number', 'deviation'], rows)

@@ -1,0 +1,243 @@
+"""
+The residual: what the IMU, MoCap and encoders say against what the model expects of them.
+
+Four groups of channels, each driven by measurements, so that an error stays where it arises:
+
+- B: specific force and angular acceleration against the body's equations at the measured tilts,
+- A: MoCap's acceleration against the IMU's specific force; no model of the robot in it,
+- W: MoCap's rate of turn against the gyroscope; likewise,
+- J: encoders against servos simulated from the commands.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.identify.gap.body import BodyModel
+from beetle_omni_ros.identify.gap.filters import low_pass
+from beetle_omni_ros.identify.gap.ingest import Flight
+from beetle_omni_ros.identify.gap.keys import Key
+from beetle_omni_ros.identify.gap.loads import module_load, spin_load
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.servo import GYROSCOPIC, simulate, Windows
+from beetle_omni_ros.identify.gap.signals import matrices, Signals
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torque_z'),
+            'A': ('acceleration_x', 'acceleration_y', 'acceleration_z'),
+            'W': ('rate_x', 'rate_y', 'rate_z'),
+            'J': ('joint_1', 'joint_2', 'joint_3', 'joint_4')}
+UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate': 'rad/s',
+         'joint': 'rad'}
+TIMING = ('imu_filter_lag.delay', 'joint_feedback_delay.delay')     # of what loads the joints
+THIN = 2        # grid points to each at which the body's equations are evaluated
+STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
+         'kp': 0.01, 'kd': 0.01, 'velocity_limit': 0.01, 'effort_limit': 0.01, 'coulomb': 5e-4,
+         'stiction': 5e-4, 'deflection_per_newton': 1e-4, 'gap': 1e-3, 'thrust_max': 0.01,
+         'share': 0.05, 'split': 1e-3,
+         'angular_momentum_at_hover': 5e-3}
+
+
+class FlightModel:
+    """
+    Residuals of one flight for any set of numbers.
+
+    Args:
+        flight: measurements.
+        robot: as believed.
+        body: the body's equations, shared by all flights.
+        keys: by name.
+        p: parameters.
+
+    Attributes:
+        modules: share of the file's tilting modules in the model, 0 or 1; fits vary it around.
+        trusted: (N,) grid points away from the floor and the rotors' limits.
+
+    """
+
+    def __init__(self, flight: Flight, robot: RobotParameters, body: BodyModel,
+                 keys: dict[str, Key], p: GapParameters):
+        """Prepare signals and servo windows."""
+        self.flight, self.robot, self.keys, self.p, self._body = flight, robot, keys, p, body
+        self.modules = 0.0
+        self.signals = Signals(flight, robot, p)
+        self.filters = {'B': low_pass(p.body_edge, p.body_every, THIN * p.grid),
+                        'A': low_pass(p.world_edge, p.world_every, p.grid),
+                        'W': low_pass(p.rate_edge, p.rate_every, p.grid),
+                        'J': low_pass(p.joint_edge, p.joint_every, p.grid)}
+        self._length = round(p.servo_window / p.grid)
+        count = len(self.signals.t) - round(p.servo_warm_up / p.grid) - 1
+        self._starts = np.arange(0, count - self._length + 1, self._length) \
+            + round(p.servo_warm_up / p.grid)
+        self._made: dict[tuple, tuple] = {}
+        self._mask = self._trusted()
+        own = robot.effects
+        self._own = {'coulomb': own.get('joint_friction', {}).get('coulomb', 0.0),
+                     'stiction': own.get('joint_friction', {}).get('stiction', 0.0),
+                     'deflection': own.get('joint_deflection', {}).get(
+                         'deflection_per_newton', 0.0),
+                     'momentum': own.get(GYROSCOPIC, {}).get('angular_momentum_at_hover', 0.0),
+                     'joint_share': own.get(GYROSCOPIC, {}).get('joint_share', 0.0)}
+
+    def _trusted(self):
+        """(M,) 0 for body samples at the rotors' limit for the voltage, or on the floor."""
+        s, p = self.signals, self.p
+        bad = s.pose({})[0][:, 2] < p.contact_height
+        rows = sorted(self.robot.rotors.map, key=lambda row: row.voltage)
+        if rows:
+            volts = s.voltage * self.robot.battery.full_voltage
+            most = np.interp(volts, [row.voltage for row in rows],
+                             [row.thrust_max for row in rows])
+            asked = self.flight.command[np.clip(np.searchsorted(
+                self.flight.command_t, s.t) - 1, 0, None), 4:].max(axis=1)
+            bad |= asked > p.limit_margin * most
+        # A rotor remembers for some of its time constants.
+        memory = round(5 * self.robot.rotors.time_constant / p.grid)
+        spread = np.convolve(bad, np.ones(memory))[:len(bad)] > 0
+        self.trusted = ~spread
+        near = THIN * self.filters['B'].margin
+        wide = np.convolve(spread, np.ones(2 * near + 1), 'same') > 0
+        return (~wide[::THIN][self.filters['B'].centres(-(-len(s.t) // THIN))]).astype(float)
+
+    def times(self, group: str) -> np.ndarray:
+        """(M,) times of a group's samples [s], relative to the flight's start."""
+        if group == 'J':
+            first, count = self._starts[0], self._length * len(self._starts)
+            return self.signals.t[first + self.filters['J'].centres(count)]
+        t = self.signals.t[::THIN] if group == 'B' else self.signals.t
+        return t[self.filters[group].centres(len(t))]
+
+    def inputs(self, theta: dict[str, float]) -> dict[str, np.ndarray]:
+        """Series (N, width) that the body's equations take."""
+        s = self.signals
+        _, rate, _ = s.imu(theta)
+        position, quaternion, velocity = s.pose(theta)
+        tilt, tilt_rate, tilt_acceleration, _ = s.joints(theta)
+        thrust, thrust_rate = s.thrust(theta)
+        return {'velocity': velocity, 'quaternion': quaternion, 'rate': rate, 'tilt': tilt,
+                'thrust': thrust, 'tilt_rate': tilt_rate, 'tilt_acceleration': tilt_acceleration,
+                'thrust_rate': thrust_rate, 'position': position, 'voltage': s.voltage,
+                'modules': np.full(len(s.t), self.modules + theta.get('modules.share', 0.0))}
+
+    def _thinned(self, theta):
+        return {name: values[::THIN] for name, values in self.inputs(theta).items()}
+
+    def residual(self, theta: dict[str, float], groups: str = 'BAWJ') -> dict[str, np.ndarray]:
+        """Group -> (M, channels) measured minus expected."""
+        made = {}
+        if 'B' in groups:
+            force, _, turning = self.signals.imu(theta)
+            expected = self._body(self._thinned(theta), theta)
+            made['B'] = self._mask[:, None] * self.filters['B'](
+                np.concatenate([force, turning], axis=1)[::THIN] - expected)
+        if 'A' in groups:
+            made['A'] = self._world(theta)
+        if 'W' in groups:
+            made['W'] = self._rates(theta)
+        if 'J' in groups:
+            made['J'] = self._joints([theta])[0]
+        return made
+
+    def _world(self, theta):
+        """IMU's acceleration in world less MoCap's (M, 3)."""
+        force, _, _ = self.signals.imu(theta)
+        position, quaternion, _ = self.signals.pose(theta)
+        world = np.einsum('nij,nj->ni', matrices(quaternion), force)
+        world[:, 2] -= self.robot.gravity
+        kernel = self.filters['A']
+        return kernel(world) - kernel(position, 2)
+
+    def _rates(self, theta):
+        """Gyroscope's rates less MoCap's (M, 3)."""
+        _, rate, _ = self.signals.imu(theta)
+        _, quaternion, _ = self.signals.pose(theta)
+        rotation = matrices(quaternion)
+        h = self.p.grid
+        change = np.empty_like(rotation)
+        change[1:-1] = (rotation[2:] - rotation[:-2]) / (2 * h)
+        change[0], change[-1] = change[1], change[-2]
+        skew = np.einsum('nji,njk->nik', rotation, change)
+        seen = np.stack([skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0],
+                         skew[:, 1, 0] - skew[:, 0, 1]], axis=1) / 2
+        return self.filters['W'](rate - seen)
+
+    def _joints(self, sets):
+        """Encoders less simulated servos, [(M, 4)] for each set."""
+        first, count = self._starts[0], self._length * len(self._starts)
+        groups: dict[tuple, list[int]] = {}
+        for k, theta in enumerate(sets):
+            groups.setdefault(tuple(theta.get(name, 0.0) for name in TIMING), []).append(k)
+        residuals: list = [None] * len(sets)
+        for members in groups.values():
+            windows, edges = self._windows(sets[members[0]])
+            targets = []
+            for k in members:
+                t = self.signals.tilt_targets(edges.ravel(), self.signals.delays(sets[k])[0])
+                # One more edge than steps in each window: the mean across windows is dropped.
+                targets.append(np.concatenate([t, t[-1:]]).reshape(*edges.shape, 4)[
+                    :, :-1].transpose(1, 0, 2))
+            runs = simulate(self.robot.joints, windows, np.array(targets),
+                            [sets[k] for k in members], {**self._own, 'modules': self.modules})
+            for k, run in zip(members, runs, strict=True):
+                angle = self.signals.joints(sets[k])[3][first:first + count]
+                residuals[k] = self.filters['J'](angle - run.transpose(1, 0, 2).reshape(-1, 4))
+        return residuals
+
+    def _windows(self, theta):
+        timing = {name: theta.get(name, 0.0) for name in TIMING}
+        key = tuple(timing.values())
+        if key not in self._made:
+            if len(self._made) > 3:
+                del self._made[next(iter(self._made))]
+            self._made[key] = self._make_windows(timing)
+        return self._made[key]
+
+    def _make_windows(self, theta):
+        p, s = self.p, self.signals
+        per = round(p.grid / p.servo_step)
+        skip, count = round(p.servo_warm_up / p.servo_step), round(p.servo_window / p.servo_step)
+        begins = s.t[self._starts] - skip * p.servo_step
+        edges = begins[:, None] + p.servo_step * np.arange(skip + count + 1)
+        tilt, rate, _, _ = s.joints(theta)
+        at = self._starts - round(p.servo_warm_up / p.grid)
+        middle = edges[:, :-1] + p.servo_step / 2
+        index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
+        thrust, _ = s.thrust({})
+        load = module_load(s, theta)
+        windows = Windows(tilt[at], rate[at], thrust[index].transpose(1, 0, 2),
+                          load[index].transpose(1, 0, 2),
+                          spin_load(s, theta)[index].transpose(1, 0, 2), p.servo_step, skip,
+                          per)
+        return windows, edges
+
+    def slopes(self, theta: dict[str, float], names: list[str]) -> dict[str, np.ndarray]:
+        """Group -> (M, channels, len(names)): derivative of the residual by each key."""
+        made = {group: np.zeros((len(self.times(group)), len(channels), len(names)))
+                for group, channels in CHANNELS.items()}
+        body = [name for name in names if self.keys[name].body]
+        if body:
+            exact = self._body.derivatives(self._thinned(theta), theta, tuple(body))
+            smooth = -self._mask[:, None, None] * self.filters['B'](exact)
+            for k, name in enumerate(body):
+                made['B'][:, :, names.index(name)] = smooth[:, :, k]
+        signal = [name for name in names if not self.keys[name].body]
+        now = self.residual(theta, 'BAW')
+        for name in signal:
+            h = STEPS[self.keys[name].parameter]
+            h = -h if theta.get(name, 0.0) + h > self.keys[name].high else h
+            groups = self.keys[name].groups.replace('J', '')
+            if groups:
+                moved = self.residual({**theta, name: theta.get(name, 0.0) + h}, groups)
+                for group, values in moved.items():
+                    made[group][:, :, names.index(name)] = (values - now[group]) / h
+        turning = [name for name in names if 'J' in self.keys[name].groups]
+        if turning:
+            sets, sizes = [theta], []
+            for name in turning:
+                h = STEPS[self.keys[name].parameter]
+                sizes.append(h)
+                sets.append({**theta, name: theta.get(name, 0.0) + h})
+            runs = self._joints(sets)
+            for name, h, run in zip(turning, sizes, runs[1:], strict=True):
+                made['J'][:, :, names.index(name)] = (run - runs[0]) / h
+        return made

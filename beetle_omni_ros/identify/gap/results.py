@@ -1,0 +1,183 @@
+"""The analysis as INTERFACES lays it out, and as tables."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.identify.gap.analysis import Analysis, hidden, JUDGED
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.rollouts import HORIZONS
+from beetle_omni_ros.identify.gap.trial import Trial
+from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.table import ABSENT, Grid
+
+MOST_ROWS = 12
+WORDS = {'no_gap': 'no gap', 'named': 'named', 'named_set': 'one of a set',
+         'unknown': 'unknown: none of the known effects', 'not_decidable': 'not decidable',
+         'bad_data': 'bad data'}
+
+
+def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -> dict:
+    """Everything as plain data; the keys are those of INTERFACES."""
+    judged = a.gaps.get(HORIZONS[JUDGED], {})
+    made = {
+        'verdict': a.verdict, 'reason': a.reason, 'closure': judged.get('closure'),
+        'gap_before': judged.get('before'), 'gap_after': judged.get('after'),
+        'noise_floor': 1.0 if judged else None,
+        'effects': [_effect(a, trial, robot) for trial in a.accepted],
+        'partial': [_effect(a, trial, robot) for trial in a.partial],
+        'where': a.where[:40],
+        'candidates': _candidates(a),
+        'next_experiment': a.experiment,
+        'horizons': {f'{h:g} s': values for h, values in a.gaps.items()},
+        'regimes': a.regimes, 'held_out': a.held_out, 'findings': a.findings,
+        'modules_of_the_file': bool(a.models[0] and a.models[0][0].modules),
+        'meta': {**meta, 'version': __version__}}
+    if a.problem is not None:
+        count = len(a.problem.time)
+        before, after, floor = a.found.cost
+        made |= {'explained': a.found.explained if a.found.accepted else None,
+                 'excess': {'samples': count, 'before': before, 'after': after,
+                            'everything': floor},
+                 'hidden': hidden(a, p), 'tolerances': _tolerances(a),
+                 'remainder': {'gain': a.rest.gain, 'positive': a.rest.positive,
+                               'frame': a.rest.frame, 'channels': dict(a.rest.channels),
+                               'terms': dict(a.rest.terms)}}
+    return made
+
+
+def _effect(a, trial, robot):
+    c = trial.candidate
+    rivals = a.found.rivals.get(c.label, [])
+    names = list(dict.fromkeys([c.name, *(t.candidate.name for t in rivals)]))
+    made = {'names': names, 'parameters': parameters(a, c.name, c.keys, a.found.theta, robot),
+            'evidence': evidence(a, trial), 'layer': CATALOGUE[c.name].layer}
+    if c.member is not None:
+        made[CATALOGUE[c.name].each] = c.member
+    if rivals:
+        made['rivals'] = [{
+            'name': t.candidate.name, 'gain': t.gain,
+            **({CATALOGUE[t.candidate.name].each: t.candidate.member}
+               if t.candidate.member else {}),
+            'parameters': parameters(a, t.candidate.name, t.candidate.keys, t.theta, robot,
+                                     with_intervals=False)} for t in rivals]
+        made['separated_by'] = CATALOGUE[c.name].separated_by
+    return made
+
+
+def parameters(a: Analysis, name: str, free: tuple[str, ...], theta: dict[str, float],
+               robot: RobotParameters, with_intervals: bool = True) -> dict:
+    """Parameter -> value, unit, 95 % interval of one effect."""
+    made = {}
+    own = [key for key in a.keys.values() if key.effect == name]
+    member = bool(CATALOGUE[name].each)
+    for parameter, spec in CATALOGUE[name].parameters.items():
+        keys = [key for key in own if key.parameter == parameter
+                and (not member or key.name in free)]
+        values = [key.value(theta.get(key.name, 0.0)) for key in keys]
+        entry = {'value': values if len(values) > 1 else values[0], 'unit': spec.unit}
+        if with_intervals:
+            widths = [key.width(theta.get(key.name, 0.0), a.widths.get(key.name, 0.0))
+                      if key.name in free else 0.0 for key in keys]
+            spans = [[v - w, v + w] for v, w in zip(values, widths, strict=True)]
+            entry['interval'] = spans if len(spans) > 1 else spans[0]
+        made[parameter] = entry
+    if name == 'joint_friction':
+        made['stiction']['value'] = max(made['stiction']['value'], made['coulomb']['value'])
+    return made
+
+
+def evidence(a: Analysis, trial: Trial) -> dict:
+    """Numbers behind a decision."""
+    count = len(a.problem.time)
+    gain, error = trial.cross
+    return {'delta_bic': trial.gain - len(trial.candidate.keys) * math.log(count),
+            'delta_chi2': trial.gain, 'cv_gain': gain,
+            'cv_gain_se': gain / error if error > 0 and math.isfinite(error) else 0.0,
+            'blocks_positive': trial.positive, 'explained_share': trial.share}
+
+
+def _candidates(a):
+    made = []
+    taken = {t.candidate.label for t in a.found.accepted}
+    for label, trial in sorted(a.found.trials.items(), key=lambda lt: -lt[1].gain):
+        seen = a.visible.get(label)
+        row = {'name': trial.candidate.name, 'accepted': label in taken,
+               'evidence': evidence(a, trial), 'reason': trial.reason,
+               'sigma_of_realistic_size': seen.sigma if seen else None,
+               'sigma_beside_rivals': seen.rivals if seen else {}}
+        if trial.candidate.member is not None:
+            row[CATALOGUE[trial.candidate.name].each] = trial.candidate.member
+        made.append(row)
+    return made
+
+
+def _tolerances(a):
+    """What was found of each robot's own differences; carried along, not named."""
+    theta = a.found.theta
+    return {name: {'deviation': theta.get(name, 0.0), 'relative': a.keys[name].relative}
+            for name in a.problem.beliefs if abs(theta.get(name, 0.0)) > 0}
+
+
+def grids(made: dict) -> list[Grid]:
+    """Tables: what was found, before and after, where, and the strongest candidates."""
+    tables = []
+    if made['effects'] or made['partial']:
+        rows = []
+        for effect in made['effects'] or made['partial']:
+            member = effect.get('rotor') or effect.get('joint')
+            name = ' or '.join(effect['names']) + (f' {member}' if member else '')
+            for k, (parameter, entry) in enumerate(effect['parameters'].items()):
+                rows.append([name if k == 0 else '', f"{parameter} [{entry['unit']}]",
+                             _numbers(entry['value']), _spans(entry.get('interval')),
+                             f"{effect['evidence']['delta_bic']:.0f}" if k == 0 else ''])
+        title = 'Effects' if made['effects'] else 'Explains a part only, not accepted'
+        tables.append(Grid(title, ['effect', 'parameter', 'value', '95 %', 'delta BIC'], rows))
+    if made['horizons']:
+        flights = 'held-out flights' if made['held_out'] else 'the fitted flights'
+        rows = [[h, *(_cell(v[k]) for k in ('before', 'after', 'effects_alone', 'placebo',
+                                            'closure'))]
+                for h, v in made['horizons'].items()]
+        tables.append(Grid(f'Free runs on {flights}: error over noise floor (1: nothing but '
+                           'noise)', ['horizon', 'before', 'after', 'effects alone', 'placebo',
+                                      'closure'], rows))
+    if made['where']:
+        rows = [[w['channel'], w['regime'], _cell(w['excess']), _cell(w['excess_after'])]
+                for w in made['where'][:6]]
+        tables.append(Grid('Where model and measurement disagree most (1: as noise)',
+                           ['channel', 'regime', 'before', 'after'], rows))
+    if made['candidates']:
+        tables.append(_evidence(made['candidates'], 8))
+    return tables
+
+
+def _evidence(rows, most):
+    shown = [[r['name'] + (f" {r.get('rotor') or r.get('joint')}"
+                           if r.get('rotor') or r.get('joint') else ''),
+              f"{r['evidence']['delta_chi2']:.0f}", _cell(r['sigma_of_realistic_size']),
+              'accepted' if r['accepted'] else r['reason']] for r in rows[:most]]
+    return Grid('Candidates, after the last step', ['entry', 'chi2', 'visible [sigma]',
+                                                    'why not'], shown)
+
+
+def _cell(value):
+    return ABSENT if value is None or not np.isfinite(value) else f'{value:.2f}'
+
+
+def _numbers(value):
+    return ', '.join(f'{v:.4g}' for v in value) if isinstance(value, list) else f'{value:.4g}'
+
+
+def _spans(interval):
+    if interval is None:
+        return ABSENT
+    if isinstance(interval[0], list):
+        return ', '.join(f'{a:.3g}..{b:.3g}' for a, b in interval)
+    return f'{interval[0]:.4g}..{interval[1]:.4g}'
+
+
+__all__ = ['evidence', 'grids', 'MOST_ROWS', 'parameters', 'results', 'WORDS']

@@ -1,0 +1,224 @@
+"""
+Free runs: the model alone, from measured states and commands, against what was measured.
+
+Nothing is fitted here. Errors after 0.1, 0.5 and 1.0 s are divided by what noise alone makes of
+them: uncertain initial states, noisy readings, and forces that come and go without a cause that
+a model could know (gusts).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from beetle_omni_ros.identify.gap.filters import low_pass
+from beetle_omni_ros.identify.gap.loads import module_load, spin_load
+from beetle_omni_ros.identify.gap.noise import Noise
+from beetle_omni_ros.identify.gap.residual import FlightModel
+from beetle_omni_ros.identify.gap.servo import simulate, Windows
+from beetle_omni_ros.identify.gap.signals import FINE, matrices, SMOOTH_IMU, SMOOTH_POSE
+
+HORIZONS = (0.1, 0.5, 1.0)      # [s]
+EVERY = 0.5                     # [s] between starts
+STATES = ('position', 'velocity', 'orientation', 'rate', 'joint')
+UNITS = dict(zip(STATES, ('m', 'm/s', 'rad', 'rad/s', 'rad'), strict=True))
+LEAST = np.array([1e-3, 5e-3, 2e-3, 1e-2, 1e-3])   # floors of the floor, by state
+DRAWS = 200
+
+
+@dataclass(frozen=True)
+class Runs:
+    """
+    Errors of one flight's free runs.
+
+    Attributes:
+        error: (H, S, 5) norm of the error of each state at each horizon, for each start.
+        regime: (S,) what the robot was doing.
+        floor: (H, 5) root mean square that noise alone would make.
+        example: times (K,) and measured, modelled positions (K, 3) of the longest run.
+
+    """
+
+    error: np.ndarray
+    regime: np.ndarray
+    floor: np.ndarray
+
+
+def free_runs(model: FlightModel, theta: dict[str, float], noise: Noise) -> Runs:
+    """Run the model with these numbers through one flight."""
+    s, h = model.signals, model.p.grid
+    steps, between = round(HORIZONS[-1] / h), round(EVERY / h)
+    starts = np.arange(0, len(s.t) - steps - 2, between)
+    fine = np.array([model.trusted[k:k + steps + 1].all() for k in starts])
+    starts = starts[fine] if fine.any() else starts
+    inputs = model.inputs(theta)
+    grid = starts[:, None] + np.arange(steps + 1)
+    tilt, rate = _tilts(model, theta, starts, steps)
+    acceleration = np.gradient(rate, h, axis=1)
+    position = inputs['position'][starts].copy()
+    velocity = inputs['velocity'][starts].copy()
+    quaternion = inputs['quaternion'][starts].copy()
+    turning = inputs['rate'][starts].copy()
+    marks = [round(k / h) for k in HORIZONS]
+    errors = []
+
+    def slope(k, part, p, v, q, w):
+        def at(x):
+            return (1 - part) * x[:, k] + part * x[:, min(k + 1, steps)]
+        rows = starts + k
+        now = {'velocity': v, 'quaternion': q, 'rate': w, 'tilt': at(tilt), 'tilt_rate': at(rate),
+               'tilt_acceleration': at(acceleration), 'position': p,
+               'thrust': (1 - part) * inputs['thrust'][rows] + part * inputs['thrust'][rows + 1],
+               'thrust_rate': inputs['thrust_rate'][rows], 'voltage': inputs['voltage'][rows],
+               'modules': inputs['modules'][rows]}
+        out = model._body(now, theta)
+        force = np.einsum('nij,nj->ni', matrices(q), out[:, :3])
+        force[:, 2] -= model.robot.gravity
+        return force, out[:, 3:]
+
+    for k in range(steps):
+        a, b = slope(k, 0.0, position, velocity, quaternion, turning)
+        middle = _turned(quaternion, 0.5 * h * turning)
+        a, b = slope(k, 0.5, position + 0.5 * h * velocity, velocity + 0.5 * h * a, middle,
+                     turning + 0.5 * h * b)
+        position = position + h * velocity + 0.5 * h * h * a
+        velocity = velocity + h * a
+        quaternion = _turned(quaternion, h * (turning + 0.5 * h * b))
+        turning = turning + h * b
+        if k + 1 in marks:
+            at = grid[:, k + 1]
+            seen, shown = matrices(inputs['quaternion'][at]), matrices(quaternion)
+            cosine = (np.einsum('nij,nij->n', seen, shown) - 1) / 2
+            errors.append(np.stack([
+                np.linalg.norm(inputs['position'][at] - position, axis=1),
+                np.linalg.norm(inputs['velocity'][at] - velocity, axis=1),
+                np.arccos(np.clip(cosine, -1, 1)),
+                np.linalg.norm(inputs['rate'][at] - turning, axis=1),
+                np.linalg.norm(inputs['tilt'][at] - tilt[:, k + 1], axis=1)], axis=1))
+    return Runs(np.array(errors), _regimes(inputs, grid), noise_floor(model, noise))
+
+
+def _tilts(model, theta, starts, steps):
+    """Servos alone: angles and rates (S, K + 1, 4)."""
+    s, p = model.signals, model.p
+    per = round(p.grid / p.servo_step)
+    count = (steps + 1) * per
+    tilt, rate, _, _ = s.joints(theta)
+    edges = s.t[starts][:, None] + p.servo_step * np.arange(count + 1)
+    index = np.clip(np.rint((edges[:, :-1] - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
+    windows = Windows(tilt[starts], rate[starts], s.thrust(theta)[0][index].transpose(1, 0, 2),
+                      module_load(s, theta)[index].transpose(1, 0, 2),
+                      spin_load(s, theta)[index].transpose(1, 0, 2), p.servo_step, 0, per)
+    targets = s.tilt_targets(edges.ravel(), s.delays(theta)[0])
+    targets = np.concatenate([targets, targets[-1:]]).reshape(*edges.shape, 4)[:, :-1]
+    run = simulate(model.robot.joints, windows, targets.transpose(1, 0, 2)[None], [theta],
+                   {**model._own, 'modules': model.modules})[0].transpose(1, 0, 2)
+    return run, np.gradient(run, p.grid, axis=1)
+
+
+def _turned(quaternion, vector):
+    """Quaternions (N, 4) followed by turns (N, 3) of the body."""
+    half = 0.5 * vector
+    x, y, z, w = quaternion.T
+    a, b, c = half.T
+    made = np.stack([x + w * a + y * c - z * b, y + w * b - x * c + z * a,
+                     z + w * c + x * b - y * a, w - x * a - y * b - z * c], axis=1)
+    return made / np.linalg.norm(made, axis=1, keepdims=True)
+
+
+def _regimes(inputs, grid):
+    """What each run mostly does: rotate, near ground, translate, tilted or hover."""
+    speed = np.linalg.norm(inputs['velocity'], axis=1)[grid].mean(axis=1)
+    turn = np.linalg.norm(inputs['rate'], axis=1)[grid].mean(axis=1)
+    tilt = np.abs(inputs['tilt']).max(axis=1)[grid].mean(axis=1)
+    low = inputs['position'][:, 2][grid].min(axis=1) < 0.6
+    names = np.full(len(grid), 'hover', dtype=object)
+    names[tilt > 1.0] = 'tilted'
+    names[speed > 0.4] = 'translate'
+    names[low] = 'near ground'
+    names[turn > 0.8] = 'rotate'
+    return names
+
+
+def regimes_at(model: FlightModel, times: np.ndarray) -> np.ndarray:
+    """Regime of the flight at each time (n,)."""
+    inputs = model.inputs({})
+    index = np.clip(np.rint((times - model.signals.t[0]) / model.p.grid).astype(int), 0,
+                    len(model.signals.t) - 1)
+    return _regimes(inputs, index[:, None])
+
+
+def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
+    """(H, 5) errors that a perfect model would show."""
+    pose, gravity = model.flight.pose, model.robot.gravity
+    third = np.diff(pose, 3, axis=0)
+    seen = np.median(np.abs(third), axis=0) / 0.6745 / np.sqrt(20)
+    position = float(np.sqrt((seen[:3]**2).sum()))
+    angle = 2 * float(np.sqrt((seen[3:]**2).sum()))
+    rate = model.flight.imu[:, 3:]
+    gyro = float(np.sqrt(((np.median(np.abs(np.diff(rate, 3, axis=0)), axis=0) / 0.6745)**2
+                          / 20).sum()))
+    # Readings at 100 Hz, interpolated to the fine grid: neighbours share their noise.
+    share = np.sqrt(2 * FINE / np.median(np.diff(model.flight.imu_t)) if False else 2.0)
+    slope = low_pass(SMOOTH_POSE, 1, FINE)
+    velocity0 = position * share * np.linalg.norm(
+        slope(np.eye(1, 4 * slope.margin + 1, 2 * slope.margin)[0], 1))
+    smooth = low_pass(SMOOTH_IMU, 1, FINE)
+    rate0 = gyro * np.linalg.norm(smooth.taps)
+    angle0 = angle * share * np.linalg.norm(low_pass(10.0, 1, FINE).taps)
+    push = _pushed(noise, model.p)
+    floors = []
+    for k, horizon in enumerate(HORIZONS):
+        floors.append([
+            2 * position**2 + (horizon * velocity0)**2 + (gravity * horizon**2 / 2 * angle0)**2
+            + push[k][0]**2,
+            2 * velocity0**2 + (gravity * horizon * angle0)**2 + push[k][1]**2,
+            2 * angle0**2 + (horizon * rate0)**2 + push[k][2]**2,
+            2 * rate0**2 + push[k][3]**2,
+            4 * float(np.mean(noise.sigma['J']))**2])
+    return np.maximum(np.sqrt(floors), LEAST)
+
+
+def _pushed(noise, p):
+    """Displacement, speed, angle and rate that the unpredictable forces of the fit make."""
+    h = p.grid * p.body_every
+    count = round(HORIZONS[-1] / h)
+    rng = np.random.default_rng(0)
+    once, twice = [], []
+    for c in range(6):
+        drive = noise.sigma['B'][c] * rng.standard_normal((DRAWS, count + 60))
+        pushed = lfilter([1.0], noise.taps['B'][c], drive, axis=1)[:, 60:]
+        speed = np.cumsum(pushed, axis=1) * h
+        once.append(speed)
+        twice.append(np.cumsum(speed, axis=1) * h)
+    made = []
+    for horizon in HORIZONS:
+        k = round(horizon / h) - 1
+        made.append([float(np.sqrt(sum((x[:, k]**2).mean() for x in part)))
+                     for part in (twice[:3], once[:3], twice[3:], once[3:])])
+    return made
+
+
+def gap(runs: list[Runs], horizon: int, rows: str | None = None,
+        floors: np.ndarray | None = None) -> float:
+    """
+    Root mean square over states of error over floor, at one horizon; 1 is nothing but noise.
+
+    Args:
+        runs: of all flights.
+        horizon: index into HORIZONS.
+        rows: regime to look at; default all.
+        floors: (H, 5) in place of each flight's own.
+
+    """
+    parts = []
+    for run in runs:
+        keep = np.ones(len(run.regime), bool) if rows is None else run.regime == rows
+        if keep.any():
+            floor = run.floor if floors is None else floors
+            parts.append((run.error[horizon][keep] / floor[horizon])**2)
+    if not parts:
+        return float('nan')
+    return float(np.sqrt(np.concatenate(parts).mean()))

@@ -1,0 +1,302 @@
+"""Forward addition and backward removal of entries, each step judged on unseen blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
+from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
+from beetle_omni_ros.identify.gap.gauge import handed_over
+from beetle_omni_ros.identify.gap.keys import SHAPES
+from beetle_omni_ros.identify.gap.trial import Found, Trial
+
+REFINED = 5             # candidates of each step that are fitted, not only estimated
+PROMISING = 0.25        # of the best linear gain
+PROMISING_CURVED = 0.1  # likewise, of those that a straight line cannot judge
+MOST_TURNS = 4          # of fresh slopes, while a fit runs away from them
+FAR = 0.2               # typical sizes of a curved number
+LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
+WIDE = 4.0              # typical sizes, within which anything is sought
+
+
+
+class Search:
+    """
+    A search over one problem.
+
+    Args:
+        problem: flights, beliefs, noise.
+        candidates: that may be accepted.
+        progress: called with a short text at each stage.
+
+    """
+
+    def __init__(self, problem: Problem, candidates: list[Candidate],
+                 progress: Callable[[str], None] = lambda text: None):
+        """See the class."""
+        self.problem, self.candidates, self.progress = problem, candidates, progress
+        self.p = problem.p
+        self.names = [name for name, key in problem.keys.items() if key.parameter not in SHAPES]
+        self.wide = {name: WIDE * problem.keys[name].typical for name in self.names}
+        self.always = [name for name in problem.beliefs if name in problem.keys]
+
+    def run(self) -> Found:
+        """Search; see the module."""
+        found, problem = Found(), self.problem
+        self.progress('noise')
+        problem.state({}, self.names)
+        state, cost = self._settle({}, [])
+        found.base = dict(state.theta)
+        while True:
+            self.progress(f'step {len(found.accepted) + 1}')
+            floor = self._floor(state)
+            trials = self._step(state, cost, [t.candidate for t in found.accepted])
+            for trial in trials:
+                found.trials[trial.candidate.label] = trial
+            best = self._judge(trials, cost, floor, [t.candidate for t in found.accepted])
+            if best is None or len(found.accepted) >= self.p.most_effects:
+                break
+            found.accepted.append(best)
+            state, cost = self._settle(best.theta, [t.candidate for t in found.accepted])
+        state, cost = self._prune(found, state, cost)
+        found.theta, found.state = dict(state.theta), state
+        base_state, before = self._refit(State(found.base, problem.residual(found.base),
+                                               state.slopes, state.names), [])
+        found.base = dict(base_state.theta)
+        found.cost = (before, cost, self._floor(state))
+        self.progress('rivals')
+        self._find_rivals(found, state, cost)
+        return found
+
+    def _free(self, accepted):
+        return frozenset(name for c in accepted for name in c.keys)
+
+    def _involved(self, accepted):
+        return list(dict.fromkeys([*self.always, *(n for c in accepted for n in c.keys)]))
+
+    def _refit(self, state, accepted, iterations=3):
+        return self.problem.refine(state, self._involved(accepted), self._free(accepted),
+                                   iterations)
+
+    def _settle(self, theta, accepted):
+        """Noise and fit in turn, and fresh slopes of everything at the point reached."""
+        problem = self.problem
+        at = dict(theta)
+        if theta:
+            problem.state(theta, self.names)
+        state = problem.learn_noise(self.wide)
+        for _ in range(MOST_TURNS):
+            state, _ = self._refit(state, accepted)
+            if not self._far(at, state.theta):
+                problem.renew(state.theta)
+                break
+            at = dict(state.theta)
+            problem.state(at, self.names)
+            state = problem.learn_noise(self.wide, 2)
+        state = problem.learn_noise(self.wide, 2)
+        return self._refit(state, accepted, 2)
+
+    def _far(self, a, b):
+        """Whether slopes taken at one point are of little use at the other."""
+        return any(abs(a.get(name, 0.0) - b.get(name, 0.0)) > FAR * self.problem.keys[
+            name].typical for name in {*a, *b} if self.problem.keys[name].parameter in CURVED)
+
+    def _floor(self, state):
+        """Objective of a straight-line fit of everything at once."""
+        step = self.problem._solve_all(state, self.wide)
+        rest = state.r + state.slopes @ step
+        moved = {n: state.theta.get(n, 0.0) + d for n, d in zip(state.names, step, strict=True)}
+        return float(rest @ rest) + self.problem.prior(
+            moved, frozenset(n for n in moved if n not in self.problem.beliefs))
+
+    def _step(self, state, cost, accepted):
+        """Trials of all candidates beside the accepted ones, the best of them fitted."""
+        problem, involved, free = self.problem, self._involved(accepted), self._free(accepted)
+        taken = {c.label for c in accepted}
+        h, g = state.slopes.T @ state.slopes, state.slopes.T @ state.r
+        chi2, trials, points = float(state.r @ state.r), [], {}
+        for c in self.candidates:
+            if c.label in taken or any(key in free for key in c.keys):
+                continue
+            names = list(dict.fromkeys([*involved, *c.keys]))
+            if c.starts or c.fixed:
+                trial, point = self._elsewhere(state, cost, c, names, free)
+            else:
+                index = [state.index[name] for name in names]
+                theta = handed_over(state.theta, c)
+                step, reached, _ = problem.solve(theta, names, free | set(c.keys),
+                                                 h[np.ix_(index, index)], g[index], chi2)
+                trial = Trial(c, cost - reached, problem._moved(theta, names, step))
+                point = state if theta is state.theta else State(
+                    theta, problem.residual(theta), state.slopes, state.names)
+            trials.append(trial)
+            points[c.label] = point
+        trials.sort(key=lambda t: -t.gain)
+        best = max(trials[0].gain, 1.0) if trials else 1.0
+        count = 0
+        for k, trial in enumerate(trials):
+            c = trial.candidate
+            curved = any(problem.keys[n].parameter in CURVED for n in c.keys)
+            if trial.gain < (PROMISING_CURVED if curved else PROMISING) * best \
+                    or trial.gain < 0.5 * self.p.least_gain or count >= REFINED + 3:
+                continue
+            if count >= REFINED and not curved:
+                continue
+            count += 1
+            names = list(dict.fromkeys([*involved, *c.keys]))
+            new, reached = problem.refine(points[c.label], names, free | set(c.keys), 4)
+            trials[k] = Trial(c, cost - reached, dict(new.theta), True)
+            points[c.label] = new
+        trials.sort(key=lambda t: -t.gain)
+        self._points = points
+        return trials
+
+    def _elsewhere(self, state, cost, c, names, free):
+        """A candidate whose slopes must be taken somewhere else than at zero."""
+        best = None
+        for start in c.starts or ((0.0,) * len(c.keys),):
+            theta = {**state.theta, **c.fixed, **dict(zip(c.keys, start, strict=True))}
+            moved = any(start)
+            r = self.problem.residual(theta) if moved else state.r
+            fresh = np.concatenate([self.problem.noise.whiten(m.slopes(theta, list(c.keys)))
+                                    for m in self.problem.models])
+            slopes = state.slopes.copy()
+            slopes[:, [state.index[name] for name in c.keys]] = fresh
+            point = State(theta, r, slopes, state.names)
+            step, reached, _ = self.problem.linear_step(point, names, free | set(c.keys))
+            # A straight line must not promise what the point itself shows it has not.
+            actual = cost - float(r @ r) - self.problem.prior(theta, free | set(c.keys))
+            gain = cost - reached
+            if c.name in LIMITS:
+                gain = min(gain, max(actual, 0.0) + 0.5 * max(gain, 0.0))
+            if best is None or gain > best[0].gain:
+                best = Trial(c, gain, self.problem._moved(theta, names, step)), point
+        return best
+
+    def _judge(self, trials, cost, floor, accepted):
+        """The first trial that passes every gate; the others get their reason."""
+        chosen, p = None, self.p
+        names_taken = {(c.name, c.member) for c in accepted}
+        for trial in trials:
+            c = trial.candidate
+            need = p.least_gain + p.parameter_price * (len(c.keys) - 1)
+            trial.share = trial.gain / max(cost - floor, trial.gain, 1e-9)
+            if trial.gain < need:
+                trial.reason = 'explains too little'
+            elif not trial.refined:
+                trial.reason = 'others explain more'
+            elif not c.large_enough(self.problem.keys, trial.theta):
+                trial.reason = 'too small to matter'
+            elif (c.name, c.member) in names_taken:
+                trial.reason = 'named already'
+            elif self._at_bound(trial):
+                trial.reason = 'beyond what is physical'
+            elif chosen is not None:
+                trial.reason = 'others explain more'
+            else:
+                self._cross_validate(trial, accepted)
+                sure = trial.cross[0] > 3 * trial.cross[1] and trial.positive >= 0.7
+                if not self._holds(trial):
+                    trial.reason = 'does not hold on data left out'
+                elif trial.share < p.least_share and not (
+                        sure and trial.share > p.weak_share):
+                    trial.reason = 'explains too small a part of what is left'
+                else:
+                    chosen = trial
+        return chosen
+
+    @staticmethod
+    def _holds(trial):
+        """Whether blocks that were left out agree."""
+        sure = trial.cross[0] >= 2 * trial.cross[1] or trial.positive >= 0.85
+        return sure and trial.cross[0] >= 0.3 * trial.gain and trial.positive >= 0.55 \
+            and trial.without_best >= max(0.05 * trial.cross[0], LEAST_ELSEWHERE)
+
+    def _at_bound(self, trial):
+        keys = self.problem.keys
+        for name in trial.candidate.keys:
+            x, key = trial.theta.get(name, 0.0), keys[name]
+            if x <= key.low or x >= key.high:
+                if not (x <= key.low and key.low == 0.0):   # zero is a bound of a friction, too
+                    return True
+        return False
+
+    def _cross_validate(self, trial, accepted):
+        """Gain on each block, with all numbers fitted to the others."""
+        problem, c = self.problem, trial.candidate
+        point = self._points[c.label]
+        free = self._free(accepted)
+        with_it = list(dict.fromkeys([*self._involved(accepted), *c.keys]))
+        without = [name for name in with_it if name not in c.keys or name in problem.beliefs]
+        zero = dict.fromkeys(c.keys, 0.0)
+        other = State({**point.theta, **zero}, problem.residual({**point.theta, **zero}),
+                      point.slopes, point.names)
+        held = np.zeros(problem.blocks)
+        for names, at, loose, sign in ((with_it, point, free | set(c.keys), -1.0),
+                                       (without, other, free, 1.0)):
+            columns = [at.index[name] for name in names]
+            s = at.slopes[:, columns]
+            per = [(s[rows].T @ s[rows], s[rows].T @ at.r[rows], float(at.r[rows] @ at.r[rows]))
+                   for rows in (problem.block == b for b in range(problem.blocks))]
+            total = [sum(part[k] for part in per) for k in range(3)]
+            for b, (h, g, chi2) in enumerate(per):
+                step, _, _ = problem.solve(at.theta, names, loose, total[0] - h, total[1] - g,
+                                           total[2] - chi2)
+                belief = problem.prior(problem._moved(at.theta, names, step), loose)
+                held[b] += sign * (chi2 + 2 * g @ step + step @ h @ step
+                                   + belief / problem.blocks)
+        error = float(held.std(ddof=1) * np.sqrt(len(held))) if len(held) > 1 else np.inf
+        trial.cross = float(held.sum()), error
+        trial.positive = float((held > 0).mean())
+        trial.without_best = float(held.sum() - held.max()) if len(held) > 1 else 0.0
+
+    def _prune(self, found, state, cost):
+        """Drop what later steps have made superfluous."""
+        while len(found.accepted) > 1:
+            losses = []
+            for trial in found.accepted:
+                rest = [t.candidate for t in found.accepted if t is not trial]
+                zero = {n: 0.0 for n in trial.candidate.keys
+                        if n not in self.problem.beliefs}
+                theta = {**state.theta, **zero}
+                start = State(theta, self.problem.residual(theta), state.slopes, state.names)
+                _, reached = self._refit(start, rest, 2)
+                losses.append(reached - cost)
+            weakest = int(np.argmin(losses))
+            small = not found.accepted[weakest].candidate.large_enough(self.problem.keys,
+                                                                       state.theta)
+            if losses[weakest] > self.p.least_gain and not small:
+                break
+            dropped = found.accepted.pop(weakest)
+            dropped.reason = 'superfluous beside the others'
+            kept = [t.candidate for t in found.accepted]
+            theta = {n: v for n, v in state.theta.items()
+                     if n not in dropped.candidate.keys or n in self.problem.beliefs}
+            state, cost = self._settle(theta, kept)
+        return state, cost
+
+    def _find_rivals(self, found, state, cost):
+        """Exchange each accepted entry for others; what does as well makes a set with it."""
+        for trial in found.accepted:
+            others = [t.candidate for t in found.accepted if t is not trial]
+            own = trial.candidate
+            zero = dict.fromkeys(own.keys, 0.0)
+            theta = {**state.theta, **zero}
+            start = State(theta, self.problem.residual(theta), state.slopes, state.names)
+            start, without = self._refit(start, others, 2)
+            gain = without - cost
+            margin = max(self.p.rival_gain, self.p.rival_share * gain)
+            near = []
+            for other in self._step(start, without, others):
+                if other.candidate.name == own.name and other.candidate.member == own.member:
+                    continue
+                if not (other.refined and other.gain > gain - margin) or self._at_bound(other) \
+                        or not other.candidate.large_enough(self.problem.keys, other.theta):
+                    continue
+                self._cross_validate(other, others)
+                if self._holds(other):
+                    near.append(other)
+            trial.gain = gain
+            found.rivals[own.label] = near

@@ -1,0 +1,239 @@
+"""What a flight's measurements say of its state, given timing and mounting of the sensors."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
+
+from beetle_omni_ros.identify.gap.filters import low_pass
+from beetle_omni_ros.identify.gap.ingest import Flight
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+FINE = 0.005            # [s] grid on which measurements are smoothed
+SMOOTH_IMU, SMOOTH_JOINT, SMOOTH_POSE = 22.0, 20.0, 6.0     # [Hz] of the model's inputs
+# The IMU's clock is everybody's: what it is late by, all else is early by. Shifting the IMU itself
+# would sample its noise elsewhere, which changes chi2 by more than a delay is worth.
+IMU_LAG = 'imu_filter_lag.delay'
+EDGE = 1.0              # [s] at both ends that smoothing and history need
+
+
+def turn(vector):
+    """(3, 3) rotation by a rotation vector [rad]."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = np.asarray(vector, dtype=float)
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    if angle < 1e-9:
+        return np.eye(3) + k
+    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * k @ k
+
+
+def matrices(q):
+    """(N, 3, 3) rotations of unit quaternions (N, 4) xyzw."""
+    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                     [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                     [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
+                    ).transpose(2, 0, 1)
+
+
+class Signals:
+    """
+    Series of one flight on the common grid, remade only where a fit's numbers change them.
+
+    Args:
+        flight: checked measurements.
+        robot: as believed.
+        p: parameters.
+
+    Attributes:
+        t: (N,) grid [s].
+
+    """
+
+    def __init__(self, flight: Flight, robot: RobotParameters, p: GapParameters):
+        """Splines and integrals that all evaluations share."""
+        self.flight, self.robot, self.p = flight, robot, p
+        steps = int((flight.duration - 2 * EDGE) / p.grid)
+        self.t = EDGE + p.grid * np.arange(steps)
+        self._ratio = round(p.grid / FINE)
+        pad = 0.5
+        self._fine = np.arange(EDGE - pad, self.t[-1] + pad + FINE / 2, FINE)
+        self._lead = round(pad / FINE)
+        # Not straight lines: between two readings those would halve the noise's power, and a fit
+        # would shift the IMU to where that pays.
+        self._imu = CubicSpline(*_filled(*_spread(flight.imu_t, flight.imu)))
+        self._pose = CubicSpline(*_filled(*_spread(flight.pose_t, flight.pose)))
+        self._joint = CubicSpline(*_filled(*_spread(flight.joint_t, flight.joint)))
+        self._command_t, command = _spread(flight.command_t, flight.command)
+        self._command = command
+        limit = robot.joints.position_limit
+        self._tilt_integral = _integral(self._command_t, np.clip(command[:, :4], -limit, limit))
+        full = robot.battery.full_voltage
+        self.voltage = np.interp(self.t, flight.battery_t, flight.battery[:, 0]) / full \
+            if len(flight.battery_t) > 1 else np.ones(len(self.t))
+        if not (0.5 < self.voltage.min() and self.voltage.max() < 1.5):
+            self.voltage = np.ones(len(self.t))
+        self._kept: dict = {}
+
+    def _cached(self, what, theta, names, make):
+        key = (what, tuple(theta.get(name, 0.0) for name in names))
+        if key not in self._kept:
+            if len(self._kept) > 60:
+                for old in list(self._kept)[:30]:
+                    del self._kept[old]
+            self._kept[key] = make()
+        return self._kept[key]
+
+    def _smooth(self, fine, edge, derivative=0):
+        """Fine series (M, ...) at the common grid."""
+        kernel = low_pass(edge, 1, FINE)
+        y = kernel(fine, derivative)
+        first = self._lead - kernel.margin
+        return y[first:first + self._ratio * len(self.t):self._ratio]
+
+    def imu(self, theta):
+        """Specific force, rates and their derivative (N, 3) each, of base_link."""
+        names = [f'{e}[{k}]' for e in (
+            'imu_accelerometer_bias.bias', 'imu_gyroscope_bias.bias',
+            'imu_misalignment.rotation', 'imu_lever_arm.offset') for k in range(3)]
+        values = np.array([theta.get(name, 0.0) for name in names])
+
+        def make():
+            fine = self._imu(np.clip(self._fine, self.flight.imu_t[0],
+                                     self.flight.imu_t[-1])) - values[:6]
+            force, rate = (self._smooth(fine[:, part], SMOOTH_IMU)
+                           for part in (slice(0, 3), slice(3, 6)))
+            turning = self._smooth(fine[:, 3:], SMOOTH_IMU, 1)
+            if values[6:9].any():
+                rotation = turn(values[6:9]).T
+                force, rate, turning = force @ rotation, rate @ rotation, turning @ rotation
+            if values[9:].any():
+                lever = values[9:]
+                force = force - np.cross(turning, lever) - np.cross(rate, np.cross(rate, lever))
+            return force, rate, turning
+        return self._cached('imu', theta, names, make)
+
+    def pose(self, theta):
+        """Position (N, 3) raw, quaternion (N, 4), velocity (N, 3) in world."""
+        names = ['mocap_time_offset.delay', IMU_LAG, *(f'mocap_misalignment.rotation[{k}]'
+                                              for k in range(3))]
+        values = [theta.get(name, 0.0) for name in names]
+
+        def make():
+            fine = self._pose(np.clip(self._fine + values[0] - values[1], self.flight.pose_t[0],
+                                      self.flight.pose_t[-1]))
+            position = fine[self._lead::self._ratio][:len(self.t), :3]
+            velocity = self._smooth(fine[:, :3], SMOOTH_POSE, 1)
+            quaternion = self._smooth(fine[:, 3:], 10.0)
+            quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+            if any(values[2:]):
+                quaternion = _times(quaternion, -np.array(values[2:]))
+            return position, quaternion, velocity
+        return self._cached('pose', theta, names, make)
+
+    def joints(self, theta):
+        """Angle, rate, acceleration (N, 4) of the tilts, and the raw reading (N, 4)."""
+        names = ['joint_feedback_delay.delay', 'joint_backlash.gap', IMU_LAG]
+        delay, gap, late = (theta.get(name, 0.0) for name in names)
+
+        def make():
+            fine = self._joint(np.clip(self._fine + delay - late, self.flight.joint_t[0],
+                                       self.flight.joint_t[-1]))
+            raw = fine[self._lead::self._ratio][:len(self.t)]
+            if gap > 0:
+                fine = _play(fine, gap / 2)
+            return tuple(self._smooth(fine, SMOOTH_JOINT, k) for k in range(3)) + (raw,)
+        return self._cached('joints', theta, names, make)
+
+    def delays(self, theta):
+        """Delays of tilt and thrust commands [s]."""
+        split, common = theta.get('base.split', 0.0), theta.get('base.delay', 0.0)
+        common += self.p.command_delay + theta.get('command_latency.delay', 0.0) \
+            + theta.get(IMU_LAG, 0.0)
+        tilt, thrust = self.robot.command_delays
+        return (tilt + common + split / 2 + theta.get('joint_command_latency.delay', 0.0),
+                thrust + common - split / 2 + theta.get('rotor_dead_time.delay', 0.0))
+
+    def thrust(self, theta):
+        """Thrusts after delay, limits and lag, and their rates of change (N, 4)."""
+        names = ['rotor_lag.time_constant', 'thrust_saturation.thrust_max']
+        lag, limit = (theta.get(name, 0.0) for name in names)
+        delay = self.delays(theta)[1]
+
+        def make():
+            rotors, h = self.robot.rotors, FINE / 2
+            # The file's own limit cuts no earlier than commands are: it is the command's.
+            most = rotors.thrust_max * np.exp(limit) if limit else np.inf
+            asked = np.clip(self._command[:, 4:], rotors.thrust_min, most)
+            tau = rotors.time_constant * np.exp(lag)
+            begin = self._fine[0] - 0.9
+            count = round((self.t[-1] - begin) / h) + 2
+            edges = begin + h * np.arange(count + 1)
+            mean = np.diff(_at(edges - delay, self._command_t, *_integral(
+                self._command_t, asked)), axis=0) / h
+            keep = np.exp(-h / tau)
+            first = mean[:1]
+            lagged, _ = lfilter([1 - keep], [1, -keep], mean, axis=0, zi=keep * first)
+            places = np.rint((self.t - begin) / h).astype(int) - 1
+            force = lagged[places]
+            return force, (mean[places + 1] - force) / tau
+        return self._cached(('thrust', delay), theta, names, make)
+
+    def tilt_targets(self, edges, delay):
+        """(K, 4) mean tilt commands between ``edges`` (K + 1,) [s], acting after ``delay``."""
+        integral = _at(edges - delay, self._command_t, *self._tilt_integral)
+        return np.diff(integral, axis=0) / np.diff(edges)[:, None]
+
+
+def _spread(t, values):
+    """Stamps at least a tenth of the usual step apart, so that splines stay tame."""
+    usual = np.median(np.diff(t))
+    keep, last = [], -np.inf
+    for k, at in enumerate(t):
+        if at - last > 0.1 * usual:
+            keep.append(k)
+            last = at
+    return t[keep], values[keep]
+
+
+def _filled(t, values):
+    """Straight lines across gaps, where a spline would swing."""
+    usual = np.median(np.diff(t))
+    gaps = np.flatnonzero(np.diff(t) > 2.5 * usual)
+    if not len(gaps):
+        return t, values
+    more = np.concatenate([np.arange(t[k] + usual, t[k + 1] - usual / 2, usual) for k in gaps])
+    at = np.sort(np.concatenate([t, more]))
+    return at, np.stack([np.interp(at, t, column) for column in values.T], axis=1)
+
+
+def _integral(t, values):
+    """Held values, and their integral at ``t``."""
+    steps = np.diff(t)[:, None] * values[:-1]
+    return values, np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+
+
+def _at(times, t, values, integral):
+    row = np.clip(np.searchsorted(t, times, side='right') - 1, 0, len(t) - 1)
+    return integral[row] + (times - t[row])[:, None] * values[row]
+
+
+def _times(quaternion, vector):
+    """Quaternions (N, 4) xyzw, each followed by a small turn of the body [rad]."""
+    angle = np.linalg.norm(vector)
+    x2, y2, z2 = vector / angle * np.sin(angle / 2)
+    w2 = np.cos(angle / 2)
+    x, y, z, w = quaternion.T
+    return np.stack([w * x2 + x * w2 + y * z2 - z * y2, w * y2 - x * z2 + y * w2 + z * x2,
+                     w * z2 + x * y2 - y * x2 + z * w2, w * w2 - x * x2 - y * y2 - z * z2], axis=1)
+
+
+def _play(x, half):
+    """Output (N, n) of a play of +-``half`` behind each column."""
+    out, y = np.empty_like(x), x[0].copy()
+    for k, row in enumerate(x):
+        y = np.minimum(np.maximum(y, row - half), row + half)
+        out[k] = y
+    return out

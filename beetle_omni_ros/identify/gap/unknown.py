@@ -1,0 +1,168 @@
+"""What no catalogue entry explains: whether it repeats, and what it goes with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from beetle_omni_ros.identify.gap.fit import Problem, State
+from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel, THIN
+from beetle_omni_ros.identify.gap.signals import matrices
+
+RIDGE = 3.0             # of a whitened and scaled regression
+TERMS_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """
+    Result of the generic regression.
+
+    Attributes:
+        gain: of chi2 on blocks left out, by group of channels.
+        positive: part of the blocks that gain.
+        channels: (name, gain) of those that gain, most first.
+        terms: (feature, gain) that describe it best, most first.
+        frame: 'world', 'body', 'rotor' or 'joint'.
+        size: channel -> root mean square of what repeats, in the channel's unit.
+
+    """
+
+    gain: float
+    positive: float
+    channels: list[tuple[str, float]]
+    terms: list[tuple[str, float]]
+    frame: str
+    size: dict[str, float]
+
+    @property
+    def text(self) -> str:
+        """One sentence."""
+        where = ', '.join(name for name, _ in self.channels[:3]) or 'no channel'
+        what = ', '.join(name for name, _ in self.terms[:TERMS_SHOWN]) or 'nothing tried'
+        return (f'repeatable in {where}; it goes with {what} ({self.frame} frame); it gains '
+                f'{self.gain:.0f} of chi2 on data left out')
+
+
+def features(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarray]:
+    """Generic regressors (N,) on the common grid, by 'frame: name'."""
+    x = model.inputs(theta)
+    rotation, made = matrices(x['quaternion']), {}
+    body = np.einsum('nji,nj->ni', rotation, x['velocity'])
+    place = x['position'] - [0.0, 0.0, 1.0]
+    axes = 'xyz'
+    for k in range(3):
+        made[f'body: v_{axes[k]}'] = body[:, k]
+        made[f'body: |v| v_{axes[k]}'] = np.linalg.norm(body, axis=1) * body[:, k]
+        made[f'body: w_{axes[k]}'] = x['rate'][:, k]
+        for j in range(3):
+            part = rotation[:, j, k]
+            made[f'world: R_{axes[j]}{axes[k]}'] = part
+            for i in range(3):
+                made[f'world: {axes[i]} R_{axes[j]}{axes[k]}'] = place[:, i] * part
+                made[f'world: {axes[i]}^2 R_{axes[j]}{axes[k]}'] = place[:, i]**2 * part
+    for i in range(4):
+        made[f'rotor: f_{i + 1}'] = x['thrust'][:, i]
+        made[f'rotor: f_{i + 1}^2'] = x['thrust'][:, i]**2 / 10
+        made[f'rotor: df_{i + 1}/dt'] = x['thrust_rate'][:, i] / 10
+        for name, function in (('sin', np.sin), ('cos', np.cos)):
+            angle = function(x['tilt'][:, i])
+            made[f'rotor: {name} q_{i + 1}'] = angle
+            made[f'rotor: f_{i + 1} {name} q_{i + 1}'] = x['thrust'][:, i] * angle
+            made[f'rotor: f_{i + 1} {name} 2q_{i + 1}'] = x['thrust'][:, i] * function(
+                2 * x['tilt'][:, i])
+        made[f'joint: dq_{i + 1}/dt'] = x['tilt_rate'][:, i]
+    made['rotor: voltage'] = 10 * (x['voltage'] - x['voltage'].mean())
+    return made
+
+
+def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
+    """
+    Regress what is left on generic features, and judge on blocks left out.
+
+    Args:
+        problem: flights and noise.
+        state: the final fit.
+        names: keys that were fitted; their slopes are taken out first.
+
+    """
+    labels, columns = None, []
+    for model in problem.models:
+        made = features(model, state.theta)
+        labels = labels or list(made)
+        columns.append(np.stack(list(made.values()), axis=1))
+    gains, total = {}, np.zeros(problem.blocks)
+    best: dict[str, float] = {}
+    size: dict[str, float] = {}
+    channel = 0
+    fitted = state.slopes[:, [state.index[n] for n in names]]
+    for group, taps in problem.noise.taps.items():
+        for k in range(len(taps)):
+            rows = problem.where == channel
+            channel += 1
+            if group in 'AW':
+                continue
+            both = [_whitened(problem, model, group, k, made)
+                    for model, made in zip(problem.models, columns, strict=True)]
+            x, smooth = (np.concatenate([pair[i] for pair in both]) for i in (0, 1))
+            held, scores, weights = _cross(x, fitted[rows], state.r[rows], problem.block[rows],
+                                           problem.blocks)
+            name = CHANNELS[group][k]
+            size[name] = float(np.sqrt(((smooth @ weights)**2).mean()))
+            gains[name] = float(held.sum())
+            if held.sum() > 0:
+                total += held
+                for label, score in zip(labels, scores, strict=True):
+                    best[label] = best.get(label, 0.0) + score
+    channels = sorted(((n, g) for n, g in gains.items() if g > 10), key=lambda ng: -ng[1])
+    terms = sorted(best.items(), key=lambda lg: -lg[1])[:TERMS_SHOWN]
+    frame = terms[0][0].partition(':')[0] if terms else 'body'
+    return Remainder(float(total.sum()), float((total > 0).mean()), channels,
+                     [(label.partition(': ')[2], g) for label, g in terms], frame, size)
+
+
+def _whitened(problem, model, group, channel, columns):
+    """Features as they would appear in one channel's residual, whitened and not."""
+    if group == 'J':
+        first, count = model._starts[0], model._length * len(model._starts)
+        columns = columns[first:first + count]
+    elif group == 'B':
+        columns = columns[::THIN]
+    smooth = model.filters[group](columns)
+    if group == 'B':
+        smooth = model._mask[:, None] * smooth
+    tap = problem.noise.taps[group][channel]
+    white = lfilter(tap, 1.0, smooth, axis=0)[len(tap) - 1:] / problem.noise.sigma[group][channel]
+    return white, smooth[len(tap) - 1:]
+
+
+def _cross(x, fitted, r, block, blocks):
+    """
+    A ridge regression, judged on blocks left out.
+
+    Returns:
+        gain of chi2 on each block, score of each feature, weights of the whole fit.
+
+    """
+    scale = np.sqrt((x**2).mean(axis=0)) + 1e-12
+    x = x / scale
+    used = (fitted**2).sum(axis=0) > 1e-6
+    basis = np.linalg.qr(fitted[:, used])[0] if used.any() else np.zeros((len(r), 0))
+    x, r = x - basis @ (basis.T @ x), r - basis @ (basis.T @ r)
+    weight = np.sqrt((x**2).mean(axis=0))
+    x = x[:, weight > 0.05]
+    h = [x[block == b].T @ x[block == b] for b in range(blocks)]
+    g = [x[block == b].T @ r[block == b] for b in range(blocks)]
+    all_h, all_g = sum(h), sum(g)
+    ridge = RIDGE * np.trace(all_h) / max(len(all_h), 1) / 100 * np.eye(len(all_h))
+    held = np.zeros(blocks)
+    for b in range(blocks):
+        w = np.linalg.solve(all_h - h[b] + ridge, all_g - g[b])
+        held[b] = 2 * g[b] @ w - w @ h[b] @ w
+    scores = np.zeros(len(weight))
+    scores[weight > 0.05] = all_g**2 / np.maximum(np.diag(all_h), 1e-9)
+    weights = np.zeros(len(weight))
+    weights[weight > 0.05] = np.linalg.solve(all_h + ridge, all_g)
+    return held, scores, weights / scale

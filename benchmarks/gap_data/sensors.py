@@ -1,0 +1,135 @@
+"""From truth to what the sensors report, with the stamps that they put on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import bessel, butter, lfilter, lfilter_zi
+from scipy.spatial.transform import Rotation
+
+from gap_data.flight import Truth
+from gap_data.hidden import Hidden
+
+
+@dataclass
+class Recording:
+    """
+    Everything that a bag of one flight holds; times in seconds since the flight began.
+
+    Attributes:
+        imu: (N, 7) stamp, specific force (3), angular rate (3).
+        mocap: (N, 8) stamp, position (3), quaternion x y z w.
+        joints: (N, 9) stamp, position (4), velocity (4).
+        battery: (N, 3) stamp, voltage, current (negative when discharging).
+        commands: (N, 9) stamp, tilt (4), thrust (4).
+        targets: (stamp, position, quaternion x y z w) of new target poses.
+        ages: seconds from stamp to arrival by the names above.
+
+    """
+
+    imu: np.ndarray
+    mocap: np.ndarray
+    joints: np.ndarray
+    battery: np.ndarray
+    commands: np.ndarray
+    targets: list
+    ages: dict[str, float]
+
+
+def measure(truth: Truth, hidden: Hidden, numbers: dict, rng: np.random.Generator, *,
+            noise: dict[str, float], shape: str = 'plain') -> Recording:
+    """
+    Sample one flight.
+
+    Args:
+        truth: of the flight.
+        hidden: sensor and timing effects.
+        numbers: see ``numbers.yaml``.
+        rng: of the noise.
+        noise: standard deviations: accelerometer, gyroscope, position, orientation, tilt.
+        shape: of the IMU's filter: 'plain' Bessel, 'butterworth'.
+
+    """
+    settings = numbers['sensors']
+    commands = np.column_stack([truth.command_t, truth.command_tilt, truth.command_thrust])
+    return Recording(
+        _imu(truth, hidden, settings, rng, noise, shape),
+        _mocap(truth, hidden, settings, rng, noise),
+        _joints(truth, hidden, settings, rng, noise), _battery(truth, numbers['battery'], rng),
+        commands, truth.course.targets,
+        {'imu': 0.001, 'mocap': 0.010, 'joints': 0.010, 'battery': 0.002, 'commands': 0.001})
+
+
+def _rows(truth, period):
+    every = int(round(period / (truth.t[1] - truth.t[0])))
+    return slice(0, len(truth.t), every)
+
+
+def _imu(truth, hidden, settings, rng, noise, shape):
+    rows = _rows(truth, settings['imu_period'])
+    readings = np.hstack([truth.columns['specific_force'], truth.columns['rate']])
+    if hidden.imu_delay > 0:
+        readings = low_pass(readings, hidden.imu_delay, truth.t[1] - truth.t[0], shape)
+    readings = readings[rows]
+    turn = Rotation.from_rotvec(hidden.imu_rotation).as_matrix()
+    force, rate = readings[:, :3] @ turn, readings[:, 3:] @ turn
+    force = force + hidden.accelerometer_bias + noise['accelerometer'] * rng.standard_normal(
+        force.shape)
+    rate = rate + hidden.gyroscope_bias + noise['gyroscope'] * rng.standard_normal(rate.shape)
+    return np.column_stack([truth.t[rows], force, rate])
+
+
+def low_pass(signal: np.ndarray, delay: float, step: float, shape: str) -> np.ndarray:
+    """
+    Second-order filter along time with a given group delay at low frequency.
+
+    Args:
+        signal: (N, k).
+        delay: [s].
+        step: [s] between rows.
+        shape: 'plain' Bessel (nearly the same delay at all frequencies) or 'butterworth'.
+
+    """
+    if shape == 'butterworth':
+        cut = np.sqrt(2) / delay
+        b, a = butter(2, min(cut / np.pi * step, 0.95))
+    else:
+        b, a = bessel(2, min(1 / delay / np.pi * step, 0.95), norm='delay')
+    start = lfilter_zi(b, a)[:, None] * signal[0]
+    return lfilter(b, a, signal, axis=0, zi=start)[0]
+
+
+def _mocap(truth, hidden, settings, rng, noise):
+    rows = _rows(truth, settings['mocap_period'])
+    stamps = truth.t[rows]
+    shift = int(round(hidden.mocap_delay / (truth.t[1] - truth.t[0])))
+    seen = np.maximum(np.arange(len(truth.t))[rows] - shift, 0)
+    position = truth.columns['position'][seen]
+    w, x, y, z = truth.columns['quaternion'][seen].T
+    turn = (Rotation.from_quat(np.column_stack([x, y, z, w]))
+            * Rotation.from_rotvec(hidden.mocap_rotation)
+            * Rotation.from_rotvec(noise['orientation'] * rng.standard_normal((len(seen), 3))))
+    position = position + noise['position'] * rng.standard_normal(position.shape)
+    return np.column_stack([stamps, position, turn.as_quat()])
+
+
+def _joints(truth, hidden, settings, rng, noise):
+    rows = _rows(truth, settings['joint_period'])
+    stamps = truth.t[rows]
+    shift = int(round(hidden.joint_feedback_delay / (truth.t[1] - truth.t[0])))
+    seen = np.maximum(np.arange(len(truth.t))[rows] - shift, 0)
+    count = 2 * np.pi / settings['counts_per_turn']
+    tilt = truth.columns['tilt'][seen]
+    tilt = tilt + noise['tilt'] * rng.standard_normal(tilt.shape)
+    rate = truth.columns['tilt_rate'][seen]
+    step = settings['velocity_count']
+    return np.column_stack([stamps, np.round(tilt / count) * count, np.round(rate / step) * step])
+
+
+def _battery(truth, settings, rng):
+    rows = _rows(truth, settings['period'])
+    voltage, current = truth.columns['voltage'][rows], truth.columns['current'][rows]
+    return np.column_stack([
+        truth.t[rows], voltage + settings['voltage_noise'] * rng.standard_normal(voltage.shape),
+        -current + settings['current_noise'] * rng.standard_normal(current.shape)])

@@ -1,0 +1,117 @@
+"""Flights by formula: chosen motion, chosen tilts and thrusts, readings that follow from them."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from beetle_omni_ros.identify.gap.body import BodyModel
+from beetle_omni_ros.identify.gap.ingest import Flight
+from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.residual import FlightModel
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+ROBOT = replace(RobotParameters.load(), multibody=None)
+P = GapParameters.load()
+KEYS = {**all_keys(ROBOT), **extra_keys()}
+BODY = BodyModel(ROBOT, KEYS, (0.0, 0.0))
+RATE, STEP = 200, 0.005
+
+
+def waves(t, seed, width, size, highest=0.5):
+    """(N, width) sums of sines, with first and second derivative."""
+    rng = np.random.default_rng(seed)
+    x = np.zeros((3, len(t), width))
+    for _ in range(4):
+        w = 2 * np.pi * rng.uniform(0.1, highest, width)
+        phase, part = rng.uniform(0, 2 * np.pi, width), size * rng.uniform(0.2, 0.5, width)
+        angle = w * t[:, None] + phase
+        x += np.array([part * np.sin(angle), part * w * np.cos(angle), -part * w**2 * np.sin(
+            angle)])
+    return x
+
+
+class Motion:
+    """What happens, on a 200 Hz grid; ``thrust`` and ``tilt`` are what the robot really has."""
+
+    def __init__(self, seed=0, duration=16.0):
+        self.t = t = np.arange(0, duration, STEP)
+        self.position, self.velocity, acceleration = waves(t, seed, 3, 0.8)
+        self.position = self.position + [0, 0, 1.2]
+        self.rate, self.turning, _ = waves(t, seed + 1, 3, 1.0)
+        turns, attitude = Rotation.from_rotvec(STEP * (self.rate[:-1] + self.rate[1:]) / 2), []
+        now = Rotation.identity()
+        for turn in turns:
+            attitude.append(now.as_quat())
+            now = now * turn
+        self.attitude = Rotation.from_quat([*attitude, now.as_quat()])
+        self.specific_force = self.attitude.inv().apply(acceleration + [0, 0, ROBOT.gravity])
+        self.tilt, self.tilt_rate, self.tilt_acceleration = waves(t, seed + 2, 4, 0.9)
+        self.thrust, self.thrust_rate, _ = waves(t, seed + 3, 4, 3.0)
+        self.thrust = self.thrust + ROBOT.hover_thrust
+        self.voltage = 25.2 - 0.15 * t / 2
+        self.delays = P.command_delay, P.command_delay
+        self.tilt_command = self.tilt + (ROBOT.joints.kd * self.tilt_rate + ROBOT.joints.inertia
+                                         * self.tilt_acceleration) / ROBOT.joints.kp
+
+    @property
+    def normals(self):
+        """(N, 4, 3) thrust directions in base_link, by scipy's rotations."""
+        made = np.empty((len(self.t), 4, 3))
+        for i, yaw in enumerate(ROBOT.rotors.arm_yaw):
+            axis = np.array([np.cos(yaw), np.sin(yaw), 0])
+            made[:, i] = Rotation.from_rotvec(self.tilt[:, i:i + 1] * axis).apply([0, 0, 1])
+        return made
+
+    @property
+    def hubs(self):
+        """(N, 4, 3) velocities of the rotors in base_link."""
+        body = self.attitude.inv().apply(self.velocity)
+        return body[:, None] + np.stack([np.cross(self.rate, r)
+                                         for r in ROBOT.rotors.positions], axis=1)
+
+    def flight(self, imu_delay=0.0, pose_delay=0.0, joint_delay=0.0, imu=None, pose=None):
+        """Readings, late by what is given; ``imu`` (N, 6) and ``pose`` change them."""
+        imu = np.concatenate([self.specific_force, self.rate], axis=1) if imu is None else imu
+        thrust = self.thrust + ROBOT.rotors.time_constant * self.thrust_rate
+        attitude = (self.attitude if pose is None else pose).as_quat()
+        pose = np.concatenate([self.position, attitude], axis=1)[::2]
+        sign = np.sign((pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1))
+        pose[1:, 3:] *= np.cumprod(sign)[:, None]
+        shift = P.command_delay + STEP / 2       # held: half a step late on average
+        # What acts at t was sent before; times of sending, for what must act when.
+        return Flight('made', 0.0, self.t[-1], self.t + imu_delay,
+                      imu, self.t[::2] + pose_delay, pose, self.t + joint_delay, self.tilt,
+                      self.t - shift,
+                      np.concatenate([self.tilt_command, thrust], axis=1), self.t,
+                      self.voltage[:, None])
+
+
+def model(flight):
+    """The package's residual of a flight."""
+    return FlightModel(flight, ROBOT, BODY, KEYS, P)
+
+
+def solved(made, names, groups, base=None, start=None, iterations=3):
+    """
+    Deviations of the named keys that make the residual least.
+
+    Args:
+        made: FlightModel.
+        names: of keys.
+        groups: that count, such as 'BA'.
+        iterations: of Gauss and Newton.
+        base: group -> residual that the formulas leave without any effect.
+        start: deviations to begin with.
+
+    """
+    theta = dict.fromkeys(names, 0.0) | (start or {})
+    for _ in range(iterations):
+        r, s = made.residual(theta, groups), made.slopes(theta, list(names))
+        y = np.concatenate([(r[g] - (base[g] if base else 0.0)).ravel() for g in groups])
+        x = np.concatenate([s[g].reshape(-1, len(names)) for g in groups])
+        change = np.linalg.lstsq(x, -y, rcond=None)[0]
+        for name, step in zip(names, change, strict=True):
+            theta[name] = float(np.clip(theta[name] + step, KEYS[name].low, KEYS[name].high))
+    return theta

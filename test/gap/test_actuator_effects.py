@@ -1,0 +1,127 @@
+"""Effects of servos and rotors, simulated by plain small steps, are recovered."""
+
+from dataclasses import replace
+
+from flights import KEYS, model, Motion, ROBOT, solved, STEP
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.gap.loads import spin_load
+
+MOTION = Motion(9, 12.0)
+FINE = 1e-4
+JOINT = ROBOT.joints
+
+
+def steps(t):
+    """(N, 4) commands that jump and wander, in rad."""
+    rng = np.random.default_rng(3)
+    jumps = rng.uniform(-0.6, 0.6, (30, 4))
+    return jumps[np.minimum((t / 0.45).astype(int), 29)] + 0.2 * np.sin(7 * t)[:, None]
+
+
+def servo(delay=0.010, kp=JOINT.kp, kd=JOINT.kd, speed=JOINT.velocity_limit,
+          effort=JOINT.effort_limit, coulomb=0.0, stiction=0.0, bend=0.0):
+    """(N, 4) joint angles at 200 Hz, by explicit steps of 0.1 ms."""
+    sent = MOTION.t
+    commands, thrust = steps(sent), MOTION.thrust
+    q, v, out = commands[0].copy(), np.zeros(4), []
+    per = round(STEP / FINE)
+    for k in range(len(sent) * per):
+        if k % per == 0:
+            out.append(q.copy())
+        row = int(np.clip(np.floor((k * FINE - delay) / STEP + 1e-6), 0, len(sent) - 1))
+        target = commands[row] + bend * thrust[min(k // per, len(thrust) - 1)]
+        torque = np.clip(kp * (target - q) - kd * v, -effort, effort)
+        if coulomb:
+            still = np.abs(v) < 1e-3
+            held = still & (np.abs(torque) < max(coulomb, stiction))
+            torque = np.where(held, -v * JOINT.inertia / FINE, torque - coulomb * np.sign(
+                np.where(still, torque, v)))
+        v = np.clip(v + FINE * torque / JOINT.inertia, -speed, speed)
+        q = q + FINE * v
+    return np.array(out)
+
+
+def flight(angles):
+    """Readings of such joints; commands are stamped when they are sent."""
+    made = MOTION.flight()
+    command = np.concatenate([steps(MOTION.t), made.command[:, 4:]], axis=1)
+    return replace(made, joint=angles, command_t=MOTION.t, command=command)
+
+
+CASES = [
+    ({'delay': 0.030}, {'joint_command_latency.delay': 0.020}, None, 0.001),
+    ({'delay': 0.025}, {'command_latency.delay': 0.015}, None, 0.001),
+    ({'kp': 0.26, 'kd': 0.011}, {'joint_bandwidth.kp': 0.26, 'joint_bandwidth.kd': 0.011}, None,
+     0.02),
+    ({'speed': 4.0}, {'joint_velocity_limit.velocity_limit': 4.0},
+     {'joint_velocity_limit.velocity_limit': np.log(0.5)}, 0.1),
+    ({'effort': 0.08}, {'joint_torque_limit.effort_limit': 0.08},
+     {'joint_torque_limit.effort_limit': np.log(0.04)}, 0.004),
+    ({'coulomb': 0.008, 'stiction': 0.008},
+     {'joint_friction.coulomb': 0.008}, {'joint_friction.coulomb': 0.006,
+                                         'joint_friction.stiction': 0.006}, 0.0012),
+    ({'bend': 0.002}, {'joint_deflection.deflection_per_newton': 0.002}, None, 1e-4)]
+
+
+@pytest.mark.parametrize('true, expected, start, within', CASES,
+                         ids=[next(iter(c[1])).partition('.')[0] for c in CASES])
+def test_a_servo_effect_is_recovered_from_commands_and_encoders(true, expected, start, within):
+    found = solved(model(flight(servo(**true))), list(expected), 'J', None, start, 6)
+    for name, value in expected.items():
+        assert KEYS[name].value(found[name]) == pytest.approx(value, abs=within)
+
+
+def test_a_servo_as_in_the_file_leaves_no_residual():
+    rest = model(flight(servo())).residual({}, 'J')['J']
+    assert np.abs(rest).max() < 2e-3
+
+
+def lagged(tau, delay, most=99.0, k_asked=None):
+    """(N, 4) thrusts at 200 Hz of commands held from their stamps, by steps of 0.1 ms."""
+    per, out, f = round(STEP / FINE), [], k_asked[0].copy()
+    for k in range(len(MOTION.t) * per):
+        if k % per == 0:
+            out.append(f.copy())
+        row = int(np.clip(np.floor((k * FINE - delay) / STEP + 1e-6), 0, len(MOTION.t) - 1))
+        f = f + FINE / tau * (np.minimum(k_asked[row], most) - f)
+    return np.array(out)
+
+
+@pytest.mark.parametrize('true, name, value, start', [
+    ({'tau': 0.06, 'delay': 0.01}, 'rotor_lag.time_constant', 0.06, 0.0),
+    ({'tau': 0.0942, 'delay': 0.022}, 'rotor_dead_time.delay', 0.012, 0.0),
+    ({'tau': 0.0942, 'delay': 0.01, 'most': 9.0}, 'thrust_saturation.thrust_max', 9.0,
+     np.log(9.5 / 20))])
+def test_a_rotor_effect_is_recovered_from_the_thrust_that_results(true, name, value, start):
+    asked = MOTION.thrust + 1.5 * np.sign(np.sin(5 * MOTION.t))[:, None]
+    made = model(replace(MOTION.flight(), command_t=MOTION.t, command=np.concatenate(
+        [steps(MOTION.t), asked], axis=1)))
+    truth = lagged(k_asked=asked, **true)
+    rows = np.rint(made.signals.t / STEP).astype(int)
+    x = start
+    for _ in range(6):
+        error = made.signals.thrust({name: x})[0] - truth[rows]
+        slope = (made.signals.thrust({name: x + 1e-3})[0] - truth[rows] - error) / 1e-3
+        x -= float((slope * error).sum() / (slope**2).sum())
+    assert KEYS[name].value(x) == pytest.approx(value, rel=0.03)
+
+
+def test_play_behind_the_encoder_turns_the_true_tilt_only():
+    made = model(MOTION.flight())
+    tight, loose = made.signals.joints({}), made.signals.joints({'joint_backlash.gap': 0.02})
+    assert np.array_equal(tight[3], loose[3])
+    apart = np.abs(tight[0] - loose[0])
+    assert 0.008 < apart.max() < 0.011
+
+
+def test_a_spinning_rotor_loads_its_joint_as_euler_says():
+    """Turning the momentum takes a torque, which the servo gives about its axis."""
+    made = model(MOTION.flight())
+    load, t = spin_load(made.signals, {}), made.signals.t
+    speed = np.sqrt(MOTION.thrust / (ROBOT.mass * ROBOT.gravity / 4))
+    for i, axis in enumerate(ROBOT.tilt_axes):
+        momentum = ROBOT.rotors.spin[i] * speed[:, i:i + 1] * MOTION.normals[:, i]
+        expected = -np.cross(MOTION.rate, momentum) @ axis
+        assert np.allclose(load[:, i], np.interp(t, MOTION.t, expected), atol=5e-3)

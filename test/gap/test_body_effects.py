@@ -1,0 +1,219 @@
+"""Each body effect, put on the readings by an independent formula, is recovered."""
+
+from dataclasses import replace
+
+import casadi as ca
+from flights import KEYS, model, Motion, ROBOT, solved
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from beetle_omni_ros.identify.gap.residual import THIN
+from beetle_omni_ros.robot.dynamics import rigid_body
+from beetle_omni_ros.robot.effects import CATALOGUE
+
+MOTION = Motion()
+HOVER = ROBOT.mass * ROBOT.gravity / 4
+SPIN, ARMS = ROBOT.rotors.spin, ROBOT.rotors.positions
+
+
+def on_rotors(force):
+    """Force and torque (N, 3) of forces (N, 4, 3) at the rotors."""
+    return force.sum(axis=1), sum(np.cross(ARMS[i], force[:, i]) for i in range(4))
+
+
+def thrust_change(part):
+    """Force and torque of thrusts that change by a part (N, 4) of themselves, with reaction."""
+    push = (part * MOTION.thrust)[:, :, None] * MOTION.normals
+    force, torque = on_rotors(push)
+    ratio = ROBOT.rotors.torque_to_thrust_ratio
+    return force, torque - ratio * (SPIN[:, None] * push).sum(axis=1)
+
+
+def speeds():
+    return np.sqrt(MOTION.thrust / HOVER)
+
+
+def split(vectors):
+    """Parts along and across the thrust axes (N, 4), (N, 4, 3)."""
+    along = (vectors * MOTION.normals).sum(axis=2)
+    return along, vectors - along[:, :, None] * MOTION.normals
+
+
+def total():
+    return on_rotors(MOTION.thrust[:, :, None] * MOTION.normals)[0]
+
+
+def wind(x):
+    return MOTION.attitude.inv().apply(x), 0.0
+
+
+def rotor_drag(x):
+    return on_rotors(-x / 4 * speeds()[:, :, None] * split(MOTION.hubs)[1])
+
+
+def body_drag(x):
+    v = MOTION.velocity
+    return MOTION.attitude.inv().apply(-x * np.linalg.norm(v, axis=1, keepdims=True) * v), 0.0
+
+
+def axial_inflow(x):
+    return thrust_change(-x * speeds() * split(MOTION.hubs)[0] / MOTION.thrust)
+
+
+def translational_lift(x):
+    return thrust_change(x * (split(MOTION.hubs)[1]**2).sum(axis=2) / MOTION.thrust)
+
+
+def tilt_thrust_loss(x):
+    return thrust_change(-x * (1 - np.cos(2 * MOTION.tilt)) / 2 / np.sin(np.radians(60))**2)
+
+
+def ground_effect(x):
+    place = np.stack([MOTION.attitude.apply(arm) for arm in ARMS], axis=1)
+    height = np.maximum(MOTION.position[:, None, 2] + place[:, :, 2], 0.08)
+    up = np.stack([MOTION.attitude.apply(MOTION.normals[:, i])[:, 2] for i in range(4)], axis=1)
+    return thrust_change(x / 16 / height**2 * up**2)
+
+
+def sag(x):
+    return thrust_change(((MOTION.voltage / 25.2)**x - 1)[:, None] * np.ones(4))
+
+
+def ratio(x):
+    push = MOTION.thrust[:, :, None] * MOTION.normals
+    change = x - ROBOT.rotors.torque_to_thrust_ratio
+    return 0.0, -change * (SPIN[:, None] * push).sum(axis=1)
+
+
+def momentum(x):
+    """Of the rotors (N, 4, 3), along spin times thrust direction."""
+    return x * (SPIN * speeds())[:, :, None] * MOTION.normals
+
+
+def spin_up(x):
+    size = np.gradient(speeds(), 0.005, axis=0)
+    return 0.0, -(x * (SPIN * size)[:, :, None] * MOTION.normals).sum(axis=1)
+
+
+def gyroscopic(x):
+    # The rate of change of the rotors' angular momentum in an inertial frame, all at once.
+    h = momentum(x).sum(axis=1)
+    world = MOTION.attitude.apply(h)
+    return 0.0, -MOTION.attitude.inv().apply(np.gradient(world, 0.005, axis=0))
+
+
+def module(x):
+    arms = ROBOT.tilt_axes
+    return 0.0, -x * MOTION.tilt_acceleration @ arms
+
+
+def joint_offset(x):
+    turned = np.stack([Rotation.from_rotvec(x * axis).apply(MOTION.normals[:, i])
+                       if i == 1 else MOTION.normals[:, i]
+                       for i, axis in enumerate(ROBOT.tilt_axes)], axis=1)
+    push = MOTION.thrust[:, :, None] * (turned - MOTION.normals)
+    force, torque = on_rotors(push)
+    return force, torque - ROBOT.rotors.torque_to_thrust_ratio * (
+        SPIN[:, None] * push).sum(axis=1)
+
+
+def mass(x):
+    return total() * (ROBOT.mass / x - 1), 0.0
+
+
+CASES = {
+    'rotor_drag.coefficient': (rotor_drag, 0.4), 'body_drag.coefficient': (body_drag, 0.1),
+    'axial_inflow.per_rotor': (axial_inflow, 0.4),
+    'translational_lift.per_rotor': (translational_lift, 0.03),
+    'tilt_thrust_loss.loss_at_60deg': (tilt_thrust_loss, 0.08),
+    'ground_effect.gain_at_0.25m': (ground_effect, 0.1), 'voltage_sag.exponent': (sag, 1.4),
+    'torque_coefficient.torque_to_thrust_ratio': (ratio, 0.02),
+    'thrust_coefficient.scale': (lambda x: thrust_change((x - 1) * np.ones(4)), 0.93),
+    'rotor_thrust_coefficient.scale[2]': (
+        lambda x: thrust_change((x - 1) * np.eye(4)[2]), 0.9),
+    'propeller_gyroscopic_torque.angular_momentum_at_hover': (gyroscopic, 0.06),
+    'rotor_acceleration_torque.angular_momentum_at_hover': (spin_up, 0.05),
+    'module_reaction.module_inertia': (module, 4e-4), 'joint_offset.offset[1]': (
+        joint_offset, 0.05), 'mass.mass': (mass, 3.3)}
+
+
+@pytest.fixture(scope='module')
+def made():
+    return model(MOTION.flight())
+
+
+def without(made, force, torque):
+    """The residual that is left where the readings hold a force [N] and torque [N m] more."""
+    size = MOTION.specific_force.shape
+    more = np.concatenate([np.broadcast_to(force, size) / ROBOT.mass,
+                           np.broadcast_to(torque, size) / ROBOT.inertia], axis=1)
+    seen = np.stack([np.interp(made.signals.t, MOTION.t, column) for column in more.T], axis=1)
+    return {'B': made.residual({}, 'B')['B'] - made.filters['B'](seen[::THIN])}
+
+
+@pytest.mark.parametrize('name', list(CASES))
+def test_a_known_value_is_recovered(name, made):
+    formula, value = CASES[name]
+    found = KEYS[name].value(solved(made, [name], 'B', without(made, *formula(value)))[name])
+    assert found == pytest.approx(value, rel=0.01)
+
+
+def test_a_wind_is_recovered_in_world_axes(made):
+    true = np.array([0.6, -1.0, 0.3])
+    names = [f'wind.force[{k}]' for k in range(3)]
+    found = solved(made, names, 'B', without(made, *wind(true)))
+    assert np.allclose([found[name] for name in names], true, rtol=0.01, atol=0.01)
+
+
+def test_every_body_effect_was_asked_for():
+    asked = {name.partition('.')[0] for name in CASES} | {
+        'wind', 'inertia', 'centre_of_mass'}     # the last two: test_dynamics
+    assert asked >= {name for name, effect in CATALOGUE.items() if effect.apply}
+
+
+@pytest.mark.parametrize('name', [n for n, e in CATALOGUE.items() if e.apply])
+def test_a_mirrored_robot_answers_as_in_a_mirror(name):
+    """Mirrored at the x-z plane: vectors change y, rates and torques change x and z."""
+    places = np.array([[1, 1, -0.02], [-1, 1, -0.02], [-1, -1, -0.02], [1, -1, -0.02]]) * 0.2
+    robot = replace(ROBOT, rotors=replace(ROBOT.rotors, positions=places))
+    rng = np.random.default_rng(4)
+    partner = [3, 2, 1, 0]
+    true, axial = np.array([1, -1, 1]), np.array([-1, 1, -1])
+    v, w, p = rng.normal(size=3), rng.normal(size=3), np.array([0.3, 0.2, 0.4])
+    attitude = Rotation.random(random_state=1)
+    tilt, rate, acceleration = rng.normal(size=(3, 4))
+    thrust, change = rng.uniform(4, 9, 4), rng.normal(size=4)
+    values = {key: (spec.typical if np.isfinite(spec.typical) else 0.3)
+              for key, spec in CATALOGUE[name].parameters.items()}
+    polar = {'offset': true if name == 'centre_of_mass' else None, 'force': true}
+    plain, mirrored = {}, {}
+    for key, value in values.items():
+        spec = CATALOGUE[name].parameters[key]
+        if np.ndim(spec.neutral) == 0:
+            own = {'mass': 3.3, 'torque_to_thrust_ratio': 0.02}.get(key, value)
+            plain[key] = mirrored[key] = own
+            continue
+        vector = value * rng.uniform(0.5, 1.5, len(spec.neutral))
+        plain[key] = tuple(vector)
+        if len(vector) == 4:
+            sign = -1 if name == 'joint_offset' else 1
+            mirrored[key] = tuple(sign * vector[partner])
+        else:
+            sign = polar.get(key)
+            mirrored[key] = tuple(vector * (1 if sign is None else sign))
+
+    def answer(effects, v, w, p, attitude, tilt, rate, acceleration, thrust, change):
+        out = rigid_body(robot, *(ca.SX(ca.DM(x)) for x in (
+            v, attitude.as_quat(), w, tilt, thrust)), tilt_acceleration=ca.DM(acceleration),
+            effects=effects, tilt_rate=ca.DM(rate), thrust_rate=ca.DM(change),
+            position=ca.DM(p), voltage_ratio=ca.DM(0.9))
+        return [np.array(ca.DM(ca.evalf(x))).ravel() for x in out]
+
+    first = answer({name: plain}, v, w, p, attitude, tilt, rate, acceleration, thrust, change)
+    flip = attitude.as_rotvec() * axial
+    second = answer({name: mirrored}, v * true, w * axial, p * true, Rotation.from_rotvec(flip),
+                    -tilt[partner], -rate[partner], -acceleration[partner], thrust[partner],
+                    change[partner])
+    assert np.allclose(first[0] * true, second[0], atol=1e-9)
+    assert np.allclose(first[1] * axial, second[1], atol=1e-9)

@@ -1,0 +1,98 @@
+"""The whole way: bags in; verdict, JSON, page and robot file out."""
+
+from dataclasses import replace
+from io import StringIO
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from beetle_omni_ros.evaluation.command import fly
+from beetle_omni_ros.identify.gap.command import gap_results, run_gap
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.tasks import make_task
+
+TRUE = np.array([1.2, -0.8, 0.0])
+POSES = """x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg
+0.8,0.4,1.2,40,20,90
+-0.6,0.8,0.9,-30,35,-120
+"""
+
+
+def quiet():
+    return Console(file=StringIO(), width=120)
+
+
+@pytest.fixture(scope='module')
+def made(tmp_path_factory):
+    """Results of two short flights in a wind of which the robot file knows nothing."""
+    folder = tmp_path_factory.mktemp('gap')
+    (folder / 'poses.csv').write_text(POSES)
+    robot = RobotParameters.load()
+    plant = replace(robot, effects={'wind': {'force': tuple(TRUE)}})
+    for k in range(2):
+        fly('hover', make_task(str(folder / 'poses.csv'), 0), robot=robot, plant=plant, seed=k,
+            bag=folder / f'flight{k}')
+    console = quiet()
+    results = gap_results([folder / 'flight0'], [folder / 'flight1'], apply=folder / 'new.yaml',
+                          json_path=folder / 'gap.json', page=folder / 'gap.html',
+                          console=console)
+    return folder, results, console.file.getvalue()
+
+
+def test_the_hidden_wind_is_named_with_its_size(made):
+    effect, = made[1]['effects']
+    assert 'wind' in effect['names']
+    force = effect['parameters']['force']
+    assert np.allclose(force['value'][:2], TRUE[:2], atol=0.1)
+    assert all(low < high for low, high in force['interval'])
+    assert force['unit'] == 'N'
+
+
+def test_the_gap_on_the_flight_held_out_shrinks_and_a_placebo_does_not_help(made):
+    results = made[1]
+    assert results['held_out'] and results['gap_after'] < results['gap_before']
+    assert results['closure'] > 0.8
+    assert results['horizons']['0.5 s']['placebo'] > results['gap_before']
+
+
+def test_the_json_holds_what_the_interfaces_fix(made):
+    results = json.loads((made[0] / 'gap.json').read_text())
+    for key in ('verdict', 'effects', 'where', 'gap_before', 'gap_after', 'noise_floor',
+                'closure', 'candidates', 'next_experiment'):
+        assert key in results
+    assert {'channel', 'regime', 'excess'} <= set(results['where'][0])
+    names = {row['name'] for row in results['candidates']}
+    assert {'wind', 'mass', 'rotor_drag', 'joint_command_latency'} <= names
+    assert {'delta_bic', 'cv_gain_se'} <= set(results['effects'][0]['evidence'])
+
+
+def test_the_new_robot_file_is_the_old_one_with_the_wind(made):
+    robot = RobotParameters.load(made[0] / 'new.yaml')
+    assert np.allclose(robot.effects['wind']['force'][:2], TRUE[:2], atol=0.1)
+    assert replace(robot, effects={}).hash() == RobotParameters.load().hash()
+    assert robot.provenance['runs'] and robot.provenance['date']
+
+
+def test_page_and_terminal_say_what_was_found(made):
+    folder, _, printed = made
+    page = (folder / 'gap.html').read_text()
+    assert 'wind' in printed and 'wind' in page
+    assert page.count('<img') >= 3 and 'src="http' not in page
+
+
+def test_a_missing_bag_is_bad_data_not_a_traceback(tmp_path):
+    code = run_gap([tmp_path / 'none'], json_path=tmp_path / 'gap.json', console=quiet(),
+                   page=tmp_path / 'gap.html')
+    results = json.loads((tmp_path / 'gap.json').read_text())
+    assert code == 0 and results['verdict'] == 'bad_data' and 'no such bag' in results['reason']
+    assert results['effects'] == [] and results['closure'] is None
+
+
+def test_the_believed_file_is_not_overwritten(tmp_path):
+    (tmp_path / 'mine.yaml').write_text('extends: robot.yaml\n')
+    with pytest.raises(ParameterError, match='extends'):
+        run_gap([tmp_path], robot=tmp_path / 'mine.yaml', apply=tmp_path / 'mine.yaml',
+                console=quiet())

@@ -1,0 +1,21 @@
+"""The command line of gap: which runs are fitted and which judge."""
+
+import pytest
+
+from beetle_omni_ros import cli
+from beetle_omni_ros.cli.gaps import spread
+
+
+@pytest.mark.parametrize(('given', 'meant'), [
+    ('a b --holdout c --json g', 'a b --holdout c --json g'),
+    ('a b --holdout c d --apply f', 'a b --holdout c --holdout d --apply f'),
+    ('--robot r a b --holdout c d', '--robot r a b --holdout c --holdout d'),
+    ('--holdout c a b', '--holdout c a b'),
+    ('a --holdout c --holdout d', 'a --holdout c --holdout d')])
+def test_every_run_after_holdout_judges(given, meant):
+    assert spread(given.split()) == meant.split()
+
+
+def test_unusable_input_is_one_line(tmp_path, capsys):
+    assert cli.main(['gap', str(tmp_path / 'none'), '--robot', str(tmp_path / 'no.yaml')]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1

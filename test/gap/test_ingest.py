@@ -1,0 +1,97 @@
+"""Recordings that cannot be judged are refused in one line that says why."""
+
+from flights import Motion, P, ROBOT
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.gap.bags import Recording
+from beetle_omni_ros.identify.gap.ingest import load_flight, prepare, UnusableFlight
+
+
+def recording(duration=16.0):
+    flight = Motion(duration=duration).flight()
+    return Recording('case', {
+        'imu/data_raw': flight.imu_t, 'mocap/pose': flight.pose_t,
+        'joint_states': flight.joint_t, 'command': flight.command_t + 0.02,
+        'battery_state': flight.battery_t}, {
+        'imu/data_raw': flight.imu, 'mocap/pose': flight.pose, 'joint_states': flight.joint,
+        'command': flight.command, 'battery_state': flight.battery})
+
+
+def refused(made, *words):
+    with pytest.raises(UnusableFlight) as error:
+        prepare(made, ROBOT, P)
+    text = str(error.value)
+    assert '\n' not in text and text.startswith('case: ')
+    for word in words:
+        assert word in text
+
+
+def cut(made, topic, keep):
+    made.times[topic], made.values[topic] = made.times[topic][keep], made.values[topic][keep]
+    return made
+
+
+def test_a_good_recording_is_taken_whole():
+    flight = prepare(recording(), ROBOT, P)
+    assert flight.duration > 15 and not flight.findings
+
+
+@pytest.mark.parametrize('topic', ['imu/data_raw', 'mocap/pose', 'joint_states', 'command'])
+def test_a_missing_topic_is_named(topic):
+    refused(cut(recording(), topic, slice(0, 0)), topic, 'missing')
+
+
+def test_a_clock_that_jumps_back_is_named_with_its_topic():
+    made = recording()
+    made.times['mocap/pose'] = made.times['mocap/pose'] - 5.0 * (made.times['mocap/pose'] > 8)
+    refused(made, 'mocap/pose', 'clock jumps')
+
+
+def test_many_stamps_that_occur_twice_are_refused():
+    made = recording()
+    times = made.times['imu/data_raw']
+    made.times['imu/data_raw'] = times[np.arange(len(times)) // 2 * 2]
+    refused(made, 'imu/data_raw', 'twice')
+
+
+def test_long_silence_of_a_sensor_is_refused_and_short_silence_is_cut_around():
+    made = recording()
+    t = made.times['imu/data_raw']
+    refused(cut(made, 'imu/data_raw', (t < 5) | (t > 9)), 'imu/data_raw', 'silent')
+    made = recording(24.0)
+    t = made.times['joint_states']
+    flight = prepare(cut(made, 'joint_states', (t < 6) | (t > 6.4)), ROBOT, P)
+    assert flight.start > 6 and flight.findings
+
+
+def test_a_recording_too_short_to_judge_is_refused():
+    made = recording()
+    for topic, t in made.times.items():
+        cut(made, topic, t < 4)
+    refused(made, 's of usable flight')
+
+
+def test_a_robot_that_stays_on_the_ground_is_no_flight():
+    made = recording()
+    made.values['command'][:, 4:] = 0.0
+    refused(made, 'does not fly')
+
+
+def test_another_robots_file_is_noticed():
+    made = recording()
+    made.values['imu/data_raw'][:, :3] *= 3
+    refused(made, 'robot file does not fit')
+
+
+def test_readings_that_are_no_numbers_are_left_out_and_counted():
+    made = recording()
+    made.values['imu/data_raw'][100:104] = np.nan
+    flight = prepare(made, ROBOT, P)
+    assert any('4 messages' in text for text in flight.findings)
+    assert np.isfinite(flight.imu).all()
+
+
+def test_no_bag_at_all_is_one_line(tmp_path):
+    with pytest.raises(UnusableFlight, match='no such bag'):
+        load_flight(tmp_path / 'nothing', ROBOT, P)

@@ -1,0 +1,70 @@
+"""Each effect of sensors and timing, put on the readings, is recovered."""
+
+from flights import KEYS, model, Motion, solved, STEP
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+MOTION = Motion(5)
+NEUTRAL = dict(model(MOTION.flight()).residual({}).items())
+
+
+def readings():
+    return np.concatenate([MOTION.specific_force, MOTION.rate], axis=1)
+
+
+def recovered(flight, names, groups):
+    found = solved(model(flight), names, groups, NEUTRAL)
+    return np.array([found[name] for name in names])
+
+
+@pytest.mark.parametrize('name, groups, reading', [
+    ('imu_filter_lag', 'AW', 'imu_delay'), ('mocap_time_offset', 'AW', 'pose_delay'),
+    ('joint_feedback_delay', 'J', 'joint_delay')])
+def test_a_late_reading_is_found_to_be_late(name, groups, reading):
+    flight = MOTION.flight(**{reading: 0.012})
+    assert recovered(flight, [f'{name}.delay'], groups) == pytest.approx([0.012], abs=3e-4)
+
+
+def test_imu_and_mocap_delays_have_opposite_signs_where_only_they_meet():
+    found = recovered(MOTION.flight(imu_delay=0.01), ['mocap_time_offset.delay'], 'W')
+    assert found == pytest.approx([-0.01], abs=5e-4)
+
+
+@pytest.mark.parametrize('name, part', [('imu_accelerometer_bias', 0), ('imu_gyroscope_bias', 3)])
+def test_a_bias_is_what_is_added(name, part):
+    true = np.array([0.1, -0.05, 0.2])
+    imu = readings()
+    imu[:, part:part + 3] += true
+    names = [f'{name}.bias[{k}]' for k in range(3)]
+    assert recovered(MOTION.flight(imu=imu), names, 'AW') == pytest.approx(true, abs=2e-3)
+
+
+def test_a_turned_imu_is_recovered_as_its_axes_seen_from_base_link():
+    true = np.array([0.05, -0.08, 0.1])
+    axes = Rotation.from_rotvec(true)       # of the sensor, in base_link
+    imu = np.concatenate([axes.inv().apply(MOTION.specific_force),
+                          axes.inv().apply(MOTION.rate)], axis=1)
+    names = [f'imu_misalignment.rotation[{k}]' for k in range(3)]
+    assert recovered(MOTION.flight(imu=imu), names, 'AW') == pytest.approx(true, abs=2e-3)
+
+
+def test_turned_markers_are_recovered_as_their_axes_seen_from_base_link():
+    true = np.array([-0.06, 0.04, 0.09])
+    names = [f'mocap_misalignment.rotation[{k}]' for k in range(3)]
+    flight = MOTION.flight(pose=MOTION.attitude * Rotation.from_rotvec(true))
+    assert recovered(flight, names, 'AW') == pytest.approx(true, abs=2e-3)
+
+
+def test_a_lever_arm_is_where_the_imu_sits():
+    true = np.array([0.03, -0.02, 0.05])
+    turning = np.gradient(MOTION.rate, STEP, axis=0)
+    imu = readings()
+    imu[:, :3] += np.cross(turning, true) + np.cross(MOTION.rate, np.cross(MOTION.rate, true))
+    names = [f'imu_lever_arm.offset[{k}]' for k in range(3)]
+    assert recovered(MOTION.flight(imu=imu), names, 'A') == pytest.approx(true, abs=1e-3)
+
+
+def test_units_of_all_sensor_keys_are_their_own():
+    for name in ('imu_accelerometer_bias.bias[0]', 'mocap_misalignment.rotation[2]'):
+        assert KEYS[name].base == 0.0 and not KEYS[name].body

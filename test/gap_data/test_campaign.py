@@ -1,0 +1,187 @@
+"""The campaign from cases to report, with stand-ins for the workflow."""
+
+from collections import Counter
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+import sys
+
+from gap_data.campaign import make_report, run_campaign
+from gap_data.cases import Case, DAMAGED, KINDS, load_settings, make_cases
+from gap_data.effects import CATALOGUE, OUTSIDE
+from gap_data.make import make_case
+from gap_data.page import html, markdown
+from gap_data.workflow import run_workflow, Workflow
+import pytest
+
+SETTINGS = load_settings()
+META = {'set': 'test', 'seed': 0, 'cases': 2, 'command_age': 0.01, 'command': 'none'}
+STUB = """
+import json, os, sys
+def run_gap(runs, holdout, robot, apply, json_path, page, console):
+    assert all((run / 'metadata.yaml').is_file() for run in [*runs, *holdout])
+    assert robot.read_text().startswith('#') and len(runs) == 2 and len(holdout) == 1
+    names = {names}
+    json_path.write_text(json.dumps({{
+        'verdict': 'named' if names else 'no_gap', 'closure': 0.9, 'where': [], 'candidates': [],
+        'effects': [{{'names': [n], 'evidence': {{}}, 'parameters': {{'mass': {{
+            'value': 3.3, 'unit': 'kg', 'interval': [3.2, 3.5]}}}}}} for n in names],
+        'gap_before': 2.0, 'gap_after': 1.0, 'noise_floor': 1.0, 'next_experiment': None}}))
+    return 0
+def noisy(**_):
+    raise RuntimeError('a bug')
+class Unusable(ValueError):
+    pass
+def complain(**_):
+    raise Unusable('bag: nothing in it')
+def refuse(**_):
+    print('bag: nothing in it', file=sys.stderr)
+    return 2
+"""
+SMALL = Case('singles', 'hard', 3, (('mass', 0.3, 'plain'),), course='slow', duration=2.0,
+             multibody=True, gust=True, tolerance=True, command_age=0.01)
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp('campaign')
+
+
+@pytest.fixture
+def stub(tmp_path, monkeypatch):
+    def make(names):
+        name = 'stub_' + '_'.join(names or ['nothing'])
+        (tmp_path / f'{name}.py').write_text(STUB.format(names=names))
+        monkeypatch.setenv('PYTHONPATH', f'{tmp_path}{os.pathsep}'
+                           + os.environ.get('PYTHONPATH', ''))
+        return name
+    return make
+
+
+def test_cases_follow_from_the_seed():
+    one, two = (make_cases(SETTINGS, 'full', 4, 0.01) for _ in range(2))
+    assert one == two and len({c.key() for c in one}) == len(one)
+    assert {c.key() for c in make_cases(SETTINGS, 'full', 5, 0.01)}.isdisjoint(
+        c.key() for c in one)
+
+
+def test_the_full_set_holds_every_name_and_kind():
+    cases = make_cases(SETTINGS, 'full', 0, 0.01)
+    for difficulty in ('clean', 'hard'):
+        names = {c.effects[0][0] for c in cases
+                 if c.kind == 'singles' and c.difficulty == difficulty}
+        assert names == set(CATALOGUE)
+    assert {c.effects[0][0] for c in cases if c.kind == 'outside'} == set(OUTSIDE)
+    assert {c.damage for c in cases if c.kind == 'damaged'} == set(DAMAGED)
+    assert set(Counter(c.kind for c in cases)) == set(KINDS)
+    hard = [c for c in cases if c.difficulty == 'hard' and c.kind == 'singles']
+    assert all(c.multibody and c.gust and c.tolerance for c in hard)
+    assert {c.conditions for c in hard} == {'nominal', 'published'}
+    assert {c.noise for c in cases if c.kind == 'none'} == {1.0, 2.0}
+
+
+def test_ordinary_sizes_are_three_detection_limits_or_more():
+    for case in make_cases(SETTINGS, 'full', 1, 0.01):
+        if case.kind in ('singles', 'pairs'):
+            for name, size, _ in case.effects:
+                assert abs(size) >= 2.99 * SETTINGS['effects'][name]['limit'], name
+
+
+def test_a_case_is_made_once_and_the_same_again(folder, tmp_path):
+    first = make_case(SMALL, folder / 'flights', folder / 'sealed')
+    assert sorted(p.name for p in first.iterdir()) == ['fit_1', 'fit_2', 'holdout_1', 'robot.yaml']
+    changed = {p: p.stat().st_mtime_ns for p in first.rglob('*.mcap')}
+    assert make_case(SMALL, folder / 'flights', folder / 'sealed') == first
+    assert {p: p.stat().st_mtime_ns for p in first.rglob('*.mcap')} == changed
+    again = make_case(SMALL, tmp_path / 'flights', tmp_path / 'sealed')
+    for path in changed:
+        assert (again / path.relative_to(first)).read_bytes() == path.read_bytes()
+    label = json.loads((folder / 'sealed' / f'{SMALL.key()}.json').read_text())
+    assert label['effects'][0]['parameters']['mass'] == pytest.approx(3.0386 + 0.3, abs=0.02)
+    assert not [p for p in first.rglob('*') if p.suffix == '.json']
+
+
+def test_a_campaign_judges_workflows_side_by_side(folder, stub):
+    none = replace(SMALL, kind='none', effects=())
+    right, silent = stub(['mass']), stub([])
+    workflows = [Workflow('right', f'{right}:run_gap'), Workflow('silent', f'{silent}:run_gap')]
+    seen = []
+    judged = run_campaign([SMALL, none], workflows, folder,
+                          done=lambda case, name, j, kept: seen.append((name, kept)))
+    assert [j['right'] for j in judged['right']] == [True, False]
+    assert [j['right'] for j in judged['silent']] == [False, True]
+    assert judged['right'][1]['wrong'] == [['mass']]
+    assert judged['right'][0]['parameters'][0]['inside'] == [True]
+    assert len(seen) == 4 and not any(kept for _, kept in seen)
+    run_campaign([SMALL, none], workflows, folder, done=lambda c, n, j, kept: seen.append(
+        (n, kept)))
+    assert all(kept for _, kept in seen[4:])
+    report = json.loads(json.dumps(make_report(judged, META)))
+    assert '<svg' in html(report) and 'single: named' in html(report)
+    assert '| none: false alarm | <= 0.05 |' in markdown(report)
+
+
+def test_a_bug_in_the_workflow_is_counted_and_does_not_stop_the_campaign(folder, stub):
+    name = stub([])
+    case = make_case(SMALL, folder / 'flights', folder / 'sealed')
+    crashed = run_workflow(Workflow('x', f'{name}:noisy'), case)
+    assert crashed['traceback'] and crashed['answer'] is None
+    for way in ('refuse', 'complain'):
+        refused = run_workflow(Workflow('x', f'{name}:{way}'), case)
+        assert refused['status'] == 2 and refused['message'] == 'bag: nothing in it'
+        assert not refused['traceback']
+    endless = f'{sys.executable} -c "import time; time.sleep(60)" {{runs}} {{json}}'
+    assert run_workflow(Workflow('x', endless, timeout=0.5), case)['status'] == 124
+
+
+@pytest.mark.parametrize('damage', ['missing_imu', 'cut', 'rest', 'broken_robot'])
+def test_damaged_cases_are_made(tmp_path, damage):
+    case = Case('damaged', 'clean', 5, damage=damage, duration=2.0, fit=1,
+                course='rest' if damage == 'rest' else 'slow')
+    made = make_case(case, tmp_path / 'flights', tmp_path / 'sealed')
+    assert (made / 'fit_1').is_dir()
+    assert ('\nmass:' in (made / 'robot.yaml').read_text()) == (damage != 'broken_robot')
+
+
+def test_a_baseline_finds_a_large_effect(tmp_path):
+    case = replace(SMALL, effects=(('wind', 2.0, 'plain'),), course='poses', duration=12.0,
+                   gust=False, multibody=False, tolerance=False)
+    made = make_case(case, tmp_path / 'flights', tmp_path / 'sealed')
+    run = run_workflow(Workflow.parse('bic'), made)
+    assert run['problems'] == [] and run['status'] == 0
+    assert run['answer']['effects'][0]['names'] == ['wind']
+    assert run['answer']['gap_after'] < 0.7 * run['answer']['gap_before']
+    (made / 'fit_1' / 'metadata.yaml').unlink()
+    for file in Path(made / 'fit_1').glob('*.mcap'):
+        file.write_bytes(b'')
+    assert run_workflow(Workflow.parse('bic'), made)['answer']['verdict'] == 'bad_data'
+
+
+def test_the_command_refuses_what_it_cannot_run(capsys, monkeypatch):
+    import gap_campaign
+    monkeypatch.setenv('PYTHONPATH', '')
+    for arguments, text in ((['--set', 'huge'], "--set 'huge'"),
+                            (['--robot', 'nowhere.yaml'], 'no such file'),
+                            (['--workflow', 'no.such:thing'], 'no module no.such'),
+                            (['--backend', 'mars'], 'expected processes or ray')):
+        more = [] if '--workflow' in arguments else ['--workflow', 'bic']
+        assert gap_campaign.main([*more, *arguments, '--cases', '0']) == 2
+        assert text in ' '.join(capsys.readouterr().err.split())
+
+
+def test_the_command_makes_flights_and_a_report(tmp_path, stub, monkeypatch, capsys):
+    import gap_campaign
+    name = stub([])
+    monkeypatch.syspath_prepend(os.environ['PYTHONPATH'].split(os.pathsep)[0])
+    settings = load_settings()
+    settings['flights']['duration'] = 2.0
+    settings['sets']['test'] = {'clean': {'none': 2}}
+    monkeypatch.setattr(gap_campaign, 'load_settings', lambda: settings)
+    assert gap_campaign.main(['--set', 'test', '--workflow', f'quiet={name}:run_gap', '--jobs',
+                              '1', '--no-baselines', '--folder', str(tmp_path)]) == 0
+    report = json.loads((tmp_path / 'report.json').read_text())
+    assert [j['right'] for j in report['cases']['quiet']] == [True, True]
+    assert str(tmp_path) not in json.dumps(report['meta'])
+    assert 'none: false alarm' in capsys.readouterr().out
+    assert (tmp_path / 'report.html').is_file() and (tmp_path / 'report.md').is_file()

@@ -1,0 +1,79 @@
+"""The blind flights themselves: flown well, lively enough, and lost ones said so."""
+
+from gap_data.controller import PoseController
+from gap_data.courses import make_course, RATE
+from gap_data.flight import fly, LostFlight
+from gap_data.hidden import Hidden
+from gap_data.truth import Robot
+import numpy as np
+import pytest
+
+HARD = {'multibody': True, 'gust': True, 'conditions': 'published'}
+CLEAN = {'multibody': False, 'gust': False, 'conditions': 'nominal'}
+
+
+def flown(kind, seconds, difficulty, robot=None, hidden=None):
+    return fly(robot or Robot.nominal(), hidden or Hidden(), kind=kind, duration=seconds, seed=2,
+               command_age=0.01, **difficulty)
+
+
+@pytest.mark.parametrize('difficulty', [CLEAN, HARD], ids=['clean', 'hard'])
+@pytest.mark.parametrize('kind', ['poses', 'lemniscate', 'hover'])
+def test_the_controller_follows_its_course(kind, difficulty):
+    truth = flown(kind, 8.0, difficulty)
+    every = int(round(1 / RATE / 0.001))
+    rows = len(truth.t) // every
+    error = truth.columns['position'][::every] - truth.course.position[:rows]
+    assert np.sqrt((error ** 2).sum(axis=1).mean()) < 0.2
+    assert truth.command_thrust.min() >= 0.3 and truth.command_thrust.max() <= 20.0
+    assert np.abs(truth.columns['tilt']).max() < 3.96
+
+
+def test_pose_flights_excite_and_hover_does_not():
+    lively, still = flown('poses', 20.0, CLEAN), flown('hover', 20.0, CLEAN)
+    assert lively.columns['rate'].std(axis=0).max() > 0.4
+    assert lively.columns['tilt'].std() > 0.3
+    assert still.columns['rate'].std(axis=0).max() < 0.02
+    assert np.linalg.norm(still.columns['velocity'], axis=1).max() < 0.1
+
+
+def test_courses_are_smooth_and_pass_low():
+    courses = [make_course('poses', 60.0, np.random.default_rng(k)) for k in range(4)]
+    for course in courses:
+        assert np.abs(np.diff(course.velocity, axis=0)).max() * RATE < 15.0
+        assert course.position[:, 2].min() < 0.36  # where the ground is felt
+        step = course.rotation[:-1].transpose(0, 2, 1) @ course.rotation[1:]
+        turned = np.stack([step[:, 2, 1], step[:, 0, 2], step[:, 1, 0]], axis=1) * RATE
+        middle = 0.5 * (course.rate[1:] + course.rate[:-1])
+        assert turned[:-200] == pytest.approx(middle[:-200], abs=0.1)
+
+
+def test_allocation_gives_the_wrench_asked_for():
+    controller = PoseController(Robot.nominal(), np.random.default_rng(0), lively=False)
+    tilt, thrust = controller.trim(np.array([3.0, -2.0, 28.0]))
+    robot, force, torque = Robot.nominal(), np.zeros(3), np.zeros(3)
+    for i in range(4):
+        ca, sa = robot.arms[i]
+        f = thrust[i] * np.array([np.sin(tilt[i]) * sa, -np.sin(tilt[i]) * ca, np.cos(tilt[i])])
+        force += f
+        torque += np.cross(robot.positions[i], f) - robot.spin[i] * robot.ratio * f
+    assert force == pytest.approx([3.0, -2.0, 28.0], abs=1e-9)
+    assert torque == pytest.approx(np.zeros(3), abs=1e-9)
+
+
+def test_a_robot_that_cannot_fly_is_a_lost_flight():
+    robot = Robot.nominal()
+    robot.thrust_scale = np.full(4, 0.3)
+    with pytest.raises(LostFlight, match='poses flight, seed 2'):
+        fly(robot, Hidden(), kind='poses', duration=5.0, seed=2, command_age=0.0, **CLEAN)
+
+
+def test_a_hidden_effect_appears_in_flight_with_its_size():
+    # the accelerometer tells the thrust along the body's axes, whatever the controller does
+    robot = Robot.nominal()
+    robot.thrust_scale = np.full(4, 0.92)
+    truth = flown('poses', 6.0, CLEAN, robot=robot)
+    tilt, thrust = truth.columns['tilt'], truth.columns['thrust']
+    lift = (thrust * np.cos(tilt)).sum(axis=1) / robot.mass
+    slope = lift @ truth.columns['specific_force'][:, 2] / (lift @ lift)
+    assert slope == pytest.approx(0.92, abs=2e-3)

@@ -1,0 +1,176 @@
+"""The blind flights' robot against closed forms."""
+
+from gap_data.gusts import draw_gust
+from gap_data.hidden import Hidden
+from gap_data.plant import Plant
+from gap_data.rotors import Pack, Rotors
+from gap_data.truth import Robot
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+BODIES = pytest.mark.parametrize('multibody', [False, True], ids=['rigid', 'multibody'])
+
+
+def plant(robot=None, hidden=None, *, multibody=False, thrust=None, tilt=(0, 0, 0, 0), **more):
+    robot = robot or Robot.nominal()
+    thrust = [robot.hover_thrust] * 4 if thrust is None else thrust
+    return Plant(robot, hidden or Hidden(), multibody=multibody, position=(0, 0, 2),
+                 quaternion=(1, 0, 0, 0), tilt=tilt, thrust=thrust, **more)
+
+
+def run(body, seconds, **wrench):
+    for _ in range(int(round(seconds / body.step_length))):
+        body.step(**wrench)
+    return body.data
+
+
+@BODIES
+def test_falls_freely_without_thrust(multibody):
+    body = plant(multibody=multibody, thrust=[0.0] * 4)
+    data = run(body, 1.0)
+    assert data.qpos[2] == pytest.approx(2 - 9.80665 / 2, abs=2e-4)
+    assert np.linalg.norm(body.specific_force) < 0.05  # the modules swing a little
+
+
+@BODIES
+def test_hovers_at_hover_thrust(multibody):
+    # a torque-free body: the rotors of the description are not quite symmetric, so tilts drift
+    body = plant(multibody=multibody)
+    data = run(body, 0.1)
+    assert data.qvel[2] == pytest.approx(0.0, abs=2e-3)
+    assert body.specific_force == pytest.approx([0, 0, 9.80665], abs=0.02)
+
+
+def test_multibody_totals_are_those_of_the_interface():
+    body = plant(multibody=True)
+    model, data = body.model, body.data
+    mujoco.mj_forward(model, data)
+    mass = model.body_mass[1:]
+    centre = mass @ data.xipos[1:] / mass.sum()
+    inertia = np.zeros((3, 3))
+    for m, p, turn, own in zip(mass, data.xipos[1:], data.ximat[1:], model.body_inertia[1:]):
+        d, r = p - centre, turn.reshape(3, 3)
+        inertia += r @ np.diag(own) @ r.T + m * (d @ d * np.eye(3) - np.outer(d, d))
+    assert mass.sum() == pytest.approx(3.0386, abs=1e-4)
+    assert centre == pytest.approx([0, 0, 2], abs=1e-5)
+    assert inertia == pytest.approx(np.diag([0.0627958, 0.0620796, 0.0948795]), abs=2e-5)
+
+
+def test_multibody_keeps_energy_and_momentum_without_forces():
+    robot = Robot.nominal()
+    robot.kp, robot.kd = np.zeros(4), np.zeros(4)
+    body = plant(robot, multibody=True, thrust=[0.0] * 4, rate=(1.0, -2.0, 1.5))
+    body.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    body.step()
+    mujoco.mj_subtreeVel(body.model, body.data)
+    energy, momentum = body.data.energy.sum(), body.data.subtree_angmom[1].copy()
+    run(body, 0.5)
+    mujoco.mj_subtreeVel(body.model, body.data)
+    assert body.data.energy.sum() == pytest.approx(energy, rel=1e-5)
+    assert body.data.subtree_angmom[1] == pytest.approx(momentum, abs=2e-5)
+
+
+def test_servo_answers_a_step_as_its_equation():
+    body = plant()
+    step = 0.05
+    body.command(0.0, [step, 0, 0, 0], [body.robot.hover_thrust] * 4)
+    angles = []
+    for _ in range(80):
+        body.step()
+        angles.append(body.data.qpos[body._q[0]])
+    j, kp, kd = 7.5e-5, 0.3449, 0.0094
+    wn, decay = np.sqrt(kp / j), kd / (2 * j)
+    wd = np.sqrt(wn ** 2 - decay ** 2)
+    t = 0.001 * np.arange(1, 81)
+    closed = step * (1 - np.exp(-decay * t) * (np.cos(wd * t) + decay / wd * np.sin(wd * t)))
+    assert angles == pytest.approx(closed, abs=2e-6)
+
+
+def test_servo_keeps_to_its_limits():
+    robot = Robot.nominal()
+    robot.velocity_limit = np.full(4, 4.0)
+    robot.effort_limit = np.full(4, 0.1)
+    body = plant(robot)
+    body.command(0.0, [2.5] * 4, [7.4] * 4)
+    rates, torques = [], []
+    for _ in range(600):
+        s = body.step()
+        rates.append(max(np.abs(s.tilt_rate)))
+        torques.append(np.abs(body.data.actuator_force[6:]).max())
+    assert 3.6 < max(rates) <= 4.0 + 1e-3
+    assert max(torques) <= 0.1 + 1e-9
+
+
+@pytest.mark.parametrize('rotor', range(4))
+def test_thrust_acts_along_the_tilted_rotor(rotor):
+    robot = Robot.nominal()
+    angle, thrust = 0.4, np.eye(4)[rotor] * 6.0
+    body = plant(robot, thrust=thrust, tilt=[angle] * 4)
+    body.command(0.0, [angle] * 4, thrust)
+    body.step()
+    yaw = np.radians([45, 135, 225, -45][rotor])
+    outward = np.array([np.cos(yaw), np.sin(yaw), 0])
+    axis = Rotation.from_rotvec(angle * outward).apply([0, 0, 1])
+    force = 6.0 * axis
+    torque = np.cross(robot.positions[rotor], force) - robot.spin[rotor] * 0.0165 * force
+    assert body.data.ctrl[:3] == pytest.approx(force, abs=1e-9)
+    assert body.data.ctrl[3:6] == pytest.approx(torque, abs=1e-9)
+
+
+def test_rotor_is_a_first_order_lag():
+    robot = Robot.nominal()
+    rotors = Rotors(robot, Hidden(), 0.001, [5.0] * 4)
+    for _ in range(94):
+        rotors.advance([9.0] * 4)
+    assert rotors.thrust[0] == pytest.approx(9 - 4 * np.exp(-0.094 / 0.0942), rel=1e-9)
+
+
+def test_two_lags_in_series_are_as_late_as_one():
+    hidden = Hidden(rotor_poles=0.12)
+    rotors = Rotors(Robot.nominal(), hidden, 0.001, [0.0] * 4)
+    lost = 0.0
+    for _ in range(2000):
+        lost += 0.001 * (1.0 - rotors.advance([1.0] * 4)[0])
+    assert lost == pytest.approx(0.0942, abs=1e-3)  # the area above the answer is the delay
+
+
+def test_pack_gives_what_the_load_leaves():
+    pack = Pack(Robot.nominal(), 1.0)
+    voltage = pack.load([7.45] * 4, 0.001, True)
+    assert pack.rest == pytest.approx(25.2)
+    assert voltage == pytest.approx(25.2 - 0.08 * pack.current, rel=1e-9)
+    assert 15 < pack.current < 25  # [A] usual for 3 kg on four 9 inch propellers
+
+
+def test_a_command_acts_after_its_age_and_delay():
+    body = plant(hidden=Hidden(thrust_delay=0.02), command_age=0.01)
+    body.command(0.0, [0.1] * 4, [9.0] * 4)
+    run(body, 0.0305)
+    assert body.rotors.thrust[0] == pytest.approx(body.robot.hover_thrust)
+    body.step()
+    assert body.rotors.thrust[0] > body.robot.hover_thrust
+    assert body.data.qpos[body._q[0]] > 0.005  # the tilt was under way 20 ms before
+
+
+def test_gusts_have_their_strength_and_colour():
+    settings = {'force': [0.3, 0.3], 'torque': [0.01, 0.01], 'time': [0.5, 0.5]}
+    waves = [draw_gust(settings, 60.0, 0.005, np.random.default_rng(k)) for k in range(8)]
+    force = np.concatenate([f for f, _ in waves])
+    assert np.sqrt((force ** 2).mean()) == pytest.approx(0.3, rel=0.1)
+    assert np.sqrt((np.concatenate([t for _, t in waves]) ** 2).mean()) == pytest.approx(
+        0.01, rel=0.1)
+    # two lags of 0.25 s: correlation (1 + s) exp(-s) at s = time / 0.25 s
+    near = (force[:-50] * force[50:]).mean() / (force ** 2).mean()
+    assert near == pytest.approx(2 * np.exp(-1), abs=0.08)
+
+
+def test_tolerances_stay_within_what_the_issue_says():
+    nominal = Robot.nominal()
+    robots = [Robot.nominal().within_tolerance(np.random.default_rng(k)) for k in range(40)]
+    assert 0.003 < max(abs(r.mass / 3.0386 - 1) for r in robots) <= 0.005
+    assert max(np.abs(r.inertia / nominal.inertia - 1).max() for r in robots) <= 0.03
+    assert max(np.abs(r.thrust_scale - 1).max() for r in robots) <= 0.01
+    assert max(np.abs(r.positions - nominal.positions).max() for r in robots) <= 0.001
+    assert max(np.abs(r.time_constant / 0.0942 - 1).max() for r in robots) <= 0.05

@@ -1,0 +1,149 @@
+"""What the blind sensors report, and the bags that hold it."""
+
+from pathlib import Path
+
+from gap_data.bags import DAMAGES, write_bag
+from gap_data.courses import Course
+from gap_data.flight import COLUMNS, Truth
+from gap_data.hidden import Hidden
+from gap_data.sensors import low_pass, measure
+from gap_data.truth import load_numbers
+import numpy as np
+import pytest
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.typesys import get_typestore, Stores
+from scipy.spatial.transform import Rotation
+
+NUMBERS = load_numbers()
+SILENT = {'accelerometer': 0, 'gyroscope': 0, 'position': 0, 'orientation': 0, 'tilt': 0}
+
+
+def made_up(seconds=4.0):
+    """A truth of smooth waves, as good as a flight for sensors."""
+    t = np.arange(int(seconds * 1000)) * 0.001
+    columns = {name: np.sin(2 * np.pi * 0.7 * t[:, None] + np.arange(size))
+               for name, size in COLUMNS.items()}
+    turn = Rotation.from_rotvec(0.5 * np.sin(t)[:, None] * [1, 0.3, -0.5]).as_quat()
+    columns['quaternion'] = turn[:, [3, 0, 1, 2]]
+    stamps = np.arange(0, seconds, 0.01)
+    still = np.zeros((1, 3))
+    course = Course(still, still, still, np.eye(3)[None], still,
+                    [(0.5, np.zeros(3), np.array([0, 0, 0, 1.0]))])
+    return Truth(t, columns, stamps, np.full((len(stamps), 4), 0.1),
+                 np.full((len(stamps), 4), 7.0), course)
+
+
+def sample(hidden=None, noise=SILENT, truth=None, seed=0):
+    return measure(truth or made_up(), hidden or Hidden(), NUMBERS, np.random.default_rng(seed),
+                   noise=noise)
+
+
+def test_stamps_are_capture_times_at_the_interface_rates():
+    truth, recording = made_up(), sample()
+    for table, rate in ((recording.imu, 200), (recording.mocap, 100), (recording.joints, 200),
+                        (recording.battery, 10)):
+        assert np.diff(table[:, 0]) == pytest.approx(1 / rate)
+    assert recording.imu[:, 1:4] == pytest.approx(truth.columns['specific_force'][::5])
+    assert recording.mocap[:, 1:4] == pytest.approx(truth.columns['position'][::10])
+    assert np.abs(recording.joints[:, 1:5] - truth.columns['tilt'][::5]).max() <= (
+        np.pi / 4096 + 1e-12)
+
+
+def test_noise_has_the_size_asked_for():
+    noise = {'accelerometer': 0.05, 'gyroscope': 0.005, 'position': 0.001, 'orientation': 0.002,
+             'tilt': 0.0}
+    quiet, loud = sample(), sample(noise=noise)
+    away = loud.imu - quiet.imu
+    assert away[:, 1:4].std() == pytest.approx(0.05, rel=0.05)
+    assert away[:, 4:].std() == pytest.approx(0.005, rel=0.05)
+    turn = (Rotation.from_quat(quiet.mocap[:, 4:]).inv() * Rotation.from_quat(loud.mocap[:, 4:]))
+    assert turn.as_rotvec().std() == pytest.approx(0.002, rel=0.08)
+
+
+def test_delays_make_readings_older_than_their_stamps():
+    old = sample(Hidden(mocap_delay=0.02, joint_feedback_delay=0.015))
+    now = sample()
+    assert old.mocap[10:, 1:4] == pytest.approx(now.mocap[8:-2, 1:4])
+    assert old.joints[10:, 1:5] == pytest.approx(now.joints[7:-3, 1:5])
+
+
+@pytest.mark.parametrize('shape', ['plain', 'butterworth'])
+def test_filter_has_its_group_delay(shape):
+    t = np.arange(4000) * 0.001
+    late = low_pass(np.sin(2 * np.pi * t)[:, None], 0.015, 0.001, shape)[:, 0]
+    assert late[1000:] == pytest.approx(np.sin(2 * np.pi * (t[1000:] - 0.015)), abs=0.01)
+
+
+def test_biases_and_mounting():
+    rotation = np.array([0.05, -0.02, 0.03])
+    hidden = Hidden(accelerometer_bias=np.array([0.1, 0.2, 0.3]), imu_rotation=rotation,
+                    gyroscope_bias=np.array([0.01, 0, 0]), mocap_rotation=rotation)
+    askew, straight = sample(hidden), sample()
+    turn = Rotation.from_rotvec(rotation)  # sensor axes seen from base_link
+    assert askew.imu[:, 1:4] == pytest.approx(
+        turn.inv().apply(straight.imu[:, 1:4]) + [0.1, 0.2, 0.3])
+    assert askew.imu[:, 4:] == pytest.approx(turn.inv().apply(straight.imu[:, 4:]) + [0.01, 0, 0])
+    seen = Rotation.from_quat(straight.mocap[:, 4:]).inv() * Rotation.from_quat(askew.mocap[:, 4:])
+    assert seen.as_rotvec() == pytest.approx(np.tile(rotation, (len(askew.mocap), 1)))
+
+
+def read(path):
+    store, rows = get_typestore(Stores.ROS2_JAZZY), {}
+    with Reader(path) as reader:
+        for connection, received, data in reader.messages():
+            message = store.deserialize_cdr(data, connection.msgtype)
+            rows.setdefault(connection.topic, []).append((received * 1e-9, message))
+    return rows
+
+
+def stamp(message):
+    return message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+
+
+def test_bag_holds_the_topics_of_the_interface(tmp_path):
+    recording = sample()
+    write_bag(tmp_path / 'bag', recording, epoch=1.78e9)
+    rows = read(tmp_path / 'bag')
+    assert set(rows) == {'/mocap/pose', '/imu/data_raw', '/joint_states', '/battery_state',
+                         '/command', '/target_pose'}
+    received, command = rows['/command'][5]
+    assert list(command.name) == [f'gimbal{i}' for i in range(1, 5)] + [
+        f'rotor{i}' for i in range(1, 5)]
+    assert command.position[:4] == pytest.approx([0.1] * 4)
+    assert np.isnan(command.position[4:]).all() and np.isnan(command.effort[:4]).all()
+    assert command.effort[4:] == pytest.approx([7.0] * 4)
+    assert stamp(command) == pytest.approx(1.78e9 + 0.05, abs=1e-6)
+    assert received >= stamp(command)
+    _, imu = rows['/imu/data_raw'][3]
+    assert imu.orientation_covariance[0] == -1
+    assert imu.linear_acceleration.x == pytest.approx(recording.imu[3, 1])
+    assert imu.angular_velocity.z == pytest.approx(recording.imu[3, 6])
+
+
+@pytest.mark.parametrize('damage', DAMAGES)
+def test_damage_is_there(tmp_path, damage):
+    recording, path = sample(truth=made_up(10.0)), tmp_path / 'bag'
+    write_bag(path, recording, epoch=1.78e9, damage=damage, rng=np.random.default_rng(3))
+    if damage == 'cut':
+        assert not (path / 'metadata.yaml').exists()
+        with pytest.raises((FileNotFoundError, ReaderError)):
+            read(path)
+        return
+    rows = read(path)
+    stamps = {topic: np.array([stamp(m) for _, m in messages])
+              for topic, messages in rows.items()}
+    if damage.startswith('missing_'):
+        assert len(rows) == 5
+    elif damage == 'clock_jump':
+        assert np.abs(np.diff(stamps['/imu/data_raw'])).max() > 3.0
+    elif damage == 'duplicates':
+        assert (np.diff(np.sort(stamps['/imu/data_raw'])) == 0).mean() > 0.1
+    else:
+        assert np.diff(stamps['/mocap/pose']).max() > 2.0
+
+
+def test_nothing_in_a_bag_tells_its_label(tmp_path):
+    write_bag(tmp_path / 'bag', sample(), epoch=1.78e9)
+    text = b''.join(p.read_bytes() for p in Path(tmp_path).rglob('*') if p.is_file())
+    for word in (b'rotor_drag', b'ground_truth', b'effect', b'label', b'sealed'):
+        assert word not in text
