@@ -59,7 +59,7 @@ class RotorBridgeNode(FlightNode):
         self._command = None
         self._state = self._absent = ''
         self._looked = self._next_try = time.monotonic()
-        self._cycle = 0
+        self._cycle, self._sent = 0, 0.0
         self._states = self.create_publisher(String, 'rotor_bridge/state', qos.LATCHED)
         self._batteries = self.create_publisher(BatteryState, 'battery_state', qos.SENSOR)
         self._rotors = self.create_publisher(JointState, 'rotor_states', qos.SENSOR)
@@ -89,7 +89,12 @@ class RotorBridgeNode(FlightNode):
         self._open(now)
         self._arming.update(now - self._looked)
         self._looked = now
-        self._send()
+        if now - self._sent < self._period / 2:
+            # A command came just before this expiry was served, which would now count for the
+            # one that its reset had promised.
+            self._timer.reset()
+        else:
+            self._send()
         self._cycle += 1
         if self._cycle % POLL_CYCLES == 0:
             self._poll()
@@ -117,7 +122,8 @@ class RotorBridgeNode(FlightNode):
             self._stream.rest()
             return False
         sent = self._board.send(command.thrust, command.stamp)
-        self._stream.add(sent, time.monotonic())
+        self._sent = time.monotonic()
+        self._stream.add(sent, self._sent)
         return sent.sent
 
     def _poll(self):
