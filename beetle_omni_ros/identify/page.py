@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-from beetle_omni_ros.runs.report_page import CSS
+from beetle_omni_ros.runs.report_page import frame
 from beetle_omni_ros.runs.table import Grid
 from beetle_omni_ros.runs.table import html as table_html
 
@@ -23,21 +23,6 @@ def page(title: str, subtitle: str, grids: list[Grid], notes: list[str],
 
     """
     said = ''.join(f'<li>{escape(note)}</li>' for note in notes)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}: {escape(subtitle)}</title>
-<style>{CSS}</style>
-</head>
-<body>
-<main>
-<header><h1>{escape(title)}</h1><p>{escape(subtitle)}</p></header>
-<section>{''.join(table_html(grid) for grid in grids)}
+    return frame(title, subtitle, f"""<section>{''.join(table_html(grid) for grid in grids)}
 {f'<ul>{said}</ul>' if said else ''}</section>
-{''.join(sections)}
-</main>
-</body>
-</html>
-"""
+{''.join(sections)}""")

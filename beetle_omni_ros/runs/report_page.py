@@ -59,6 +59,15 @@ def page(title: str, subtitle: str, cards: list[str], tables: str, sections: lis
          poses: list[str], faults: str) -> str:
     """Put the whole page together; everything it needs is in it."""
     folded = f'<section><details><summary>Every pose</summary>{"".join(poses)}</details></section>'
+    return frame(title, subtitle, f"""<div class="cards">{''.join(cards)}</div>
+<section>{tables}</section>
+{''.join(sections)}
+{folded if poses else ''}
+<section class="faults"><h2>Faults</h2>{faults}</section>""")
+
+
+def frame(title: str, subtitle: str, content: str) -> str:
+    """Return a whole page around ``content``, which is HTML."""
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -70,11 +79,7 @@ def page(title: str, subtitle: str, cards: list[str], tables: str, sections: lis
 <body>
 <main>
 <header><h1>{escape(title)}</h1><p>{escape(subtitle)}</p></header>
-<div class="cards">{''.join(cards)}</div>
-<section>{tables}</section>
-{''.join(sections)}
-{folded if poses else ''}
-<section class="faults"><h2>Faults</h2>{faults}</section>
+{content}
 </main>
 </body>
 </html>
