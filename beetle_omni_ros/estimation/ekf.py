@@ -39,7 +39,7 @@ class ErrorStateEkf:
         """
         self._parameters = parameters
         self._model = ErrorStateModel(parameters, gravity)
-        self._mounting = Mounting(parameters.imu, gravity)
+        self._mounting = Mounting(parameters.imu, gravity, parameters.time_offset.trend_samples)
         self.reset()
 
     def reset(self) -> None:
@@ -78,7 +78,7 @@ class ErrorStateEkf:
     def estimate(self) -> Estimate | None:
         """The state at the newest IMU sample; None while uninitialised."""
         if self._estimate is None and self._track is not None:
-            self._estimate = self._mounting.estimate(self._track.newest)
+            self._estimate = self._mounting.estimate(self._track.newest, self._readings)
         return self._estimate
 
     def imu(self, sample: ImuSample) -> bool:

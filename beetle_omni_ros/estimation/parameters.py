@@ -107,6 +107,9 @@ class TimeOffsetParameters:
         0.1, doc='slower motion says nothing about it', unit='m/s', low=0.001, high=10)
     rate: float = parameter(
         0.2, doc='slower rotation says nothing about it', unit='rad/s', low=0.001, high=10)
+    trend_samples: int = parameter(
+        4, doc='readings through which the trend is laid that carries a late rate on; 1 holds it',
+        low=1, high=100)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
-from ekf_flights import error_state, fly, GRAVITY, run, Sensors
+from ekf_flights import error_state, feed, fly, GRAVITY, run, Sensors
 import numpy as np
 import pytest
 
 from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, PoseSample
+from beetle_omni_ros.estimation.mounting import Mounting
 
 
 def estimate_of(flight, parameters=None):
@@ -74,6 +75,34 @@ def test_latency_hidden_in_the_stamps_of_the_imu_is_found_and_bridged(age):
     blind = run(ErrorStateEkf(trusting, GRAVITY), flight)
     assert (np.linalg.norm(blind.estimate.position - truth['position'][0])
             > 3 * np.linalg.norm(ekf.estimate.position - truth['position'][0]))
+
+
+@pytest.mark.parametrize('age', [0.015, 0.025])
+def test_a_late_rate_goes_on_changing_as_it_did(age):
+    """Its error in motion is less than half of what holding the last reading leaves."""
+    shipped = EkfParameters.load()
+    held = replace(shipped, time_offset=replace(shipped.time_offset, trend_samples=1))
+    errors = {}
+    for name, parameters in (('carried on', shipped), ('held', held)):
+        flight = fly(4, 6.0)
+        flight.imu = [replace(s, stamp=s.stamp + age) for s in flight.imu]
+        ekf, found = ErrorStateEkf(parameters, GRAVITY), []
+        for _, sample in flight.arrivals():
+            feed(ekf, sample)
+            found.append(ekf.estimate)
+        late = [e for e in found if e is not None and e.stamp > 4.0]
+        truth = flight.trajectory(np.array([e.stamp for e in late]))['rate']
+        found = np.array([e.angular_velocity for e in late])
+        errors[name] = np.sqrt(np.mean((found - truth) ** 2))
+    assert errors['carried on'] < 0.5 * errors['held']
+
+
+def test_an_impact_is_no_trend():
+    mounting = Mounting(EkfParameters.load().imu, GRAVITY, 3)
+    readings = [(0.005 * i, np.zeros(3), np.array([float(i), 0, 0]), False) for i in range(3)]
+    np.testing.assert_allclose(mounting.trend(readings), [200, 0, 0])
+    readings[1] = (*readings[1][:3], True)
+    assert not mounting.trend(readings).any() and not mounting.trend(readings[:2]).any()
 
 
 def test_late_stamps_of_the_mocap_do_not_shift_the_estimate_in_time():
