@@ -17,8 +17,8 @@ from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train import batch, rewards, starts
-from beetle_omni_ros.train.model import CENTRE, MASS, module_reaction, nominal_body
-from beetle_omni_ros.train.observations import actor_observation, critic_observation, Signals
+from beetle_omni_ros.train.model import CENTRE, INERTIA, MASS, module_reaction, nominal_body
+from beetle_omni_ros.train.observations import actor_observation, critic_observation, late, Signals
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics
 
@@ -193,7 +193,12 @@ class TiltableQuadrotorEnv(VecEnv):
         return new
 
     def _follow(self, s, x, rotation):
-        """The disturbance estimate: what the nominal model cannot explain, through a lag."""
+        """
+        The disturbance estimate: what the nominal model cannot explain, through a lag.
+
+        The estimator compares the body rate that it gets with what the present commands should
+        do; where the rate is late, its change of long ago is held against that of now.
+        """
         e, period = self.cfg.estimate, self.cfg.episode.period
         mass = s['body'][:, MASS]
         weight = torch.zeros_like(s['wrench'][:, :3])
@@ -205,10 +210,19 @@ class TiltableQuadrotorEnv(VecEnv):
         centre = s['body'][:, CENTRE] - self._module_moment / mass * (thrusts + up)
         pull = batch.turned_back(rotation, weight * mass)
         force = s['wrench'][:, :3] + (mass - self._nominal_mass) * weight
-        torque = s['wrench'][:, 3:] + torch.linalg.cross(centre, pull)
+        torque = s['wrench'][:, 3:] + torch.linalg.cross(centre, pull) \
+            + s['body'][:, INERTIA] / period * self._late_change(s, x)
         lag = torch.cat((torch.full_like(force, e.force_bandwidth * period),
                          torch.full_like(torque, e.torque_bandwidth * period)), -1)
         return s['estimate'] + lag * (torch.cat((force, torque), -1) - s['estimate'])
+
+    @staticmethod
+    def _late_change(s, x):
+        """(N, 3) change of the delayed body rate over the last step, less that of the true one."""
+        rates = torch.cat((x[:, None, model.RATE], s['x'][:, None, model.RATE],
+                           s['past_motion'][:, :, 3:]), 1)
+        changes = rates[:, :-1] - rates[:, 1:]
+        return late(changes, s['delays'][:, 2:3]) - changes[:, 0]
 
     def _retarget(self, new, due, rotation, draw):
         target = self._starts.target(draw, new['x'][:, model.POSITION],

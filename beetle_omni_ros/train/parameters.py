@@ -91,7 +91,7 @@ class RandomParameters:
     tilt_bias: float = parameter(0.0524, doc='each joint', unit='rad', low=0, high=0.5)
     tilt_noise: float = parameter(0.0349, doc='each joint', unit='rad', low=0, high=0.5)
     noise_power: float = parameter(
-        2.0, doc='noise and biases of a robot are scaled by u^power with u uniform in [0, 1]; 0: '
+        1.5, doc='noise and biases of a robot are scaled by u^power with u uniform in [0, 1]; 0: '
                  'every robot has them in full', low=0, high=10)
     velocity_latency: np.ndarray = parameter([0.0, 0.025], doc='age of velocity and rate',
                                              unit='s', shape=(2,), low=0, high=0.03)
@@ -100,8 +100,8 @@ class RandomParameters:
     command_latency: np.ndarray = parameter([0.005, 0.015], doc='until a command acts', unit='s',
                                             shape=(2,), low=0, high=0.02)
     thrust_limit: np.ndarray = parameter(
-        [16.0, 20.0], doc='largest thrust that the battery gives, whatever is commanded', unit='N',
-        shape=(2,), low=0, high=100)
+        [16.5, 20.0], doc='largest thrust that the battery gives, whatever is commanded',
+        unit='N', shape=(2,), low=0, high=100)
     force_share: float = parameter(0.3, doc='share of robots with a constant force', low=0, high=1)
     force: float = parameter(4.0, doc='its size, each axis up to', unit='N', low=0, high=50)
     strong_share: float = parameter(0.08, doc='share of robots with a strong constant force',
@@ -155,20 +155,20 @@ class RewardWeights:
     thrust_limit: float = parameter(-0.01, doc='published')
     joint_action_rate: float = parameter(-0.05, doc='published -5e-4')
     thrust_action_rate: float = parameter(-2e-3, doc='published -1e-4')
-    thrust_power: float = parameter(-5e-4, doc='published -1e-5; wasted thrust is missing '
+    thrust_power: float = parameter(-1e-4, doc='published -1e-5; wasted thrust is missing '
                                                 'where a low battery limits it')
     joint_acceleration: float = parameter(-1.5e-5, doc='published')
     z_axis_align: float = parameter(-0.1, doc='published')
     thrust_allocation: float = parameter(-1e-5, doc='published')
     attitude: float = parameter(-1.0, doc='own: slope far from the target')
-    near_position: float = parameter(1.0, doc='own: slope close to the target')
-    near_attitude: float = parameter(1.0, doc='own: slope close to the target')
-    near_pose: float = parameter(1.0, doc='own: slope close to the target')
-    exact_pose: float = parameter(1.0, doc='own: slope in the last centimetres')
+    near_position: float = parameter(1.5, doc='own: slope close to the target')
+    near_attitude: float = parameter(1.5, doc='own: slope close to the target')
+    near_pose: float = parameter(1.5, doc='own: slope close to the target')
+    exact_pose: float = parameter(1.5, doc='own: slope in the last centimetres')
     joint_winding: float = parameter(-1.0, doc='own: joints beyond half a turn')
     hover_tilt_rate: float = parameter(-5.0, doc='own: smooth commands at the target')
     hover_thrust_rate: float = parameter(-0.15, doc='own: smooth commands at the target')
-    sinking: float = parameter(-10.0, doc='own: below both start and target')
+    sinking: float = parameter(-20.0, doc='own: below both start and target')
     termination: float = parameter(-800.0, doc='own: less than the worst flight would cost')
     scale: float = parameter(0.01, doc='of the sum')
 
@@ -180,12 +180,12 @@ class NetworkParameters:
     hidden: np.ndarray = parameter([512, 256, 128], doc='published')
     output_scale: float = parameter(4.0, doc='action for each unit of the last layer', low=0.01,
                                     high=100)
-    carry: float = parameter(0.5, doc='part of the previous action that the output is added to',
+    carry: float = parameter(0.7, doc='part of the previous action that the output is added to',
                              low=0, high=1)
     last_gain: float = parameter(0.01, doc='initial gain of the last layer', low=0, high=10)
-    tilt_std: float = parameter(0.7, doc='initial standard deviation of the tilt actions', low=0,
+    tilt_std: float = parameter(0.6, doc='initial standard deviation of the tilt actions', low=0,
                                 high=10)
-    thrust_std: float = parameter(2.0, doc='of the thrust actions', low=0, high=10)
+    thrust_std: float = parameter(1.7, doc='of the thrust actions', low=0, high=10)
 
     def __post_init__(self):
         """Refuse layers without neurons, and no layers."""
@@ -228,14 +228,15 @@ class ScheduleParameters:
     end: float = parameter(0.8, doc='part at which it is complete', low=0, high=1)
     kl: np.ndarray = parameter([0.01, 0.005], doc='desired divergence of an update', shape=(2,))
     entropy: np.ndarray = parameter([5e-4, 0.0], doc='weight of the entropy', shape=(2,))
-    tilt_std_limit: np.ndarray = parameter([0.8, 0.15], doc='largest standard deviation of the '
+    tilt_std_limit: np.ndarray = parameter([0.7, 0.12], doc='largest standard deviation of the '
                                            'tilt actions, in actions', shape=(2,))
-    thrust_std_limit: np.ndarray = parameter([3.0, 0.4], doc='the same, thrust', shape=(2,))
+    thrust_std_limit: np.ndarray = parameter([2.5, 0.32], doc='the same, thrust', shape=(2,))
     smooth: np.ndarray = parameter([0.1, 1.0], doc='factor on the weights of *_action_rate and '
                                    'hover_*_rate', shape=(2,))
     severity: np.ndarray = parameter([0.0, 1.0], doc='factor on forces, payloads and pushes',
                                      shape=(2,))
     near: np.ndarray = parameter([0.5, 1.0], doc='factor on the weights of near_*', shape=(2,))
+    sinking: np.ndarray = parameter([0.3, 1.0], doc='factor on the weight of sinking', shape=(2,))
 
 
 @dataclass(frozen=True, kw_only=True)

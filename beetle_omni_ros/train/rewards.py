@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import torch
 
+SINKING_LIMIT = 0.3    # [m] what the deepest dive costs
+
 
 class Moment(NamedTuple):
     """
@@ -176,8 +178,8 @@ def hover_thrust_rate(m: Moment) -> torch.Tensor:
 
 
 def sinking(m: Moment) -> torch.Tensor:
-    """Below both start and target, where a floor may be."""
-    return m.depth.clamp(max=2.0) ** 2
+    """Below both start and target, where a floor may be; saturates, or an early end would pay."""
+    return m.depth / (1 + m.depth / SINKING_LIMIT)
 
 
 TERMS = {term.__name__: term for term in (

@@ -20,7 +20,7 @@ from beetle_omni_ros.train.parameters import TrainParameters
 
 SCHEDULED = {'smooth': ('joint_action_rate', 'thrust_action_rate', 'hover_tilt_rate',
                         'hover_thrust_rate'),
-             'near': ('near_position', 'near_attitude', 'near_pose')}
+             'near': ('near_position', 'near_attitude', 'near_pose'), 'sinking': ('sinking',)}
 SCHEDULE_EVERY = 10      # iterations between two changes of the schedule
 
 

@@ -226,6 +226,21 @@ def test_the_estimate_approaches_the_disturbance():
     torch.testing.assert_close(env.state['estimate'][:, :3], lag * force, atol=1e-3, rtol=1e-3)
 
 
+def test_a_late_rate_enters_the_estimate_as_a_torque():
+    """The estimator holds the change of the rate of two steps ago against that of now."""
+    env = quiet({**only('hold'), 'memory': True}, robots=2)
+    s, n = env.state, env.num_envs
+    history = torch.randn(n, 5, 3, generator=torch.Generator().manual_seed(0))    # newest first
+    x = s['x'].clone()
+    x[:, model.RATE], s['x'][:, model.RATE] = history[:, 0], history[:, 1]
+    s['past_motion'][:, :, 3:] = history[:, 2:]
+    s['delays'][:, 2] = torch.tensor([0.0, 0.02])
+    change = env._late_change(s, x)
+    assert not change[0].any()
+    torch.testing.assert_close(
+        change[1], history[1, 2] - history[1, 3] - (history[1, 0] - history[1, 1]))
+
+
 # ---- all of it
 
 def test_the_same_seed_is_the_same_flight_and_another_is_not():

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from beetle_omni_ros.train import rewards
-from beetle_omni_ros.train.parameters import RewardWeights
+from beetle_omni_ros.train.parameters import RewardWeights, TrainParameters
 
 TILT_LIMIT, THRUST_LIMIT, HOVER = 3.96, 20.0, 7.2
 NOT_TERMS = {'termination', 'scale'}
@@ -167,6 +167,12 @@ def test_limits_do_not_punish_what_is_within_them():
     assert not rewards.thrust_limit(moment(thrust_command=thrusts)).any()
     assert float(rewards.thrust_limit(moment(thrust_command=[[-2.0, 23.0, 5, 5]]))) == 13
     assert not rewards.joint_winding(moment(tilt=[[np.pi, -np.pi, 0, 1]])).any()
+
+
+def test_no_dive_costs_as_much_as_ending_the_episode():
+    p = TrainParameters.load()
+    deepest = float(rewards.sinking(moment(depth=1e3)))
+    assert -p.reward.sinking * deepest / (1 - p.ppo.discount) < -p.reward.termination
 
 
 def test_saturating_penalties_stay_finite_far_beyond():

@@ -38,7 +38,8 @@ def test_the_schedule_is_linear_between_its_ends():
     made = runner(**{'schedule.begin': 0.25, 'schedule.end': 0.75, 'schedule.kl': [0.01, 0.005],
                      'schedule.entropy': [4e-4, 0.0], 'schedule.tilt_std_limit': [0.8, 0.2],
                      'schedule.thrust_std_limit': [3.0, 1.0], 'schedule.severity': [0.0, 1.0],
-                     'schedule.smooth': [0.1, 1.0], 'schedule.near': [0.5, 1.0]})
+                     'schedule.smooth': [0.1, 1.0], 'schedule.near': [0.5, 1.0],
+                     'schedule.sinking': [0.1, 1.0]})
     begin, middle, end = ([0.01, 4e-4, 0.8, 3.0, 0.0], [0.0075, 2e-4, 0.5, 2.0, 0.5],
                           [0.005, 0.0, 0.2, 1.0, 1.0])
     for part, knobs, smooth, near in ((0.0, begin, 0.1, 0.5), (0.25, begin, 0.1, 0.5),
@@ -48,7 +49,7 @@ def test_the_schedule_is_linear_between_its_ends():
         assert found == pytest.approx(knobs)
         assert factors == pytest.approx({
             **dict.fromkeys(('joint_action_rate', 'thrust_action_rate', 'hover_tilt_rate',
-                             'hover_thrust_rate'), smooth),
+                             'hover_thrust_rate', 'sinking'), smooth),
             **dict.fromkeys(('near_position', 'near_attitude', 'near_pose'), near)})
         made.apply_schedule(part)
         np.testing.assert_allclose(made.alg.knobs, knobs[:4], rtol=1e-6)
