@@ -41,6 +41,7 @@ class TiltableQuadrotorEnv(VecEnv):
         weights: (R,) reward weights in the order of ``rewards.TERMS``, on the device; may be
             changed between steps.
         severity: () factor on forces, payloads and pushes, likewise.
+        depth_limit: () how far below both start and target the floor is [m], likewise.
 
     """
 
@@ -61,6 +62,7 @@ class TiltableQuadrotorEnv(VecEnv):
         self._torque_ratio = self._tensor(-np.array(rotors.spin) * rotors.torque_to_thrust_ratio)
         self._starts = starts.Starts(parameters, robot, self.num_envs, self.device)
         self.severity = self._starts.severity
+        self.depth_limit = torch.full((), np.inf, device=self.device)
         self._module_moment = module_reaction(robot)['mass_moment'] if robot.multibody else 0.0
         self._axes = self._tensor(robot.tilt_axes)
         self._sideways = self._tensor(np.cross(robot.tilt_axes, [0.0, 0.0, 1.0]))
@@ -130,7 +132,8 @@ class TiltableQuadrotorEnv(VecEnv):
         terms = rewards.terms(moment)
         broken = ~torch.isfinite(x).all(-1)
         died = broken | (moment.position_error > limits.position_limit) \
-            | (moment.speed > limits.velocity_limit) | (moment.rate > limits.rate_limit)
+            | (moment.speed > limits.velocity_limit) | (moment.rate > limits.rate_limit) \
+            | ((moment.depth > self.depth_limit) & (s['disturbed'][:, 0] < 0.5))
         reward = torch.where(broken, 0.0, terms @ weights) \
             + died * (self.cfg.reward.termination * self.cfg.reward.scale)
         age = s['age'] + 1

@@ -235,6 +235,9 @@ class ScheduleParameters:
                                    'hover_*_rate', shape=(2,))
     severity: np.ndarray = parameter([0.0, 1.0], doc='factor on forces, payloads and pushes',
                                      shape=(2,))
+    depth_limit: np.ndarray = parameter([9.0, 9.0], doc='farther below both start and target '
+                                        'ends the episode of an undisturbed robot', unit='m',
+                                        shape=(2,))
     near: np.ndarray = parameter([0.5, 1.0], doc='factor on the weights of near_*', shape=(2,))
     sinking: np.ndarray = parameter([0.3, 1.0], doc='factor on the weight of sinking', shape=(2,))
 

@@ -96,7 +96,8 @@ class Runner(OnPolicyRunner):
 
         Returns:
             desired KL, entropy weight, bounds of the standard deviations of tilt and thrust
-            actions, severity of disturbances; factors on reward weights by term.
+            actions, severity of disturbances, depth of the floor; factors on reward weights by
+            term.
 
         """
         s = self.parameters.schedule
@@ -108,13 +109,14 @@ class Runner(OnPolicyRunner):
         factors = {term: at(getattr(s, name)) for name, terms in SCHEDULED.items()
                    for term in terms}
         return [at(s.kl), at(s.entropy), at(s.tilt_std_limit), at(s.thrust_std_limit),
-                at(s.severity)], factors
+                at(s.severity), at(s.depth_limit)], factors
 
     def apply_schedule(self, part: float) -> None:
         """Bring optimiser and environment to the schedule's state at a part of the training."""
         knobs, factors = self.knobs(part)
         self.alg.knobs.copy_(torch.tensor(knobs[:4]))
         self.env.severity.fill_(knobs[4])
+        self.env.depth_limit.fill_(knobs[5])
         weights = [factors.get(name, 1.0) for name in rewards.TERMS]
         self.env.weights.copy_(self.env.base_weights * torch.tensor(
             weights, device=self.env.device))

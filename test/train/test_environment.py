@@ -210,6 +210,19 @@ def test_pushes_change_velocities_by_their_severity(severity):
     assert bool(pushed.any()) == bool(severity)
 
 
+def test_a_dive_below_the_floor_ends_the_episode_unless_something_pushes_down():
+    env = quiet({**only('hold'), 'episode.target_time': [100, 100]}, robots=4)
+    s = env.state
+    s['age'].zero_()
+    s['disturbed'][:] = torch.tensor([0.0, 0.0, 1.0, 0.0])[:, None]
+    s['x'][:, 2] = s['floor'][:, 0] - torch.tensor([0.3, 0.5, 0.5, 0.5])
+    env.depth_limit.fill_(0.4)
+    s['floor'][3] -= 0.2
+    env.advance((s['previous'] - env.offset) / env.scale)
+    assert env.done.tolist() == [False, True, False, False]
+    assert float(env.reward[1]) < 0.5 * env.cfg.reward.termination * env.cfg.reward.scale
+
+
 def test_the_estimate_approaches_the_disturbance():
     env = quiet({**only('hold'), 'memory': True, 'random.force_share': 1.0, 'random.torque': 0.0,
                  'random.force': 1.0, 'episode.target_time': [100, 100]}, robots=32)

@@ -39,9 +39,9 @@ def test_the_schedule_is_linear_between_its_ends():
                      'schedule.entropy': [4e-4, 0.0], 'schedule.tilt_std_limit': [0.8, 0.2],
                      'schedule.thrust_std_limit': [3.0, 1.0], 'schedule.severity': [0.0, 1.0],
                      'schedule.smooth': [0.1, 1.0], 'schedule.near': [0.5, 1.0],
-                     'schedule.sinking': [0.1, 1.0]})
-    begin, middle, end = ([0.01, 4e-4, 0.8, 3.0, 0.0], [0.0075, 2e-4, 0.5, 2.0, 0.5],
-                          [0.005, 0.0, 0.2, 1.0, 1.0])
+                     'schedule.sinking': [0.1, 1.0], 'schedule.depth_limit': [5.0, 1.0]})
+    begin, middle, end = ([0.01, 4e-4, 0.8, 3.0, 0.0, 5.0], [0.0075, 2e-4, 0.5, 2.0, 0.5, 3.0],
+                          [0.005, 0.0, 0.2, 1.0, 1.0, 1.0])
     for part, knobs, smooth, near in ((0.0, begin, 0.1, 0.5), (0.25, begin, 0.1, 0.5),
                                       (0.5, middle, 0.55, 0.75), (0.75, end, 1.0, 1.0),
                                       (1.0, end, 1.0, 1.0)):
@@ -54,6 +54,7 @@ def test_the_schedule_is_linear_between_its_ends():
         made.apply_schedule(part)
         np.testing.assert_allclose(made.alg.knobs, knobs[:4], rtol=1e-6)
         assert float(made.env.severity) == pytest.approx(knobs[4])
+        assert float(made.env.depth_limit) == pytest.approx(knobs[5])
         for name, weight in zip(rewards.TERMS, made.env.weights.tolist()):
             full = getattr(made.parameters.reward, name) * made.parameters.reward.scale
             assert weight == pytest.approx(full * factors.get(name, 1.0), rel=1e-5), name
