@@ -112,7 +112,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
             estimator.imu.gyroscope_noise)
         supervisor.select(controller)
         stayed = loop.fly(task, progress)
-        recorder.write_meta({'crashed': not stayed})
+        recorder.write_meta({'crashed': not stayed, 'ended': loop.ending})
     return memory.log()
 
 
@@ -166,6 +166,10 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
                       files=files, bag=folder, meta=meta,
                       progress=lambda part, bar=bar: bars.update(bar, completed=part))
             results[name] = metrics_of_runs.metrics(log, flown)
+            if log.meta['ended']:
+                console.print(f'{name}: the flight ended early, {log.meta["ended"]}',
+                              style='yellow', highlight=False)
+                results[name]['ended'] = log.meta['ended']
     table.print_results(results, console)
     if json_path:
         write_json(json_path, results)

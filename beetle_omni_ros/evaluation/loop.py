@@ -60,11 +60,17 @@ class FlightLoop:
         self._ticks = 0
         self._state_name = ''
         self._crashed = False
+        self._ending = ''
 
     @property
     def compute(self) -> dict[str, dict]:
         """Controller -> summary of its CPU times."""
         return {name: timer.summary() for name, timer in self._timers.items()}
+
+    @property
+    def ending(self) -> str:
+        """When and why the supervisor ended the flight before its task, in words, or ''."""
+        return self._ending
 
     def fly(self, task: Task, progress: Callable[[float], None] = lambda part: None) -> bool:
         """
@@ -197,6 +203,10 @@ class FlightLoop:
         if name == 'flying':
             name = f'flying:{self._supervisor.active}'
         if name != self._state_name:
+            if self._state_name.startswith(('flying', 'fallback')) \
+                    and name in ('landing', 'emergency_stop', 'disarmed'):
+                said = [e.text for e in self._supervisor.events][-1:]
+                self._ending = f'{name} at {now:.1f} s: {said[0] if said else "unknown"}'
             if self._state_name.startswith(('flying', 'fallback', 'landing')) \
                     and name in ('disarmed', 'emergency_stop'):
                 self._crashed = True

@@ -23,7 +23,7 @@ SEGMENT = 8.0                       # [s] of a pose, and the windows of the task
 AT_TARGET, ON_THE_WAY = (7.0, 7.5), (1.0, 7.0)
 # Latencies of the simulated robot, and the publication's table in full.
 NOMINAL = {'command_latency': [0.010, 0.010], 'velocity_latency': [0.0, 0.0],
-           'tilt_latency': [0.010, 0.010], 'thrust_limit': [20.0, 20.0]}
+           'tilt_latency': [0.010, 0.010]}
 PUBLISHED = {'command_latency': [0.005, 0.015], 'velocity_latency': [0.015, 0.025],
              'tilt_latency': [0.005, 0.010], 'noise_power': 0.0}
 SILENT = {'force_bias': 0.0, 'torque_bias': 0.0, 'force_noise': 0.0, 'torque_noise': 0.0}
@@ -38,7 +38,7 @@ def conditions(name: str, random: RandomParameters) -> RandomParameters:
         return replace(random, **own, **dict.fromkeys(DISTURBANCES, 0.0))
     zero = {entry.name: 0.0 for entry in fields(RandomParameters)
             if isinstance(getattr(random, entry.name), float)}
-    zero.update(push_period=1.0)
+    zero.update(push_period=1.0, thrust_sag=random.thrust_sag)
     return replace(random, **zero, **{key: np.array(value) for key, value in NOMINAL.items()})
 
 

@@ -110,7 +110,8 @@ class TiltableQuadrotorEnv(VecEnv):
         asked = self.offset + self.scale * actions
         command = torch.clamp(asked, self._low, self._high)
         s = self.state
-        given = tuple(torch.cat((c[:, :4], torch.minimum(c[:, 4:], s['thrust_limit'])), -1)
+        limit = self._thrust_limit()
+        given = tuple(torch.cat((c[:, :4], torch.minimum(c[:, 4:], limit)), -1)
                       for c in (command, s['previous'], s['older']))
         x = self.physics.advance(s['x'], given, s['delays'][:, :2], s['wrench'], s['body'])
         results = self._finish(s, x, asked, command, self._numbers(), self.weights)
@@ -122,6 +123,12 @@ class TiltableQuadrotorEnv(VecEnv):
         self.done.copy_(done)
         self.timeout.copy_(timeout)
         self.tally.add_(tally)
+
+    def _thrust_limit(self):
+        """(N, 1) largest thrust that the pack gives under the present load [N]."""
+        load = (self.state['x'][:, model.THRUST].clamp(min=0) ** 1.5).sum(-1, keepdim=True)
+        beyond = (load - 4 * self.robot.hover_thrust ** 1.5).clamp(min=0)
+        return (self.state['thrust_limit'] - self.cfg.random.thrust_sag * beyond).clamp(min=0)
 
     def _after(self, s, x, asked, command, numbers, weights):
         """All that follows the physics: push, reward, end, new targets, reset, observation."""

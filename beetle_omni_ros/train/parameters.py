@@ -100,8 +100,11 @@ class RandomParameters:
     command_latency: np.ndarray = parameter([0.005, 0.015], doc='until a command acts', unit='s',
                                             shape=(2,), low=0, high=0.02)
     thrust_limit: np.ndarray = parameter(
-        [16.5, 20.0], doc='largest thrust that the battery gives, whatever is commanded',
+        [18.0, 22.0], doc='largest thrust that the battery gives while four rotors hover',
         unit='N', shape=(2,), low=0, high=100)
+    thrust_sag: float = parameter(
+        0.037, doc='what is less of it for each N^1.5 that the rotors draw beyond hover: the '
+        "pack's resistance", unit='N^-0.5', low=0, high=1)
     force_share: float = parameter(0.3, doc='share of robots with a constant force', low=0, high=1)
     force: float = parameter(4.0, doc='its size, each axis up to', unit='N', low=0, high=50)
     strong_share: float = parameter(0.08, doc='share of robots with a strong constant force',

@@ -100,6 +100,19 @@ def test_a_robot_that_cannot_lift_off_says_so(poses, tmp_path):
         evaluate(poses, plant=plant)
 
 
+def test_a_flight_that_the_supervisor_ends_says_when_and_why(poses, monkeypatch):
+    small = SimulatorParameters.load()
+    small = replace(small, battery=replace(small.battery, capacity=0.04))
+    monkeypatch.setattr(command.SimulatorParameters, 'load', lambda: small)
+    monkeypatch.setattr(loop, 'SWAP_CHARGE', 0.0)
+    text = io.StringIO()
+    results = command.run_evaluate(controllers=['nmpc'], task=str(poses),
+                                   console=Console(file=text, width=200))
+    assert 'battery empty' in results['nmpc']['ended']
+    assert results['nmpc']['ended'].startswith('landing at ')
+    assert f"nmpc: the flight ended early, {results['nmpc']['ended']}" in text.getvalue()
+
+
 def test_a_force_task_ends_with_the_level_that_was_too_much():
     task = make_task('force')
     log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)

@@ -1,5 +1,7 @@
 """What happens in a step: commands and their delays, targets, ends, resets, disturbances."""
 
+from dataclasses import replace
+
 from learning import environment, only, quiet, ROBOT
 import numpy as np
 import pytest
@@ -7,7 +9,10 @@ from scipy.spatial.transform import Rotation
 import torch
 
 from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.sim.battery import Battery
+from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.train import rewards
+from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics
 
 PERIOD = 0.01
@@ -80,7 +85,7 @@ def test_no_two_entries_of_the_state_share_memory():
 
 
 def test_the_thrust_limit_binds_the_rotors_and_is_not_seen():
-    env = quiet({**only('hover'), 'random.thrust_limit': [9.0, 9.0],
+    env = quiet({**only('hover'), 'random.thrust_limit': [9.0, 9.0], 'random.thrust_sag': 0.0,
                  'random.command_latency': [0.0, 0.0]})
     action = torch.zeros(env.num_envs, 8)
     action[:, 4:] = 12.0
@@ -92,6 +97,27 @@ def test_the_thrust_limit_binds_the_rotors_and_is_not_seen():
     torch.testing.assert_close(env.state['x'], expected)
     torch.testing.assert_close(env.state['previous'], asked)
     torch.testing.assert_close(env.observation[:, 29:33], action[:, 4:])
+
+
+@pytest.mark.parametrize('charge', [0.9, 0.6, 0.35])
+def test_the_pack_sags_under_load_as_the_simulated_one(charge):
+    pack = Battery(replace(ROBOT, rotors=replace(ROBOT.rotors, thrust_max=40.0)),
+                   SimulatorParameters.load().battery)
+    shipped = TrainParameters.load().random
+
+    def limit(thrust):
+        pack.charge = charge
+        pack.step(np.full(4, thrust), 1e-6)
+        return pack.thrust_limit
+
+    assert shipped.thrust_limit[0] < limit(ROBOT.hover_thrust) < shipped.thrust_limit[1]
+    env = quiet({**only('hover'), 'random.thrust_limit': [limit(ROBOT.hover_thrust)] * 2,
+                 'random.thrust_sag': shipped.thrust_sag})
+    for thrust in (9.0, 11.0, 13.0):
+        env.state['x'][:, model.THRUST] = thrust
+        np.testing.assert_allclose(env._thrust_limit(), limit(thrust), atol=0.6)
+    env.state['x'][:, model.THRUST] = 1.0    # no more than in hover
+    np.testing.assert_allclose(env._thrust_limit(), limit(ROBOT.hover_thrust), rtol=1e-6)
 
 
 def test_actions_beyond_the_actuators_act_and_are_seen_as_their_limits():
