@@ -13,6 +13,9 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 
 FINE = 0.005            # [s] grid on which measurements are smoothed
 SMOOTH_IMU, SMOOTH_JOINT, SMOOTH_POSE = 22.0, 20.0, 6.0     # [Hz] of the model's inputs
+# [Hz] of what is compared. Every other reading as it is would let the noise above the grid's
+# Nyquist rate through, differently for every shift in time: a fit finds delays where that pays.
+SMOOTH_READING = 35.0
 # The IMU's clock is everybody's: what it is late by, all else is early by. Shifting the IMU itself
 # would sample its noise elsewhere, which changes chi2 by more than a delay is worth.
 IMU_LAG = 'imu_filter_lag.delay'
@@ -141,7 +144,7 @@ class Signals:
         def make():
             fine = self._joint(np.clip(self._fine + delay - late, self.flight.joint_t[0],
                                        self.flight.joint_t[-1]))
-            raw = fine[self._lead::self._ratio][:len(self.t)]
+            raw = self._smooth(fine, SMOOTH_READING)
             if gap > 0:
                 fine = _play(fine, gap / 2)
             return tuple(self._smooth(fine, SMOOTH_JOINT, k) for k in range(3)) + (raw,)
