@@ -175,6 +175,22 @@ class FlightModel:
                 residuals[k] = self.filters['J'](self._reading(sets[k]) - run.reshape(-1, 4))
         return residuals
 
+    def guide(self, theta: dict[str, float]) -> None:
+        """
+        From now on take quick tilting from the servo model at this point, if encoders are noisy.
+
+        Noise in the tilts stands in the residual and in the slopes of the body's equations: its
+        second derivative, for one, is explained by more mass in the tilting modules.
+        """
+        s = self.signals
+        if s.reading_noise < self.p.guide_above:
+            return
+        run = self._servos([theta], theta)[0].reshape(-1, 4)
+        tilts = s.joints(theta)[0].copy()
+        tilts[self._starts[0]:self._starts[0] + len(run)] = run
+        s.follow(tilts)
+        self._made.clear()
+
     def _reading(self, theta):
         """Encoders (K, 4) in the windows of the servos, one after the other."""
         first, count = self._starts[0], self._length * len(self._starts)

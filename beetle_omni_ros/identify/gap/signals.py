@@ -52,6 +52,8 @@ class Signals:
 
     Attributes:
         t: (N,) grid [s].
+        reading_noise: [rad] standard deviation of an encoder's reading, from what is no motion.
+        guide: (N, 4) [rad] tilts that a servo model expects, or None: encoders alone.
 
     """
 
@@ -79,6 +81,15 @@ class Signals:
         if not (0.5 < self.voltage.min() and self.voltage.max() < 1.5):
             self.voltage = np.ones(len(self.t))
         self._kept: dict = {}
+        third = np.abs(np.diff(flight.joint, 3, axis=0))
+        self.reading_noise = float(np.median(np.sqrt((np.minimum(third, np.quantile(
+            third, 0.9, axis=0))**2).mean(axis=0) / 20)))
+        self.guide: np.ndarray | None = None
+
+    def follow(self, guide: np.ndarray) -> None:
+        """Take the tilts (N, 4) [rad] of a servo model where encoders say only noise."""
+        self.guide = guide
+        self._kept = {key: value for key, value in self._kept.items() if key[0] != 'joints'}
 
     def _cached(self, what, theta, names, make):
         key = (what, tuple(theta.get(name, 0.0) for name in names))
@@ -147,8 +158,17 @@ class Signals:
             raw = self._smooth(fine, SMOOTH_READING)
             if gap > 0:
                 fine = _play(fine, gap / 2)
+            if self.guide is not None:
+                return *self._guided(raw, gap), raw
             return tuple(self._smooth(fine, SMOOTH_JOINT, k) for k in range(3)) + (raw,)
         return self._cached('joints', theta, names, make)
+
+    def _guided(self, raw, gap):
+        """Angle, rate, acceleration (N, 4): slow motion as read, quick motion as expected."""
+        guide = _play(self.guide, gap / 2) if gap > 0 else self.guide
+        slow = low_pass(self.p.guide_edge, 1, self.p.grid)
+        quick = low_pass(SMOOTH_JOINT, 1, self.p.grid)
+        return tuple(_within(quick, guide, k) + _within(slow, raw - guide, k) for k in range(3))
 
     def delays(self, theta):
         """Delays of tilt and thrust commands [s]."""
@@ -188,6 +208,12 @@ class Signals:
         """(K, 4) mean tilt commands between ``edges`` (K + 1,) [s], acting after ``delay``."""
         integral = _at(edges - delay, self._command_t, *self._tilt_integral)
         return np.diff(integral, axis=0) / np.diff(edges)[:, None]
+
+
+def _within(kernel, series, derivative):
+    """Filtered series (N, n), its ends held."""
+    ends = ((kernel.margin, kernel.margin), (0, 0))
+    return kernel(np.pad(series, ends, mode='edge'), derivative)
 
 
 def _spread(t, values):
