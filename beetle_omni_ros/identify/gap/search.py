@@ -256,8 +256,8 @@ class Search:
         trial.without_best = float(held.sum() - held.max()) if len(held) > 1 else 0.0
 
     def _prune(self, found, state, cost):
-        """Drop what later steps have made superfluous."""
-        while len(found.accepted) > 1:
+        """Drop what later steps, or the noise learnt after the last one, made superfluous."""
+        while found.accepted:
             losses = []
             for trial in found.accepted:
                 rest = [t.candidate for t in found.accepted if t is not trial]
