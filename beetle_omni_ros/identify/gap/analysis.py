@@ -95,7 +95,7 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
     models = [FlightModel(flight, robot, body, a.keys, p) for flight in fitted]
     others = [FlightModel(flight, robot, body, a.keys, p) for flight in judging]
     a.models = models, others or models
-    coarse = float(np.median([_pose_noise(flight) for flight in fitted])) > p.coarse_noise
+    coarse = float(np.median([m.signals.position_noise for m in models])) > p.coarse_noise
     if coarse:
         a.findings.append('sensors are noisy: latencies within their usual range are not named')
     beliefs = tolerances(p, coarse, _swing(robot))
@@ -117,12 +117,6 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
     progress('free runs')
     _falsify(a)
     return a
-
-
-def _pose_noise(flight):
-    """Standard deviation of a MoCap reading [m], from what is no motion."""
-    third = np.diff(flight.pose[:, :3], 3, axis=0)
-    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20))
 
 
 def _modules(robot):

@@ -163,7 +163,8 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
                           / 20).sum()))
     # Readings at 100 Hz, interpolated to the fine grid: neighbours share their noise.
     share = np.sqrt(2 * FINE / np.median(np.diff(model.flight.imu_t)) if False else 2.0)
-    slope = low_pass(SMOOTH_POSE, 1, FINE)
+    coarse = model.signals.position_noise > model.p.coarse_noise
+    slope = low_pass(model.p.velocity_edge if coarse else SMOOTH_POSE, 1, FINE)
     velocity0 = position * share * np.linalg.norm(
         slope(np.eye(1, 4 * slope.margin + 1, 2 * slope.margin)[0], 1))
     smooth = low_pass(SMOOTH_IMU, 1, FINE)

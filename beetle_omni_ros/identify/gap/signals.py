@@ -53,6 +53,7 @@ class Signals:
     Attributes:
         t: (N,) grid [s].
         reading_noise: [rad] standard deviation of an encoder's reading, from what is no motion.
+        position_noise: [m] likewise of MoCap's positions.
         guide: (N, 4) [rad] tilts that a servo model expects, or None: encoders alone.
 
     """
@@ -84,6 +85,8 @@ class Signals:
         third = np.abs(np.diff(flight.joint, 3, axis=0))
         self.reading_noise = float(np.median(np.sqrt((np.minimum(third, np.quantile(
             third, 0.9, axis=0))**2).mean(axis=0) / 20)))
+        third = np.diff(flight.pose[:, :3], 3, axis=0)
+        self.position_noise = float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20))
         self.guide: np.ndarray | None = None
 
     def follow(self, guide: np.ndarray) -> None:
@@ -139,13 +142,28 @@ class Signals:
             fine = self._pose(np.clip(self._fine + values[0] - values[1], self.flight.pose_t[0],
                                       self.flight.pose_t[-1]))
             position = fine[self._lead::self._ratio][:len(self.t), :3]
-            velocity = self._smooth(fine[:, :3], SMOOTH_POSE, 1)
             quaternion = self._smooth(fine[:, 3:], 10.0)
             quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+            if self.position_noise > self.p.coarse_noise:
+                velocity = self._fused(self._smooth(fine[:, :3], SMOOTH_POSE), quaternion)
+            else:
+                velocity = self._smooth(fine[:, :3], SMOOTH_POSE, 1)
             if any(values[2:]):
                 quaternion = _times(quaternion, -np.array(values[2:]))
             return position, quaternion, velocity
         return self._cached('pose', theta, names, make)
+
+    def _fused(self, position, quaternion):
+        """Velocity (N, 3): slow changes as positions (N, 3) show them, quick ones by the IMU."""
+        acceleration = np.einsum('nij,nj->ni', matrices(quaternion), self.imu({})[0])
+        acceleration[:, 2] -= self.robot.gravity
+        quick = self.p.grid * np.cumsum(acceleration, axis=0)
+        kernel = low_pass(self.p.velocity_edge, 1, self.p.grid)
+        # Positions go on straight at the ends: held, they would stop the robot there.
+        lead = np.arange(-kernel.margin, 0)[:, None] * (position[20] - position[0]) / 20
+        tail = np.arange(1, kernel.margin + 1)[:, None] * (position[-1] - position[-21]) / 20
+        longer = np.concatenate([position[0] + lead, position, position[-1] + tail])
+        return kernel(longer, 1) + quick - _within(kernel, quick, 0)
 
     def joints(self, theta):
         """Angle, rate, acceleration (N, 4) of the tilts, and the raw reading (N, 4)."""
