@@ -19,7 +19,12 @@ from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.identify.gap.servo import simulate, Windows
 from beetle_omni_ros.identify.gap.signals import (
-    FINE, matrices, SMOOTH_IMU, SMOOTH_JOINT, SMOOTH_POSE)
+    FINE,
+    matrices,
+    SMOOTH_IMU,
+    SMOOTH_JOINT,
+    SMOOTH_POSE,
+)
 
 HORIZONS = (0.1, 0.5, 1.0)      # [s]
 EVERY = 0.5                     # [s] between starts

@@ -91,7 +91,7 @@ class Signals:
 
     def follow(self, guide: np.ndarray) -> None:
         """Take the tilts (N, 4) [rad] of a servo model where encoders say only noise."""
-        self.guide = guide
+        self.guide, self._expected = guide, _derivatives(guide, self.p.grid)
         self._kept = {key: value for key, value in self._kept.items() if key[0] != 'joints'}
 
     def _cached(self, what, theta, names, make):
@@ -184,9 +184,11 @@ class Signals:
     def _guided(self, raw, gap):
         """Angle, rate, acceleration (N, 4): slow motion as read, quick motion as expected."""
         guide = _play(self.guide, gap / 2) if gap > 0 else self.guide
-        slow = low_pass(self.p.guide_edge, 1, self.p.grid)
-        quick = low_pass(SMOOTH_JOINT, 1, self.p.grid)
-        return tuple(_within(quick, guide, k) + _within(slow, raw - guide, k) for k in range(3))
+        expected = self._expected if gap <= 0 else _derivatives(guide, self.p.grid)
+        slow = [_within(low_pass(self.p.guide_edge, 1, self.p.grid), raw - guide, 0)]
+        for _ in range(2):
+            slow.append(np.gradient(slow[-1], self.p.grid, axis=0))
+        return tuple(a + b for a, b in zip(expected, slow, strict=True))
 
     def delays(self, theta):
         """Delays of tilt and thrust commands [s]."""
@@ -226,6 +228,12 @@ class Signals:
         """(K, 4) mean tilt commands between ``edges`` (K + 1,) [s], acting after ``delay``."""
         integral = _at(edges - delay, self._command_t, *self._tilt_integral)
         return np.diff(integral, axis=0) / np.diff(edges)[:, None]
+
+
+def _derivatives(series, period):
+    """Smoothed series (N, n), its first and its second derivative."""
+    kernel = low_pass(SMOOTH_JOINT, 1, period)
+    return tuple(_within(kernel, series, k) for k in range(3))
 
 
 def _within(kernel, series, derivative):
