@@ -129,3 +129,15 @@ def test_an_only_step_goes_too_if_the_fit_does_not_miss_it(monkeypatch, loss, ke
     found = Found(accepted=[trial])
     search._prune(found, state, 100.0)
     assert len(found.accepted) == kept
+
+
+def test_each_rotor_may_have_a_lag_of_its_own():
+    signals, h = model(MOTION.flight()).signals, P.grid
+    plain, slow = signals.thrust({})[0], signals.thrust({'rotor.lag[2]': 0.2})[0]
+    assert slow[:, [0, 1, 3]] == pytest.approx(plain[:, [0, 1, 3]], abs=1e-12)
+    # f' = (f* - f) / T with f* as before
+    asked = plain[1:-1] + ROBOT.rotors.time_constant * (plain[2:] - plain[:-2]) / (2 * h)
+    tau = ROBOT.rotors.time_constant * np.exp(0.2)
+    again = slow[1:-1] + tau * (slow[2:] - slow[:-2]) / (2 * h)
+    assert again[:, 2] == pytest.approx(asked[:, 2], abs=0.02)
+    assert rms(slow[:, 2] - plain[:, 2]) > 0.03

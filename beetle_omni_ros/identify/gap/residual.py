@@ -36,7 +36,7 @@ THIN = 2        # grid points to each at which the body's equations are evaluate
 STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
          'kp': 0.01, 'kd': 0.01, 'velocity_limit': 0.01, 'effort_limit': 0.01, 'coulomb': 5e-4,
          'stiction': 5e-4, 'deflection_per_newton': 1e-4, 'gap': 1e-3, 'thrust_max': 0.01,
-         'share': 0.05, 'split': 1e-3, 'ratio': 0.01,
+         'share': 0.05, 'split': 1e-3, 'ratio': 0.01, 'lag': 0.02,
          'angular_momentum_at_hover': 5e-3}
 
 

@@ -201,8 +201,9 @@ class Signals:
 
     def thrust(self, theta):
         """Thrusts after delay, limits and lag, and their rates of change (N, 4)."""
-        names = ['rotor_lag.time_constant', 'thrust_saturation.thrust_max']
-        lag, limit = (theta.get(name, 0.0) for name in names)
+        names = ['rotor_lag.time_constant', 'thrust_saturation.thrust_max',
+                 *(f'rotor.lag[{k}]' for k in range(4))]
+        lag, limit, *own = (theta.get(name, 0.0) for name in names)
         delay = self.delays(theta)[1]
 
         def make():
@@ -210,15 +211,15 @@ class Signals:
             # The file's own limit cuts no earlier than commands are: it is the command's.
             most = rotors.thrust_max * np.exp(limit) if limit else np.inf
             asked = np.clip(self._command[:, 4:], rotors.thrust_min, most)
-            tau = rotors.time_constant * np.exp(lag)
+            tau = rotors.time_constant * np.exp(lag + np.array(own))
             begin = self._fine[0] - 0.9
             count = round((self.t[-1] - begin) / h) + 2
             edges = begin + h * np.arange(count + 1)
             mean = np.diff(_at(edges - delay, self._command_t, *_integral(
                 self._command_t, asked)), axis=0) / h
             keep = np.exp(-h / tau)
-            first = mean[:1]
-            lagged, _ = lfilter([1 - keep], [1, -keep], mean, axis=0, zi=keep * first)
+            lagged = np.stack([lfilter([1 - k], [1, -k], column, zi=k * column[:1])[0]
+                               for k, column in zip(keep, mean.T, strict=True)], axis=1)
             places = np.rint((self.t - begin) / h).astype(int) - 1
             force = lagged[places]
             return force, (mean[places + 1] - force) / tau
