@@ -19,8 +19,9 @@ from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import Key
 from beetle_omni_ros.identify.gap.loads import module_load, spin_load
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.series import matrices
 from beetle_omni_ros.identify.gap.servo import GYROSCOPIC, simulate, Windows
-from beetle_omni_ros.identify.gap.signals import matrices, Signals
+from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torque_z'),
