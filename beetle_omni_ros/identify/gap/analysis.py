@@ -95,10 +95,10 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
     models = [FlightModel(flight, robot, body, a.keys, p) for flight in fitted]
     others = [FlightModel(flight, robot, body, a.keys, p) for flight in judging]
     a.models = models, others or models
-    coarse = float(np.median([_pose_noise(flight) for flight in fitted])) > p.coarse_noise
+    coarse = float(np.median([m.signals.position_noise for m in models])) > p.coarse_noise
     if coarse:
         a.findings.append('sensors are noisy: latencies within their usual range are not named')
-    beliefs = tolerances(p, coarse)
+    beliefs = tolerances(p, coarse, _swing(robot))
     if robot.multibody is None or 'module_reaction' in robot.effects:
         del beliefs['modules.share']
     a.problem = Problem(models, a.keys, beliefs, p)
@@ -119,18 +119,18 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
     return a
 
 
-def _pose_noise(flight):
-    """Standard deviation of a MoCap reading [m], from what is no motion."""
-    third = np.diff(flight.pose[:, :3], 3, axis=0)
-    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20))
-
-
 def _modules(robot):
     if robot.multibody is None:
         return 0.0, 0.0
     module = robot.multibody.module
     depth = -float(module.centre_of_mass[2])
     return float(module.inertia[0] + module.mass * depth**2), float(module.mass * depth)
+
+
+def _swing(robot):
+    """Logarithm of a module's inertia about its joint over the servo's number."""
+    inertia = _modules(robot)[0]
+    return float(np.log(max(inertia / robot.joints.inertia, 1.0))) if inertia else 0.0
 
 
 def _choose_modules(problem, others):
@@ -240,6 +240,8 @@ def _falsify(a):
     """Free runs before, after and with a placebo, on the flights that judge."""
     found, noise = a.found, a.problem.noise
     judges = a.models[1]
+    for model in judges:
+        model.guide(found.theta)
     keys = {n for t in found.accepted for n in t.candidate.keys}
     # The same robot, with its tolerances as found, without and with what was named ...
     points = {'before': {n: x for n, x in found.theta.items() if n not in keys},
@@ -273,7 +275,8 @@ def _falsify(a):
 def _plain(a, theta, named):
     """The robot file's own numbers, with the sensors and the bus as they were found."""
     return {name: x for name, x in theta.items() if not a.keys[name].body
-            and a.keys[name].effect not in ('rotor_lag', 'joint_bandwidth', 'modules')
+            and a.keys[name].effect not in ('rotor_lag', 'joint_bandwidth', 'modules', 'swing',
+                                             'rotor')
             and name in a.problem.beliefs and name not in named}
 
 

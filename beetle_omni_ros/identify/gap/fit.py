@@ -96,6 +96,11 @@ class Problem:
         self._raw = [(r, s, names, theta) for r, s in zip(raw, slopes, strict=True)]
         return self._whitened()
 
+    def guide(self, theta: dict[str, float]) -> None:
+        """Let noisy encoders' tilts follow the servos at this point; see FlightModel."""
+        for model in self.models:
+            model.guide(theta)
+
     def renew(self, theta: dict[str, float]) -> None:
         """Take the residual at a point nearby; slopes stay those of the last :meth:`state`."""
         self._raw = [(m.residual(theta), old[1], old[2], theta)

@@ -27,7 +27,7 @@ GROUPS = {  # signal-layer entries -> channel groups in which they show
     'joint_backlash': 'B', 'joint_feedback_delay': 'BJ', 'mocap_time_offset': 'AW',
     'imu_filter_lag': 'BAWJ', 'imu_accelerometer_bias': 'BA', 'imu_gyroscope_bias': 'BW',
     'imu_misalignment': 'BAW', 'imu_lever_arm': 'BA', 'mocap_misalignment': 'AW',
-    'base': 'BJ', 'modules': 'BJ'}
+    'base': 'BJ', 'modules': 'BJ', 'swing': 'J', 'rotor': 'B'}
 
 
 @dataclass(frozen=True)
@@ -133,13 +133,15 @@ class Belief:
         return (0.0 if -self.below < x < self.above else 1 / self.deviation) + 1 / self.inner
 
 
-def tolerances(p: GapParameters, coarse: bool = False) -> dict[str, Belief]:
+def tolerances(p: GapParameters, coarse: bool = False,
+               swing: float = 0.0) -> dict[str, Belief]:
     """
     Keys that every robot differs by, with the belief that it is by little.
 
     Args:
         p: parameters.
         coarse: whether the sensors are of the kind whose stamps hide their latency.
+        swing: logarithm by which a servo's inertia may be larger than it says.
 
     """
     made = {'mass.mass': p.tolerance_mass, 'thrust_coefficient.scale': p.tolerance_thrust,
@@ -156,7 +158,8 @@ def tolerances(p: GapParameters, coarse: bool = False) -> dict[str, Belief]:
                  f'mocap_misalignment.rotation[{k}]': p.tolerance_angle}
     for k in range(4):
         made |= {f'rotor_thrust_coefficient.scale[{k}]': p.tolerance_thrust,
-                 f'joint_offset.offset[{k}]': p.tolerance_angle}
+                 f'joint_offset.offset[{k}]': p.tolerance_angle,
+                 f'rotor.lag[{k}]': p.tolerance_lag}
     for k in range(12):
         made[f'position.offset[{k}]'] = p.tolerance_position
     beliefs = {name: Belief(deviation) for name, deviation in made.items()}
@@ -164,6 +167,8 @@ def tolerances(p: GapParameters, coarse: bool = False) -> dict[str, Belief]:
     reach, nominal = p.command_delay_range, p.command_delay
     beliefs['base.delay'] = Belief(5e-4, nominal, reach / 2, 0.003)
     beliefs['base.split'] = Belief(5e-4, reach, reach, 0.004)
+    near = p.tolerance_swing
+    beliefs['swing.ratio'] = Belief(p.tolerance_lag, near, max(swing, near), swing + near)
     if coarse:
         imu, joint = p.coarse_latency
         beliefs['imu_filter_lag.delay'] = Belief(p.tolerance_delay, 0.0, imu, imu)
@@ -173,13 +178,18 @@ def tolerances(p: GapParameters, coarse: bool = False) -> dict[str, Belief]:
 
 
 def extra_keys() -> dict[str, Key]:
-    """Keys of what is no catalogue entry: rotor positions, the modules, delays of the bus."""
+    """Keys of what is no catalogue entry: rotor positions, modules, servos, delays of the bus."""
     keys = {}
     for k in range(12):
         name = f'position.offset[{k}]'
         keys[name] = Key(name, 'position', 'offset', k, 0.0, False, -0.05, 0.05, 0.001, 0.0, True)
     keys['modules.share'] = Key('modules.share', 'modules', 'share', None, 0.0, False, -2, 2,
                                 0.05, 0.0, False)
+    keys['swing.ratio'] = Key('swing.ratio', 'swing', 'ratio', None, 0.0, False, -1, 1, 0.1, 0.0,
+                              False)
+    for k in range(4):
+        name = f'rotor.lag[{k}]'
+        keys[name] = Key(name, 'rotor', 'lag', k, 0.0, False, -1, 1, 0.1, 0.0, False)
     for part in ('delay', 'split'):
         keys[f'base.{part}'] = Key(f'base.{part}', 'base', part, None, 0.0, False, -0.05, 0.05,
                                    0.005, 0.0, False)

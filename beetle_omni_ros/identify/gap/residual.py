@@ -19,8 +19,9 @@ from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import Key
 from beetle_omni_ros.identify.gap.loads import module_load, spin_load
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.series import matrices
 from beetle_omni_ros.identify.gap.servo import GYROSCOPIC, simulate, Windows
-from beetle_omni_ros.identify.gap.signals import matrices, Signals
+from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torque_z'),
@@ -30,11 +31,13 @@ CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torq
 UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate': 'rad/s',
          'joint': 'rad'}
 TIMING = ('imu_filter_lag.delay', 'joint_feedback_delay.delay')     # of what loads the joints
+# By which an encoder's reading is taken later for each second of a delay.
+SHIFTS = {'imu_filter_lag.delay': -1.0, 'joint_feedback_delay.delay': 1.0}
 THIN = 2        # grid points to each at which the body's equations are evaluated
 STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
          'kp': 0.01, 'kd': 0.01, 'velocity_limit': 0.01, 'effort_limit': 0.01, 'coulomb': 5e-4,
          'stiction': 5e-4, 'deflection_per_newton': 1e-4, 'gap': 1e-3, 'thrust_max': 0.01,
-         'share': 0.05, 'split': 1e-3,
+         'share': 0.05, 'split': 1e-3, 'ratio': 0.01, 'lag': 0.02,
          'angular_momentum_at_hover': 5e-3}
 
 
@@ -163,25 +166,68 @@ class FlightModel:
 
     def _joints(self, sets):
         """Encoders less simulated servos, [(M, 4)] for each set."""
-        first, count = self._starts[0], self._length * len(self._starts)
         groups: dict[tuple, list[int]] = {}
         for k, theta in enumerate(sets):
             groups.setdefault(tuple(theta.get(name, 0.0) for name in TIMING), []).append(k)
         residuals: list = [None] * len(sets)
         for members in groups.values():
-            windows, edges = self._windows(sets[members[0]])
-            targets = []
-            for k in members:
-                t = self.signals.tilt_targets(edges.ravel(), self.signals.delays(sets[k])[0])
-                # One more edge than steps in each window: the mean across windows is dropped.
-                targets.append(np.concatenate([t, t[-1:]]).reshape(*edges.shape, 4)[
-                    :, :-1].transpose(1, 0, 2))
-            runs = simulate(self.robot.joints, windows, np.array(targets),
-                            [sets[k] for k in members], {**self._own, 'modules': self.modules})
+            runs = self._servos([sets[k] for k in members], sets[members[0]])
             for k, run in zip(members, runs, strict=True):
-                angle = self.signals.joints(sets[k])[3][first:first + count]
-                residuals[k] = self.filters['J'](angle - run.transpose(1, 0, 2).reshape(-1, 4))
+                residuals[k] = self.filters['J'](self._reading(sets[k]) - run.reshape(-1, 4))
         return residuals
+
+    def guide(self, theta: dict[str, float]) -> None:
+        """
+        From now on take quick tilting from the servo model at this point, if encoders are noisy.
+
+        Noise in the tilts stands in the residual and in the slopes of the body's equations: its
+        second derivative, for one, is explained by more mass in the tilting modules.
+        """
+        s = self.signals
+        if s.reading_noise < self.p.guide_above:
+            return
+        run = self._servos([theta], theta)[0].reshape(-1, 4)
+        tilts = s.joints(theta)[0].copy()
+        tilts[self._starts[0]:self._starts[0] + len(run)] = run
+        s.follow(tilts)
+        self._made.clear()
+
+    def _reading(self, theta):
+        """Encoders (K, 4) in the windows of the servos, one after the other."""
+        first, count = self._starts[0], self._length * len(self._starts)
+        return self.signals.joints(theta)[3][first:first + count]
+
+    def _servos(self, sets, at):
+        """Simulated servos (P, W, M, 4) of each set, begun and loaded as measured under ``at``."""
+        windows, edges = self._windows(at)
+        targets = []
+        for theta in sets:
+            t = self.signals.tilt_targets(edges.ravel(), self.signals.delays(theta)[0])
+            # One more edge than steps in each window: the mean across windows is dropped.
+            targets.append(np.concatenate([t, t[-1:]]).reshape(*edges.shape, 4)[
+                :, :-1].transpose(1, 0, 2))
+        runs = simulate(self.robot.joints, windows, np.array(targets), sets,
+                        {**self._own, 'modules': self.modules})
+        return runs.transpose(0, 2, 1, 3)
+
+    def _joint_slopes(self, theta, names):
+        """
+        Derivatives (M, 4) of the joints' residual by each key.
+
+        By a delay of the readings it is the rate of turn of the simulated servo, not that of the
+        encoder: the derivative of noise explains the same noise shifted, and goes on doing so
+        wherever a fit moves without fresh slopes.
+        """
+        sizes = [STEPS[self.keys[name].parameter] for name in names]
+        sets = [theta, *({**theta, name: theta.get(name, 0.0) + h}
+                         for name, h in zip(names, sizes, strict=True))]
+        runs = self._servos(sets, theta)
+        rate = np.gradient(runs[0], self.p.grid, axis=1)
+        made = []
+        for name, h, run in zip(names, sizes, runs[1:], strict=True):
+            slope = rate * SHIFTS.get(name, 0.0) - (run - runs[0]) / h
+            made.append(self.filters['J'](slope.reshape(-1, 4)))
+        return made
 
     def _windows(self, theta):
         timing = {name: theta.get(name, 0.0) for name in TIMING}
@@ -232,12 +278,6 @@ class FlightModel:
                     made[group][:, :, names.index(name)] = (values - now[group]) / h
         turning = [name for name in names if 'J' in self.keys[name].groups]
         if turning:
-            sets, sizes = [theta], []
-            for name in turning:
-                h = STEPS[self.keys[name].parameter]
-                sizes.append(h)
-                sets.append({**theta, name: theta.get(name, 0.0) + h})
-            runs = self._joints(sets)
-            for name, h, run in zip(turning, sizes, runs[1:], strict=True):
-                made['J'][:, :, names.index(name)] = (run - runs[0]) / h
+            for name, slope in zip(turning, self._joint_slopes(theta, turning), strict=True):
+                made['J'][:, :, names.index(name)] = slope
         return made

@@ -18,7 +18,13 @@ from beetle_omni_ros.identify.gap.loads import module_load, spin_load
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.identify.gap.servo import simulate, Windows
-from beetle_omni_ros.identify.gap.signals import FINE, matrices, SMOOTH_IMU, SMOOTH_POSE
+from beetle_omni_ros.identify.gap.signals import (
+    FINE,
+    matrices,
+    SMOOTH_IMU,
+    SMOOTH_JOINT,
+    SMOOTH_POSE,
+)
 
 HORIZONS = (0.1, 0.5, 1.0)      # [s]
 EVERY = 0.5                     # [s] between starts
@@ -162,12 +168,16 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
                           / 20).sum()))
     # Readings at 100 Hz, interpolated to the fine grid: neighbours share their noise.
     share = np.sqrt(2 * FINE / np.median(np.diff(model.flight.imu_t)) if False else 2.0)
-    slope = low_pass(SMOOTH_POSE, 1, FINE)
+    coarse = model.signals.position_noise > model.p.coarse_noise
+    slope = low_pass(model.p.velocity_edge if coarse else SMOOTH_POSE, 1, FINE)
     velocity0 = position * share * np.linalg.norm(
         slope(np.eye(1, 4 * slope.margin + 1, 2 * slope.margin)[0], 1))
     smooth = low_pass(SMOOTH_IMU, 1, FINE)
     rate0 = gyro * np.linalg.norm(smooth.taps)
     angle0 = angle * share * np.linalg.norm(low_pass(10.0, 1, FINE).taps)
+    s = model.signals
+    edge = SMOOTH_JOINT if s.guide is None else model.p.guide_edge
+    joint0 = s.reading_noise * np.linalg.norm(low_pass(edge, 1, FINE).taps)
     push = _pushed(noise, model.p)
     floors = []
     for k, horizon in enumerate(HORIZONS):
@@ -177,7 +187,7 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
             2 * velocity0**2 + (gravity * horizon * angle0)**2 + push[k][1]**2,
             2 * angle0**2 + (horizon * rate0)**2 + push[k][2]**2,
             2 * rate0**2 + push[k][3]**2,
-            4 * float(np.mean(noise.sigma['J']))**2])
+            4 * float(np.mean(noise.sigma['J']))**2 + 8 * joint0**2])
     return np.maximum(np.sqrt(floors), LEAST)
 
 

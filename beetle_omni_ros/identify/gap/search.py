@@ -46,6 +46,7 @@ class Search:
         """Search; see the module."""
         found, problem = Found(), self.problem
         self.progress('noise')
+        problem.guide({})
         problem.state({}, self.names)
         state, cost = self._settle({}, [])
         found.base = dict(state.theta)
@@ -85,6 +86,7 @@ class Search:
         problem = self.problem
         at = dict(theta)
         if theta:
+            problem.guide(theta)
             problem.state(theta, self.names)
         state = problem.learn_noise(self.wide)
         for _ in range(MOST_TURNS):
@@ -93,6 +95,7 @@ class Search:
                 problem.renew(state.theta)
                 break
             at = dict(state.theta)
+            problem.guide(at)
             problem.state(at, self.names)
             state = problem.learn_noise(self.wide, 2)
         state = problem.learn_noise(self.wide, 2)
@@ -253,8 +256,8 @@ class Search:
         trial.without_best = float(held.sum() - held.max()) if len(held) > 1 else 0.0
 
     def _prune(self, found, state, cost):
-        """Drop what later steps have made superfluous."""
-        while len(found.accepted) > 1:
+        """Drop what later steps, or the noise learnt after the last one, made superfluous."""
+        while found.accepted:
             losses = []
             for trial in found.accepted:
                 rest = [t.candidate for t in found.accepted if t is not trial]

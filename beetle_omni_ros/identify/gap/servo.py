@@ -78,14 +78,15 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
     share = base['modules'] + column('modules.share')
     momentum = (base['momentum'] + column(f'{GYROSCOPIC}.angular_momentum_at_hover')) * (
         base['joint_share'] + column(f'{GYROSCOPIC}.joint_share'))
-    damping = 0.5 * h * kd / joint.inertia
-    keep, gain = (1 - damping) / (1 + damping), h / joint.inertia / (1 + damping)
+    inertia = joint.inertia * column('swing.ratio', np.exp)
+    damping = 0.5 * h * kd / inertia
+    keep, gain = (1 - damping) / (1 + damping), h / inertia / (1 + damping)
     sliding, holding = coulomb * gain, np.maximum(stiction, coulomb) * gain
     rubs, bends, loaded = sliding.any() or holding.any(), soft.any(), share.any()
     spins = momentum.any()
     # The clip of the torque matters only where the largest error could meet it.
     reach = kp * np.abs(targets - windows.start).max() * 1.5 + kd * speed
-    weak, kick = bool((effort < reach).any()), h * effort / joint.inertia
+    weak, kick = bool((effort < reach).any()), h * effort / inertia
     count = targets.shape[1]
     q = np.broadcast_to(windows.start, (len(sets), *windows.start.shape)).copy()
     v = np.broadcast_to(windows.start_rate, q.shape).copy()

@@ -9,33 +9,29 @@ from scipy.signal import lfilter
 from beetle_omni_ros.identify.gap.filters import low_pass
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.series import (
+    derivatives,
+    filled,
+    held_at,
+    integral,
+    matrices,
+    play,
+    spread,
+    turn,
+    turned,
+    within,
+)
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 FINE = 0.005            # [s] grid on which measurements are smoothed
 SMOOTH_IMU, SMOOTH_JOINT, SMOOTH_POSE = 22.0, 20.0, 6.0     # [Hz] of the model's inputs
+# [Hz] of what is compared. Every other reading as it is would let the noise above the grid's
+# Nyquist rate through, differently for every shift in time: a fit finds delays where that pays.
+SMOOTH_READING = 35.0
 # The IMU's clock is everybody's: what it is late by, all else is early by. Shifting the IMU itself
 # would sample its noise elsewhere, which changes chi2 by more than a delay is worth.
 IMU_LAG = 'imu_filter_lag.delay'
 EDGE = 1.0              # [s] at both ends that smoothing and history need
-
-
-def turn(vector):
-    """(3, 3) rotation by a rotation vector [rad]."""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = np.asarray(vector, dtype=float)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    if angle < 1e-9:
-        return np.eye(3) + k
-    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * k @ k
-
-
-def matrices(q):
-    """(N, 3, 3) rotations of unit quaternions (N, 4) xyzw."""
-    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                     [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                     [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
-                    ).transpose(2, 0, 1)
 
 
 class Signals:
@@ -49,6 +45,9 @@ class Signals:
 
     Attributes:
         t: (N,) grid [s].
+        reading_noise: [rad] standard deviation of an encoder's reading, from what is no motion.
+        position_noise: [m] likewise of MoCap's positions.
+        guide: (N, 4) [rad] tilts that a servo model expects, or None: encoders alone.
 
     """
 
@@ -63,19 +62,30 @@ class Signals:
         self._lead = round(pad / FINE)
         # Not straight lines: between two readings those would halve the noise's power, and a fit
         # would shift the IMU to where that pays.
-        self._imu = CubicSpline(*_filled(*_spread(flight.imu_t, flight.imu)))
-        self._pose = CubicSpline(*_filled(*_spread(flight.pose_t, flight.pose)))
-        self._joint = CubicSpline(*_filled(*_spread(flight.joint_t, flight.joint)))
-        self._command_t, command = _spread(flight.command_t, flight.command)
+        self._imu = CubicSpline(*filled(*spread(flight.imu_t, flight.imu)))
+        self._pose = CubicSpline(*filled(*spread(flight.pose_t, flight.pose)))
+        self._joint = CubicSpline(*filled(*spread(flight.joint_t, flight.joint)))
+        self._command_t, command = spread(flight.command_t, flight.command)
         self._command = command
         limit = robot.joints.position_limit
-        self._tilt_integral = _integral(self._command_t, np.clip(command[:, :4], -limit, limit))
+        self._tilt_integral = integral(self._command_t, np.clip(command[:, :4], -limit, limit))
         full = robot.battery.full_voltage
         self.voltage = np.interp(self.t, flight.battery_t, flight.battery[:, 0]) / full \
             if len(flight.battery_t) > 1 else np.ones(len(self.t))
         if not (0.5 < self.voltage.min() and self.voltage.max() < 1.5):
             self.voltage = np.ones(len(self.t))
         self._kept: dict = {}
+        third = np.abs(np.diff(flight.joint, 3, axis=0))
+        self.reading_noise = float(np.median(np.sqrt((np.minimum(third, np.quantile(
+            third, 0.9, axis=0))**2).mean(axis=0) / 20)))
+        third = np.diff(flight.pose[:, :3], 3, axis=0)
+        self.position_noise = float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20))
+        self.guide: np.ndarray | None = None
+
+    def follow(self, guide: np.ndarray) -> None:
+        """Take the tilts (N, 4) [rad] of a servo model where encoders say only noise."""
+        self.guide, self._expected = guide, derivatives(guide, SMOOTH_JOINT, self.p.grid)
+        self._kept = {key: value for key, value in self._kept.items() if key[0] != 'joints'}
 
     def _cached(self, what, theta, names, make):
         key = (what, tuple(theta.get(name, 0.0) for name in names))
@@ -125,13 +135,28 @@ class Signals:
             fine = self._pose(np.clip(self._fine + values[0] - values[1], self.flight.pose_t[0],
                                       self.flight.pose_t[-1]))
             position = fine[self._lead::self._ratio][:len(self.t), :3]
-            velocity = self._smooth(fine[:, :3], SMOOTH_POSE, 1)
             quaternion = self._smooth(fine[:, 3:], 10.0)
             quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+            if self.position_noise > self.p.coarse_noise:
+                velocity = self._fused(self._smooth(fine[:, :3], SMOOTH_POSE), quaternion)
+            else:
+                velocity = self._smooth(fine[:, :3], SMOOTH_POSE, 1)
             if any(values[2:]):
-                quaternion = _times(quaternion, -np.array(values[2:]))
+                quaternion = turned(quaternion, -np.array(values[2:]))
             return position, quaternion, velocity
         return self._cached('pose', theta, names, make)
+
+    def _fused(self, position, quaternion):
+        """Velocity (N, 3): slow changes as positions (N, 3) show them, quick ones by the IMU."""
+        acceleration = np.einsum('nij,nj->ni', matrices(quaternion), self.imu({})[0])
+        acceleration[:, 2] -= self.robot.gravity
+        quick = self.p.grid * np.cumsum(acceleration, axis=0)
+        kernel = low_pass(self.p.velocity_edge, 1, self.p.grid)
+        # Positions go on straight at the ends: held, they would stop the robot there.
+        lead = np.arange(-kernel.margin, 0)[:, None] * (position[20] - position[0]) / 20
+        tail = np.arange(1, kernel.margin + 1)[:, None] * (position[-1] - position[-21]) / 20
+        longer = np.concatenate([position[0] + lead, position, position[-1] + tail])
+        return kernel(longer, 1) + quick - within(kernel, quick, 0)
 
     def joints(self, theta):
         """Angle, rate, acceleration (N, 4) of the tilts, and the raw reading (N, 4)."""
@@ -141,11 +166,22 @@ class Signals:
         def make():
             fine = self._joint(np.clip(self._fine + delay - late, self.flight.joint_t[0],
                                        self.flight.joint_t[-1]))
-            raw = fine[self._lead::self._ratio][:len(self.t)]
+            raw = self._smooth(fine, SMOOTH_READING)
             if gap > 0:
-                fine = _play(fine, gap / 2)
+                fine = play(fine, gap / 2)
+            if self.guide is not None:
+                return *self._guided(raw, gap), raw
             return tuple(self._smooth(fine, SMOOTH_JOINT, k) for k in range(3)) + (raw,)
         return self._cached('joints', theta, names, make)
+
+    def _guided(self, raw, gap):
+        """Angle, rate, acceleration (N, 4): slow motion as read, quick motion as expected."""
+        guide = play(self.guide, gap / 2) if gap > 0 else self.guide
+        expected = self._expected if gap <= 0 else derivatives(guide, SMOOTH_JOINT, self.p.grid)
+        slow = [within(low_pass(self.p.guide_edge, 1, self.p.grid), raw - guide, 0)]
+        for _ in range(2):
+            slow.append(np.gradient(slow[-1], self.p.grid, axis=0))
+        return tuple(a + b for a, b in zip(expected, slow, strict=True))
 
     def delays(self, theta):
         """Delays of tilt and thrust commands [s]."""
@@ -158,8 +194,9 @@ class Signals:
 
     def thrust(self, theta):
         """Thrusts after delay, limits and lag, and their rates of change (N, 4)."""
-        names = ['rotor_lag.time_constant', 'thrust_saturation.thrust_max']
-        lag, limit = (theta.get(name, 0.0) for name in names)
+        names = ['rotor_lag.time_constant', 'thrust_saturation.thrust_max',
+                 *(f'rotor.lag[{k}]' for k in range(4))]
+        lag, limit, *own = (theta.get(name, 0.0) for name in names)
         delay = self.delays(theta)[1]
 
         def make():
@@ -167,15 +204,15 @@ class Signals:
             # The file's own limit cuts no earlier than commands are: it is the command's.
             most = rotors.thrust_max * np.exp(limit) if limit else np.inf
             asked = np.clip(self._command[:, 4:], rotors.thrust_min, most)
-            tau = rotors.time_constant * np.exp(lag)
+            tau = rotors.time_constant * np.exp(lag + np.array(own))
             begin = self._fine[0] - 0.9
             count = round((self.t[-1] - begin) / h) + 2
             edges = begin + h * np.arange(count + 1)
-            mean = np.diff(_at(edges - delay, self._command_t, *_integral(
+            mean = np.diff(held_at(edges - delay, self._command_t, *integral(
                 self._command_t, asked)), axis=0) / h
             keep = np.exp(-h / tau)
-            first = mean[:1]
-            lagged, _ = lfilter([1 - keep], [1, -keep], mean, axis=0, zi=keep * first)
+            lagged = np.stack([lfilter([1 - k], [1, -k], column, zi=k * column[:1])[0]
+                               for k, column in zip(keep, mean.T, strict=True)], axis=1)
             places = np.rint((self.t - begin) / h).astype(int) - 1
             force = lagged[places]
             return force, (mean[places + 1] - force) / tau
@@ -183,57 +220,5 @@ class Signals:
 
     def tilt_targets(self, edges, delay):
         """(K, 4) mean tilt commands between ``edges`` (K + 1,) [s], acting after ``delay``."""
-        integral = _at(edges - delay, self._command_t, *self._tilt_integral)
+        integral = held_at(edges - delay, self._command_t, *self._tilt_integral)
         return np.diff(integral, axis=0) / np.diff(edges)[:, None]
-
-
-def _spread(t, values):
-    """Stamps at least a tenth of the usual step apart, so that splines stay tame."""
-    usual = np.median(np.diff(t))
-    keep, last = [], -np.inf
-    for k, at in enumerate(t):
-        if at - last > 0.1 * usual:
-            keep.append(k)
-            last = at
-    return t[keep], values[keep]
-
-
-def _filled(t, values):
-    """Straight lines across gaps, where a spline would swing."""
-    usual = np.median(np.diff(t))
-    gaps = np.flatnonzero(np.diff(t) > 2.5 * usual)
-    if not len(gaps):
-        return t, values
-    more = np.concatenate([np.arange(t[k] + usual, t[k + 1] - usual / 2, usual) for k in gaps])
-    at = np.sort(np.concatenate([t, more]))
-    return at, np.stack([np.interp(at, t, column) for column in values.T], axis=1)
-
-
-def _integral(t, values):
-    """Held values, and their integral at ``t``."""
-    steps = np.diff(t)[:, None] * values[:-1]
-    return values, np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
-
-
-def _at(times, t, values, integral):
-    row = np.clip(np.searchsorted(t, times, side='right') - 1, 0, len(t) - 1)
-    return integral[row] + (times - t[row])[:, None] * values[row]
-
-
-def _times(quaternion, vector):
-    """Quaternions (N, 4) xyzw, each followed by a small turn of the body [rad]."""
-    angle = np.linalg.norm(vector)
-    x2, y2, z2 = vector / angle * np.sin(angle / 2)
-    w2 = np.cos(angle / 2)
-    x, y, z, w = quaternion.T
-    return np.stack([w * x2 + x * w2 + y * z2 - z * y2, w * y2 - x * z2 + y * w2 + z * x2,
-                     w * z2 + x * y2 - y * x2 + z * w2, w * w2 - x * x2 - y * y2 - z * z2], axis=1)
-
-
-def _play(x, half):
-    """Output (N, n) of a play of +-``half`` behind each column."""
-    out, y = np.empty_like(x), x[0].copy()
-    for k, row in enumerate(x):
-        y = np.minimum(np.maximum(y, row - half), row + half)
-        out[k] = y
-    return out

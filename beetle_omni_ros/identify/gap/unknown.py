@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel, THIN
-from beetle_omni_ros.identify.gap.signals import matrices
+from beetle_omni_ros.identify.gap.series import matrices
 
 RIDGE = 3.0             # of a whitened and scaled regression
 TERMS_SHOWN = 4

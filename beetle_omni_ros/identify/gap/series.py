@@ -1,0 +1,91 @@
+"""Rotations, and series of readings as arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.identify.gap.filters import low_pass
+
+
+def turn(vector):
+    """(3, 3) rotation by a rotation vector [rad]."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = np.asarray(vector, dtype=float)
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    if angle < 1e-9:
+        return np.eye(3) + k
+    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * k @ k
+
+
+def matrices(q):
+    """(N, 3, 3) rotations of unit quaternions (N, 4) xyzw."""
+    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                     [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                     [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
+                    ).transpose(2, 0, 1)
+
+
+def derivatives(series, edge, period):
+    """Smoothed series (N, n), its first and its second derivative."""
+    kernel = low_pass(edge, 1, period)
+    return tuple(within(kernel, series, k) for k in range(3))
+
+
+def within(kernel, series, derivative):
+    """Filtered series (N, n), its ends held."""
+    ends = ((kernel.margin, kernel.margin), (0, 0))
+    return kernel(np.pad(series, ends, mode='edge'), derivative)
+
+
+def spread(t, values):
+    """Stamps at least a tenth of the usual step apart, so that splines stay tame."""
+    usual = np.median(np.diff(t))
+    keep, last = [], -np.inf
+    for k, at in enumerate(t):
+        if at - last > 0.1 * usual:
+            keep.append(k)
+            last = at
+    return t[keep], values[keep]
+
+
+def filled(t, values):
+    """Straight lines across gaps, where a spline would swing."""
+    usual = np.median(np.diff(t))
+    gaps = np.flatnonzero(np.diff(t) > 2.5 * usual)
+    if not len(gaps):
+        return t, values
+    more = np.concatenate([np.arange(t[k] + usual, t[k + 1] - usual / 2, usual) for k in gaps])
+    at = np.sort(np.concatenate([t, more]))
+    return at, np.stack([np.interp(at, t, column) for column in values.T], axis=1)
+
+
+def integral(t, values):
+    """Held values (N, n), and their integral (N, n) at ``t`` (N,) [s]."""
+    steps = np.diff(t)[:, None] * values[:-1]
+    return values, np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+
+
+def held_at(times, t, values, sums):
+    """Integral (K, n) of held values at ``times`` (K,) [s], from :func:`integral`."""
+    row = np.clip(np.searchsorted(t, times, side='right') - 1, 0, len(t) - 1)
+    return sums[row] + (times - t[row])[:, None] * values[row]
+
+
+def turned(quaternion, vector):
+    """Quaternions (N, 4) xyzw, each followed by a small turn of the body [rad]."""
+    angle = np.linalg.norm(vector)
+    x2, y2, z2 = vector / angle * np.sin(angle / 2)
+    w2 = np.cos(angle / 2)
+    x, y, z, w = quaternion.T
+    return np.stack([w * x2 + x * w2 + y * z2 - z * y2, w * y2 - x * z2 + y * w2 + z * x2,
+                     w * z2 + x * y2 - y * x2 + z * w2, w * w2 - x * x2 - y * y2 - z * z2], axis=1)
+
+
+def play(x, half):
+    """Output (N, n) of a play of +-``half`` behind each column."""
+    out, y = np.empty_like(x), x[0].copy()
+    for k, row in enumerate(x):
+        y = np.minimum(np.maximum(y, row - half), row + half)
+        out[k] = y
+    return out

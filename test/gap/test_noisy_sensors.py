@@ -1,0 +1,143 @@
+"""Sensors as noisy as the publication's: what noise must not pass for."""
+
+from dataclasses import replace
+
+from flights import KEYS, model, Motion, P, ROBOT, solved
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.gap.candidates import Candidate
+from beetle_omni_ros.identify.gap.fit import State
+from beetle_omni_ros.identify.gap.keys import tolerances
+from beetle_omni_ros.identify.gap.search import Search
+from beetle_omni_ros.identify.gap.servo import simulate, Windows
+from beetle_omni_ros.identify.gap.trial import Found, Trial
+
+MOTION = Motion(7)
+DELAY = 'joint_feedback_delay.delay'
+
+
+def noisy(tilt=0.0, position=0.0, **late):
+    rng, flight = np.random.default_rng(3), MOTION.flight(**late)
+    pose = flight.pose.copy()
+    pose[:, :3] += position * rng.standard_normal((len(pose), 3))
+    return replace(flight, pose=pose,
+                   joint=flight.joint + tilt * rng.standard_normal(flight.joint.shape))
+
+
+def at(made, series):
+    """Truth (N, n) of 200 Hz at the times of a model's grid."""
+    return np.stack([np.interp(made.signals.t, MOTION.t, x) for x in series.T], axis=1)
+
+
+def rms(x):
+    return float(np.sqrt((x**2).mean()))
+
+
+@pytest.mark.parametrize('name', [DELAY, 'imu_filter_lag.delay'])
+def test_slopes_by_a_delay_hold_no_noise_of_the_encoders(name):
+    slopes = [model(noisy(tilt)).slopes({}, [name])['J'] for tilt in (0.0, 0.02)]
+    clean = model(noisy()).slopes({}, [DELAY])['J']
+    assert rms(slopes[1] - slopes[0]) < 0.02 * rms(clean)
+
+
+def test_a_stale_slope_does_not_explain_noise():
+    made = model(noisy(0.02))
+    slope = made.slopes({}, [DELAY])['J'].ravel()
+    for moved in (-0.004, 0.004):
+        rest = made.residual({DELAY: moved}, 'J')['J'].ravel() - slope * moved
+        gain = (slope @ rest)**2 / (slope @ slope)
+        assert gain < 0.01 * rest @ rest
+
+
+def test_late_and_noisy_encoders_are_found_to_be_late():
+    found = solved(model(noisy(0.02, joint_delay=0.012)), [DELAY], 'J')
+    assert found[DELAY] == pytest.approx(0.012, abs=1e-3)
+
+
+def test_noise_of_readings_is_known_from_the_readings():
+    signals = model(noisy(0.02, 0.006)).signals
+    assert signals.reading_noise == pytest.approx(0.02, rel=0.15)
+    assert signals.position_noise == pytest.approx(0.006, rel=0.1)
+
+
+def test_tilts_follow_the_servo_where_encoders_are_noisy():
+    made = model(noisy(0.02))
+    inside = slice(100, -150)
+    truth = at(made, MOTION.tilt), at(made, MOTION.tilt_acceleration)
+    before = [made.signals.joints({})[k] - truth[j] for j, k in enumerate((0, 2))]
+    made.guide({})
+    after = [made.signals.joints({})[k] - truth[j] for j, k in enumerate((0, 2))]
+    assert rms(after[0][inside]) < 0.35 * rms(before[0][inside])
+    assert rms(after[1][inside]) < 0.05 * rms(before[1][inside])
+
+
+def test_slow_errors_of_the_servo_model_are_corrected_by_the_encoders():
+    made = model(noisy(0.02))
+    made.guide({})
+    made.signals.follow(made.signals.guide + 0.1)
+    error = made.signals.joints({})[0] - at(made, MOTION.tilt)
+    assert rms(error[100:-150]) < 0.01
+
+
+def test_good_encoders_stand_for_themselves():
+    made = model(noisy(4e-4))
+    made.guide({})
+    assert made.signals.guide is None
+
+
+def test_the_imu_carries_the_velocity_where_positions_are_noisy():
+    errors = [rms((made.signals.pose({})[2] - at(made, MOTION.velocity))[100:-100])
+              for made in (model(noisy(position=0.006)), model(noisy(position=0.0035)))]
+    assert errors[0] < 0.012 < errors[1]    # the less noisy one is what positions alone give
+
+
+def test_inertia_of_a_servo_is_the_inverse_of_its_gains():
+    k, shape = 400, (1, 1, 4)
+    zero = np.zeros((k, 1, 4))
+    windows = Windows(zero[0], zero[0], zero, zero, zero, P.servo_step, 0, 8)
+    target = np.full((2, k, *shape[1:]), 0.3)
+    heavy, soft = simulate(ROBOT.joints, windows, target, [
+        {'swing.ratio': 0.2}, {'joint_bandwidth.kp': -0.2, 'joint_bandwidth.kd': -0.2}],
+        {'coulomb': 0.0, 'stiction': 0.0, 'deflection': 0.0, 'modules': 0.0, 'momentum': 0.0,
+         'joint_share': 0.0})
+    same = simulate(ROBOT.joints, windows, target[:1], [{}], {
+        'coulomb': 0.0, 'stiction': 0.0, 'deflection': 0.0, 'modules': 0.0, 'momentum': 0.0,
+        'joint_share': 0.0})[0]
+    assert heavy == pytest.approx(soft, abs=1e-12)
+    assert np.abs(heavy - same).max() > 0.005
+
+
+def test_a_module_may_be_heavier_about_its_joint_than_the_servo_says():
+    belief = tolerances(P, swing=0.28)['swing.ratio']
+    assert abs(belief.residual(0.25)) < 1 < abs(belief.residual(0.4))
+    assert abs(tolerances(P)['swing.ratio'].residual(0.25)) > 2
+
+
+@pytest.mark.parametrize('loss, kept', [(3.0, 0), (300.0, 1)])
+def test_an_only_step_goes_too_if_the_fit_does_not_miss_it(monkeypatch, loss, kept):
+    trial = Trial(Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag'), 99.0,
+                  {'rotor_drag.coefficient': 0.4})
+    search = Search.__new__(Search)
+    search.p = P
+    search.problem = type('Problem', (), {'keys': KEYS, 'beliefs': {},
+                                          'residual': lambda self, theta: np.zeros(1)})()
+    state = State(dict(trial.theta), np.zeros(1), np.zeros((1, 0)), [])
+    monkeypatch.setattr(search, '_refit', lambda start, rest, n: (start, 100.0 + loss),
+                        raising=False)
+    monkeypatch.setattr(search, '_settle', lambda theta, rest: (state, 100.0), raising=False)
+    found = Found(accepted=[trial])
+    search._prune(found, state, 100.0)
+    assert len(found.accepted) == kept
+
+
+def test_each_rotor_may_have_a_lag_of_its_own():
+    signals, h = model(MOTION.flight()).signals, P.grid
+    plain, slow = signals.thrust({})[0], signals.thrust({'rotor.lag[2]': 0.2})[0]
+    assert slow[:, [0, 1, 3]] == pytest.approx(plain[:, [0, 1, 3]], abs=1e-12)
+    # f' = (f* - f) / T with f* as before
+    asked = plain[1:-1] + ROBOT.rotors.time_constant * (plain[2:] - plain[:-2]) / (2 * h)
+    tau = ROBOT.rotors.time_constant * np.exp(0.2)
+    again = slow[1:-1] + tau * (slow[2:] - slow[:-2]) / (2 * h)
+    assert again[:, 2] == pytest.approx(asked[:, 2], abs=0.02)
+    assert rms(slow[:, 2] - plain[:, 2]) > 0.03
