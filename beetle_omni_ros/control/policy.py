@@ -14,6 +14,7 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.control.observation import disturbed, observed
 from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.control.unwinding import Unwinding, UnwindingParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -48,6 +49,8 @@ class PolicyParameters:
     model: EstimateParameters = group(EstimateParameters, 'for the estimate')
     disturbance: DisturbanceParameters = group(
         DisturbanceParameters, 'what a policy with memory sees')
+    unwinding: UnwindingParameters = group(
+        UnwindingParameters, 'through a level attitude where joints end at their stops')
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> PolicyParameters:
@@ -62,7 +65,8 @@ class PolicyController:
     Its previous action is the command in force, whoever gave it, so that it takes over where
     another controller leaves off. Targets are cut to the limits of the actuators, as they were
     in training; an output that is not finite or absurdly large goes out as it is, for the
-    supervisor to refuse.
+    supervisor to refuse. Where the joints are wound so that a pose stays out of reach, it is shown
+    a level attitude first (:mod:`control.unwinding`).
 
     Args:
         robot: what the controller believes about the robot.
@@ -89,12 +93,14 @@ class PolicyController:
         self._hover = [robot.hover_thrust] * 4
         self._estimator = DisturbanceEstimator(
             robot, p, FunctionCall(model.integrator(robot), None)) if contract.memory else None
+        self._unwinding = Unwinding(p.unwinding)
         self.reset()
 
     def reset(self) -> None:
         """Forget the last command, the estimate and all counts."""
         self._command: Command | None = None
         self._steps = self._rejected = self._faults = self._cut = 0
+        self._unwinding.reset()
         if self._estimator:
             self._estimator.reset()
 
@@ -113,7 +119,7 @@ class PolicyController:
         """Counts since reset, and what a policy with memory estimates."""
         told = {'policy': self.contract.name, 'steps': self._steps,
                 'rejected_states': self._rejected, 'faulty_actions': self._faults,
-                'steps_at_a_limit': self._cut}
+                'steps_at_a_limit': self._cut, 'unwound': self._unwinding.attempts}
         if self._estimator:
             d = self._estimator.disturbance
             told['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
@@ -123,7 +129,9 @@ class PolicyController:
     def _observe(self, state, target):
         """Numbers for the network, or None when one of them is not finite."""
         time = state.stamp
-        if not isinstance(target, PoseTarget):
+        if isinstance(target, PoseTarget):
+            target = self._unwinding.target(state, target)
+        else:
             time += self._parameters.trajectory_lookahead
         observation = observed(state, target.at(time), self._previous_action(state))
         if not isfinite(sum(observation)):

@@ -259,3 +259,26 @@ def test_a_contract_of_the_trainer_loads(tmp_path):
     path = write(tmp_path / 'p.onnx', memory=True, metadata=replace(
         contract, name='mine', training={'seed': 1}).to_metadata())
     assert controller(path).diagnostics()['policy'] == 'mine'
+
+
+def test_a_wound_robot_that_stays_off_its_pose_is_flown_through_level_but_not_off_a_trajectory(
+        tmp_path):
+    # the last two tilts asked for are z of the target's x and z axes in world
+    policy = controller(write(tmp_path / 'p.onnx', weights=selecting([0, 1, 17, 20, 4, 5, 6, 7])))
+    scale = policy.contract.action_scale[3]
+    on_its_head = PoseTarget(np.array([0.0, 0.0, 1.5]), np.array([1.0, 0.0, 0.0, 0.0]))
+    times = np.array([0.0, 10.0])
+    trajectory = TrajectoryTarget(
+        times, np.tile(on_its_head.position, (2, 1)), np.tile(on_its_head.quaternion, (2, 1)),
+        np.zeros((2, 3)), np.zeros((2, 3)))
+
+    def seen(target):
+        policy.reset()
+        commands = [policy.step(state(0.01 * k, tilt=np.array([1.5, 3.0, -1.5, -3.0])), target)
+                    for k in range(200)]
+        return [command.tilt[3] / scale for command in commands]
+
+    up = seen(on_its_head)
+    assert up[0] == pytest.approx(-1.0) and max(up) == pytest.approx(1.0)
+    assert policy.diagnostics()['unwound'] == 1
+    assert seen(trajectory) == pytest.approx([-1.0] * 200)

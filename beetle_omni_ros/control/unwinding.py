@@ -1,0 +1,142 @@
+"""
+The way off a joint's stop: through a level attitude and back to the target.
+
+A joint can hold most thrust directions at two angles, a turn apart. Past half a turn the better
+one may lie a full turn back, and on the way there the thrust points away from where it is needed.
+A policy that acts on the present state alone holds on to what it has: two opposite joints hang
+near half a turn or push against their stops, and the robot stays 10 to 90 degrees off.
+
+In a level hover each tilt is zero, and no other angle within the travel gives the same thrust. So
+a robot that is asked to be level, at the place where it shall be, unwinds all its joints; from
+there the target is reached as from a take-off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from beetle_omni_ros.control.base import PoseTarget, State
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.schema import parameter
+
+ARRIVED = 0.35    # [rad] from level: near enough to turn back
+UNWOUND = 2.0     # [rad] all tilts below: on the way to zero
+STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnwindingParameters:
+    """When a pose counts as out of reach for the way in which the joints are wound."""
+
+    attempts: int = parameter(2, doc='for one target; 0: never', low=0, high=100)
+    tilt: float = parameter(2.4, doc='a joint beyond is wound', unit='rad', low=0.5, high=10)
+    angle: float = parameter(0.14, doc='attitude error from which the target counts as missed',
+                             unit='rad', low=0.01, high=3)
+    distance: float = parameter(0.08, doc='the same, position', unit='m', low=0.005, high=10)
+    progress: float = parameter(0.8, doc='an error below this part of the least so far is '
+                                         'progress', low=0, high=1)
+    patience: float = parameter(0.8, doc='without progress', unit='s', low=0.05, high=100)
+    height: float = parameter(1.2, doc='of the way through level at least, in world', unit='m',
+                              low=-1000, high=1000)
+    duration: float = parameter(1.5, doc='longest way through level', unit='s', low=0.1, high=100)
+
+
+class Unwinding:
+    """
+    Puts a level attitude in a pose target's place while a robot unwinds.
+
+    Args:
+        parameters: when.
+
+    Attributes:
+        attempts: since the last reset.
+
+    """
+
+    def __init__(self, parameters: UnwindingParameters):
+        self._p = parameters
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget target and attempts."""
+        self.attempts = 0
+        self._given: PoseTarget | None = None
+        self._start()
+
+    def _start(self):
+        """A target that is new."""
+        self._left = self._p.attempts
+        self._level: PoseTarget | None = None
+        self._until = 0.0
+        self._watch(-np.inf)
+
+    def _watch(self, now):
+        """Wait for progress from now on."""
+        self._least, self._since = np.inf, now
+
+    def target(self, state: State, given: PoseTarget) -> PoseTarget:
+        """
+        What to fly towards: ``given``, or a level attitude at its position.
+
+        Args:
+            state: finite.
+            given: the target.
+
+        """
+        if given is not self._given:
+            if self._given is None or not _same(given, self._given):
+                self._start()
+            self._given = given
+        if self._level is not None:
+            if self._unwound(state) or state.stamp >= self._until:
+                self._level = None
+                self._watch(state.stamp)
+                return given
+            return self._level
+        if self._left and self._stuck(state, given):
+            self._left -= 1
+            self.attempts += 1
+            self._until = state.stamp + self._p.duration
+            self._level = self._through(state, given)
+            return self._level
+        return given
+
+    def _stuck(self, state, given):
+        """Whether joints are wound, and the error has long stood still."""
+        p = self._p
+        if not max(map(abs, state.tilt.tolist())) >= p.tilt:    # mostly; the rest costs more
+            self._watch(state.stamp)
+            return False
+        error = max(rotations.geodesic_angle(state.quaternion, given.quaternion) / p.angle,
+                    float(np.linalg.norm(given.position - state.position)) / p.distance)
+        if not error > max(1.0, p.progress * self._least):
+            self._least, self._since = error, state.stamp
+        return state.stamp - self._since >= p.patience
+
+    def _through(self, state, given):
+        position = given.position.copy()
+        position[2] = max(position[2], self._p.height)
+        return replace(given, position=position, quaternion=levelled(state.quaternion))
+
+    def _unwound(self, state):
+        return rotations.geodesic_angle(state.quaternion, self._level.quaternion) < ARRIVED \
+            and np.abs(state.tilt).max() < UNWOUND
+
+
+def levelled(quaternion: np.ndarray) -> np.ndarray:
+    """(4,) the level attitude that is the smallest turn away from ``quaternion``, both xyzw."""
+    up = rotations.matrix(quaternion).T @ STRAIGHT_UP      # world's z in the body
+    axis = np.cross(up, STRAIGHT_UP)
+    sine = np.linalg.norm(axis)
+    if sine < 1e-9:     # level already, or upside down: about the own x axis
+        turn = np.array([1.0, 0.0, 0.0]) * (0.0 if up[2] > 0 else np.pi)
+    else:
+        turn = axis / sine * np.arctan2(sine, up[2])
+    return rotations.normalized(rotations.multiply(
+        quaternion, rotations.conjugate(rotations.exp(turn))))
+
+
+def _same(a, b):
+    return np.array_equal(a.position, b.position) and np.array_equal(a.quaternion, b.quaternion)

@@ -1,0 +1,133 @@
+"""The way off a joint's stop: when it is taken, where it leads, and that it ends."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.base import PoseTarget, State
+from beetle_omni_ros.control.unwinding import levelled, Unwinding, UnwindingParameters
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+PARAMETERS = UnwindingParameters()
+ROBOT = RobotParameters.load()
+TARGET = PoseTarget(np.array([0.0, 0.0, 1.0]), rotations.from_rpy(1.2, 0.4, -2.0))
+OFF = rotations.multiply(TARGET.quaternion, rotations.exp(np.array([0.0, 0.4, 0.0])))
+WOUND = np.array([1.5, 3.8, -1.5, -3.7])
+
+
+def stuck(stamp, **changed):
+    values = {'position': TARGET.position, 'velocity': np.zeros(3), 'quaternion': OFF,
+              'angular_velocity': np.zeros(3), 'tilt': WOUND, 'tilt_velocity': np.zeros(4),
+              **changed}
+    return State(stamp, **values, tilt_stamp=stamp)
+
+
+def fly(unwinding, seconds, begin=0.0, target=TARGET, **changed):
+    """Targets shown over a time, every 10 ms."""
+    return [unwinding.target(stuck(begin + 0.01 * k, **changed), target)
+            for k in range(round(seconds * 100))]
+
+
+quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(
+    lambda q: sum(v * v for v in q) > 0.01).map(rotations.normalized)
+
+
+@settings(max_examples=100, deadline=None)
+@given(quaternions)
+def test_the_level_attitude_is_level_and_the_nearest_one(quaternion):
+    level = levelled(quaternion)
+    assert rotations.matrix(level)[2] == pytest.approx([0, 0, 1], abs=1e-7)
+    way = rotations.geodesic_angle(level, quaternion)
+    for yaw in np.linspace(0, 2 * np.pi, 12):
+        other = rotations.multiply(rotations.exp(np.array([0, 0, yaw])), level)
+        assert rotations.geodesic_angle(other, quaternion) >= way - 1e-6
+
+
+@pytest.mark.parametrize('tilt', [WOUND, np.full(4, 3.9), np.full(4, -3.9)])
+def test_a_level_hover_needs_all_joints_at_zero_however_they_were_wound(tilt):
+    wanted = Allocator(ROBOT).hover(np.array([0.0, 0.0, 0.3, np.sqrt(0.91)]), tilt).tilt
+    assert np.abs(wanted).max() < 0.05
+    assert 2 * np.pi - 0.05 > ROBOT.joints.position_limit
+
+
+def test_a_robot_stuck_at_a_stop_is_shown_level_above_the_same_place_after_its_patience():
+    unwinding = Unwinding(PARAMETERS)
+    shown = fly(unwinding, 1.0)
+    first = next(k for k, t in enumerate(shown) if t is not TARGET)
+    assert 0.01 * first == pytest.approx(PARAMETERS.patience, abs=0.011)
+    assert all(t is shown[-1] for t in shown[first:])
+    assert shown[-1].position == pytest.approx([0.0, 0.0, PARAMETERS.height])
+    assert rotations.matrix(shown[-1].quaternion)[2, 2] == pytest.approx(1.0)
+    assert unwinding.attempts == 1
+
+
+@pytest.mark.parametrize('changed', [
+    {'tilt': np.array([1.5, 2.3, -1.5, -2.3])}, {'quaternion': TARGET.quaternion},
+    {'tilt': np.full(4, np.nan)}, {'quaternion': np.full(4, np.nan)}])
+def test_who_is_not_stuck_sees_the_target(changed):
+    assert all(t is TARGET for t in fly(Unwinding(PARAMETERS), 3.0, **changed))
+
+
+@pytest.mark.parametrize('rate, goes_through_level', [(1.0, False), (0.05, True)])
+def test_who_gets_nearer_sees_the_target(rate, goes_through_level):
+    unwinding = Unwinding(PARAMETERS)
+    shown = []
+    for k in range(200):
+        angle = 1.5 * np.exp(-rate * 0.01 * k)
+        attitude = rotations.multiply(TARGET.quaternion, rotations.exp(np.array([0, angle, 0])))
+        shown.append(unwinding.target(stuck(0.01 * k, quaternion=attitude), TARGET))
+    assert any(t is not TARGET for t in shown) == goes_through_level
+
+
+def test_a_position_out_of_reach_counts_as_an_attitude_does():
+    shown = fly(Unwinding(PARAMETERS), 1.0, quaternion=TARGET.quaternion,
+                position=TARGET.position + [0.0, 0.1, 0.0])
+    assert shown[-1] is not TARGET
+
+
+def test_a_place_that_is_high_enough_stays():
+    target = PoseTarget(np.array([0.5, 0.0, 1.7]), TARGET.quaternion)
+    shown = fly(Unwinding(PARAMETERS), 1.0, target=target, position=target.position)
+    assert shown[-1] is not target and np.array_equal(shown[-1].position, target.position)
+
+
+def test_the_target_returns_once_the_joints_are_unwound():
+    unwinding = Unwinding(PARAMETERS)
+    level = fly(unwinding, 1.0)[-1]
+    assert fly(unwinding, 0.1, 1.0, quaternion=level.quaternion)[-1] is level    # still wound
+    assert fly(unwinding, 0.1, 1.1, quaternion=level.quaternion,
+               tilt=np.full(4, 0.5))[-1] is TARGET
+
+
+def test_who_stays_stuck_gets_the_target_back_and_no_more_attempts_than_allowed():
+    unwinding = Unwinding(PARAMETERS)
+    shown = fly(unwinding, 30.0)
+    away = sum(t is not TARGET for t in shown) * 0.01
+    assert unwinding.attempts == PARAMETERS.attempts
+    assert away == pytest.approx(PARAMETERS.attempts * PARAMETERS.duration, abs=0.1)
+    assert shown[-1] is TARGET
+
+
+def test_a_new_target_is_followed_at_once_and_may_be_tried_again():
+    unwinding = Unwinding(PARAMETERS)
+    fly(unwinding, 30.0)
+    other = PoseTarget(TARGET.position + [0, 0, 0.2], TARGET.quaternion, 30.0)
+    shown = fly(unwinding, 5.0, 30.0, other)
+    assert shown[0] is other and unwinding.attempts > PARAMETERS.attempts
+    unwinding = Unwinding(PARAMETERS)
+    assert fly(unwinding, 1.0)[-1] is not TARGET     # on its way through level
+    assert fly(unwinding, 0.1, 1.0, other)[0] is other
+
+
+def test_the_same_pose_issued_again_does_not_begin_anew():
+    unwinding = Unwinding(PARAMETERS)
+    shown = [unwinding.target(stuck(0.01 * k), PoseTarget(
+        TARGET.position.copy(), TARGET.quaternion.copy(), 0.01 * k)) for k in range(100)]
+    assert rotations.matrix(shown[-1].quaternion)[2, 2] == pytest.approx(1.0)
+
+
+def test_without_attempts_nothing_is_shown_but_the_target():
+    assert all(t is TARGET for t in fly(Unwinding(UnwindingParameters(attempts=0)), 5.0))
