@@ -108,7 +108,7 @@ class TimeOffsetParameters:
     rate: float = parameter(
         0.2, doc='slower rotation says nothing about it', unit='rad/s', low=0.001, high=10)
     trend_samples: int = parameter(
-        4, doc='readings through which the trend is laid that carries a late rate on; 1 holds it',
+        3, doc='readings through which the trend is laid that carries a late rate on; 1 holds it',
         low=1, high=100)
 
 
