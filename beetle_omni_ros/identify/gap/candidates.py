@@ -44,6 +44,10 @@ class Candidate:
     label: str = ''
     member: int | None = None
 
+    def pushes(self, keys: dict[str, Key]) -> bool:
+        """Whether it shows in nothing but the forces on the body, as gusts do."""
+        return all(keys[name].groups == 'B' for name in self.keys)
+
     def large_enough(self, keys: dict[str, Key], theta: dict[str, float]) -> bool:
         """Whether anyone would act on it."""
         if self.name in ('joint_velocity_limit', 'joint_torque_limit', 'thrust_saturation'):

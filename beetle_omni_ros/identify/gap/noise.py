@@ -64,6 +64,12 @@ class Noise:
                 parts.append(filtered / self.sigma[group][k])
         return np.concatenate(parts)
 
+    @property
+    def spread(self) -> dict[str, np.ndarray]:
+        """Group -> (channels,) standard deviation of the coloured noise, not whitened."""
+        return {group: self.sigma[group] * np.sqrt([_gain(tap) for tap in taps])
+                for group, taps in self.taps.items()}
+
     def places(self, counts: dict[str, int]) -> list[tuple[str, int, np.ndarray]]:
         """(group, channel, sample indices) in the order of :meth:`whiten`."""
         made = []

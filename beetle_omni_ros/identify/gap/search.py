@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
+from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
 from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.keys import SHAPES
@@ -44,12 +45,13 @@ class Search:
 
     def run(self) -> Found:
         """Search; see the module."""
-        found, problem = Found(), self.problem
+        found, problem, everyone = Found(), self.problem, self.candidates
         self.progress('noise')
         problem.guide({})
         problem.state({}, self.names)
         state, cost = self._settle({}, [])
         found.base = dict(state.theta)
+        found.still = liveliness(problem) < self.p.least_liveliness
         while True:
             self.progress(f'step {len(found.accepted) + 1}')
             floor = self._floor(state)
@@ -60,6 +62,9 @@ class Search:
             if best is None or len(found.accepted) >= self.p.most_effects:
                 break
             found.accepted.append(best)
+            if found.still and best.candidate.pushes(problem.keys):
+                # One explanation of a flight that cannot decide is enough.
+                self.candidates = [c for c in self.candidates if not c.pushes(problem.keys)]
             state, cost = self._settle(best.theta, [t.candidate for t in found.accepted])
         state, cost = self._prune(found, state, cost)
         found.theta, found.state = dict(state.theta), state
@@ -68,6 +73,7 @@ class Search:
         found.base = dict(base_state.theta)
         found.cost = (before, cost, self._floor(state))
         self.progress('rivals')
+        self.candidates = everyone
         self._find_rivals(found, state, cost)
         return found
 
