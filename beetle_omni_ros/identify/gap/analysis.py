@@ -14,6 +14,7 @@ from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, Key, tolerances
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, Rhythm, rhythm
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel
 from beetle_omni_ros.identify.gap.rollouts import free_runs, gap, HORIZONS, regimes_at, Runs
 from beetle_omni_ros.identify.gap.search import Search
@@ -40,6 +41,8 @@ class Analysis:
         widths: key -> half width of its 95 % interval, as deviation.
         visible: label -> what the data could show.
         rest: what is left.
+        patterns: questions beyond the catalogue, best answer first.
+        rhythm: the sharpest line of what is left.
         where: channels and regimes by disagreement.
         runs: 'before', 'after', 'placebo' -> free runs of the flights that judge.
         gaps: horizon -> before, after, placebo, closure.
@@ -59,6 +62,8 @@ class Analysis:
     widths: dict[str, float] = field(default_factory=dict)
     visible: dict[str, Visibility] = field(default_factory=dict)
     rest: Remainder | None = None
+    patterns: list[Pattern] = field(default_factory=list)
+    rhythm: Rhythm = Rhythm(0.0, 0.0, 0.0)
     where: list[dict] = field(default_factory=list)
     runs: dict[str, list[Runs]] = field(default_factory=dict)
     gaps: dict[float, dict] = field(default_factory=dict)
@@ -112,6 +117,8 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
     a.widths = deviations(a.problem, a.found.state, involved, free)
     a.visible = visibility(a.problem, a.found.state, search.always, tried)
     a.rest = remainder(a.problem, a.found.state, involved)
+    a.patterns = patterns(a.problem, a.found.state, involved)
+    a.rhythm = rhythm(a.problem, a.found.theta)
     a.where = _where(a)
     _decide(a, p)
     progress('free runs')
@@ -185,6 +192,7 @@ def _decide(a, p):
     share = len(out_of_sight) / max(len({label.partition(' ')[0].partition('[')[0]
                                          for label in a.visible}), 1)
     repeats = _repeats(a.rest, p)
+    strange = _strange(a, before - after, p)
     sets = [[t, *found.rivals.get(t.candidate.label, [])] for t in found.accepted]
     names = [len({t.candidate.name for t in members}) for members in sets]
     pushed = [t for t in found.accepted if t.candidate.pushes(a.keys)]
@@ -194,11 +202,12 @@ def _decide(a, p):
         found.accepted[:] = [t for t in found.accepted if t not in pushed]
     elif found.accepted:
         part = a.rest.gain / max(before - after, 1e-9)
-        if left > p.least_left and explained < p.enough or repeats and part > p.remainder_share:
+        if left > p.least_left and explained < p.enough or strange \
+                or repeats and part > p.remainder_share:
             a.verdict, a.partial = 'unknown', list(found.accepted)
             a.reason = (f'{found.accepted[0].candidate.name} and its like explain '
                         f'{explained:.0%} of what known effects could; the rest is '
-                        f'{a.rest.text}')
+                        f'{strange or a.rest.text}')
             found.accepted.clear()
         elif max(names) >= p.crowd or (share > p.most_hidden and max(names) > 1):
             a.verdict = 'not_decidable'
@@ -206,8 +215,8 @@ def _decide(a, p):
         else:
             a.verdict = 'named_set' if max(names) > 1 else 'named'
             a.reason = f'explains {explained:.1%} of what known effects could explain'
-    elif repeats or left > 0.05 * count:
-        a.verdict, a.reason = 'unknown', a.rest.text
+    elif repeats or strange or left > 0.05 * count:
+        a.verdict, a.reason = 'unknown', strange or a.rest.text
     elif share > p.most_hidden:
         a.verdict = 'not_decidable'
         a.reason = (f'{len(out_of_sight)} known effects of realistic size would not show in '
@@ -224,6 +233,22 @@ def _stillness(sets, pushed, out_of_sight):
     found = f'; {" or ".join(seen)} would explain it, and others as well' if seen else \
         f'; {len(out_of_sight)} known effects of realistic size would not show'
     return 'the robot hardly moves but where it is pushed' + found
+
+
+def _strange(a, explained, p):
+    """What no entry can be and these flights show all the same, in words; '' if nothing."""
+    line = a.rhythm
+    if line.ratio > p.least_line and line.size > p.least_force:
+        return (f'a force with a rhythm of its own, {line.frequency:.2f} Hz and '
+                f'{line.size:.2f} m/s^2, which goes with no state')
+    for pattern in a.patterns:
+        force, torque = pattern.size
+        sure = pattern.gain > max(p.least_pattern, 3 * pattern.error) and pattern.positive >= 0.7
+        if sure and (force > p.least_force or torque > p.least_torque) \
+                and pattern.gain > p.pattern_share * explained:
+            return (f'a force that goes with {pattern.text} ({force:.2f} m/s^2, {torque:.2f} '
+                    f'rad/s^2); it gains {pattern.gain:.0f} of chi2 on data left out')
+    return ''
 
 
 def _repeats(rest, p):
@@ -264,6 +289,7 @@ def _falsify(a):
                      for trials in (found.accepted, a.partial))
     # What explains a part and is not named closes no gap.
     reached = {n: x for n, x in found.theta.items() if n not in refused}
+    reached |= {n: found.base[n] for n in refused if n in found.base}
     # The same robot, with its tolerances as found, without and with what was named ...
     points = {'before': {n: x for n, x in reached.items() if n not in keys}, 'after': reached}
     # ... and the robot file as it is, and with nothing but what was named.
