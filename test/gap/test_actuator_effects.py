@@ -6,6 +6,7 @@ from flights import KEYS, model, Motion, ROBOT, solved, STEP
 import numpy as np
 import pytest
 
+from beetle_omni_ros.identify.gap.candidates import _torques, candidates
 from beetle_omni_ros.identify.gap.loads import spin_load
 
 MOTION = Motion(9, 12.0)
@@ -125,3 +126,20 @@ def test_a_spinning_rotor_loads_its_joint_as_euler_says():
         momentum = ROBOT.rotors.spin[i] * speed[:, i:i + 1] * MOTION.normals[:, i]
         expected = -np.cross(MOTION.rate, momentum) @ axis
         assert np.allclose(load[:, i], np.interp(t, MOTION.t, expected), atol=5e-3)
+
+
+def test_a_torque_limit_is_sought_where_it_acts():
+    made = model(flight(servo(effort=0.05)))
+    begin = next(c for c in candidates(KEYS, [made]) if c.name == 'joint_torque_limit').starts
+    tried = [start[0] for start in begin]
+    key = 'joint_torque_limit.effort_limit'
+    rest = [np.square(made.residual(theta, 'J')['J']).mean()
+            for theta in ({}, *({key: x} for x in tried), {key: np.log(0.05 / 3.0)})]
+    # Every start has a slope, and one lies nearer to the truth than no limit at all.
+    assert all(x != rest[0] for x in rest[1:-1]) and rest[-1] < min(rest[1:-1]) < rest[0]
+
+
+def test_turning_servos_ask_for_less_than_their_lag_suggests():
+    asked = np.abs(_torques(model(MOTION.flight())))
+    lag = JOINT.kp * np.abs(MOTION.tilt_command - MOTION.tilt)
+    assert np.quantile(asked, 0.999) < 0.5 * np.quantile(lag, 0.999)
