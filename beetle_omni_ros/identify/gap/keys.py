@@ -128,6 +128,11 @@ class Belief:
         out = max(x - self.above, 0.0) + min(x + self.below, 0.0)
         return out / self.deviation + x / self.inner
 
+    def within(self, x: float, deviations: float) -> float:
+        """``x``, or the nearest value that is no more than so many deviations off."""
+        reach = deviations * self.deviation
+        return min(max(x, -self.below - reach), self.above + reach)
+
     def slope(self, x: float) -> float:
         """Derivative of :meth:`residual`."""
         return (0.0 if -self.below < x < self.above else 1 / self.deviation) + 1 / self.inner

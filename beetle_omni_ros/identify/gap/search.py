@@ -19,6 +19,8 @@ PROMISING_CURVED = 0.1  # likewise, of those that a straight line cannot judge
 MOST_TURNS = 4          # of fresh slopes, while a fit runs away from them
 FAR = 0.2               # typical sizes of a curved number
 LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
+BEYOND = 3.0            # standard deviations of a tolerance that no robot has ...
+ROUNDS = 3              # ... and how often others may take over from it
 WIDE = 4.0              # typical sizes, within which anything is sought
 
 
@@ -71,6 +73,8 @@ class Search:
         base_state, before = self._refit(State(found.base, problem.residual(found.base),
                                                state.slopes, state.names), [])
         found.base = dict(base_state.theta)
+        if found.accepted:
+            before = self._believable(base_state, before)
         found.cost = (before, cost, self._floor(state))
         self.progress('rivals')
         self.candidates = everyone
@@ -86,6 +90,28 @@ class Search:
     def _refit(self, state, accepted, iterations=3):
         return self.problem.refine(state, self._involved(accepted), self._free(accepted),
                                    iterations)
+
+    def _believable(self, state, cost):
+        """
+        Objective of a fit without effects in which nothing is further off than robots are.
+
+        A tolerance of 3 % takes an effect of 30 % over for a hundred of chi2, whatever the data
+        would say of the effect: what the effect explains must not be counted against that.
+        """
+        problem, held, theta = self.problem, set(), dict(state.theta)
+        for _ in range(ROUNDS):
+            beyond = {n for n in self.always if n not in held
+                      and abs(problem.beliefs[n].residual(theta.get(n, 0.0))) > BEYOND}
+            if not beyond:
+                break
+            held |= beyond
+            for name in beyond:
+                theta[name] = problem.beliefs[name].within(theta[name], BEYOND)
+            start = State(theta, problem.residual(theta), state.slopes, state.names)
+            names = [n for n in self.always if n not in held]
+            now, cost = problem.refine(start, names, frozenset(), 2)
+            theta = dict(now.theta)
+        return cost
 
     def _settle(self, theta, accepted):
         """Noise and fit in turn, and fresh slopes of everything at the point reached."""
