@@ -3,7 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-from flights import KEYS, model, Motion, P, ROBOT
+from flights import gusts, KEYS, model, Motion, P, pushed
 import numpy as np
 import pytest
 
@@ -22,44 +22,22 @@ NAMES = [*(f'wind.force[{k}]' for k in range(3)),
 NOTHING = Remainder(0.0, 0.0, [], [], 'body', {})
 
 
-def gust(seed, size=0.1, lag=0.5):
-    """(N, 3) coloured force over mass [m/s^2]."""
-    rng, keep = np.random.default_rng(seed), np.exp(-0.005 / lag)
-    x, made = np.zeros(3), []
-    for step in rng.standard_normal((len(MOTION.t), 3)):
-        x = keep * x + np.sqrt(1 - keep**2) * step
-        made.append(x)
-    return size * np.array(made)
-
-
-def thrust_at(motion):
-    """(N, 3) specific force that the rotors make in base_link."""
-    return np.einsum('ni,nij->nj', motion.thrust, motion.normals) / ROBOT.mass
-
-
-def problem(push, pull=0.0):
-    """
-    The fit's problem of a flight with a force.
-
-    Args:
-        push: (N, 3) acceleration in world that the force makes.
-        pull: (N, 3) likewise in base_link.
-
-    """
-    own = MOTION.attitude.inv().apply(push) + pull
-    # The motion is what it is: thrust holds it against the force, as the sensor shows.
-    imu = np.concatenate([thrust_at(MOTION) + own, MOTION.rate], axis=1)
-    made = Problem([model(MOTION.flight(imu=imu))], KEYS, tolerances(P), P)
+def problem(push):
+    """The fit's problem of a flight with a force that accelerates by ``push`` (N, 3) in world."""
+    made = Problem([model(pushed(MOTION, push))], KEYS, tolerances(P), P)
     # Turns are not those that the thrusts make: only forces are looked at.
     made.models[0]._mask = np.ones(len(made.models[0]._mask))
-    residual = made.models[0].residual({})
-    made.noise = Noise.of([residual], P)
+    made.noise = Noise.of([made.models[0].residual({})], P)
     made._label()
     return made, made.state({}, NAMES)
 
 
-def best(push, pull=0.0):
-    return {p.text: p for p in patterns(*problem(push, pull), NAMES)}
+def gust(seed, size=0.1):
+    return gusts(MOTION, seed, size)
+
+
+def best(push):
+    return {p.text: p for p in patterns(*problem(push), NAMES)}
 
 
 def field():

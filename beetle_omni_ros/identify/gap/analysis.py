@@ -16,7 +16,14 @@ from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, Key, toleran
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, Rhythm, rhythm
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel
-from beetle_omni_ros.identify.gap.rollouts import free_runs, gap, HORIZONS, regimes_at, Runs
+from beetle_omni_ros.identify.gap.rollouts import (
+    free_runs,
+    gap,
+    HORIZONS,
+    regimes_at,
+    Runs,
+    trimmed,
+)
 from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.gap.trial import Found, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
@@ -122,7 +129,7 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
     a.where = _where(a)
     _decide(a, p)
     progress('free runs')
-    _falsify(a)
+    _falsify(a, search.wide)
     return a
 
 
@@ -279,10 +286,9 @@ def _experiment(a, sets, out_of_sight):
     return None
 
 
-def _falsify(a):
+def _falsify(a, wide):
     """Free runs before, after and with a placebo, on the flights that judge."""
-    found, noise = a.found, a.problem.noise
-    judges = a.models[1]
+    found, judges = a.found, a.models[1]
     for model in judges:
         model.guide(found.theta)
     keys, refused = ({n for t in trials for n in t.candidate.keys}
@@ -296,23 +302,21 @@ def _falsify(a):
     plain = _plain(a, reached, keys)
     points |= {'file': plain, 'effects_alone': {**plain, **{n: found.theta[n] for n in keys}},
                'placebo': _placebo(a)}
+    noise = {m: a.problem.noise_of(m, found.theta, wide) for m in {*a.models[0], *judges}}
     for name, theta in points.items():
         if found.accepted or name in ('before', 'file'):
-            a.runs[name] = [free_runs(m, theta, noise) for m in judges]
+            a.runs[name] = [free_runs(m, theta, noise[m]) for m in judges]
     for name, same in (('after', 'before'), ('placebo', 'before'), ('effects_alone', 'file')):
         a.runs.setdefault(name, a.runs[same])
-    # No floor is higher than what the model reached on the flights that it was fitted to.
-    own = [free_runs(a.models[0][0], found.theta, noise)]
-    reached = np.sqrt(np.mean([(run.error**2).mean(axis=1) for run in own], axis=0))
-    floors = np.minimum(np.mean([run.floor for run in own], axis=0), np.maximum(reached, 1e-4))
+    trim = trimmed([free_runs(m, found.theta, noise[m]) for m in a.models[0]])
     for h, horizon in enumerate(HORIZONS):
-        values = {name: gap(runs, h, floors=floors) for name, runs in a.runs.items()}
+        values = {name: gap(runs, h, trim=trim) for name, runs in a.runs.items()}
         a.gaps[horizon] = {**values, 'closure': closure(values['before'], values['after']),
                            'placebo_closure': closure(values['before'], values['placebo']),
                            'closure_of_effects_alone': closure(values['file'],
                                                                values['effects_alone'])}
     for regime in np.unique(np.concatenate([run.regime for run in a.runs['before']])):
-        before, after = (gap(a.runs[name], JUDGED, regime, floors)
+        before, after = (gap(a.runs[name], JUDGED, regime, trim)
                          for name in ('before', 'after'))
         a.regimes[str(regime)] = {'before': before, 'after': after,
                                   'worse': bool(after > WORSE * before)}

@@ -211,8 +211,19 @@ def _pushed(noise, p):
     return made
 
 
+def trimmed(fitted: list[Runs]) -> np.ndarray:
+    """
+    (H, 5) part of a floor that is needed: no floor is higher than what the model reaches.
+
+    Each fitted flight is held against its own floor, for gusts differ from flight to flight: what
+    the model reached on a calm day is no floor for a windy one.
+    """
+    reached = np.mean([(run.error**2).mean(axis=1) / run.floor**2 for run in fitted], axis=0)
+    return np.clip(np.sqrt(reached), 1e-2, 1.0)
+
+
 def gap(runs: list[Runs], horizon: int, rows: str | None = None,
-        floors: np.ndarray | None = None) -> float:
+        trim: np.ndarray | None = None) -> float:
     """
     Root mean square over states of error over floor, at one horizon; 1 is nothing but noise.
 
@@ -220,14 +231,14 @@ def gap(runs: list[Runs], horizon: int, rows: str | None = None,
         runs: of all flights.
         horizon: index into HORIZONS.
         rows: regime to look at; default all.
-        floors: (H, 5) in place of each flight's own.
+        trim: (H, 5) of each flight's own floor; see :func:`trimmed`.
 
     """
     parts = []
     for run in runs:
         keep = np.ones(len(run.regime), bool) if rows is None else run.regime == rows
         if keep.any():
-            floor = run.floor if floors is None else floors
+            floor = run.floor if trim is None else run.floor * trim
             parts.append((run.error[horizon][keep] / floor[horizon])**2)
     if not parts:
         return float('nan')
