@@ -128,15 +128,17 @@ def test_a_spinning_rotor_loads_its_joint_as_euler_says():
         assert np.allclose(load[:, i], np.interp(t, MOTION.t, expected), atol=5e-3)
 
 
-def test_a_torque_limit_is_sought_where_it_acts():
-    made = model(flight(servo(effort=0.05)))
+def test_a_torque_limit_is_sought_where_it_acts_and_found_there():
+    made, key = model(flight(servo(effort=0.05))), 'joint_torque_limit.effort_limit'
     begin = next(c for c in candidates(KEYS, [made]) if c.name == 'joint_torque_limit').starts
     tried = [start[0] for start in begin]
-    key = 'joint_torque_limit.effort_limit'
     rest = [np.square(made.residual(theta, 'J')['J']).mean()
-            for theta in ({}, *({key: x} for x in tried), {key: np.log(0.05 / 3.0)})]
-    # Every start has a slope, and one lies nearer to the truth than no limit at all.
-    assert all(x != rest[0] for x in rest[1:-1]) and rest[-1] < min(rest[1:-1]) < rest[0]
+            for theta in ({}, *({key: x} for x in tried))]
+    # Every start has a slope, one is nearer than no limit at all, and none is at a bound.
+    assert all(x != rest[0] for x in rest[1:]) and min(rest[1:]) < rest[0]
+    assert all(KEYS[key].low < x for x in tried)
+    found = solved(made, [key], 'J', None, {key: tried[int(np.argmin(rest[1:]))]}, 6)
+    assert KEYS[key].value(found[key]) == pytest.approx(0.05, abs=0.003)
 
 
 def test_turning_servos_ask_for_less_than_their_lag_suggests():
