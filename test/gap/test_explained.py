@@ -27,6 +27,32 @@ class Straight(Problem):
                                             theta.get(OTHER, 0.0)]
 
 
+class Curved(Straight):
+    """The same with slopes that are twice too steep: each step goes half the way."""
+
+    def learn_noise(self, wide, rounds=3):
+        theta = getattr(self, 'at', {})
+        return State(dict(theta), self.residual(theta), 2 * self.columns, [LAG, OTHER])
+
+    def state(self, theta, names):
+        self.at = theta
+
+    def guide(self, theta):
+        pass
+
+    def renew(self, theta):
+        self.at = theta
+
+
+def test_a_slow_fit_leaves_nothing_for_others_to_gain():
+    problem = Curved(0.25, 0.0)
+    search = Search.__new__(Search)
+    search.problem, search.always, search.wide, search.names = problem, [LAG, OTHER], {}, []
+    state, cost = search._settle({}, [])
+    _, again = problem.refine(state, search.always, frozenset(), 10)
+    assert cost - again < 1.0
+
+
 def before(truth, overlap=0.0):
     """Objective without effects: as fitted, and with believable tolerances only."""
     problem = Straight(truth, overlap)

@@ -21,6 +21,7 @@ FAR = 0.2               # typical sizes of a curved number
 LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
 BEYOND = 3.0            # standard deviations of a tolerance that no robot has ...
 ROUNDS = 3              # ... and how often others may take over from it
+MOST_ITERATIONS = 10    # of a fit, which ends by itself where it gains no more
 WIDE = 4.0              # typical sizes, within which anything is sought
 
 
@@ -131,7 +132,8 @@ class Search:
             problem.state(at, self.names)
             state = problem.learn_noise(self.wide, 2)
         state = problem.learn_noise(self.wide, 2)
-        return self._refit(state, accepted, 2)
+        # To the end: what this fit leaves on the way is a gain of every candidate's.
+        return self._refit(state, accepted, MOST_ITERATIONS)
 
     def _far(self, a, b):
         """Whether slopes taken at one point are of little use at the other."""
