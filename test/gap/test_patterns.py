@@ -95,6 +95,7 @@ SURE = Pattern('the place', 90.0, 15.0, 1.0, (0.2, 0.0))
 
 @pytest.mark.parametrize('pattern, verdict', [
     (SURE, 'unknown'), (replace(SURE, error=60.0), 'no_gap'),
+    (replace(SURE, error=38.0), 'unknown'), (replace(SURE, error=38.0, positive=0.75), 'no_gap'),
     (replace(SURE, positive=0.5), 'no_gap'), (replace(SURE, gain=20.0, error=1.0), 'no_gap'),
     (replace(SURE, size=(0.01, 0.01)), 'no_gap')])
 def test_a_sure_and_large_pattern_is_unknown(pattern, verdict):

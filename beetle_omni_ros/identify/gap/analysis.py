@@ -250,9 +250,9 @@ def _strange(a, explained, p):
                 f'{line.size:.2f} m/s^2, which goes with no state')
     for pattern in a.patterns:
         force, torque = pattern.size
-        sure = pattern.gain > max(p.least_pattern, 3 * pattern.error) and pattern.positive >= 0.7
-        if sure and (force > p.least_force or torque > p.least_torque) \
-                and pattern.gain > p.pattern_share * explained:
+        large = force > p.least_force or torque > p.least_torque
+        if pattern.sure and large and pattern.gain > max(p.least_pattern,
+                                                         p.pattern_share * explained):
             return (f'a force that goes with {pattern.text} ({force:.2f} m/s^2, {torque:.2f} '
                     f'rad/s^2); it gains {pattern.gain:.0f} of chi2 on data left out')
     return ''

@@ -51,6 +51,17 @@ class Pattern:
     positive: float
     size: tuple[float, float]
 
+    @property
+    def sure(self) -> bool:
+        """
+        Whether blocks that were left out agree.
+
+        What changes with time gains most where it is largest: where nearly every block gains,
+        they need not gain alike.
+        """
+        return self.gain > 3 * self.error and self.positive >= 0.7 \
+            or self.gain > 2 * self.error and self.positive >= 0.85
+
 
 def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:
     """
