@@ -1,11 +1,16 @@
 """What noise and gusts alone make of a free run: of each flight its own, and nothing else."""
 
-from flights import gusts, KEYS, model, Motion, P, pushed
+from dataclasses import replace
+
+from flights import gusts, KEYS, model, Motion, P, pushed, ROBOT
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
+from beetle_omni_ros.identify.gap.noise import Noise
+from beetle_omni_ros.identify.gap.residual import THIN
 from beetle_omni_ros.identify.gap.rollouts import gap, HORIZONS, noise_floor, Runs, trimmed
 
 HALF = HORIZONS.index(0.5)
@@ -38,7 +43,9 @@ def test_every_flight_has_its_own_gusts():
     storm = problem.noise_of(windy, {}, WIDE)
     assert spread(storm) / spread(calm[0]) == pytest.approx(4, rel=0.3)
     assert spread(calm[1]) / spread(calm[0]) == pytest.approx(1, rel=0.3)
-    assert noise_floor(windy, storm)[HALF, 1] > 2 * noise_floor(windy, calm[0])[HALF, 1]
+    calm, storm = (replace(noise, seen={'B': noise.seen['B'] * ([1] * 3 + [0] * 3)})
+                   for noise in (calm[0], storm))     # turns are not what this motion is about
+    assert noise_floor(windy, storm)[HALF, 1] > 2 * noise_floor(windy, calm)[HALF, 1]
 
 
 def test_a_force_that_the_catalogue_knows_is_no_noise():
@@ -67,3 +74,21 @@ def test_no_floor_is_higher_than_what_the_model_reaches():
 
 def test_a_bad_fit_does_not_raise_the_floor():
     assert trimmed([runs(3.0, 0.1)]) == pytest.approx(1)
+
+
+def test_torques_that_nobody_knows_lean_the_thrust():
+    size, step = 0.5, THIN * P.grid * P.body_every
+    noise = Noise({'B': np.ones((6, 1))}, {'B': np.array([0, 0, 0, *[size] * 3]),
+                                           'J': np.zeros(4)})
+    floor = noise_floor(made(np.zeros(3)), noise)[HALF]
+    rng, reached = np.random.default_rng(5), []
+    for _ in range(400):    # a body that hovers and is turned, in plain steps
+        attitude, (rate, velocity, place) = Rotation.identity(), np.zeros((3, 3))
+        for _ in range(round(HORIZONS[HALF] / step)):
+            rate = rate + step * size * rng.standard_normal(3)
+            attitude = attitude * Rotation.from_rotvec(step * rate)
+            force = attitude.apply([0, 0, ROBOT.gravity]) - [0, 0, ROBOT.gravity]
+            velocity = velocity + step * force
+            place = place + step * velocity
+        reached.append([place @ place, velocity @ velocity])
+    assert floor[:2] == pytest.approx(np.sqrt(np.mean(reached, axis=0)), rel=0.2)
