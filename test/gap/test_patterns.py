@@ -13,7 +13,7 @@ from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, Rhythm, rhythm
-from beetle_omni_ros.identify.gap.trial import Found, Trial
+from beetle_omni_ros.identify.gap.trial import Found, TOO_SMALL, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder
 
 MOTION = Motion(7, duration=60.0)
@@ -73,10 +73,12 @@ def test_gusts_have_no_line(seed):
     assert rhythm(made, {}).ratio < P.least_line
 
 
-def decided(accepted=(), found=(), line=Rhythm(0.0, 0.0, 0.0)):
+def decided(accepted=(), found=(), line=Rhythm(0.0, 0.0, 0.0), left=0.0, trials=()):
     names = [n for t in accepted for n in t.candidate.keys]
     search = Found(accepted=list(accepted), state=SimpleNamespace(names=names),
-                   cost=(1000.0, 1000.0 - 200.0 * len(names), 1000.0 - 200.0 * len(names)))
+                   cost=(1000.0, 1000.0 - 200.0 * len(names),
+                         1000.0 - 200.0 * len(names) - left),
+                   trials={t.candidate.label: t for t in trials})
     a = Analysis(keys=KEYS, found=search, rest=NOTHING, patterns=list(found), rhythm=line)
     a.problem = SimpleNamespace(time=np.zeros(1000), beliefs={})
     _decide(a, P)
@@ -88,6 +90,19 @@ def test_a_force_with_a_rhythm_of_its_own_is_unknown():
     a = decided(line=Rhythm(3.3, 500.0, 0.2))
     assert a.verdict == 'unknown' and '3.30 Hz' in a.reason
     assert decided(line=Rhythm(3.3, 500.0, 0.5 * P.least_force)).verdict == 'no_gap'
+
+
+def wind():
+    return Trial(Candidate('wind', ('wind.force[0]',), label='wind'), 200.0,
+                 {'wind.force[0]': 1.0}, True)
+
+
+@pytest.mark.parametrize('reason, verdict', [(TOO_SMALL, 'named'), ('', 'unknown')])
+def test_what_is_too_small_to_matter_is_no_unknown(reason, verdict):
+    key = 'joint_command_latency.delay'
+    other = Trial(Candidate('joint_command_latency', (key,), label='latency'), 90.0,
+                  {key: 8e-4}, True, reason=reason)
+    assert decided([wind()], left=120.0, trials=[other]).verdict == verdict
 
 
 SURE = Pattern('the place', 90.0, 15.0, 1.0, (0.2, 0.0))
@@ -104,8 +119,6 @@ def test_a_sure_and_large_pattern_is_unknown(pattern, verdict):
 
 @pytest.mark.parametrize('gain, verdict', [(90.0, 'unknown'), (35.0, 'named')])
 def test_a_name_does_not_stand_where_a_pattern_explains_as_much_again(gain, verdict):
-    wind = Trial(Candidate('wind', ('wind.force[0]',), label='wind'), 200.0,
-                 {'wind.force[0]': 1.0}, True)
-    a = decided([wind], [replace(SURE, gain=gain, error=5.0)])
+    a = decided([wind()], [replace(SURE, gain=gain, error=5.0)])
     assert a.verdict == verdict
     assert [t.candidate.name for t in a.partial] == (['wind'] if verdict == 'unknown' else [])

@@ -25,7 +25,7 @@ from beetle_omni_ros.identify.gap.rollouts import (
     trimmed,
 )
 from beetle_omni_ros.identify.gap.search import Search
-from beetle_omni_ros.identify.gap.trial import Found, Trial
+from beetle_omni_ros.identify.gap.trial import Found, TOO_SMALL, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -193,7 +193,9 @@ def _decide(a, p):
     before, after, floor = found.cost
     # Everything at once also fits some noise: a chi2 of one for each number without a belief.
     floor += sum(name not in a.problem.beliefs for name in found.state.names)
-    left = max(after - floor, 0.0)
+    # A latency of a millisecond is no unknown, however clearly it shows.
+    small = max((t.gain for t in found.trials.values() if t.reason == TOO_SMALL), default=0.0)
+    left = max(after - floor - small, 0.0)
     explained = (before - after) / max(before - after + left, 1e-9)
     out_of_sight = hidden(a, p)
     share = len(out_of_sight) / max(len({label.partition(' ')[0].partition('[')[0]

@@ -11,7 +11,7 @@ from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
 from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.keys import SHAPES
-from beetle_omni_ros.identify.gap.trial import Found, Trial
+from beetle_omni_ros.identify.gap.trial import Found, TOO_SMALL, Trial
 
 REFINED = 5             # candidates of each step that are fitted, not only estimated
 PROMISING = 0.25        # of the best linear gain
@@ -225,7 +225,7 @@ class Search:
             elif not trial.refined:
                 trial.reason = 'others explain more'
             elif not c.large_enough(self.problem.keys, trial.theta):
-                trial.reason = 'too small to matter'
+                trial.reason = TOO_SMALL
             elif (c.name, c.member) in names_taken:
                 trial.reason = 'named already'
             elif self._at_bound(trial):

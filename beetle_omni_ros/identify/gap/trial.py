@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import State
 
+TOO_SMALL = 'too small to matter'
+
 
 @dataclass
 class Trial:
