@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.identify.gap.body import BodyModel
@@ -86,6 +87,20 @@ class Motion:
                       self.t - shift,
                       np.concatenate([self.tilt_command, thrust], axis=1), self.t,
                       self.voltage[:, None])
+
+
+def gusts(motion, seed, size=0.1, lag=0.5):
+    """(N, 3) acceleration [m/s^2] by a coloured force that goes with nothing."""
+    keep = np.exp(-STEP / lag)
+    white = np.random.default_rng(seed).standard_normal((len(motion.t), 3))
+    return size * lfilter([np.sqrt(1 - keep**2)], [1, -keep], white, axis=0)
+
+
+def pushed(motion, push):
+    """Readings where the rotors' forces and ``push`` (N, 3) in world make the acceleration."""
+    thrust = np.einsum('ni,nij->nj', motion.thrust, motion.normals) / ROBOT.mass
+    force = thrust + motion.attitude.inv().apply(push)
+    return motion.flight(imu=np.concatenate([force, motion.rate], axis=1))
 
 
 def model(flight):

@@ -6,6 +6,7 @@ from flights import KEYS, model, Motion, ROBOT, solved, STEP
 import numpy as np
 import pytest
 
+from beetle_omni_ros.identify.gap.candidates import _torques, candidates
 from beetle_omni_ros.identify.gap.loads import spin_load
 
 MOTION = Motion(9, 12.0)
@@ -125,3 +126,22 @@ def test_a_spinning_rotor_loads_its_joint_as_euler_says():
         momentum = ROBOT.rotors.spin[i] * speed[:, i:i + 1] * MOTION.normals[:, i]
         expected = -np.cross(MOTION.rate, momentum) @ axis
         assert np.allclose(load[:, i], np.interp(t, MOTION.t, expected), atol=5e-3)
+
+
+def test_a_torque_limit_is_sought_where_it_acts_and_found_there():
+    made, key = model(flight(servo(effort=0.05))), 'joint_torque_limit.effort_limit'
+    begin = next(c for c in candidates(KEYS, [made]) if c.name == 'joint_torque_limit').starts
+    tried = [start[0] for start in begin]
+    rest = [np.square(made.residual(theta, 'J')['J']).mean()
+            for theta in ({}, *({key: x} for x in tried))]
+    # Every start has a slope, one is nearer than no limit at all, and none is at a bound.
+    assert all(x != rest[0] for x in rest[1:]) and min(rest[1:]) < rest[0]
+    assert all(KEYS[key].low < x for x in tried)
+    found = solved(made, [key], 'J', None, {key: tried[int(np.argmin(rest[1:]))]}, 6)
+    assert KEYS[key].value(found[key]) == pytest.approx(0.05, abs=0.003)
+
+
+def test_turning_servos_ask_for_less_than_their_lag_suggests():
+    asked = np.abs(_torques(model(MOTION.flight())))
+    lag = JOINT.kp * np.abs(MOTION.tilt_command - MOTION.tilt)
+    assert np.quantile(asked, 0.999) < 0.5 * np.quantile(lag, 0.999)

@@ -14,10 +14,18 @@ from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, Key, tolerances
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, Rhythm, rhythm
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel
-from beetle_omni_ros.identify.gap.rollouts import free_runs, gap, HORIZONS, regimes_at, Runs
+from beetle_omni_ros.identify.gap.rollouts import (
+    free_runs,
+    gap,
+    HORIZONS,
+    regimes_at,
+    Runs,
+    trimmed,
+)
 from beetle_omni_ros.identify.gap.search import Search
-from beetle_omni_ros.identify.gap.trial import Found, Trial
+from beetle_omni_ros.identify.gap.trial import Found, TOO_SMALL, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -40,6 +48,8 @@ class Analysis:
         widths: key -> half width of its 95 % interval, as deviation.
         visible: label -> what the data could show.
         rest: what is left.
+        patterns: questions beyond the catalogue, best answer first.
+        rhythm: the sharpest line of what is left.
         where: channels and regimes by disagreement.
         runs: 'before', 'after', 'placebo' -> free runs of the flights that judge.
         gaps: horizon -> before, after, placebo, closure.
@@ -59,6 +69,8 @@ class Analysis:
     widths: dict[str, float] = field(default_factory=dict)
     visible: dict[str, Visibility] = field(default_factory=dict)
     rest: Remainder | None = None
+    patterns: list[Pattern] = field(default_factory=list)
+    rhythm: Rhythm = Rhythm(0.0, 0.0, 0.0)
     where: list[dict] = field(default_factory=list)
     runs: dict[str, list[Runs]] = field(default_factory=dict)
     gaps: dict[float, dict] = field(default_factory=dict)
@@ -112,10 +124,12 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
     a.widths = deviations(a.problem, a.found.state, involved, free)
     a.visible = visibility(a.problem, a.found.state, search.always, tried)
     a.rest = remainder(a.problem, a.found.state, involved)
+    a.patterns = patterns(a.problem, a.found.state, involved)
+    a.rhythm = rhythm(a.problem, a.found.theta)
     a.where = _where(a)
     _decide(a, p)
     progress('free runs')
-    _falsify(a)
+    _falsify(a, search.wide)
     return a
 
 
@@ -179,21 +193,30 @@ def _decide(a, p):
     before, after, floor = found.cost
     # Everything at once also fits some noise: a chi2 of one for each number without a belief.
     floor += sum(name not in a.problem.beliefs for name in found.state.names)
-    left = max(after - floor, 0.0)
+    # A latency of a millisecond is no unknown, however clearly it shows.
+    small = max((t.gain for t in found.trials.values() if t.reason == TOO_SMALL), default=0.0)
+    left = max(after - floor - small, 0.0)
     explained = (before - after) / max(before - after + left, 1e-9)
     out_of_sight = hidden(a, p)
     share = len(out_of_sight) / max(len({label.partition(' ')[0].partition('[')[0]
                                          for label in a.visible}), 1)
     repeats = _repeats(a.rest, p)
+    strange = _strange(a, before - after, p)
     sets = [[t, *found.rivals.get(t.candidate.label, [])] for t in found.accepted]
     names = [len({t.candidate.name for t in members}) for members in sets]
-    if found.accepted:
+    pushed = [t for t in found.accepted if t.candidate.pushes(a.keys)]
+    if found.still and (pushed or not found.accepted):
+        a.verdict, a.partial = 'not_decidable', pushed
+        a.reason = _stillness(sets, pushed, out_of_sight)
+        found.accepted[:] = [t for t in found.accepted if t not in pushed]
+    elif found.accepted:
         part = a.rest.gain / max(before - after, 1e-9)
-        if left > p.least_left and explained < p.enough or repeats and part > p.remainder_share:
+        if left > p.least_left and explained < p.enough or strange \
+                or repeats and part > p.remainder_share:
             a.verdict, a.partial = 'unknown', list(found.accepted)
             a.reason = (f'{found.accepted[0].candidate.name} and its like explain '
                         f'{explained:.0%} of what known effects could; the rest is '
-                        f'{a.rest.text}')
+                        f'{strange or a.rest.text}')
             found.accepted.clear()
         elif max(names) >= p.crowd or (share > p.most_hidden and max(names) > 1):
             a.verdict = 'not_decidable'
@@ -201,15 +224,40 @@ def _decide(a, p):
         else:
             a.verdict = 'named_set' if max(names) > 1 else 'named'
             a.reason = f'explains {explained:.1%} of what known effects could explain'
-    elif repeats or left > 0.05 * count:
-        a.verdict, a.reason = 'unknown', a.rest.text
+    elif repeats or strange or left > 0.05 * count:
+        a.verdict, a.reason = 'unknown', strange or a.rest.text
     elif share > p.most_hidden:
         a.verdict = 'not_decidable'
         a.reason = (f'{len(out_of_sight)} known effects of realistic size would not show in '
                     'these flights')
     else:
         a.verdict, a.reason = 'no_gap', 'what is left is noise and manufacturing tolerance'
-    a.experiment = _experiment(a, sets if found.accepted else [], out_of_sight)
+    a.experiment = _experiment(a, sets if found.accepted or pushed else [], out_of_sight)
+
+
+def _stillness(sets, pushed, out_of_sight):
+    """Why a flight that hardly moves decides nothing about forces."""
+    seen = sorted({t.candidate.name for members in sets if members[0] in pushed
+                   for t in members})
+    found = f'; {" or ".join(seen)} would explain it, and others as well' if seen else \
+        f'; {len(out_of_sight)} known effects of realistic size would not show'
+    return 'the robot hardly moves but where it is pushed' + found
+
+
+def _strange(a, explained, p):
+    """What no entry can be and these flights show all the same, in words; '' if nothing."""
+    line = a.rhythm
+    if line.ratio > p.least_line and line.size > p.least_force:
+        return (f'a force with a rhythm of its own, {line.frequency:.2f} Hz and '
+                f'{line.size:.2f} m/s^2, which goes with no state')
+    for pattern in a.patterns:
+        force, torque = pattern.size
+        large = force > p.least_force or torque > p.least_torque
+        if pattern.sure and large and pattern.gain > max(p.least_pattern,
+                                                         p.pattern_share * explained):
+            return (f'a force that goes with {pattern.text} ({force:.2f} m/s^2, {torque:.2f} '
+                    f'rad/s^2); it gains {pattern.gain:.0f} of chi2 on data left out')
+    return ''
 
 
 def _repeats(rest, p):
@@ -221,6 +269,10 @@ def _repeats(rest, p):
 
 
 def _experiment(a, sets, out_of_sight):
+    if a.verdict == 'not_decidable' and a.found.still:
+        own = [CATALOGUE[name].separated_by for name in dict.fromkeys(
+            t.candidate.name for members in sets for t in members)]
+        return '; '.join(['60 s of poses with large turns, tilts and translation', *own[:3]])
     if a.verdict in ('named_set', 'not_decidable') and sets:
         members = max(sets, key=len)
         others = sorted({t.candidate.name for t in members[1:]})
@@ -236,37 +288,37 @@ def _experiment(a, sets, out_of_sight):
     return None
 
 
-def _falsify(a):
+def _falsify(a, wide):
     """Free runs before, after and with a placebo, on the flights that judge."""
-    found, noise = a.found, a.problem.noise
-    judges = a.models[1]
+    found, judges = a.found, a.models[1]
     for model in judges:
         model.guide(found.theta)
-    keys = {n for t in found.accepted for n in t.candidate.keys}
+    keys, refused = ({n for t in trials for n in t.candidate.keys}
+                     for trials in (found.accepted, a.partial))
+    # What explains a part and is not named closes no gap.
+    reached = {n: x for n, x in found.theta.items() if n not in refused}
+    reached |= {n: found.base[n] for n in refused if n in found.base}
     # The same robot, with its tolerances as found, without and with what was named ...
-    points = {'before': {n: x for n, x in found.theta.items() if n not in keys},
-              'after': found.theta}
+    points = {'before': {n: x for n, x in reached.items() if n not in keys}, 'after': reached}
     # ... and the robot file as it is, and with nothing but what was named.
-    plain = _plain(a, found.theta, keys)
+    plain = _plain(a, reached, keys)
     points |= {'file': plain, 'effects_alone': {**plain, **{n: found.theta[n] for n in keys}},
                'placebo': _placebo(a)}
+    noise = {m: a.problem.noise_of(m, found.theta, wide) for m in {*a.models[0], *judges}}
     for name, theta in points.items():
         if found.accepted or name in ('before', 'file'):
-            a.runs[name] = [free_runs(m, theta, noise) for m in judges]
+            a.runs[name] = [free_runs(m, theta, noise[m]) for m in judges]
     for name, same in (('after', 'before'), ('placebo', 'before'), ('effects_alone', 'file')):
         a.runs.setdefault(name, a.runs[same])
-    # No floor is higher than what the model reached on the flights that it was fitted to.
-    own = [free_runs(a.models[0][0], found.theta, noise)]
-    reached = np.sqrt(np.mean([(run.error**2).mean(axis=1) for run in own], axis=0))
-    floors = np.minimum(np.mean([run.floor for run in own], axis=0), np.maximum(reached, 1e-4))
+    trim = trimmed([free_runs(m, found.theta, noise[m]) for m in a.models[0]])
     for h, horizon in enumerate(HORIZONS):
-        values = {name: gap(runs, h, floors=floors) for name, runs in a.runs.items()}
+        values = {name: gap(runs, h, trim=trim) for name, runs in a.runs.items()}
         a.gaps[horizon] = {**values, 'closure': closure(values['before'], values['after']),
                            'placebo_closure': closure(values['before'], values['placebo']),
                            'closure_of_effects_alone': closure(values['file'],
                                                                values['effects_alone'])}
     for regime in np.unique(np.concatenate([run.regime for run in a.runs['before']])):
-        before, after = (gap(a.runs[name], JUDGED, regime, floors)
+        before, after = (gap(a.runs[name], JUDGED, regime, trim)
                          for name in ('before', 'after'))
         a.regimes[str(regime)] = {'before': before, 'after': after,
                                   'worse': bool(after > WORSE * before)}

@@ -44,6 +44,10 @@ class Candidate:
     label: str = ''
     member: int | None = None
 
+    def pushes(self, keys: dict[str, Key]) -> bool:
+        """Whether it shows in nothing but the forces on the body, as gusts do."""
+        return all(keys[name].groups == 'B' for name in self.keys)
+
     def large_enough(self, keys: dict[str, Key], theta: dict[str, float]) -> bool:
         """Whether anyone would act on it."""
         if self.name in ('joint_velocity_limit', 'joint_torque_limit', 'thrust_saturation'):
@@ -82,16 +86,15 @@ def _starts(name, keys, models):
         return ((0.005,), (0.02,))
     if name == 'joint_friction':
         return ((0.004, 0.004), (0.012, 0.015))
-    joint = models[0].robot.joints
     if name == 'joint_velocity_limit':
         met = max(np.abs(m.signals.joints({})[1]).max() for m in models)
         base = keys['joint_velocity_limit.velocity_limit'].base
         return tuple((float(np.log(part * met / base)),) for part in (0.95, 0.8)
                      if part * met < 0.95 * base)
     if name == 'joint_torque_limit':
-        asked = max(np.quantile(np.abs(_errors(m)), 0.999) for m in models) * joint.kp
+        asked = max(np.quantile(np.abs(_torques(m)), 0.999) for m in models)
         base = keys['joint_torque_limit.effort_limit'].base
-        return tuple((float(np.log(part * asked / base)),) for part in (0.9, 0.6)
+        return tuple((float(np.log(part * asked / base)),) for part in (1.1, 0.8, 0.5)
                      if part * asked < 0.98 * base)
     asked = max(np.quantile(m.flight.command[:, 4:], 0.999) for m in models)
     base = keys['thrust_saturation.thrust_max'].base
@@ -99,7 +102,16 @@ def _starts(name, keys, models):
                  if part * asked < 1.2 * base)
 
 
-def _errors(model):
-    s = model.signals
-    row = np.clip(np.searchsorted(model.flight.command_t, s.t) - 1, 0, None)
-    return model.flight.command[row, :4] - s.joints({})[3]
+def _torques(model):
+    """
+    Torques [N m] that the servos' loops ask for, free of limits and of the encoders' noise.
+
+    Not the stiffness times the error alone: while a servo turns, most of that is for the damping.
+    """
+    s, joint = model.signals, model.robot.joints
+    run = model._servos([{}], {})[0]
+    rate = np.gradient(run, model.p.grid, axis=1)
+    times = s.t[model._starts][:, None] + model.p.grid * np.arange(run.shape[1])
+    edges = np.append(times.ravel(), times[-1, -1] + model.p.grid)
+    target = s.tilt_targets(edges, s.delays({})[0]).reshape(run.shape)
+    return joint.kp * (target - run) - joint.kd * rate

@@ -9,6 +9,8 @@ from scipy.stats import t as student
 
 from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import Problem, State
+from beetle_omni_ros.identify.gap.residual import THIN
+from beetle_omni_ros.identify.gap.series import matrices
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 MODEL_ERROR = 0.005     # of a value: no form is exact
@@ -48,6 +50,27 @@ def deviations(problem: Problem, state: State, names: list[str],
         x = state.theta.get(name, 0.0)
         widths[name] = factor * np.sqrt(max(curvature, scatter)) + MODEL_ERROR * abs(x)
     return widths
+
+
+def liveliness(problem: Problem) -> float:
+    """
+    How far accelerations exceed what no known effect explains, on the axis where they do most.
+
+    Near 1 or below, the robot moves because it is pushed, and its controller's commands answer
+    the push: thrust, speed and rate of turn then go with the push, and a fit takes that for an
+    effect of theirs (a thrust too weak, a negative inflow). Only a motion that somebody planned
+    is independent of what disturbs it.
+    """
+    moved = []
+    for model in problem.models:
+        force, _, turning = model.signals.imu({})
+        rotation = matrices(model.signals.pose({})[1])
+        both = np.concatenate([np.einsum('nij,nj->ni', rotation, force), turning], axis=1)
+        moved.append(model.filters['B'](both[::THIN]).var(axis=0))
+    noise = problem.noise.spread['B']
+    # Axes of the world against axes of the body: the mean over the three.
+    level = np.repeat([(noise[:3]**2).mean(), (noise[3:]**2).mean()], 3)
+    return float(np.sqrt((np.mean(moved, axis=0) / level).max()))
 
 
 @dataclass(frozen=True)

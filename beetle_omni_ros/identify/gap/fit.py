@@ -136,6 +136,27 @@ class Problem:
         assert len(names) == state.slopes.shape[1]
         return state
 
+    def noise_of(self, model: FlightModel, theta: dict[str, float],
+                 wide: dict[str, float]) -> Noise:
+        """
+        Noise of one flight alone, around a fit of everything to it.
+
+        Gusts differ from flight to flight; what any known number could explain is none of them.
+
+        Args:
+            model: of the flight, fitted here or not.
+            theta: point at which slopes are taken, if it was not fitted.
+            wide: as of :meth:`learn_noise`.
+
+        """
+        alone = Problem([model], self.keys, self.beliefs, self.p)
+        if model in self.models:
+            alone._raw = [self._raw[self.models.index(model)]]
+        else:
+            alone.state(theta, self._raw[0][2])
+        alone.learn_noise(wide)
+        return alone.noise
+
     def _solve_all(self, state, wide):
         h, g = state.slopes.T @ state.slopes, state.slopes.T @ state.r
         for k, name in enumerate(state.names):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
@@ -19,12 +19,15 @@ class Noise:
 
     Attributes:
         taps: group -> (channels, order + 1) prediction-error filters, first entry 1.
-        sigma: group -> (channels,) standard deviation of what cannot be predicted.
+        sigma: group -> (channels,) standard deviation of what cannot be predicted, as a fit
+            believes it: raised where a floor says so.
+        seen: likewise, as the residual shows it; empty: as believed.
 
     """
 
     taps: dict[str, np.ndarray]
     sigma: dict[str, np.ndarray]
+    seen: dict[str, np.ndarray] = field(default_factory=dict)
 
     @classmethod
     def white(cls, p: GapParameters) -> Noise:
@@ -40,18 +43,20 @@ class Noise:
 
         A channel is never believed to be quieter than its floor: no model is that good.
         """
-        taps, sigma, floors = {}, {}, _floors(p)
+        taps, sigma, seen, floors = {}, {}, {}, _floors(p)
         for group, channels in CHANNELS.items():
             order = p.body_order if group == 'B' else p.other_order
-            rows, levels = [], []
+            rows, levels, own = [], [], []
             for k in range(len(channels)):
                 series = [r[group][:, k] for r in residuals]
                 filtered, level = _autoregression(series, order)
                 white = level / np.sqrt(_gain(filtered))
                 rows.append(filtered)
+                own.append(level)
                 levels.append(level * max(1.0, floors[group][k] / max(white, 1e-12)))
             taps[group], sigma[group] = np.array(rows), np.array(levels)
-        return cls(taps, sigma)
+            seen[group] = np.array(own)
+        return cls(taps, sigma, seen)
 
     def whiten(self, residual: dict[str, np.ndarray]) -> np.ndarray:
         """(n,) or (n, K) whitened samples of one flight's residual or slopes, groups in a row."""
@@ -63,6 +68,12 @@ class Noise:
                 filtered = lfilter(tap, 1.0, values[:, k], axis=0)[order:]
                 parts.append(filtered / self.sigma[group][k])
         return np.concatenate(parts)
+
+    @property
+    def spread(self) -> dict[str, np.ndarray]:
+        """Group -> (channels,) standard deviation of the coloured noise, not whitened."""
+        return {group: self.sigma[group] * np.sqrt([_gain(tap) for tap in taps])
+                for group, taps in self.taps.items()}
 
     def places(self, counts: dict[str, int]) -> list[tuple[str, int, np.ndarray]]:
         """(group, channel, sample indices) in the order of :meth:`whiten`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 import math
 
 import numpy as np
@@ -46,7 +47,9 @@ def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -
                  'hidden': hidden(a, p), 'tolerances': _tolerances(a),
                  'remainder': {'gain': a.rest.gain, 'positive': a.rest.positive,
                                'frame': a.rest.frame, 'channels': dict(a.rest.channels),
-                               'terms': dict(a.rest.terms)}}
+                               'terms': dict(a.rest.terms)},
+                 'patterns': [asdict(pattern) for pattern in a.patterns],
+                 'rhythm': asdict(a.rhythm)}
     return made
 
 

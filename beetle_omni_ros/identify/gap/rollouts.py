@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 from beetle_omni_ros.identify.gap.filters import low_pass
 from beetle_omni_ros.identify.gap.loads import module_load, spin_load
 from beetle_omni_ros.identify.gap.noise import Noise
-from beetle_omni_ros.identify.gap.residual import FlightModel
+from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
 from beetle_omni_ros.identify.gap.servo import simulate, Windows
 from beetle_omni_ros.identify.gap.signals import (
     FINE,
@@ -178,7 +178,7 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
     s = model.signals
     edge = SMOOTH_JOINT if s.guide is None else model.p.guide_edge
     joint0 = s.reading_noise * np.linalg.norm(low_pass(edge, 1, FINE).taps)
-    push = _pushed(noise, model.p)
+    push = _pushed(noise, model.p, gravity)
     floors = []
     for k, horizon in enumerate(HORIZONS):
         floors.append([
@@ -191,28 +191,48 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
     return np.maximum(np.sqrt(floors), LEAST)
 
 
-def _pushed(noise, p):
-    """Displacement, speed, angle and rate that the unpredictable forces of the fit make."""
-    h = p.grid * p.body_every
+def _pushed(noise, p, gravity):
+    """
+    Displacement, speed, angle and rate that the unpredictable forces of the fit make.
+
+    What turns the body turns its thrust, too: from half a second on, that moves it further than
+    the forces themselves.
+    """
+    h = THIN * p.grid * p.body_every
+    level = noise.seen.get('B', noise.sigma['B'])   # what a fit is told to believe is more
     count = round(HORIZONS[-1] / h)
     rng = np.random.default_rng(0)
     once, twice = [], []
     for c in range(6):
-        drive = noise.sigma['B'][c] * rng.standard_normal((DRAWS, count + 60))
+        drive = level[c] * rng.standard_normal((DRAWS, count + 60))
         pushed = lfilter([1.0], noise.taps['B'][c], drive, axis=1)[:, 60:]
         speed = np.cumsum(pushed, axis=1) * h
         once.append(speed)
         twice.append(np.cumsum(speed, axis=1) * h)
+    # A turn about the vertical does not lean the thrust: two axes of three do.
+    lean = [np.sqrt(2 / 3) * gravity * h * np.cumsum(angle, axis=1) for angle in twice[3:]]
+    speeds, places = [*once[:3], *lean], [*twice[:3], *(h * np.cumsum(x, axis=1) for x in lean)]
     made = []
     for horizon in HORIZONS:
         k = round(horizon / h) - 1
         made.append([float(np.sqrt(sum((x[:, k]**2).mean() for x in part)))
-                     for part in (twice[:3], once[:3], twice[3:], once[3:])])
+                     for part in (places, speeds, twice[3:], once[3:])])
     return made
 
 
+def trimmed(fitted: list[Runs]) -> np.ndarray:
+    """
+    (H, 5) part of a floor that is needed: no floor is higher than what the model reaches.
+
+    Each fitted flight is held against its own floor, for gusts differ from flight to flight: what
+    the model reached on a calm day is no floor for a windy one.
+    """
+    reached = np.mean([(run.error**2).mean(axis=1) / run.floor**2 for run in fitted], axis=0)
+    return np.clip(np.sqrt(reached), 1e-2, 1.0)
+
+
 def gap(runs: list[Runs], horizon: int, rows: str | None = None,
-        floors: np.ndarray | None = None) -> float:
+        trim: np.ndarray | None = None) -> float:
     """
     Root mean square over states of error over floor, at one horizon; 1 is nothing but noise.
 
@@ -220,14 +240,14 @@ def gap(runs: list[Runs], horizon: int, rows: str | None = None,
         runs: of all flights.
         horizon: index into HORIZONS.
         rows: regime to look at; default all.
-        floors: (H, 5) in place of each flight's own.
+        trim: (H, 5) of each flight's own floor; see :func:`trimmed`.
 
     """
     parts = []
     for run in runs:
         keep = np.ones(len(run.regime), bool) if rows is None else run.regime == rows
         if keep.any():
-            floor = run.floor if floors is None else floors
+            floor = run.floor if trim is None else run.floor * trim
             parts.append((run.error[horizon][keep] / floor[horizon])**2)
     if not parts:
         return float('nan')

@@ -7,10 +7,11 @@ from collections.abc import Callable
 import numpy as np
 
 from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
+from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
 from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.keys import SHAPES
-from beetle_omni_ros.identify.gap.trial import Found, Trial
+from beetle_omni_ros.identify.gap.trial import Found, TOO_SMALL, Trial
 
 REFINED = 5             # candidates of each step that are fitted, not only estimated
 PROMISING = 0.25        # of the best linear gain
@@ -18,6 +19,9 @@ PROMISING_CURVED = 0.1  # likewise, of those that a straight line cannot judge
 MOST_TURNS = 4          # of fresh slopes, while a fit runs away from them
 FAR = 0.2               # typical sizes of a curved number
 LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
+BEYOND = 3.0            # standard deviations of a tolerance that no robot has ...
+ROUNDS = 3              # ... and how often others may take over from it
+MOST_ITERATIONS = 10    # of a fit, which ends by itself where it gains no more
 WIDE = 4.0              # typical sizes, within which anything is sought
 
 
@@ -44,12 +48,13 @@ class Search:
 
     def run(self) -> Found:
         """Search; see the module."""
-        found, problem = Found(), self.problem
+        found, problem, everyone = Found(), self.problem, self.candidates
         self.progress('noise')
         problem.guide({})
         problem.state({}, self.names)
         state, cost = self._settle({}, [])
         found.base = dict(state.theta)
+        found.still = liveliness(problem) < self.p.least_liveliness
         while True:
             self.progress(f'step {len(found.accepted) + 1}')
             floor = self._floor(state)
@@ -60,14 +65,20 @@ class Search:
             if best is None or len(found.accepted) >= self.p.most_effects:
                 break
             found.accepted.append(best)
+            if found.still and best.candidate.pushes(problem.keys):
+                # One explanation of a flight that cannot decide is enough.
+                self.candidates = [c for c in self.candidates if not c.pushes(problem.keys)]
             state, cost = self._settle(best.theta, [t.candidate for t in found.accepted])
         state, cost = self._prune(found, state, cost)
         found.theta, found.state = dict(state.theta), state
         base_state, before = self._refit(State(found.base, problem.residual(found.base),
                                                state.slopes, state.names), [])
         found.base = dict(base_state.theta)
+        if found.accepted:
+            before = self._believable(base_state, before)
         found.cost = (before, cost, self._floor(state))
         self.progress('rivals')
+        self.candidates = everyone
         self._find_rivals(found, state, cost)
         return found
 
@@ -80,6 +91,28 @@ class Search:
     def _refit(self, state, accepted, iterations=3):
         return self.problem.refine(state, self._involved(accepted), self._free(accepted),
                                    iterations)
+
+    def _believable(self, state, cost):
+        """
+        Objective of a fit without effects in which nothing is further off than robots are.
+
+        A tolerance of 3 % takes an effect of 30 % over for a hundred of chi2, whatever the data
+        would say of the effect: what the effect explains must not be counted against that.
+        """
+        problem, held, theta = self.problem, set(), dict(state.theta)
+        for _ in range(ROUNDS):
+            beyond = {n for n in self.always if n not in held
+                      and abs(problem.beliefs[n].residual(theta.get(n, 0.0))) > BEYOND}
+            if not beyond:
+                break
+            held |= beyond
+            for name in beyond:
+                theta[name] = problem.beliefs[name].within(theta[name], BEYOND)
+            start = State(theta, problem.residual(theta), state.slopes, state.names)
+            names = [n for n in self.always if n not in held]
+            now, cost = problem.refine(start, names, frozenset(), 2)
+            theta = dict(now.theta)
+        return cost
 
     def _settle(self, theta, accepted):
         """Noise and fit in turn, and fresh slopes of everything at the point reached."""
@@ -99,7 +132,8 @@ class Search:
             problem.state(at, self.names)
             state = problem.learn_noise(self.wide, 2)
         state = problem.learn_noise(self.wide, 2)
-        return self._refit(state, accepted, 2)
+        # To the end: what this fit leaves on the way is a gain of every candidate's.
+        return self._refit(state, accepted, MOST_ITERATIONS)
 
     def _far(self, a, b):
         """Whether slopes taken at one point are of little use at the other."""
@@ -191,7 +225,7 @@ class Search:
             elif not trial.refined:
                 trial.reason = 'others explain more'
             elif not c.large_enough(self.problem.keys, trial.theta):
-                trial.reason = 'too small to matter'
+                trial.reason = TOO_SMALL
             elif (c.name, c.member) in names_taken:
                 trial.reason = 'named already'
             elif self._at_bound(trial):

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import State
 
+TOO_SMALL = 'too small to matter'
+
 
 @dataclass
 class Trial:
@@ -50,7 +52,7 @@ class Found:
         theta: of the final fit.
         state: there, with the slopes of all keys.
         cost: objective of base, final, and everything (straight line).
-        rest: whatever is left unexplained.
+        still: whether the robot hardly moves but where it is pushed; see ``liveliness``.
 
     """
 
@@ -61,6 +63,7 @@ class Found:
     theta: dict[str, float] = field(default_factory=dict)
     state: State | None = None
     cost: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    still: bool = False
 
     @property
     def explained(self) -> float:

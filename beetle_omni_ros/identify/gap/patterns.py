@@ -1,0 +1,240 @@
+"""
+Forces that no catalogue entry makes: where, when and with what they come, tried one by one.
+
+A regression on everything at once spreads thin: in gusts it finds nothing that the data would
+show to someone who asked for one thing. Here each question is one of its own: a force that
+depends on the place, one that goes with speed, rotors whose thrust goes with something, a mass
+that swings; all six channels of the body together, judged on blocks left out. A force with a
+rhythm of its own is no function of the state at all and is looked for in the spectrum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import bilinear, lfilter
+
+from beetle_omni_ros.identify.gap.fit import Problem, State
+from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
+from beetle_omni_ros.identify.gap.series import matrices
+
+ROTORS = tuple(f'rotor_thrust_coefficient.scale[{k}]' for k in range(4))
+WORLD = tuple(f'wind.force[{k}]' for k in range(3))
+FORCE, PART = 0.5, 0.05     # sizes that are likely: [N], and of a rotor's thrust
+WARM = 20.0                 # [s] in which something that warms up does
+SPACING, WIDTH = 0.9, 0.7   # [m] of the places where a force is sought
+SWINGS = (0.8, 1.1, 1.5, 2.0, 2.7)   # [Hz] of loose masses, weakly damped
+DAMPING = 0.1
+SWUNG = 0.05                # likely mass of them, of the robot's
+RHYTHMS = 0.5, 6.0          # [Hz] of forces that come by themselves: below, a task repeats
+NEAR = 0.4                  # [Hz] to both sides that a line must exceed
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """
+    One question and its answer.
+
+    Attributes:
+        text: what goes with what.
+        gain: of chi2 on blocks left out.
+        error: standard error of it.
+        positive: part of the blocks that gain.
+        size: root mean square of specific force [m/s^2] and of angular acceleration [rad/s^2].
+
+    """
+
+    text: str
+    gain: float
+    error: float
+    positive: float
+    size: tuple[float, float]
+
+    @property
+    def sure(self) -> bool:
+        """
+        Whether blocks that were left out agree.
+
+        What changes with time gains most where it is largest: where nearly every block gains,
+        they need not gain alike.
+        """
+        return self.gain > 3 * self.error and self.positive >= 0.7 \
+            or self.gain > 2 * self.error and self.positive >= 0.85
+
+
+def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:
+    """
+    Every question, the best answer first.
+
+    Args:
+        problem: flights and noise.
+        state: the final fit.
+        names: keys that were fitted; their slopes are taken out first.
+
+    """
+    asked = [questions(model, state.theta) for model in problem.models]
+    rows = problem.where < 6
+    fitted = state.slopes[rows][:, [state.index[name] for name in names]]
+    used = (fitted**2).sum(axis=0) > 1e-6
+    fitted = fitted[:, used]
+    index = [state.index[name] for name, keep in zip(names, used, strict=True) if keep]
+    raw = [slopes['B'][:, :, index] for _, slopes, *_ in problem._raw]
+    r = state.r[rows]
+    r = r - fitted @ np.linalg.lstsq(fitted, r, rcond=None)[0]
+    made = []
+    for text in asked[0]:
+        white, plain = zip(*(_seen(problem, model, each[text])
+                             for model, each in zip(problem.models, asked, strict=True)),
+                           strict=True)
+        x = np.concatenate(white)
+        known = np.linalg.lstsq(fitted, x, rcond=None)[0]
+        x -= fitted @ known
+        held, weights = _judged(x, r, problem.block[rows], problem.blocks)
+        # What a known number takes over, a constant wind or a thrust, is no part of it.
+        size = np.sqrt(np.mean([((each @ weights - slopes @ (known @ weights))**2).mean(axis=0)
+                                for each, slopes in zip(plain, raw, strict=True)], axis=0))
+        error = float(held.std(ddof=1) * np.sqrt(len(held))) if len(held) > 1 else np.inf
+        made.append(Pattern(text, float(held.sum()), error, float((held > 0).mean()),
+                            (float(np.linalg.norm(size[:3])), float(np.linalg.norm(size[3:])))))
+    return sorted(made, key=lambda p: -p.gain)
+
+
+def questions(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarray]:
+    """Text -> (N, 6, K) specific force and angular acceleration of likely size, every THIN."""
+    x = {name: values[::THIN] for name, values in model.inputs(theta).items()}
+    exact = model._body.derivatives(x, theta, (*ROTORS, *WORLD))
+    rotor, world = PART * exact[:, :, :4], FORCE * exact[:, :, 4:]
+    rotation = matrices(x['quaternion'])
+    body = np.einsum('ncj,nji->nci', world, rotation)
+    speed = np.linalg.norm(x['velocity'], axis=1)[:, None]
+    own = np.einsum('nji,nj->ni', rotation, x['velocity'])
+    time = THIN * model.p.grid * np.arange(len(speed))[:, None]
+    tilts = np.concatenate([np.sin(x['tilt']), np.cos(x['tilt'])], axis=1)
+    return {
+        'the place': _times(world, _places(x['position'])),
+        'the direction of motion': np.concatenate([
+            _times(world, x['velocity'] / (speed + 0.05)), _times(body, own / (speed + 0.05))],
+            axis=2),
+        'turns of the body, through thrust': _times(rotor, np.tanh(x['rate'])),
+        'motion of the body, through thrust': _times(rotor, np.tanh(own)),
+        'tilts of the rotors, through thrust': _times(rotor, tilts),
+        'thrust of the rotors': _times(rotor, x['thrust'] / 8.0 - 1.0),
+        'time of flight, through thrust': _times(rotor, np.concatenate(
+            [1 - np.exp(-time / WARM), time / time[-1]], axis=1)),
+        'a mass that swings': _swings(model._body(x, theta)[:, :3], THIN * model.p.grid)}
+
+
+def _times(forces, shares):
+    """(N, 6, A B) every force (N, 6, A) with every share (N, B)."""
+    both = forces[:, :, :, None] * shares[:, None, None, :]
+    return both.reshape(*forces.shape[:2], -1)
+
+
+def _places(position):
+    """(N, B) nearness to points of a grid in the plane, height, and one."""
+    corners = SPACING * np.array([(i, j) for i in range(-2, 3) for j in range(-2, 3)])
+    off = position[:, None, :2] - corners
+    near = np.exp(-0.5 * (off**2).sum(axis=2) / WIDTH**2)
+    return np.column_stack([near, position[:, 2] - 1.0])
+
+
+def _swings(force, period):
+    """
+    (N, 6, K) what masses on weak springs return of the body's specific force.
+
+    Args:
+        force: (N, 3) that the model expects: measured, it would hold the gust that it explains.
+        period: between samples [s].
+
+    """
+    size = np.zeros((len(force), 6, 3 * len(SWINGS)))
+    for j, frequency in enumerate(SWINGS):
+        w = 2 * np.pi * frequency
+        b, a = bilinear([2 * DAMPING * w, w * w], [1.0, 2 * DAMPING * w, w * w], 1 / period)
+        # Less what a mass that is tied down would do: that is in the robot's own mass.
+        swung = lfilter(b, a, force - force[0], axis=0) - (force - force[0])
+        for k in range(3):
+            size[:, k, k * len(SWINGS) + j] = SWUNG * swung[:, k]
+    return size
+
+
+def _seen(problem, model, columns):
+    """Columns (N, 6, K) as they show in one flight's residual, whitened and not."""
+    smooth = model._mask[:, None, None] * model.filters['B'](columns)
+    taps, sigma = problem.noise.taps['B'], problem.noise.sigma['B']
+    white = [lfilter(tap, 1.0, smooth[:, c], axis=0)[len(tap) - 1:] / sigma[c]
+             for c, tap in enumerate(taps)]
+    return np.concatenate(white), smooth
+
+
+def _judged(x, r, block, blocks):
+    """Gain of chi2 on each block left out, of weights that are likely to be about one."""
+    parts = [(x[block == b].T @ x[block == b], x[block == b].T @ r[block == b])
+             for b in range(blocks)]
+    h, g = (sum(part[k] for part in parts) for k in (0, 1))
+    one = np.eye(len(g))
+    held = np.zeros(blocks)
+    for b, (own, score) in enumerate(parts):
+        w = np.linalg.solve(h - own + one, g - score)
+        held[b] = 2 * score @ w - w @ own @ w
+    return held, np.linalg.solve(h + one, g)
+
+
+@dataclass(frozen=True)
+class Rhythm:
+    """
+    The sharpest line in the spectrum of what is left.
+
+    Attributes:
+        frequency: [Hz].
+        ratio: of its power to the median of what lies beside it.
+        size: [m/s^2] root mean square.
+
+    """
+
+    frequency: float
+    ratio: float
+    size: float
+
+
+def rhythm(problem: Problem, theta: dict[str, float]) -> Rhythm:
+    """
+    A force with a rhythm of its own: a line at the same frequency in every flight.
+
+    Gusts have no lines. In the world's axes a force that keeps its direction does not vary with
+    the attitude; in the body's a loose part does not: the sharper one counts.
+    """
+    h = THIN * problem.p.grid * problem.models[0].filters['B'].every
+    rest = [(m.residual(theta, 'B')['B'][:, :3], _turns(m)) for m in problem.models]
+    count = 2 * min(len(r) for r, _ in rest)
+    best = Rhythm(0.0, 0.0, 0.0)
+    for frame in (0, 1):
+        spectra = []
+        for r, rotation in rest:
+            r = np.einsum('nij,nj->ni', rotation, r) if frame == 0 else r
+            window = np.hanning(len(r))[:, None]
+            power = np.abs(np.fft.rfft((r - r.mean(axis=0)) * window, count, axis=0))**2
+            spectra.append(2 * power.sum(axis=1) / (window.sum()**2))
+        found = _line(np.fft.rfftfreq(count, h), np.mean(spectra, axis=0))
+        best = max(best, found, key=lambda line: line.ratio)
+    return best
+
+
+def _turns(model):
+    """(M, 3, 3) body to world at the samples of the body's residual."""
+    rotation = matrices(model.signals.pose({})[1])[::THIN]
+    return rotation[model.filters['B'].centres(len(rotation))]
+
+
+def _line(frequency, power):
+    """The line that exceeds its surroundings most."""
+    step = frequency[1]
+    reach = round(NEAR / step)
+    inside = np.flatnonzero((frequency > RHYTHMS[0]) & (frequency < RHYTHMS[1]))
+    inside = inside[(inside >= reach) & (inside + reach < len(power))]
+    beside = np.array([np.median(power[k - reach:k + reach + 1]) for k in inside])
+    ratio = power[inside] / np.maximum(beside, 1e-30)
+    top = int(np.argmax(ratio))
+    return Rhythm(float(frequency[inside[top]]), float(ratio[top]),
+                  float(np.sqrt(power[inside[top]])))

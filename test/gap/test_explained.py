@@ -1,0 +1,91 @@
+"""How much an effect explains is not counted against tolerances that no robot has."""
+
+from flights import KEYS, P
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.gap.fit import Problem, State
+from beetle_omni_ros.identify.gap.keys import Belief, tolerances
+from beetle_omni_ros.identify.gap.search import BEYOND, Search
+
+LAG, OTHER = 'rotor_lag.time_constant', 'inertia.inertia[0]'
+
+
+class Straight(Problem):
+    """A residual that is a straight line of two tolerances."""
+
+    def __init__(self, truth, overlap):
+        self.keys, self.p = KEYS, P
+        self.beliefs = {name: tolerances(P)[name] for name in (LAG, OTHER)}
+        rng = np.random.default_rng(0)
+        one, two = rng.standard_normal((2, 2000))
+        self.columns = 30 * np.stack([one, overlap * one + (1 - overlap) * two], axis=1)
+        self.noise, self.truth = rng.standard_normal(2000), truth
+
+    def residual(self, theta):
+        return self.noise + self.columns @ [theta.get(LAG, 0.0) - self.truth,
+                                            theta.get(OTHER, 0.0)]
+
+
+class Curved(Straight):
+    """The same with slopes that are twice too steep: each step goes half the way."""
+
+    def learn_noise(self, wide, rounds=3):
+        theta = getattr(self, 'at', {})
+        return State(dict(theta), self.residual(theta), 2 * self.columns, [LAG, OTHER])
+
+    def state(self, theta, names):
+        self.at = theta
+
+    def guide(self, theta):
+        pass
+
+    def renew(self, theta):
+        self.at = theta
+
+
+def test_a_slow_fit_leaves_nothing_for_others_to_gain():
+    problem = Curved(0.25, 0.0)
+    search = Search.__new__(Search)
+    search.problem, search.always, search.wide, search.names = problem, [LAG, OTHER], {}, []
+    state, cost = search._settle({}, [])
+    _, again = problem.refine(state, search.always, frozenset(), 10)
+    assert cost - again < 1.0
+
+
+def before(truth, overlap=0.0):
+    """Objective without effects: as fitted, and with believable tolerances only."""
+    problem = Straight(truth, overlap)
+    search = Search.__new__(Search)
+    search.problem, search.always = problem, [LAG, OTHER]
+    start = State({}, problem.residual({}), problem.columns, [LAG, OTHER])
+    state, cost = problem.refine(start, search.always, frozenset())
+    return cost, search._believable(state, cost)
+
+
+def test_a_lag_far_beyond_tolerance_is_not_taken_over_by_it():
+    fitted, believable = before(0.25)
+    # The tolerance's own price is eight deviations: 70 of chi2. The data say thousands.
+    assert fitted < 2300 and believable > fitted + 1000 * 30**2 * (0.25 - 0.09)**2
+
+
+def test_nor_by_the_tolerance_of_something_else():
+    fitted, believable = before(0.25, overlap=0.99)
+    assert believable > fitted + 1000
+
+
+def test_a_lag_within_tolerance_is():
+    fitted, believable = before(0.05)
+    assert believable == fitted
+
+
+@pytest.mark.parametrize('x, expected', [(0.02, 0.02), (0.2, 0.09), (-0.2, -0.09)])
+def test_a_belief_has_an_end(x, expected):
+    assert Belief(0.03).within(x, BEYOND) == pytest.approx(expected)
+
+
+def test_a_free_range_ends_beyond_itself():
+    belief = Belief(5e-4, 0.010, 0.005, 0.003)
+    assert belief.within(0.004, BEYOND) == 0.004
+    assert belief.within(0.02, BEYOND) == pytest.approx(0.0065)
+    assert belief.within(-0.02, BEYOND) == pytest.approx(-0.0115)

@@ -1,0 +1,94 @@
+"""What noise and gusts alone make of a free run: of each flight its own, and nothing else."""
+
+from dataclasses import replace
+
+from flights import gusts, KEYS, model, Motion, P, pushed, ROBOT
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from beetle_omni_ros.identify.gap.fit import Problem
+from beetle_omni_ros.identify.gap.keys import tolerances
+from beetle_omni_ros.identify.gap.noise import Noise
+from beetle_omni_ros.identify.gap.residual import THIN
+from beetle_omni_ros.identify.gap.rollouts import gap, HORIZONS, noise_floor, Runs, trimmed
+
+HALF = HORIZONS.index(0.5)
+MOTION = Motion(7, duration=60.0)
+NAMES = [f'wind.force[{k}]' for k in range(3)]
+WIDE = dict.fromkeys(NAMES, 4.0)
+
+
+def made(push):
+    flight = model(pushed(MOTION, push))
+    flight._mask = np.ones(len(flight._mask))
+    return flight
+
+
+def fitted(*pushes):
+    problem = Problem([made(push) for push in pushes], KEYS, tolerances(P), P)
+    problem.state({}, NAMES)
+    problem.learn_noise(WIDE)
+    return problem
+
+
+def spread(noise):
+    return float(np.linalg.norm(noise.spread['B'][:3]))
+
+
+def test_every_flight_has_its_own_gusts():
+    problem, windy = fitted(gusts(MOTION, 1, 0.1), gusts(MOTION, 2, 0.1)), made(
+        gusts(MOTION, 3, 0.4))
+    calm = [problem.noise_of(m, {}, WIDE) for m in problem.models]
+    storm = problem.noise_of(windy, {}, WIDE)
+    assert spread(storm) / spread(calm[0]) == pytest.approx(4, rel=0.3)
+    assert spread(calm[1]) / spread(calm[0]) == pytest.approx(1, rel=0.3)
+    calm, storm = (replace(noise, seen={'B': noise.seen['B'] * ([1] * 3 + [0] * 3)})
+                   for noise in (calm[0], storm))     # turns are not what this motion is about
+    assert noise_floor(windy, storm)[HALF, 1] > 2 * noise_floor(windy, calm)[HALF, 1]
+
+
+def test_a_force_that_the_catalogue_knows_is_no_noise():
+    problem = fitted(gusts(MOTION, 1, 0.1))
+    plain, blown = (problem.noise_of(made(gusts(MOTION, 3, 0.1) + push), {}, WIDE)
+                    for push in ([0, 0, 0], [0.8, -0.5, 0.0]))
+    assert spread(blown) == pytest.approx(spread(plain), rel=0.02)
+
+
+def runs(error, floor):
+    shape = len(HORIZONS), 50, 5
+    return Runs(np.full(shape, error), np.full(50, 'hover', object),
+                np.full((len(HORIZONS), 5), floor))
+
+
+def test_a_perfect_model_is_at_the_floor_on_a_windy_day_too():
+    trim = trimmed([runs(0.1, 0.1), runs(0.2, 0.2)])
+    assert gap([runs(0.5, 0.5)], HALF, trim=trim) == pytest.approx(1)
+
+
+def test_no_floor_is_higher_than_what_the_model_reaches():
+    trim = trimmed([runs(0.05, 0.1), runs(0.1, 0.2)])
+    assert trim == pytest.approx(0.5)
+    assert gap([runs(0.5, 0.5)], HALF, trim=trim) == pytest.approx(2)
+
+
+def test_a_bad_fit_does_not_raise_the_floor():
+    assert trimmed([runs(3.0, 0.1)]) == pytest.approx(1)
+
+
+def test_torques_that_nobody_knows_lean_the_thrust():
+    size, step = 0.5, THIN * P.grid * P.body_every
+    noise = Noise({'B': np.ones((6, 1))}, {'B': np.array([0, 0, 0, *[size] * 3]),
+                                           'J': np.zeros(4)})
+    floor = noise_floor(made(np.zeros(3)), noise)[HALF]
+    rng, reached = np.random.default_rng(5), []
+    for _ in range(400):    # a body that hovers and is turned, in plain steps
+        attitude, (rate, velocity, place) = Rotation.identity(), np.zeros((3, 3))
+        for _ in range(round(HORIZONS[HALF] / step)):
+            rate = rate + step * size * rng.standard_normal(3)
+            attitude = attitude * Rotation.from_rotvec(step * rate)
+            force = attitude.apply([0, 0, ROBOT.gravity]) - [0, 0, ROBOT.gravity]
+            velocity = velocity + step * force
+            place = place + step * velocity
+        reached.append([place @ place, velocity @ velocity])
+    assert floor[:2] == pytest.approx(np.sqrt(np.mean(reached, axis=0)), rel=0.2)
