@@ -7,7 +7,7 @@ from flights import gusts, KEYS, model, Motion, P, pushed
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.analysis import _decide, Analysis
+from beetle_omni_ros.identify.gap.analysis import Analysis
 from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
@@ -15,6 +15,7 @@ from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, Rhythm, rhythm
 from beetle_omni_ros.identify.gap.trial import Found, TOO_SMALL, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder
+from beetle_omni_ros.identify.gap.verdict import decide
 
 MOTION = Motion(7, duration=60.0)
 NAMES = [*(f'wind.force[{k}]' for k in range(3)),
@@ -81,7 +82,7 @@ def decided(accepted=(), found=(), line=Rhythm(0.0, 0.0, 0.0), left=0.0, trials=
                    trials={t.candidate.label: t for t in trials})
     a = Analysis(keys=KEYS, found=search, rest=NOTHING, patterns=list(found), rhythm=line)
     a.problem = SimpleNamespace(time=np.zeros(1000), beliefs={})
-    _decide(a, P)
+    decide(a, P)
     return a
 
 

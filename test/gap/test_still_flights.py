@@ -7,7 +7,7 @@ from flights import KEYS, model, Motion, P
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.analysis import _decide, Analysis
+from beetle_omni_ros.identify.gap.analysis import Analysis
 from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.certainty import liveliness, Visibility
 from beetle_omni_ros.identify.gap.fit import Problem
@@ -16,6 +16,7 @@ from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.gap.trial import Found, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder
+from beetle_omni_ros.identify.gap.verdict import decide
 
 MOTION = Motion(7)
 NOTHING = Remainder(0.0, 0.0, [], [], 'body', {})
@@ -42,7 +43,7 @@ def decided(accepted, still, rivals=(), everything=700.0):
     a = Analysis(keys=KEYS, found=found, rest=NOTHING,
                  visible={'mass': Visibility(50.0, {}), 'rotor_drag': Visibility(1.0, {})})
     a.problem = SimpleNamespace(time=np.zeros(1000), beliefs={})
-    _decide(a, P)
+    decide(a, P)
     return a
 
 

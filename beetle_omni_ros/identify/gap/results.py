@@ -8,10 +8,11 @@ import math
 import numpy as np
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.gap.analysis import Analysis, hidden, JUDGED
+from beetle_omni_ros.identify.gap.analysis import Analysis, JUDGED
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.rollouts import HORIZONS
 from beetle_omni_ros.identify.gap.trial import Trial
+from beetle_omni_ros.identify.gap.verdict import hidden
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.table import ABSENT, Grid

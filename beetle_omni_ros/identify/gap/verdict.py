@@ -1,0 +1,122 @@
+"""What to say of an analysis: a name, a set, unknown, not decidable, or no gap; and why."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.trial import TOO_SMALL
+from beetle_omni_ros.robot.effects import CATALOGUE
+
+if TYPE_CHECKING:
+    from beetle_omni_ros.identify.gap.analysis import Analysis
+
+
+def hidden(a: Analysis, p: GapParameters) -> list[str]:
+    """Names of entries of which these data could not show a realistic size."""
+    best: dict[str, float] = {}
+    for label, seen in a.visible.items():
+        name = label.partition(' ')[0].partition('[')[0]
+        best[name] = max(best.get(name, 0.0), seen.sigma)
+    return [name for name, sigma in best.items() if sigma < p.decidable]
+
+
+def decide(a: Analysis, p: GapParameters) -> None:
+    """Set verdict, reason, what explains only a part, and what to fly next."""
+    found, count = a.found, len(a.problem.time)
+    before, after, floor = found.cost
+    # Everything at once also fits some noise: a chi2 of one for each number without a belief.
+    floor += sum(name not in a.problem.beliefs for name in found.state.names)
+    # A latency of a millisecond is no unknown, however clearly it shows.
+    small = max((t.gain for t in found.trials.values() if t.reason == TOO_SMALL), default=0.0)
+    left = max(after - floor - small, 0.0)
+    explained = (before - after) / max(before - after + left, 1e-9)
+    out_of_sight = hidden(a, p)
+    share = len(out_of_sight) / max(len({label.partition(' ')[0].partition('[')[0]
+                                         for label in a.visible}), 1)
+    repeats = _repeats(a.rest, p)
+    strange = _strange(a, before - after, p)
+    sets = [[t, *found.rivals.get(t.candidate.label, [])] for t in found.accepted]
+    names = [len({t.candidate.name for t in members}) for members in sets]
+    pushed = [t for t in found.accepted if t.candidate.pushes(a.keys)]
+    if found.still and (pushed or not found.accepted):
+        a.verdict, a.partial = 'not_decidable', pushed
+        a.reason = _stillness(sets, pushed, out_of_sight)
+        found.accepted[:] = [t for t in found.accepted if t not in pushed]
+    elif found.accepted:
+        part = a.rest.gain / max(before - after, 1e-9)
+        if left > p.least_left and explained < p.enough or strange \
+                or repeats and part > p.remainder_share:
+            a.verdict, a.partial = 'unknown', list(found.accepted)
+            a.reason = (f'{found.accepted[0].candidate.name} and its like explain '
+                        f'{explained:.0%} of what known effects could; the rest is '
+                        f'{strange or a.rest.text}')
+            found.accepted.clear()
+        elif max(names) >= p.crowd or (share > p.most_hidden and max(names) > 1):
+            a.verdict = 'not_decidable'
+            a.reason = f'these flights cannot tell {max(names)} explanations apart'
+        else:
+            a.verdict = 'named_set' if max(names) > 1 else 'named'
+            a.reason = f'explains {explained:.1%} of what known effects could explain'
+    elif repeats or strange or left > 0.05 * count:
+        a.verdict, a.reason = 'unknown', strange or a.rest.text
+    elif share > p.most_hidden:
+        a.verdict = 'not_decidable'
+        a.reason = (f'{len(out_of_sight)} known effects of realistic size would not show in '
+                    'these flights')
+    else:
+        a.verdict, a.reason = 'no_gap', 'what is left is noise and manufacturing tolerance'
+    a.experiment = _experiment(a, sets if found.accepted or pushed else [], out_of_sight)
+
+
+def _stillness(sets, pushed, out_of_sight):
+    """Why a flight that hardly moves decides nothing about forces."""
+    seen = sorted({t.candidate.name for members in sets if members[0] in pushed
+                   for t in members})
+    found = f'; {" or ".join(seen)} would explain it, and others as well' if seen else \
+        f'; {len(out_of_sight)} known effects of realistic size would not show'
+    return 'the robot hardly moves but where it is pushed' + found
+
+
+def _strange(a, explained, p):
+    """What no entry can be and these flights show all the same, in words; '' if nothing."""
+    line = a.rhythm
+    if line.ratio > p.least_line and line.size > p.least_force:
+        return (f'a force with a rhythm of its own, {line.frequency:.2f} Hz and '
+                f'{line.size:.2f} m/s^2, which goes with no state')
+    for pattern in a.patterns:
+        force, torque = pattern.size
+        large = force > p.least_force or torque > p.least_torque
+        if pattern.sure and large and pattern.gain > max(p.least_pattern,
+                                                         p.pattern_share * explained):
+            return (f'a force that goes with {pattern.text} ({force:.2f} m/s^2, {torque:.2f} '
+                    f'rad/s^2); it gains {pattern.gain:.0f} of chi2 on data left out')
+    return ''
+
+
+def _repeats(rest, p):
+    """Whether what is left repeats, and is more than tolerances leave behind."""
+    limits = {'force': p.least_force, 'torque': p.least_torque, 'joint': p.least_joint}
+    large = [name for name, gain in rest.channels if gain > p.least_channel
+             and rest.size[name] > limits[name.partition('_')[0]]]
+    return rest.gain > p.least_remainder and rest.positive >= 0.7 and bool(large)
+
+
+def _experiment(a, sets, out_of_sight):
+    if a.verdict == 'not_decidable' and a.found.still:
+        own = [CATALOGUE[name].separated_by for name in dict.fromkeys(
+            t.candidate.name for members in sets for t in members)]
+        return '; '.join(['60 s of poses with large turns, tilts and translation', *own[:3]])
+    if a.verdict in ('named_set', 'not_decidable') and sets:
+        members = max(sets, key=len)
+        others = sorted({t.candidate.name for t in members[1:]})
+        return (f'{CATALOGUE[members[0].candidate.name].separated_by} (separates '
+                f'{members[0].candidate.name} from {", ".join(others) or "the rest"})')
+    if a.verdict == 'not_decidable':
+        flights = list(dict.fromkeys(CATALOGUE[name].excited_by for name in out_of_sight))
+        tests = list(dict.fromkeys(CATALOGUE[name].separated_by for name in out_of_sight))
+        return (f'poses with large turns, tilts and translation ({"; ".join(flights[:5])}); '
+                f'best: {"; ".join(tests[:3])}')
+    if a.verdict == 'unknown':
+        return 'the same task three times over: what repeats is model, the rest is gusts'
+    return None
