@@ -59,7 +59,8 @@ def measure(folder: Path, name: str, seconds: float) -> dict:
     task.write_text('\n'.join(['x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg', *rows]) + '\n')
     result.unlink(missing_ok=True)
     with bare_timer() as counted:
-        status = run_fly(task=str(task), composed=composed, actuators=actuators, json_path=result,
+        status = run_fly(task=str(task), composed=composed, actuators=actuators, clock='system',
+                         json_path=result,
                          console=Console(quiet=True))
     if status or not result.exists():
         sys.exit(f'flight with {name} failed (status {status})')

@@ -31,10 +31,15 @@ def fly(bag: Annotated[Path, typer.Option(
         task: TaskOption = 'waypoints',
         conditions: ConditionsOption = 'nominal',
         seed: SeedOption = 0,
-        actuators: Annotated[str, typer.Option(
+        actuators: Annotated[Optional[str], typer.Option(
             '--actuators', metavar='emulated|direct',
             help='Through joint_bridge_node, rotor_bridge_node, serial ports and emulated '
-                 'devices; or straight into the simulated plant.')] = 'emulated',
+                 'devices, the default; or straight into the simulated plant.')] = None,
+        clock: Annotated[str, typer.Option(
+            '--clock', metavar='auto|system|simulated',
+            help='Real time on the system clock; or simulated time on /clock, which waits for '
+                 'nodes that are late, with direct actuators; auto: simulated where the computer '
+                 'is too slow for real time.')] = 'auto',
         robot: RobotOption = None,
         plant: PlantOption = None,
         policy: PolicyOption = None,
@@ -59,9 +64,10 @@ def fly(bag: Annotated[Path, typer.Option(
     from beetle_omni_ros.nodes.fly import FlightError, run_fly
     try:
         code = run_fly(controller=controller, task=task, bag=bag, seed=seed,
-                       conditions=conditions, actuators=actuators, robot=robot, plant=plant,
-                       policy=policy, allow_other_robot=allow_other_robot, standby=standby,
-                       composed=composed, json_path=json_path, domain_id=domain_id)
+                       conditions=conditions, actuators=actuators, clock=clock, robot=robot,
+                       plant=plant, policy=policy, allow_other_robot=allow_other_robot,
+                       standby=standby, composed=composed, json_path=json_path,
+                       domain_id=domain_id)
     except FlightError as error:
         raise typer.Exit(fail(error, FAILED)) from None
     raise typer.Exit(code if isinstance(code, int) else 0)

@@ -21,10 +21,19 @@ SETTLE_TIME = 1.0       # s before arming, in which all processes come to rest
 LANDING_TIMEOUT = 30.0  # s
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
 LOOK_PERIOD = 0.1       # s between looks at processes and progress
+WATCH_TIME = 2.0        # s of looking whether the simulator keeps real time, before arming
+LOST_TIME = 0.2         # s that it may lose then
+BUSY = 0.9              # part of a core that the composed nodes may need
+LOST_SHARE = 0.01       # part of a flight that the simulator loses where slowness let it fail
+PACING = 'sim_node: pacing'
 
 
 class FlightError(RuntimeError):
     """The flight did not go as asked; the text is one line for the operator."""
+
+
+class TooSlowError(FlightError):
+    """The computer cannot do the work of this flight in real time."""
 
 
 class Flight:
@@ -36,18 +45,20 @@ class Flight:
         operator: in the same domain.
         task: what to fly.
         bars: where to show how it goes.
+        may_be_slow: try although the simulator does not keep real time.
 
     Attributes:
         measured: CPU of the graph and of its bridges [% of one core], latencies [ms], cycles of
-            the bridges.
+            the bridges; where time was simulated, its ratio to real time, and no latencies.
 
     """
 
-    def __init__(self, graph: Graph, operator: Operator, task: Task, bars: Progress):
+    def __init__(self, graph: Graph, operator: Operator, task: Task, bars: Progress,
+                 may_be_slow: bool = True):
         """Prepare the bar."""
         self._graph, self._operator, self._task = graph, operator, task
         self._bridges = [node for node in graph.nodes if node in BRIDGES]
-        self._bars = bars
+        self._bars, self._may_be_slow = bars, may_be_slow
         self._bar = bars.add_task('', total=task.duration, at='')
         self._reported: set[str] = set()
         self.measured: dict[str, float] = {}
@@ -57,48 +68,86 @@ class Flight:
         Get ready, take off and fly the task to its end.
 
         Raises:
-            FlightError: naming what went wrong.
+            TooSlowError: the simulator did not keep real time and must.
+            FlightError: naming what else went wrong.
 
         """
         operator = self._operator
         self._await('starting (the first time compiles the controller)',
                     lambda: operator.ready and operator.progress, READY_TIMEOUT)
         self._await('actuators', lambda: not operator.waits_for(self._bridges), BRIDGES_TIMEOUT)
-        self._take_off()
-        counts = BridgeCounts(operator.values)
-        cpu, bridges_cpu = self._graph.cpu_seconds(), self._graph.cpu_seconds(bridges=True)
-        start = time.monotonic()
+        self._await('watching the simulator', lambda: PACING in operator.diagnostics,
+                    BRIDGES_TIMEOUT)
+        lost, begin = self._lost(), operator.time()
+        if not self._may_be_slow:
+            self._watch(lost)
+        try:
+            self._take_off()
+            self._fly_task()
+        except FlightError as error:
+            late, flown = self._lost() - lost, operator.time() - begin
+            if not self._may_be_slow and late > LOST_SHARE * flown:
+                raise TooSlowError(f'{error}; the simulator fell {late:.1f} s behind in '
+                                   f'{flown:.0f} s') from None
+            raise
+        self._take_latencies()
+
+    def _watch(self, lost):
+        """Let the nodes run for a while and see whether they keep real time."""
+        graph, steady = self._graph, time.monotonic()
+        cpu = graph.cpu_seconds() - graph.cpu_seconds(bridges=True)
+        self._look(WATCH_TIME)
+        cpu = graph.cpu_seconds() - graph.cpu_seconds(bridges=True) - cpu
+        if (late := self._lost() - lost) > LOST_TIME:
+            raise TooSlowError(f'the simulator fell {late:.1f} s behind in {WATCH_TIME:g} s')
+        if graph.composed and (busy := cpu / (time.monotonic() - steady)) > BUSY:
+            raise TooSlowError(f'the nodes use {busy:.0%} of a core before the start')
+
+    def _lost(self):
+        """Time that the simulator has left out because it came too late [s]."""
+        return float(self._operator.values(PACING).get('lost_s', 0.0))
+
+    def _fly_task(self):
+        operator, graph = self._operator, self._graph
+        self._counts = BridgeCounts(operator.values)
+        cpu, bridges_cpu = graph.cpu_seconds(), graph.cpu_seconds(bridges=True)
+        start, steady = operator.time(), time.monotonic()
+        left = operator.countdown(self._task.duration + SPARE_TIME)
         while not operator.progress.startswith('done'):
             self._look()
-            flown = time.monotonic() - start
+            flown, passed = operator.time() - start, time.monotonic() - steady
             self._say(f'{self._task.name} ({operator.state})', operator.progress, flown)
-            self._measure('cpu_percent', self._graph.cpu_seconds() - cpu, start)
+            self.measured['cpu_percent'] = 100 * (graph.cpu_seconds() - cpu) / passed
             if self._bridges:
-                self._measure('bridges_cpu_percent',
-                              self._graph.cpu_seconds(bridges=True) - bridges_cpu, start)
+                self.measured['bridges_cpu_percent'] = \
+                    100 * (graph.cpu_seconds(bridges=True) - bridges_cpu) / passed
+            if graph.simulated:
+                self.measured['real_time_factor'] = flown / passed
             if operator.state in ('disarmed', 'emergency_stop'):
                 raise FlightError(f"the flight ended early, supervisor in '{operator.state}'")
-            if flown > self._task.duration + SPARE_TIME:
+            if next(left, None) is None:
                 raise FlightError(f"the task hangs at '{operator.progress}'")
+
+    def _take_latencies(self):
+        operator = self._operator
+        if self._graph.simulated:
+            return
         status, prefix = ('rotor_bridge_node', 'age_') if self._bridges else ('sim_node', '')
         for name in ('median_ms', 'p99_ms', 'max_ms'):
             value = operator.values(f'{status}: latency').get(prefix + name)
             if value is not None:
                 self.measured[f'latency_{name}'] = float(value)
-        self.measured.update(counts.measured())
-
-    def _measure(self, key, seconds, start):
-        self.measured[key] = 100 * seconds / (time.monotonic() - start)
+        self.measured.update(self._counts.measured())
 
     def _take_off(self):
         """Arm and climb; a start that the busy computer spoilt on the ground is tried again."""
         operator = self._operator
         for _ in range(TAKEOFF_ATTEMPTS):
             self._say('arming')
-            deadline = time.monotonic() + ARM_TIMEOUT
+            left = operator.countdown(ARM_TIMEOUT)
             self._look(SETTLE_TIME)
             while not (answer := operator.call('arm'))[0]:
-                if time.monotonic() > deadline:
+                if next(left, None) is None:
                     raise FlightError(f'supervisor_node refuses to arm: {answer[1]}')
                 self._look()
             operator.states.clear()
@@ -124,10 +173,10 @@ class Flight:
 
     def _await(self, text, condition, timeout):
         self._say(text)
-        deadline = time.monotonic() + timeout
+        left = self._operator.countdown(timeout)
         while not condition():
             self._look()
-            if time.monotonic() > deadline:
+            if next(left, None) is None:
                 waits = self._operator.waits_for(self._bridges)
                 raise FlightError(f'{text}: nothing after {timeout:g} s, supervisor in '
                                   f"'{self._operator.state}'" + (waits and f'; {waits}'))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import contextmanager, ExitStack
 import os
 from pathlib import Path
+import shutil
 import signal
 import sys
 import tempfile
@@ -16,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from beetle_omni_ros import __version__
 from beetle_omni_ros.nodes import domain, runner
 from beetle_omni_ros.nodes.actuators import ACTUATORS, bridged
-from beetle_omni_ros.nodes.flight import Flight, FlightError
+from beetle_omni_ros.nodes.flight import Flight, FlightError, TooSlowError
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.standby import controller_nodes
@@ -29,13 +30,14 @@ from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
 
 INTERRUPTED = 130
+CLOCKS = {'auto': ('system', 'simulated'), 'system': ('system',), 'simulated': ('simulated',)}
 
 
 def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | None = None,
-            seed: int = 0, conditions: str = 'nominal', actuators: str = 'emulated',
-            robot: Path | None = None, plant: Path | None = None, policy: Path | None = None,
-            allow_other_robot: bool = False, standby: bool = True, composed: bool = True,
-            json_path: Path | None = None,
+            seed: int = 0, conditions: str = 'nominal', actuators: str | None = None,
+            clock: str = 'auto', robot: Path | None = None, plant: Path | None = None,
+            policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
+            composed: bool = True, json_path: Path | None = None,
             domain_id: int | None = None, console: Console | None = None) -> int:
     """
     Fly a task through the ROS graph and print what the bag says.
@@ -47,7 +49,9 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
         seed: of the task and the simulation.
         conditions: 'nominal' or 'published'.
         actuators: 'emulated': through drivers, serial ports and emulated devices; 'direct':
-            straight into the plant.
+            straight into the plant; default emulated, direct in simulated time.
+        clock: 'system': real time; 'simulated': time that waits for nodes that are late; 'auto':
+            simulated if the computer turns out to be too slow for real time.
         robot: file that estimator and controller believe; default the shipped one.
         plant: file that is true in the simulation; default ``robot``.
         policy: file for 'rl'; default the shipped one.
@@ -73,27 +77,36 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
                 check_writable(json_path)
             flown = make_task(task, seed)
             RobotParameters.load(plant or robot)
-            if actuators not in ACTUATORS:
-                raise ParameterError(f"actuators '{actuators}': expected "
-                                     f"{' or '.join(ACTUATORS)}")
-            meta = {'task': task, 'conditions': conditions, 'seed': seed, 'actuators': actuators,
-                    'robot': str(robot) if robot else 'params/robot.yaml',
-                    'plant': str(plant) if plant else None, 'version': __version__,
-                    'controller': controller, 'composed': composed}
+            _check_choices(actuators, clock)
             controllers, left_out = controller_nodes(
                 controller, robot_file=str(Path(robot).absolute()) if robot else '',
                 policy=str(policy or ''), allow_other_robot=allow_other_robot, standby=standby)
             if left_out:
-                console.print(f'rl does not stand by: {left_out}', markup=False, emoji=False,
-                              highlight=False)
-            parameters = _parameters(controllers, task, bag, seed, conditions, robot, plant)
-            parameters['supervisor_node']['controller'] = controller
-            if actuators == 'emulated':
-                _join(parameters, bridged(folder, parameters['ekf_node']))
+                _tell(console, f'rl does not stand by: {left_out}')
             number = stack.enter_context(domain.reserved()) if domain_id is None else domain_id
-            graph = Graph(parameters, folder, number, composed)
             stack.enter_context(_terminable())
-            status = _fly(graph, controller, flown, meta, console)
+            for kind in CLOCKS[clock]:
+                chosen = actuators or ('direct' if kind == 'simulated' else 'emulated')
+                meta = {'task': task, 'conditions': conditions, 'seed': seed, 'actuators': chosen,
+                        'clock': kind, 'robot': str(robot) if robot else 'params/robot.yaml',
+                        'plant': str(plant) if plant else None, 'version': __version__,
+                        'controller': controller, 'composed': composed}
+                parameters = _parameters(controllers, task, bag, seed, conditions, robot, plant)
+                parameters['supervisor_node']['controller'] = controller
+                if chosen == 'emulated':
+                    _join(parameters, bridged(folder, parameters['ekf_node']))
+                graph = Graph(parameters, folder, number, composed, kind == 'simulated')
+                try:
+                    status = _fly(graph, controller, flown, meta, console,
+                                  may_be_slow=kind == CLOCKS[clock][-1])
+                    break
+                except TooSlowError as error:
+                    _tell(console, f'this computer is too slow for real time: {error}; again in '
+                          'simulated time, which waits for the nodes, and without serial devices')
+                    actuators = None
+                    shutil.rmtree(bag, ignore_errors=True)
+                    for log in folder.glob('*.log'):
+                        log.unlink()
             if not bag.exists():
                 return status or runner.FAILED
             return max(status, _report(bag, controller, flown, meta, json_path, console))
@@ -103,6 +116,20 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
     except KeyboardInterrupt:
         print('beetle_omni fly: interrupted; everything is stopped', file=sys.stderr)
         return INTERRUPTED
+
+
+def _check_choices(actuators, clock):
+    for key, value, known in (('actuators', actuators, (None, *ACTUATORS)),
+                              ('clock', clock, CLOCKS)):
+        if value not in known:
+            raise ParameterError(f"{key} '{value}': expected {' or '.join(filter(None, known))}")
+    if clock == 'simulated' and actuators == 'emulated':
+        raise ParameterError("actuators 'emulated': serial devices keep real time; expected "
+                             "direct with clock 'simulated'")
+
+
+def _tell(console, text):
+    console.print(text, markup=False, emoji=False, highlight=False)
 
 
 def _parameters(controllers, task, bag, seed, conditions, robot, plant):
@@ -123,7 +150,8 @@ def _join(parameters, more):
         parameters[node] = {**parameters.get(node, {}), **values}
 
 
-def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console) -> int:
+def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console,
+         may_be_slow: bool) -> int:
     """Start, fly, land, stop; report every fault by the node's name."""
     status = runner.OK
     operator = None
@@ -133,9 +161,11 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
         columns = (TextColumn('{task.description}'), BarColumn(),
                    TextColumn('{task.fields[at]}'), TimeElapsedColumn())
         with Progress(*columns, console=console, transient=True) as bars:
-            flight = Flight(graph, operator, task, bars)
+            flight = Flight(graph, operator, task, bars, may_be_slow)
             try:
                 flight.fly()
+            except TooSlowError:
+                raise
             except FlightError as error:
                 print(f'beetle_omni fly: error: {error}', file=sys.stderr)
                 status = runner.FAILED
@@ -178,6 +208,8 @@ def _print_measured(meta, console):
                       f"{measured['cpu_percent']:.0f} % of one core while the task was flown"
                       + (f", of it {measured['bridges_cpu_percent']:.0f} % in the bridges"
                          if 'bridges_cpu_percent' in measured else ''))
+    if 'real_time_factor' in measured:
+        console.print(f"simulated time: {measured['real_time_factor']:.2f} of real time")
     if 'latency_p99_ms' in measured:
         end = 'its command at the actuators' if meta['actuators'] == 'direct' \
             else 'the last byte of its command to the motor board'

@@ -29,13 +29,19 @@ class Graph:
         domain: ROS domain.
         composed: one process for all but the bridges, which share another: they wait for their
             serial ports; or one for each.
+        simulated: time is simulated, and waits for nodes that are late.
 
     """
 
     def __init__(self, parameters: dict[str, dict], folder: Path, domain: int,
-                 composed: bool = True):
+                 composed: bool = True, simulated: bool = False):
         """Prepare; :meth:`start` starts."""
+        if simulated:
+            parameters = {node: {**values, **({'clock': 'simulated'} if node == 'sim_node'
+                                              else {'use_sim_time': True})}
+                          for node, values in parameters.items()}
         self.folder, self.domain = Path(folder), domain
+        self.composed, self.simulated = composed, simulated
         self.nodes = list(parameters)
         simulator = parameters.get('sim_node', {})
         self._ports = [port for port in map(simulator.get, ('servo_port', 'board_port')) if port]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
@@ -51,7 +50,7 @@ class Input:
     received: int = 0
     reported: int = 0
     age: float = float('nan')
-    seen: float | None = None           # steady time of the last good message
+    seen: float | None = None           # elapsed() at the last good message
     rejected: Counter = field(default_factory=Counter)
     rejected_reported: int = 0
 
@@ -76,7 +75,7 @@ class Health:
         self._publisher = node.create_publisher(DiagnosticArray, 'diagnostics', qos.EVENT)
         self._timer = node.create_timer(PERIOD, self._publish,
                                         clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._last = time.monotonic()
+        self._last = node.elapsed()
 
     def watch(self, topic: str, stale_after: float | None) -> None:
         """Report ``topic``; an error when it is silent for ``stale_after`` [s] once it came."""
@@ -87,7 +86,7 @@ class Health:
         entry = self._inputs[topic]
         entry.received += 1
         entry.age = age
-        entry.seen = time.monotonic()
+        entry.seen = self._node.elapsed()
 
     def rejected(self, topic: str, reason: str) -> None:
         """Count a refused message; the first of a kind is logged, save backlog at the start."""
@@ -111,7 +110,7 @@ class Health:
         self._extra.append((name, source))
 
     def _publish(self):
-        now = time.monotonic()
+        now = self._node.elapsed()
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
         if self._inputs:
@@ -128,7 +127,8 @@ class Health:
     def _input_status(self, now):
         level, faults, values = OK, [], {}
         for topic, entry in self._inputs.items():
-            values[f'{topic} rate_hz'] = (entry.received - entry.reported) / (now - self._last)
+            passed = max(now - self._last, 1e-9)
+            values[f'{topic} rate_hz'] = (entry.received - entry.reported) / passed
             values[f'{topic} age_ms'] = 1e3 * entry.age
             values[f'{topic} received'] = entry.received
             values[f'{topic} rejected'] = entry.rejected.total()

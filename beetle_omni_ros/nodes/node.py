@@ -23,6 +23,8 @@ class FlightNode(Node):
 
     Attributes:
         real_time: whether it is part of the control loop and runs before ordinary processes.
+        steady_clock: for timers that have nothing to do with the flight.
+        flight_clock: for those that have; simulated time where ``use_sim_time`` is set.
 
     """
 
@@ -49,6 +51,9 @@ class FlightNode(Node):
         super().__init__(name)
         self._claim = instance.claim(self)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        # Simulated time may stand still; what times a flight then goes by it, and by nothing else.
+        self.simulated = bool(self.get_parameter('use_sim_time').value)
+        self.flight_clock = self.get_clock() if self.simulated else self.steady_clock
         self.parameters = parameters.declare(self, parameter_class, file, file_key,
                                              on_change, changeable)
         self.health = Health(self)
@@ -59,6 +64,10 @@ class FlightNode(Node):
     def now(self) -> float:
         """ROS time [s]."""
         return self.get_clock().now().nanoseconds * 1e-9
+
+    def elapsed(self) -> float:
+        """Time that nobody sets [s]: steady, or simulated where that is used."""
+        return self.now() if self.simulated else time.monotonic()
 
     def listen(self, message_type: type, topic: str, read: Callable, handle: Callable,
                profile: QoSProfile = qos.SENSOR, max_age: float | None = None,

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import rclpy
 from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from beetle_omni_ros.nodes import qos, runner
+from beetle_omni_ros.nodes import convert, qos, runner
 from beetle_omni_ros.nodes.actuators import READY, STATES
 
+# Where time is simulated and slow, or stands still because its source died, waiting ends with this
+# much steady time for each second of it.
+SLOWEST = 20.0
 SERVICES = ('arm', 'disarm', 'land', 'emergency_stop')
 
 
 class Operator:
     """
     A small node with a context of its own, spun only while it is asked something.
+
+    Where time is simulated, seconds are those of /clock.
 
     Attributes:
         state: the supervisor's state, '' before it is known.
@@ -44,7 +50,9 @@ class Operator:
         self.bridges: dict[str, str] = {}
         self.commands = 0
         self.diagnostics: dict[str, DiagnosticStatus] = {}
+        self._simulated: float | None = None
         node = self._node
+        node.create_subscription(Clock, '/clock', self._on_clock, qos.SENSOR)
         node.create_subscription(String, 'supervisor/state', self._on_state, qos.LATCHED)
         node.create_subscription(String, 'reference/state', self._on_progress, qos.LATCHED)
         for bridge, topic in STATES.items():
@@ -55,6 +63,13 @@ class Operator:
         self._diagnostics = node.create_publisher(DiagnosticArray, 'diagnostics', qos.EVENT)
         self._clients = {name: node.create_client(Trigger, f'supervisor_node/{name}')
                          for name in SERVICES}
+
+    def _on_clock(self, message):
+        self._simulated = convert.seconds(message.clock)
+
+    def time(self) -> float:
+        """Seconds of the flight from some moment on, as far as they are known."""
+        return time.monotonic() if self._simulated is None else self._simulated
 
     def _on_state(self, message):
         self.state = message.data
@@ -88,15 +103,26 @@ class Operator:
 
     def spin(self, seconds: float) -> None:
         """Take in messages for so long."""
-        deadline = time.monotonic() + seconds
-        while (left := deadline - time.monotonic()) > 0:
-            self._executor.spin_once(timeout_sec=left)
+        for left in self.countdown(seconds):
+            self._executor.spin_once(timeout_sec=min(left, 0.1))
+
+    def countdown(self, seconds: float) -> Iterator[float]:
+        """Yield the time that is left [s], steady or simulated, until it is over."""
+        simulated, start = self._simulated is not None, self.time()
+        steady = time.monotonic()
+        while True:
+            if simulated != (self._simulated is not None):      # the clock has just appeared
+                simulated, start, steady = True, self.time(), time.monotonic()
+            left = start + seconds - self.time()
+            if left <= 0 or time.monotonic() - steady > SLOWEST * seconds + 1.0:
+                return
+            yield left
 
     def wait(self, condition, timeout: float) -> bool:
         """Take in messages until ``condition()`` or ``timeout`` [s]; whether it came true."""
-        deadline = time.monotonic() + timeout
+        left = self.countdown(timeout)
         while not condition():
-            if time.monotonic() > deadline:
+            if next(left, None) is None:
                 return False
             self.spin(0.05)
         return True

@@ -10,6 +10,10 @@ PHASE_WINDOW = 50       # calls of the timer that tell its phase
 SLEW = 0.01             # most that a tick's stamp may be stretched for it
 CLOCK_STEP = 0.005      # s of change between ROS and steady time: the clock was set
 CLOCK_READING = 0.001   # s in which both clocks must have been read to be compared
+# Simulated time waits for who is farther behind than in any flight in real time, where the newest
+# sample is one period old, but not for the dead.
+LAG = 0.02              # s between the newest sample sent and the one that was answered last
+PATIENCE = 0.3          # s of steady time
 
 
 class Pacing:
@@ -90,3 +94,58 @@ class Pacing:
         if abs(offset - self._offset) > CLOCK_STEP:
             self.clock_steps += 1
             self._offset = offset
+
+
+class Waiting:
+    """
+    Ticks of simulated time: one each time the timer fires, none while somebody is late.
+
+    What takes too long on a slow computer then takes longer, and is not missed. Who falls silent
+    is waited for once, and again when it has come back.
+
+    Args:
+        tick: length of one [s].
+        steady: clock that nobody sets; returns seconds.
+        epoch: time of the stamps at which simulated time is zero [s].
+
+    Attributes:
+        ticks: counted so far.
+        waits: calls of :meth:`due` that had to wait.
+        started, lost_ticks, clock_steps: as in :class:`Pacing`; nothing is lost here.
+
+    """
+
+    started, lost_ticks, clock_steps = True, 0, 0
+
+    def __init__(self, tick: float, steady, epoch: float):
+        """Start with the first call of :meth:`due`."""
+        self._tick, self._steady, self.epoch = tick, steady, epoch
+        self._sent = float('-inf')
+        self._heard: dict[str, tuple[float, float]] = {}
+        self._last = steady()
+        self.ticks = self.waits = 0
+
+    @property
+    def now(self) -> float:
+        """Simulated time, as in the stamps [s]."""
+        return self.epoch + self.ticks * self._tick
+
+    def sent(self, stamp: float) -> None:
+        """Note the stamp of a sample that others answer."""
+        self._sent = stamp
+
+    def heard(self, name: str, stamp: float) -> None:
+        """Note an answer of ``name`` to the sample with this stamp."""
+        self._heard[name] = (stamp, self._steady())
+
+    def due(self) -> int:
+        """Count and return the ticks that are due now: one, or none."""
+        now = self._steady()
+        late = any(self._sent - stamp > LAG and now - arrived < PATIENCE
+                   for stamp, arrived in self._heard.values())
+        if late and now - self._last < PATIENCE:
+            self.waits += 1
+            return 0
+        self._last = now
+        self.ticks += 1
+        return 1

@@ -61,7 +61,7 @@ class ReferenceNode(FlightNode):
             self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.SENSOR)
         self.health.report('task', lambda: (health.OK, self._state, {'task': self._task.name}))
         self.create_timer(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer,
-                          clock=self.steady_clock)
+                          clock=self.flight_clock)
 
     def _set_state(self, state):
         if state != self._state:

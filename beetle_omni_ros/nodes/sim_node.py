@@ -8,12 +8,13 @@ import time
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, JointState
 
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.nodes import convert, health, qos, runner
 from beetle_omni_ros.nodes.node import FlightNode
-from beetle_omni_ros.nodes.pacing import Pacing
+from beetle_omni_ros.nodes.pacing import Pacing, Waiting
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 from beetle_omni_ros.sim.emulated.fault_switches import (
@@ -57,19 +58,28 @@ class SimNodeParameters:
     servo_bus_file: str = parameter(
         '', doc='ids, signs, zeros and baud rate of the emulated servos; empty: the shipped file',
         read_only=True)
+    clock: str = parameter('system', choices=('system', 'simulated'), read_only=True,
+                           doc='real time, or simulated time on /clock that waits for nodes which '
+                           'are late; those need use_sim_time then')
     payload: float = parameter(0.0, doc='mass attached below the body', unit='kg', low=0, high=2)
     servo_faults: ServoFaultSwitches = group(ServoFaultSwitches, 'faults of the servo bus')
     board_faults: BoardFaultSwitches = group(BoardFaultSwitches, 'faults of the motor board')
 
 
 class SimNode(FlightNode):
-    """Steps the simulator on the steady clock, stamps its readings in ROS time."""
+    """
+    Steps the simulator on the steady clock, stamps its readings in ROS time.
+
+    With ``clock`` simulated it makes the time of the others: /clock goes on with each step, and
+    steps wait until estimator and actuator commands have answered what they were sent.
+    """
 
     real_time = True
 
     def __init__(self):
         """Build the plant at rest on the ground."""
         self._devices: EmulatedActuators | None = None
+        self._clock_publisher = None
         super().__init__('sim_node', SimNodeParameters, on_change=self._changed)
         given = self.parameters
         self._robot = RobotParameters.load(given.robot_file or None)
@@ -77,7 +87,7 @@ class SimNode(FlightNode):
             self._robot, SimulatorParameters.load(given.simulator_file or None),
             conditions=given.conditions, seed=given.seed)
         self._simulator.set_payload(given.payload)
-        self._pacing = Pacing(self._simulator.tick, time.monotonic, self.now)
+        self._pacing = self._make_pacing(given)
         self._latency = health.Distribution()
         self._publish_to = {
             'mocap': self.create_publisher(PoseStamped, 'mocap/pose', qos.SENSOR),
@@ -92,6 +102,22 @@ class SimNode(FlightNode):
         else:
             self._take_commands()
         self.create_timer(self._simulator.tick, self._on_timer, clock=self.steady_clock)
+
+    def _make_pacing(self, given):
+        if given.clock == 'system':
+            return Pacing(self._simulator.tick, time.monotonic, self.now)
+        if given.actuators == 'emulated':
+            raise ParameterError("key 'clock': simulated: serial devices keep real time; start "
+                                 'with actuators:=direct')
+        pacing = Waiting(self._simulator.tick, time.monotonic, super().now())
+        self._clock_publisher = self.create_publisher(Clock, '/clock', qos.SENSOR)
+        self.listen(Odometry, 'odom', convert.odom,
+                    lambda odom: pacing.heard('odom', odom.stamp), qos.ESTIMATE)
+        return pacing
+
+    def now(self) -> float:
+        """ROS time [s]; where it is simulated, this node makes it."""
+        return super().now() if self._clock_publisher is None else self._pacing.now
 
     def _take_commands(self):
         """Let the topic move the plant, and publish what the devices would measure."""
@@ -168,7 +194,12 @@ class SimNode(FlightNode):
 
     def _on_timer(self):
         for _ in range(self._pacing.due()):
-            self._publish(self.timed(self._step))
+            frame = self.timed(self._step)
+            if self._clock_publisher is not None:
+                self._clock_publisher.publish(Clock(clock=convert.time_message(self._pacing.now)))
+                if frame.imu is not None:
+                    self._pacing.sent(self._pacing.epoch + frame.imu.stamp)
+            self._publish(frame)
 
     def _publish(self, frame):
         epoch, publish_to = self._pacing.epoch, self._publish_to
@@ -194,6 +225,8 @@ class SimNode(FlightNode):
 
     def _on_command(self, command):
         self._latency.add(self.now() - command.stamp)
+        if self._clock_publisher is not None:
+            self._pacing.heard('command', command.stamp)
         if self._pacing.started:
             self._simulator.command(replace(command, stamp=command.stamp - self._pacing.epoch))
 
@@ -205,6 +238,7 @@ class SimNode(FlightNode):
         level = health.WARN if pacing.lost_ticks else health.OK
         return level, f'{pacing.lost_ticks} ticks lost', {
             'ticks': pacing.ticks, 'lost_ticks': pacing.lost_ticks,
+            'lost_s': pacing.lost_ticks * self._simulator.tick,
             'clock_steps': pacing.clock_steps, 'simulated_s': self._simulator.time}
 
     def _devices_status(self):

@@ -61,7 +61,7 @@ class SupervisorNode(FlightNode):
         for name in ('arm', 'disarm', 'land', 'emergency_stop'):
             self.create_service(Trigger, f'~/{name}', self._request(name))
         self.health.report('supervisor', self._supervisor_status)
-        self.create_timer(WATCH_PERIOD, self._update, clock=self.steady_clock)
+        self.create_timer(WATCH_PERIOD, self._update, clock=self.flight_clock)
         self._update()
 
     def _listen(self):

@@ -16,7 +16,7 @@ import time
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu, JointState
-from witness import HEADER, PATIENT, READY, Witness
+from witness import HEADER, READY, Witness
 
 from beetle_omni_ros.nodes import convert, qos
 from beetle_omni_ros.nodes.graph import Graph
@@ -36,8 +36,7 @@ def flight(ros_domain, tmp_path):
     parameters = {name: {} for name in NODES}
     parameters['recorder_node'] = {'bag': str(bag)}
     parameters['reference_node'] = {'task': str(task)}
-    parameters['supervisor_node'] = PATIENT
-    graph = Graph(parameters, tmp_path, ros_domain, composed=False)
+    graph = Graph(parameters, tmp_path, ros_domain, composed=False, simulated=True)
     witness = None
     try:
         graph.start()
@@ -59,7 +58,7 @@ def logged(graph, name):
 def test_the_loss_of_recorder_reference_controller_and_estimator(flight):
     graph, witness, bag = flight
     witness.spin(2)
-    killed_at = time.time()
+    killed_at = witness.time()
     graph.kill('recorder_node')
     assert witness.stays_in_the_air(0.5)
     log = read_bag(bag)
@@ -154,17 +153,17 @@ def test_bad_messages_are_refused_counted_and_change_nothing(ros_domain, tmp_pat
 
 FLY = ('import sys\nfrom pathlib import Path\nfrom beetle_omni_ros.nodes.fly import run_fly\n'
        'sys.exit(run_fly(task=sys.argv[1], bag=Path(sys.argv[2]), json_path=Path(sys.argv[3]), '
-       'composed=sys.argv[4] == "composed"))')
+       'composed=sys.argv[4] == "composed", clock=sys.argv[5]))')
 
 
-def fly(tmp_path, poses, arrangement):
+def fly(tmp_path, poses, arrangement, clock='auto'):
     """Start a flight as the command line does; (process, bag, result file)."""
     task, bag, result = tmp_path / 'poses.csv', tmp_path / 'run', tmp_path / 'result.json'
     task.write_text(HEADER + poses)
     environment = dict(os.environ)
     environment.pop('ROS_DOMAIN_ID', None)
     return subprocess.Popen(
-        [sys.executable, '-c', FLY, str(task), str(bag), str(result), arrangement],
+        [sys.executable, '-c', FLY, str(task), str(bag), str(result), arrangement, clock],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment), bag, result
 
 
@@ -186,8 +185,10 @@ def test_one_call_flies_and_the_bag_gives_the_printed_numbers(tmp_path):
     process, bag, result = fly(tmp_path, '0.3,0,1,20,0,0\n', 'composed')
     output, error = process.communicate(timeout=READY)
     assert process.returncode == 0, error
-    assert 'CPU' in output and 'latency' in output
     results = json.loads(result.read_text())
+    # On a computer that is too slow for it, simulated time, in which latencies mean nothing.
+    real = results['meta']['clock'] == 'system'
+    assert 'CPU' in output and ('latency' if real else 'of real time') in output
     assert results['nmpc']['success_rate'] == 1.0 and len(results['nmpc']['poses']) == 1
     assert results['meta']['graph']['cpu_percent'] > 0
     again = metrics(read_bag(bag), make_task(str(tmp_path / 'poses.csv')))
@@ -197,7 +198,7 @@ def test_one_call_flies_and_the_bag_gives_the_printed_numbers(tmp_path):
 
 
 def test_a_death_in_flight_is_named_and_nothing_is_left_behind(tmp_path):
-    process, bag, _ = fly(tmp_path, '0,0,1.2,0,0,0\n' * 10, 'separate')
+    process, bag, _ = fly(tmp_path, '0,0,1.2,0,0,0\n' * 10, 'separate', 'simulated')
     deadline, nodes = time.monotonic() + READY, {}
     try:
         while not (bag.is_dir() and b'flying:nmpc' in newest(bag)):
@@ -247,6 +248,8 @@ def test_an_interrupt_stops_every_process(tmp_path, arrangement):
     ('robot', '/nowhere.yaml', '/nowhere.yaml'),
     ('json_path', '/nowhere/result.json', '/nowhere/result.json'),
     ('controller', 'hover', "controller 'hover': no node for it; expected nmpc or rl"),
+    ('clock', 'sundial', "clock 'sundial': expected auto or system or simulated"),
+    ('actuators', 'strings', "actuators 'strings': expected emulated or direct"),
 ])
 def test_unusable_input_is_refused_before_anything_starts(capsys, argument, value, named):
     from beetle_omni_ros.nodes.fly import run_fly

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from beetle_omni_ros.nodes.pacing import CATCH_UP_TICKS, Pacing
+from beetle_omni_ros.nodes.pacing import CATCH_UP_TICKS, LAG, Pacing, PATIENCE, Waiting
 
 TICK, ROS = 0.005, 1.8e9
 
@@ -86,3 +86,58 @@ def test_a_preemption_between_the_clock_readings_changes_no_stamp(clock):
     readings.hold = 0.02
     pacing.due()
     assert pacing.clock_steps == 0
+
+
+@pytest.fixture
+def waiting(clock):
+    return Waiting(TICK, lambda: clock.now, ROS)
+
+
+def fly(waiting, clock, seconds, answers):
+    """Fire the timer; ``answers(k)`` is the stamp that is answered after call k, or None."""
+    for k in range(round(seconds / TICK)):
+        if waiting.due():
+            waiting.sent(waiting.now)
+        clock.now += TICK
+        if (stamp := answers(k)) is not None:
+            waiting.heard('odom', stamp)
+
+
+def test_simulated_time_goes_on_while_everybody_answers_or_nobody_has_yet(waiting, clock):
+    fly(waiting, clock, 1.0, lambda k: None)
+    fly(waiting, clock, 1.0, lambda k: waiting.now - 0.5 * LAG)
+    assert waiting.ticks == 400 and waiting.waits == 0
+    assert waiting.now == pytest.approx(ROS + 2.0)
+
+
+@pytest.mark.parametrize('slowness', [3, 10])
+def test_it_is_as_slow_as_the_slowest_and_never_far_ahead(waiting, clock, slowness):
+    leads = []
+
+    def answer(k):
+        # one sample in `slowness` periods, in their order
+        stamp = ROS + TICK * (k // slowness)
+        leads.append(waiting.now - stamp)
+        return stamp
+
+    fly(waiting, clock, 2.0, answer)
+    assert waiting.ticks == pytest.approx(400 / slowness, abs=LAG / TICK + 2)
+    assert max(leads) <= LAG + 2 * TICK and waiting.lost_ticks == 0
+
+
+def test_who_falls_silent_is_waited_for_once_and_again_when_it_is_back(waiting, clock):
+    fly(waiting, clock, 0.5, lambda k: waiting.now)
+    fly(waiting, clock, 2.0, lambda k: None)
+    silent = PATIENCE / TICK
+    assert 0 < waiting.waits <= silent + 1
+    assert waiting.ticks == 500 - waiting.waits
+    before = waiting.waits
+    fly(waiting, clock, 0.1, lambda k: ROS + 0.5 if k == 0 else None)
+    assert waiting.waits - before == pytest.approx(19, abs=1)
+
+
+def test_answers_that_never_become_newer_stop_it_for_no_longer_than_its_patience(waiting, clock):
+    fly(waiting, clock, 0.1, lambda k: ROS)
+    before = waiting.ticks
+    fly(waiting, clock, 10 * PATIENCE, lambda k: ROS)
+    assert 8 <= waiting.ticks - before <= 12

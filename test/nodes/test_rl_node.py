@@ -14,7 +14,7 @@ import pytest
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import JointState
-from witness import HEADER, PATIENT, READY, Witness
+from witness import HEADER, READY, Witness
 
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
@@ -186,8 +186,8 @@ def flight(request, ros_domain, tmp_path):
         policy = ''
     controllers, reason = controller_nodes('nmpc', policy=policy)
     assert not reason
-    graph = Graph({'sim_node': {}, 'ekf_node': {}, **controllers, 'supervisor_node': PATIENT,
-                   'reference_node': {'task': 'random20'}}, tmp_path, ros_domain)
+    graph = Graph({'sim_node': {}, 'ekf_node': {}, **controllers, 'supervisor_node': {},
+                   'reference_node': {'task': 'random20'}}, tmp_path, ros_domain, simulated=True)
     pilot = None
     try:
         graph.start()
@@ -238,12 +238,12 @@ def test_one_call_flies_the_policy_and_the_bag_holds_both_controllers(tmp_path):
     task.write_text(HEADER + '0.3,0,1,20,0,0\n')
     done = subprocess.run(
         [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--controller', 'rl', '--policy',
-         str(policy), '--task', str(task), '--bag', str(bag), '--json', str(result)],
+         str(policy), '--task', str(task), '--bag', str(bag), '--json', str(result),
+         '--clock', 'simulated'],
         capture_output=True, text=True, timeout=READY, check=False)
     assert done.returncode == 0, done.stderr
     results = json.loads(result.read_text())
     assert set(results) == {'meta', 'rl'} and not results['rl']['crashed']
-    # In real time on a busy machine; how exactly a policy flies is tested in process.
     assert results['rl']['poses'][0]['U_position_m'] < 0.5
     log = read_bag(bag)
     assert 'flying:rl' in log.states and 'flying:nmpc' not in log.states

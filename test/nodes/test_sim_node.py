@@ -61,6 +61,19 @@ def test_the_direct_path_is_as_it_was(make):
     assert not put(node, board_faults__hang=True).successful
 
 
+def test_simulated_time_is_made_here_and_not_with_serial_devices(make):
+    node = make('clock:=simulated', actuators='direct')
+    assert '/clock' in topics(node)[0] and '/odom' in topics(node)[1]
+    before = node.now()
+    ticks = [node._on_timer() or node.now() for _ in range(10)]
+    assert np.allclose(np.diff([before, *ticks]), 0.005, rtol=0, atol=1e-6)
+
+
+def test_simulated_time_and_serial_devices_do_not_go_together(make):
+    with pytest.raises(ParameterError, match=r"key 'clock': simulated: serial devices keep real"):
+        make('clock:=simulated')
+
+
 def test_ports_have_the_names_that_were_asked_for_and_go_with_the_node(make, tmp_path):
     servos, board = tmp_path / 'servos', tmp_path / 'board'
     servos.symlink_to('/nowhere')           # left by a process that was killed
