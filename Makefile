@@ -28,7 +28,7 @@ fly: setup  ## fly the waypoints in real time through ROS nodes; the bag lands i
 	$(TOOL) fly --controller nmpc --task waypoints --bag runs_out/fly_$(RUN) $(ARGS)
 
 test: setup-train  ## the whole test suite
-	@.venv/bin/python -m pytest $(ARGS)
+	@.ci/test $(ARGS)
 
 lint: setup  ## style of every Python file
 	@.venv/bin/ruff check .

@@ -91,6 +91,7 @@ TEST = [
     'pytest>=8',
     'pytest-rerunfailures>=14',
     'pytest-timeout>=2.2',
+    'pytest-xdist>=3.3',
 ]
 
 DEVELOPMENT = [

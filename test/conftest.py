@@ -9,6 +9,8 @@ import pytest
 
 # Jazzy writes a scalar field of a wrong type as garbage unless this is set before the import.
 os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
+if 'PYTEST_XDIST_WORKER' in os.environ:     # each worker has one core
+    os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 # Appended, so that no helper can shadow an installed module.
 for folder in sorted(Path(__file__).parent.iterdir()):
@@ -27,22 +29,22 @@ STALL = 0.05        # s; the limits of silence in these tests are 50 to 80 ms
 BEAT, BEGIN = pytest.StashKey(), pytest.StashKey[float]()
 
 
-def pytest_configure(config):
-    """Watch for stalls of the computer as long as the tests run."""
-    from stillness import Heartbeat
-    config.stash[BEAT] = Heartbeat()
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """Mark what runs in real time, give it a second chance, watch the computer meanwhile."""
+    real_time = [item for item in items if Path(item.path).parent.name in REAL_TIME]
+    for item in real_time:
+        item.add_marker(pytest.mark.real_time)
+        item.add_marker(pytest.mark.flaky(reruns=RERUNS))
+    if real_time and config.getoption('markexpr') != 'not real_time':
+        from stillness import Heartbeat
+        config.stash[BEAT] = Heartbeat()
 
 
 def pytest_unconfigure(config):
     """Stop watching."""
-    config.stash[BEAT].close()
-
-
-def pytest_collection_modifyitems(items):
-    """Give tests that run in real time a second chance."""
-    for item in items:
-        if Path(item.path).parent.name in REAL_TIME:
-            item.add_marker(pytest.mark.flaky(reruns=RERUNS))
+    if BEAT in config.stash:
+        config.stash[BEAT].close()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -52,7 +54,7 @@ def pytest_runtest_makereport(item, call):
         item.stash[BEGIN] = call.start
     report = yield
     last = getattr(item, 'execution_count', RERUNS + 1) > RERUNS
-    if report.failed and last and Path(item.path).parent.name in REAL_TIME:
+    if report.failed and last and item.get_closest_marker('real_time'):
         offset = time.monotonic() - time.time()
         stalls = item.config.stash[BEAT].stalls(item.stash[BEGIN] + offset, call.stop + offset)
         if (longest := max(stalls, default=0.0)) >= STALL:

@@ -69,6 +69,7 @@ def robot(ros_domain, tmp_path):
         graph.start()
         mechanic = Mechanic(ros_domain)
         assert mechanic.wait(lambda: mechanic.ready, READY), graph.dead()
+        mechanic.can_judge(graph)
         mechanic.start()
         yield graph, mechanic
     finally:
