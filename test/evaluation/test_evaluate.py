@@ -130,11 +130,11 @@ def test_a_force_task_ends_with_the_level_that_was_too_much():
 
 def test_an_empty_pack_is_swapped_at_the_next_target(tmp_path, monkeypatch):
     small = SimulatorParameters.load()
-    small = replace(small, battery=replace(small.battery, capacity=0.15))
+    small = replace(small, battery=replace(small.battery, capacity=0.3))
     monkeypatch.setattr(command.SimulatorParameters, 'load', lambda: small)
-    task = make_task('random3')
+    task = make_task('random5')
     log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)
     assert not log.meta['crashed']
     assert metrics(log, task)['success_rate'] == 1.0
     drawn = -np.sum(log.battery_current[:-1] * np.diff(log.battery_t)) / 3600
-    assert drawn > 0.15   # [A h] more than one pack holds
+    assert drawn > 0.3   # [A h] more than one pack holds
