@@ -18,11 +18,16 @@ from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train import batch, rewards, starts
 from beetle_omni_ros.train.model import CENTRE, INERTIA, MASS, module_reaction, nominal_body
-from beetle_omni_ros.train.observations import actor_observation, critic_observation, late, Signals
+from beetle_omni_ros.train.observations import (
+    actor_observation,
+    carried_on,
+    critic_observation,
+    Signals,
+)
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics
 
-NUMBERS = 136       # random numbers of a robot and a step
+NUMBERS = 138       # random numbers of a robot and a step
 REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] as the task metrics
 
 
@@ -197,7 +202,7 @@ class TiltableQuadrotorEnv(VecEnv):
         new.update(
             x=x, previous=command, older=s['previous'], age=age,
             target_left=s['target_left'] - 1,
-            past_motion=torch.cat((motion[:, None], s['past_motion'][:, :2]), 1),
+            past_motion=torch.cat((motion[:, None], s['past_motion'][:, :3]), 1),
             past_tilt=torch.cat((s['x'][:, None, model.TILT], s['past_tilt'][:, :1]), 1),
             estimate=self._follow(s, x, rotation))
         return new
@@ -207,7 +212,8 @@ class TiltableQuadrotorEnv(VecEnv):
         The disturbance estimate: what the nominal model cannot explain, through a lag.
 
         The estimator compares the body rate that it gets with what the present commands should
-        do; where the rate is late, its change of long ago is held against that of now.
+        do; where the rate is late, its change of long ago, carried on as the rate is, is held
+        against that of now.
         """
         e, period = self.cfg.estimate, self.cfg.episode.period
         mass = s['body'][:, MASS]
@@ -232,7 +238,8 @@ class TiltableQuadrotorEnv(VecEnv):
         rates = torch.cat((x[:, None, model.RATE], s['x'][:, None, model.RATE],
                            s['past_motion'][:, :, 3:]), 1)
         changes = rates[:, :-1] - rates[:, 1:]
-        return late(changes, s['delays'][:, 2:3]) - changes[:, 0]
+        delay = s['delays'][:, 2:3]
+        return carried_on(changes, delay, s['carried'] * delay) - changes[:, 0]
 
     def _retarget(self, new, due, rotation, draw):
         target = self._starts.target(draw, new['x'][:, model.POSITION],

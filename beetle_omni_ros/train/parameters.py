@@ -95,6 +95,9 @@ class RandomParameters:
                  'every robot has them in full', low=0, high=10)
     velocity_latency: np.ndarray = parameter([0.0, 0.025], doc='age of velocity and rate',
                                              unit='s', shape=(2,), low=0, high=0.03)
+    carried_share: float = parameter(
+        0.75, doc='share of robots whose late velocity and rate come carried on along their '
+        'trend, as the estimator gives them', low=0, high=1)
     tilt_latency: np.ndarray = parameter([0.005, 0.015], doc='age of the joint feedback',
                                          unit='s', shape=(2,), low=0, high=0.02)
     command_latency: np.ndarray = parameter([0.005, 0.015], doc='until a command acts', unit='s',

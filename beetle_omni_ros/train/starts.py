@@ -81,7 +81,7 @@ class Starts:
         motion = torch.cat((body_velocity, rate), -1)
         command = torch.cat((tilt, thrust), -1)
         state = {'x': x, 'previous': command, 'older': command,
-                 'past_motion': motion[:, None].expand(-1, 3, -1),
+                 'past_motion': motion[:, None].expand(-1, 4, -1),
                  'past_tilt': tilt[:, None].expand(-1, 2, -1),
                  'age': torch.zeros_like(tilt[:, 0])}
         state.update(self.target(d, x[:, :3], attitude))
@@ -134,8 +134,10 @@ class Starts:
             d.around(self._p.estimate.torque_bias, 3)), -1)
         delays = torch.cat([d.uniform(1, *span) for span in self._latencies], -1)
         pushed = d.chance(r.push_share)
+        carried = d.chance(r.carried_share).float()
         disturbed = (forced | strong | pushed | (load > 0)).float()
         return {'thrust_limit': d.uniform(1, *self._thrust_limit),
                 'body': torch.cat((total, inertia, centre), -1), 'wrench': wrench,
-                'noise': noise, 'bias': bias, 'delays': delays, 'pushed': pushed.float(),
+                'noise': noise, 'bias': bias, 'delays': delays, 'carried': carried,
+                'pushed': pushed.float(),
                 'disturbed': disturbed, 'estimate': torch.zeros_like(wrench)}

@@ -269,15 +269,17 @@ def test_a_late_rate_enters_the_estimate_as_a_torque():
     """The estimator holds the change of the rate of two steps ago against that of now."""
     env = quiet({**only('hold'), 'memory': True}, robots=2)
     s, n = env.state, env.num_envs
-    history = torch.randn(n, 5, 3, generator=torch.Generator().manual_seed(0))    # newest first
+    history = torch.randn(n, 6, 3, generator=torch.Generator().manual_seed(0))    # newest first
     x = s['x'].clone()
     x[:, model.RATE], s['x'][:, model.RATE] = history[:, 0], history[:, 1]
     s['past_motion'][:, :, 3:] = history[:, 2:]
     s['delays'][:, 2] = torch.tensor([0.0, 0.02])
     change = env._late_change(s, x)
     assert not change[0].any()
-    torch.testing.assert_close(
-        change[1], history[1, 2] - history[1, 3] - (history[1, 0] - history[1, 1]))
+    steps = history[1, :-1] - history[1, 1:]
+    torch.testing.assert_close(change[1], steps[2] - steps[0])
+    s['carried'].fill_(1.0)
+    torch.testing.assert_close(env._late_change(s, x)[1], 3 * steps[2] - 2 * steps[3] - steps[0])
 
 
 # ---- all of it

@@ -10,7 +10,7 @@ from beetle_omni_ros.control.base import Reference, State
 from beetle_omni_ros.control.observation import observation
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.observations import late, Signals
+from beetle_omni_ros.train.observations import carried_on, late, Signals
 
 SEEN = {'velocity': slice(0, 3), 'rate': slice(3, 6), 'tilt': slice(21, 25)}
 
@@ -107,6 +107,31 @@ def test_a_delayed_robot_sees_its_past(delay, weights, late_one):
             else truth[0][name]
         torch.testing.assert_close(env.observation[:, places], expected, atol=1e-5, rtol=1e-5)
     assert (truth[0]['tilt'] - truth[1]['tilt']).abs().max() > 0.01
+
+
+@pytest.mark.parametrize('delay', [0.0, 0.012, 0.02, 0.025])
+def test_carried_on_a_steady_change_is_not_late_and_a_swing_lags_less(delay):
+    t = -0.01 * torch.arange(5)[None, :, None]
+    span = torch.full((1, 1), delay)
+    ramp = 3.0 - 2.0 * t
+    torch.testing.assert_close(carried_on(ramp, span, span), ramp[:, 0])
+    torch.testing.assert_close(carried_on(ramp, span, 0 * span), late(ramp, span))
+    swings = torch.stack([torch.sin(2 * torch.pi * 2.0 * t + phase) for phase in
+                          torch.linspace(0, 6.2, 40)])[:, 0]
+    spans = span.expand(40, 1)
+    wrong = (carried_on(swings, spans, spans) - swings[:, 0]).abs().max()
+    assert wrong <= 0.45 * (late(swings, spans) - swings[:, 0]).abs().max() + 1e-6
+
+
+def test_a_robot_whose_rate_is_carried_on_sees_it_louder():
+    env = quiet({'random.rate_noise': 0.04, 'random.noise_power': 0.0,
+                 'random.velocity_latency': [0.02, 0.02], 'random.carried_share': 0.5},
+                robots=4000)
+    carried = env.state['carried'][:, 0] > 0.5
+    assert 0.45 < carried.float().mean() < 0.55
+    spread = {kind: widths(env, env.cfg.random)['rate'][mask].std()
+              for kind, mask in (('held', ~carried), ('carried', carried))}
+    assert spread['carried'] / spread['held'] == pytest.approx(13 ** 0.5, rel=0.05)
 
 
 def test_the_past_of_a_robot_begins_with_its_start():
