@@ -1,0 +1,113 @@
+"""What a flight does where the computer cannot keep real time."""
+
+import io
+from itertools import count
+import time
+
+import pytest
+from rich.console import Console
+from rich.progress import Progress
+
+from beetle_omni_ros.nodes import fly
+from beetle_omni_ros.nodes.flight import Flight, FlightError, PACING, TooSlowError
+from beetle_omni_ros.runs.tasks import make_task
+
+
+class Nodes:
+    """Stands in for graph and operator of nodes that are ready and refuse to arm."""
+
+    nodes, composed, simulated = ('sim_node',), True, False
+    ready, progress, state, states = True, 'waiting', 'disarmed', []
+    diagnostics = {PACING: None}
+
+    def __init__(self, load=0.3, lost=0.0):
+        self._load, self._lost, self._looks = load, lost, count()
+
+    def cpu_seconds(self, bridges=False):
+        return 0.0 if bridges else self._load * time.monotonic()
+
+    def values(self, name):
+        return {'lost_s': str(self._lost * next(self._looks))} if name == PACING else {}
+
+    def countdown(self, seconds):
+        yield from range(3)
+
+    def dead(self):
+        return {}
+
+    def waits_for(self, bridges):
+        return ''
+
+    def call(self, name):
+        return False, 'not level'
+
+    def time(self):
+        return time.monotonic()
+
+    def spin(self, seconds):
+        time.sleep(min(seconds, 0.05))
+
+
+def flown(nodes, **options):
+    with Progress(console=Console(file=io.StringIO())) as bars:
+        Flight(nodes, nodes, make_task('hover'), bars, **options).fly()
+
+
+@pytest.mark.parametrize(('nodes', 'named'), [
+    ({'load': 0.99}, '99% of a core before the start'),
+    ({'lost': 0.5}, 'the simulator fell 0.5 s behind in 2 s')])
+def test_a_computer_that_is_too_slow_is_found_out_before_arming(nodes, named):
+    with pytest.raises(TooSlowError, match=named):
+        flown(Nodes(**nodes), may_be_slow=False)
+    with pytest.raises(FlightError, match='refuses to arm: not level') as raised:
+        flown(Nodes(**nodes))               # who may be slow tries
+    assert raised.type is FlightError
+
+
+def test_a_fast_one_tries_and_a_failed_flight_says_what_the_simulator_lost():
+    with pytest.raises(FlightError, match='refuses to arm: not level$') as raised:
+        flown(Nodes(), may_be_slow=False)
+    assert raised.type is FlightError
+    with pytest.raises(TooSlowError, match='refuses to arm: not level; the simulator fell 0.2 s'):
+        flown(Nodes(lost=0.1), may_be_slow=False)
+
+
+@pytest.fixture
+def attempts(monkeypatch):
+    """Graphs that `fly` started; the first in real time is too slow."""
+    graphs = []
+
+    def one(graph, controller, task, meta, console, may_be_slow):
+        graphs.append((graph, meta, may_be_slow))
+        if not may_be_slow and not graph.simulated:
+            raise TooSlowError('the nodes use 99% of a core before the start')
+        return 1        # flown, but no bag of it is there
+
+    monkeypatch.setattr(fly, '_fly', one)
+    return graphs
+
+
+def test_fly_turns_to_simulated_time_without_serial_devices_and_says_so(attempts, tmp_path):
+    text = io.StringIO()
+    status = fly.run_fly(bag=tmp_path / 'bag', domain_id=1, console=Console(file=text, width=300))
+    assert status == 1
+    (real, real_meta, _), (slow, slow_meta, may_be_slow) = attempts
+    assert not real.simulated and real_meta['actuators'] == 'emulated'
+    assert slow.simulated and slow_meta['actuators'] == 'direct' and may_be_slow
+    assert slow_meta['clock'] == 'simulated'
+    assert {'joint_bridge_node', 'rotor_bridge_node'} <= set(real.nodes)
+    assert not {'joint_bridge_node', 'rotor_bridge_node'} & set(slow.nodes)
+    assert 'too slow for real time: the nodes use 99% of a core' in text.getvalue()
+
+
+@pytest.mark.parametrize('clock', ['system', 'simulated'])
+def test_a_clock_that_was_asked_for_is_kept(attempts, tmp_path, clock):
+    fly.run_fly(clock=clock, bag=tmp_path / 'bag', domain_id=1,
+                console=Console(file=io.StringIO()))
+    assert [(graph.simulated, may) for graph, _, may in attempts] == [
+        (clock == 'simulated', True)]
+
+
+def test_simulated_time_with_serial_devices_is_refused(capsys):
+    assert fly.run_fly(clock='simulated', actuators='emulated') == 2
+    assert "actuators 'emulated': serial devices keep real time" in capsys.readouterr().err
