@@ -58,6 +58,16 @@ def test_the_gap_on_the_flight_held_out_shrinks_and_a_placebo_does_not_help(made
     assert results['horizons']['0.5 s']['placebo'] > results['gap_before']
 
 
+def test_what_makes_flights_held_out_worse_is_not_named(made):
+    folder, robot = made[0], RobotParameters.load()
+    fly('hover', make_task(str(folder / 'poses.csv'), 0), robot=robot, plant=robot, seed=2,
+        bag=folder / 'calm')        # another day: no wind
+    results = gap_results([folder / 'flight0'], [folder / 'calm'], console=quiet())
+    assert results['verdict'] == 'unknown' and results['effects'] == []
+    assert 'wind' in results['reason'] and 'makes the held-out ones worse' in results['reason']
+    assert results['gap_after'] == results['gap_before']
+
+
 def test_the_json_holds_what_the_interfaces_fix(made):
     results = json.loads((made[0] / 'gap.json').read_text())
     for key in ('verdict', 'effects', 'where', 'gap_before', 'gap_after', 'noise_floor',

@@ -27,7 +27,7 @@ from beetle_omni_ros.identify.gap.rollouts import (
 from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.gap.trial import Found, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
-from beetle_omni_ros.identify.gap.verdict import decide
+from beetle_omni_ros.identify.gap.verdict import decide, withdraw
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 JUDGED = HORIZONS.index(0.5)
@@ -202,17 +202,29 @@ def _falsify(a, wide):
     for name, same in (('after', 'before'), ('placebo', 'before'), ('effects_alone', 'file')):
         a.runs.setdefault(name, a.runs[same])
     trim = trimmed([free_runs(m, found.theta, noise[m]) for m in a.models[0]])
+    _measure(a, trim)
+    judged = a.gaps[HORIZONS[JUDGED]]
+    if found.accepted and a.held_out and judged['after'] > max(
+            AT_FLOOR, WORSE * judged['before']):
+        withdraw(a, judged)
+        a.runs |= {'after': a.runs['before'], 'effects_alone': a.runs['file'],
+                   'placebo': a.runs['before']}
+        _measure(a, trim)
+    for regime in np.unique(np.concatenate([run.regime for run in a.runs['before']])):
+        before, after = (gap(a.runs[name], JUDGED, regime, trim)
+                         for name in ('before', 'after'))
+        a.regimes[str(regime)] = {'before': before, 'after': after,
+                                  'worse': bool(after > WORSE * before)}
+
+
+def _measure(a, trim):
+    """The gap at each horizon, and what of it is closed."""
     for h, horizon in enumerate(HORIZONS):
         values = {name: gap(runs, h, trim=trim) for name, runs in a.runs.items()}
         a.gaps[horizon] = {**values, 'closure': closure(values['before'], values['after']),
                            'placebo_closure': closure(values['before'], values['placebo']),
                            'closure_of_effects_alone': closure(values['file'],
                                                                values['effects_alone'])}
-    for regime in np.unique(np.concatenate([run.regime for run in a.runs['before']])):
-        before, after = (gap(a.runs[name], JUDGED, regime, trim)
-                         for name in ('before', 'after'))
-        a.regimes[str(regime)] = {'before': before, 'after': after,
-                                  'worse': bool(after > WORSE * before)}
 
 
 def _plain(a, theta, named):

@@ -69,6 +69,23 @@ def decide(a: Analysis, p: GapParameters) -> None:
     a.experiment = _experiment(a, sets if found.accepted or pushed else [], out_of_sight)
 
 
+def withdraw(a: Analysis, gap: dict[str, float]) -> None:
+    """
+    Take back what makes flights that were not fitted worse: such a model is not to be flown with.
+
+    Args:
+        a: decided, with something named.
+        gap: 'before' and 'after' of the flights that judge, in noise floors.
+
+    """
+    names = ' and '.join(t.candidate.name for t in a.accepted)
+    a.verdict, a.partial = 'unknown', list(a.found.accepted)
+    a.reason = (f'{names} would explain the fitted flights and makes the held-out ones worse: '
+                f'{gap["before"]:.2f} to {gap["after"]:.2f} noise floors in free runs')
+    a.found.accepted.clear()
+    a.experiment = _experiment(a, [], [])
+
+
 def _stillness(sets, pushed, out_of_sight):
     """Why a flight that hardly moves decides nothing about forces."""
     seen = sorted({t.candidate.name for members in sets if members[0] in pushed
