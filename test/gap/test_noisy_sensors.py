@@ -141,3 +141,15 @@ def test_each_rotor_may_have_a_lag_of_its_own():
     again = slow[1:-1] + tau * (slow[2:] - slow[:-2]) / (2 * h)
     assert again[:, 2] == pytest.approx(asked[:, 2], abs=0.02)
     assert rms(slow[:, 2] - plain[:, 2]) > 0.03
+
+
+def test_delays_that_data_cannot_tell_apart_have_the_same_slopes():
+    names = ['base.delay', 'base.split', 'command_latency.delay', 'rotor_dead_time.delay',
+             'joint_command_latency.delay']
+    slopes = model(MOTION.flight()).slopes({}, names)
+    for group, split, own in (('B', -2, 3), ('J', 2, 4)):
+        late = slopes[group][:, :, 0]
+        assert rms(late) > 0.1
+        for other in (split * slopes[group][:, :, 1], slopes[group][:, :, 2],
+                      slopes[group][:, :, own]):
+            assert rms(other - late) < 1e-6 * rms(late)
