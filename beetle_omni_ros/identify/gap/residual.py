@@ -221,16 +221,21 @@ class FlightModel:
         encoder: the derivative of noise explains the same noise shifted, and goes on doing so
         wherever a fit moves without fresh slopes.
         """
-        sizes = [STEPS[self.keys[name].parameter] for name in names]
+        # Servos do not feel each other: what moves one moves it as if all were moved.
+        sources = [f'joint_bandwidth.{self.keys[name].parameter}'
+                   if self.keys[name].effect == 'servo' else name for name in names]
+        moved = list(dict.fromkeys(sources))
+        sizes = [STEPS[self.keys[name].parameter] for name in moved]
         sets = [theta, *({**theta, name: theta.get(name, 0.0) + h}
-                         for name, h in zip(names, sizes, strict=True))]
+                         for name, h in zip(moved, sizes, strict=True))]
         runs = self._servos(sets, theta)
-        rate = np.gradient(runs[0], self.p.grid, axis=1)
-        made = []
-        for name, h, run in zip(names, sizes, runs[1:], strict=True):
+        rate, slopes = np.gradient(runs[0], self.p.grid, axis=1), {}
+        for name, h, run in zip(moved, sizes, runs[1:], strict=True):
             slope = rate * SHIFTS.get(name, 0.0) - (run - runs[0]) / h
-            made.append(self.filters['J'](slope.reshape(-1, 4)))
-        return made
+            slopes[name] = self.filters['J'](slope.reshape(-1, 4))
+        return [slopes[source] * (np.arange(4) == self.keys[name].index)
+                if source != name else slopes[name]
+                for name, source in zip(names, sources, strict=True)]
 
     def _windows(self, theta):
         timing = {name: theta.get(name, 0.0) for name in TIMING}
