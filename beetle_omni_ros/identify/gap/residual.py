@@ -33,8 +33,8 @@ UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate':
 TIMING = ('imu_filter_lag.delay', 'joint_feedback_delay.delay')     # of what loads the joints
 # By which an encoder's reading is taken later for each second of a delay.
 SHIFTS = {'imu_filter_lag.delay': -1.0, 'joint_feedback_delay.delay': 1.0}
-# Taken to both sides, by the same shift of a command: one-sided, delays that data cannot tell apart
-# would differ by the second derivative, and a straight line through all would fit that with them.
+# Taken to both sides, by the same shift of a command: one-sided, delays that data cannot tell
+# apart would differ by the second derivative, and a straight line through all would fit that.
 BOTH_SIDES = ('delay', 'split')
 THIN = 2        # grid points to each at which the body's equations are evaluated
 STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
