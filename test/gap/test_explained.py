@@ -4,9 +4,11 @@ from flights import KEYS, P
 import numpy as np
 import pytest
 
+from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.keys import Belief, tolerances
 from beetle_omni_ros.identify.gap.search import BEYOND, Search
+from beetle_omni_ros.identify.gap.trial import Trial
 
 LAG, OTHER = 'rotor_lag.time_constant', 'inertia.inertia[0]'
 
@@ -89,3 +91,20 @@ def test_a_free_range_ends_beyond_itself():
     assert belief.within(0.004, BEYOND) == 0.004
     assert belief.within(0.02, BEYOND) == pytest.approx(0.0065)
     assert belief.within(-0.02, BEYOND) == pytest.approx(-0.0115)
+
+
+@pytest.mark.parametrize('gain, left, named', [
+    (60.0, 70.0, True), (60.0, 170.0, False), (600.0, 1700.0, True), (600.0, 6000.0, False),
+    (30.0, 31.0, False)])
+def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch, gain, left,
+                                                                     named):
+    drag = Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag')
+    trial = Trial(drag, gain, {'rotor_drag.coefficient': 0.4}, refined=True)
+
+    def agreed(self, trial, accepted):
+        trial.cross, trial.positive, trial.without_best = (gain, gain / 10), 1.0, 0.9 * gain
+
+    monkeypatch.setattr(Search, '_cross_validate', agreed)
+    search = Search.__new__(Search)
+    search.p, search.problem = P, type('Problem', (), {'keys': KEYS})()
+    assert (search._judge([trial], 1000.0 + left, 1000.0, []) is trial) == named

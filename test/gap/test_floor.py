@@ -76,10 +76,19 @@ def test_a_bad_fit_does_not_raise_the_floor():
     assert trimmed([runs(3.0, 0.1)]) == pytest.approx(1)
 
 
+def test_joints_are_at_the_floor_where_they_spread_as_the_noise_does():
+    keep, drive = 0.9, 0.004
+    spread = drive / np.sqrt(1 - keep**2)     # of x' = keep x + e
+    flight = made(np.zeros(3))
+    noise = Noise({'B': np.ones((6, 1)), 'J': np.tile([1.0, -keep], (4, 1))},
+                  {'B': np.zeros(6), 'J': np.full(4, drive)})
+    assert noise_floor(flight, noise)[HALF, 4] == pytest.approx(2 * spread, rel=0.02)
+
+
 def test_torques_that_nobody_knows_lean_the_thrust():
     size, step = 0.5, THIN * P.grid * P.body_every
-    noise = Noise({'B': np.ones((6, 1))}, {'B': np.array([0, 0, 0, *[size] * 3]),
-                                           'J': np.zeros(4)})
+    noise = Noise({'B': np.ones((6, 1)), 'J': np.ones((4, 1))},
+                  {'B': np.array([0, 0, 0, *[size] * 3]), 'J': np.zeros(4)})
     floor = noise_floor(made(np.zeros(3)), noise)[HALF]
     rng, reached = np.random.default_rng(5), []
     for _ in range(400):    # a body that hovers and is turned, in plain steps

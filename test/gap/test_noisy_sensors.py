@@ -141,3 +141,38 @@ def test_each_rotor_may_have_a_lag_of_its_own():
     again = slow[1:-1] + tau * (slow[2:] - slow[:-2]) / (2 * h)
     assert again[:, 2] == pytest.approx(asked[:, 2], abs=0.02)
     assert rms(slow[:, 2] - plain[:, 2]) > 0.03
+
+
+def test_a_servo_stiffer_than_the_others_sags_less_under_its_load():
+    k, load = 800, 0.02
+    zero, held = np.zeros((k, 1, 4)), np.full((k, 1, 4), load)
+    windows = Windows(zero[0], zero[0], zero, held, zero, P.servo_step, 0, 8)
+    shown = simulate(ROBOT.joints, windows, np.zeros((1, k, 1, 4)),
+                     [{'servo.kp[1]': np.log(1.25), 'servo.kd[2]': 0.3}],
+                     {'coulomb': 0.0, 'stiction': 0.0, 'deflection': 0.0, 'modules': 1.0,
+                      'momentum': 0.0, 'joint_share': 0.0})[0, -1, 0]
+    sag = load / ROBOT.joints.kp        # of a spring
+    assert shown == pytest.approx([sag, sag / 1.25, sag, sag], rel=1e-3)
+
+
+@pytest.mark.parametrize('gain', ['kp', 'kd'])
+def test_slopes_by_a_servos_own_gain_are_what_its_joint_does(gain):
+    made, own = model(MOTION.flight()), [f'servo.{gain}[{k}]' for k in range(4)]
+    slopes, h = made.slopes({}, [f'joint_bandwidth.{gain}', *own])['J'], 0.01
+    for k, name in enumerate(own):
+        moved = (made.residual({name: h}, 'J')['J'] - made.residual({}, 'J')['J']) / h
+        assert np.abs(moved[:, k]).max() > 1e-3
+        assert slopes[:, :, k + 1] == pytest.approx(moved, abs=1e-9)
+    assert slopes[:, :, 1:].sum(axis=2) == pytest.approx(slopes[:, :, 0], abs=1e-12)
+
+
+def test_delays_that_data_cannot_tell_apart_have_the_same_slopes():
+    names = ['base.delay', 'base.split', 'command_latency.delay', 'rotor_dead_time.delay',
+             'joint_command_latency.delay']
+    slopes = model(MOTION.flight()).slopes({}, names)
+    for group, split, own in (('B', -2, 3), ('J', 2, 4)):
+        late = slopes[group][:, :, 0]
+        assert rms(late) > 0.1
+        for other in (split * slopes[group][:, :, 1], slopes[group][:, :, 2],
+                      slopes[group][:, :, own]):
+            assert rms(other - late) < 1e-6 * rms(late)

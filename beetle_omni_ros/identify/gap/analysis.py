@@ -231,7 +231,7 @@ def _plain(a, theta, named):
     """The robot file's own numbers, with the sensors and the bus as they were found."""
     return {name: x for name, x in theta.items() if not a.keys[name].body
             and a.keys[name].effect not in ('rotor_lag', 'joint_bandwidth', 'modules', 'swing',
-                                             'rotor')
+                                             'rotor', 'servo')
             and name in a.problem.beliefs and name not in named}
 
 

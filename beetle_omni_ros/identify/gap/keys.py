@@ -30,7 +30,7 @@ GROUPS = {  # signal-layer entries -> channel groups in which they show
     'joint_backlash': 'B', 'joint_feedback_delay': 'BJ', 'mocap_time_offset': 'AW',
     'imu_filter_lag': 'BAWJ', 'imu_accelerometer_bias': 'BA', 'imu_gyroscope_bias': 'BW',
     'imu_misalignment': 'BAW', 'imu_lever_arm': 'BA', 'mocap_misalignment': 'AW',
-    'base': 'BJ', 'modules': 'BJ', 'swing': 'J', 'rotor': 'B'}
+    'base': 'BJ', 'modules': 'BJ', 'swing': 'J', 'rotor': 'B', 'servo': 'J'}
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,8 @@ def tolerances(p: GapParameters, coarse: bool = False,
     for k in range(4):
         made |= {f'rotor_thrust_coefficient.scale[{k}]': p.tolerance_thrust,
                  f'joint_offset.offset[{k}]': p.tolerance_angle,
-                 f'rotor.lag[{k}]': p.tolerance_lag}
+                 f'rotor.lag[{k}]': p.tolerance_lag, f'servo.kp[{k}]': p.tolerance_lag,
+                 f'servo.kd[{k}]': p.tolerance_lag}
     for k in range(12):
         made[f'position.offset[{k}]'] = p.tolerance_position
     beliefs = {name: Belief(deviation) for name, deviation in made.items()}
@@ -199,6 +200,9 @@ def extra_keys() -> dict[str, Key]:
     for k in range(4):
         name = f'rotor.lag[{k}]'
         keys[name] = Key(name, 'rotor', 'lag', k, 0.0, False, -1, 1, 0.1, 0.0, False)
+        for gain in ('kp', 'kd'):
+            name = f'servo.{gain}[{k}]'
+            keys[name] = Key(name, 'servo', gain, k, 0.0, False, -1, 1, 0.3, 0.0, False)
     for part in ('delay', 'split'):
         keys[f'base.{part}'] = Key(f'base.{part}', 'base', part, None, 0.0, False, -0.05, 0.05,
                                    0.005, 0.0, False)

@@ -50,10 +50,10 @@ class Noise:
             for k in range(len(channels)):
                 series = [r[group][:, k] for r in residuals]
                 filtered, level = _autoregression(series, order)
-                white = level / np.sqrt(_gain(filtered))
+                coloured = level * np.sqrt(_gain(filtered))
                 rows.append(filtered)
                 own.append(level)
-                levels.append(level * max(1.0, floors[group][k] / max(white, 1e-12)))
+                levels.append(level * max(1.0, floors[group][k] / max(coloured, 1e-12)))
             taps[group], sigma[group] = np.array(rows), np.array(levels)
             seen[group] = np.array(own)
         return cls(taps, sigma, seen)
@@ -108,5 +108,6 @@ def _autoregression(series, order):
 
 def _gain(taps):
     """Variance of the coloured series for unit variance of what drives it."""
-    response = np.fft.rfft(taps, 512)
+    # Round the whole circle: half of it would count the slowest twice, of which colour is made.
+    response = np.fft.fft(taps, 4096)
     return float(np.mean(1 / np.maximum(np.abs(response)**2, 1e-9)))

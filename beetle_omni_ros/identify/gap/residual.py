@@ -33,11 +33,14 @@ UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate':
 TIMING = ('imu_filter_lag.delay', 'joint_feedback_delay.delay')     # of what loads the joints
 # By which an encoder's reading is taken later for each second of a delay.
 SHIFTS = {'imu_filter_lag.delay': -1.0, 'joint_feedback_delay.delay': 1.0}
+# Taken to both sides, by the same shift of a command: one-sided, delays that data cannot tell
+# apart would differ by the second derivative, and a straight line through all would fit that.
+BOTH_SIDES = ('delay', 'split')
 THIN = 2        # grid points to each at which the body's equations are evaluated
 STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
          'kp': 0.01, 'kd': 0.01, 'velocity_limit': 0.01, 'effort_limit': 0.01, 'coulomb': 5e-4,
          'stiction': 5e-4, 'deflection_per_newton': 1e-4, 'gap': 1e-3, 'thrust_max': 0.01,
-         'share': 0.05, 'split': 1e-3, 'ratio': 0.01, 'lag': 0.02,
+         'share': 0.05, 'split': 2e-3, 'ratio': 0.01, 'lag': 0.02,
          'angular_momentum_at_hover': 5e-3}
 
 
@@ -218,16 +221,21 @@ class FlightModel:
         encoder: the derivative of noise explains the same noise shifted, and goes on doing so
         wherever a fit moves without fresh slopes.
         """
-        sizes = [STEPS[self.keys[name].parameter] for name in names]
+        # Servos do not feel each other: what moves one moves it as if all were moved.
+        sources = [f'joint_bandwidth.{self.keys[name].parameter}'
+                   if self.keys[name].effect == 'servo' else name for name in names]
+        moved = list(dict.fromkeys(sources))
+        sizes = [STEPS[self.keys[name].parameter] for name in moved]
         sets = [theta, *({**theta, name: theta.get(name, 0.0) + h}
-                         for name, h in zip(names, sizes, strict=True))]
+                         for name, h in zip(moved, sizes, strict=True))]
         runs = self._servos(sets, theta)
-        rate = np.gradient(runs[0], self.p.grid, axis=1)
-        made = []
-        for name, h, run in zip(names, sizes, runs[1:], strict=True):
+        rate, slopes = np.gradient(runs[0], self.p.grid, axis=1), {}
+        for name, h, run in zip(moved, sizes, runs[1:], strict=True):
             slope = rate * SHIFTS.get(name, 0.0) - (run - runs[0]) / h
-            made.append(self.filters['J'](slope.reshape(-1, 4)))
-        return made
+            slopes[name] = self.filters['J'](slope.reshape(-1, 4))
+        return [slopes[source] * (np.arange(4) == self.keys[name].index)
+                if source != name else slopes[name]
+                for name, source in zip(names, sources, strict=True)]
 
     def _windows(self, theta):
         timing = {name: theta.get(name, 0.0) for name in TIMING}
@@ -273,9 +281,12 @@ class FlightModel:
             h = -h if theta.get(name, 0.0) + h > self.keys[name].high else h
             groups = self.keys[name].groups.replace('J', '')
             if groups:
-                moved = self.residual({**theta, name: theta.get(name, 0.0) + h}, groups)
+                here, other, width = theta.get(name, 0.0), now, h
+                if self.keys[name].parameter in BOTH_SIDES:
+                    other, width = self.residual({**theta, name: here - h}, groups), 2 * h
+                moved = self.residual({**theta, name: here + h}, groups)
                 for group, values in moved.items():
-                    made[group][:, :, names.index(name)] = (values - now[group]) / h
+                    made[group][:, :, names.index(name)] = (values - other[group]) / width
         turning = [name for name in names if 'J' in self.keys[name].groups]
         if turning:
             for name, slope in zip(turning, self._joint_slopes(theta, turning), strict=True):

@@ -187,7 +187,7 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
             2 * velocity0**2 + (gravity * horizon * angle0)**2 + push[k][1]**2,
             2 * angle0**2 + (horizon * rate0)**2 + push[k][2]**2,
             2 * rate0**2 + push[k][3]**2,
-            4 * float(np.mean(noise.sigma['J']))**2 + 8 * joint0**2])
+            4 * float(np.mean(noise.spread['J']**2)) + 8 * joint0**2])
     return np.maximum(np.sqrt(floors), LEAST)
 
 

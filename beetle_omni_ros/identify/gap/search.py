@@ -238,7 +238,7 @@ class Search:
                 if not self._holds(trial):
                     trial.reason = 'does not hold on data left out'
                 elif trial.share < p.least_share and not (
-                        sure and trial.share > p.weak_share):
+                        sure and trial.share > p.weak_share and trial.gain > p.weak_gain * need):
                     trial.reason = 'explains too small a part of what is left'
                 else:
                     chosen = trial

@@ -67,9 +67,12 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
     def column(name, made=lambda x: x):
         return np.array([made(values.get(name, 0.0)) for values in sets])[:, None, None]
 
+    def each(name):
+        return np.concatenate([column(f'{name}[{k}]', np.exp) for k in range(4)], axis=2)
+
     h = windows.step
-    kp = joint.kp * column('joint_bandwidth.kp', np.exp)
-    kd = joint.kd * column('joint_bandwidth.kd', np.exp)
+    kp = joint.kp * column('joint_bandwidth.kp', np.exp) * each('servo.kp')
+    kd = joint.kd * column('joint_bandwidth.kd', np.exp) * each('servo.kd')
     speed = joint.velocity_limit * column('joint_velocity_limit.velocity_limit', np.exp)
     effort = joint.effort_limit * column('joint_torque_limit.effort_limit', np.exp)
     coulomb = base['coulomb'] + column('joint_friction.coulomb', lambda x: max(x, 0.0))
