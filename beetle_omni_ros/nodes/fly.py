@@ -51,7 +51,8 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
         actuators: 'emulated': through drivers, serial ports and emulated devices; 'direct':
             straight into the plant; default emulated, direct in simulated time.
         clock: 'system': real time; 'simulated': time that waits for nodes that are late; 'auto':
-            simulated if the computer turns out to be too slow for real time.
+            simulated if the computer turns out to be too slow for real time, unless ``actuators``
+            are asked to be emulated.
         robot: file that estimator and controller believe; default the shipped one.
         plant: file that is true in the simulation; default ``robot``.
         policy: file for 'rl'; default the shipped one.
@@ -77,7 +78,7 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
                 check_writable(json_path)
             flown = make_task(task, seed)
             RobotParameters.load(plant or robot)
-            _check_choices(actuators, clock)
+            clocks = _clocks(clock, actuators)
             controllers, left_out = controller_nodes(
                 controller, robot_file=str(Path(robot).absolute()) if robot else '',
                 policy=str(policy or ''), allow_other_robot=allow_other_robot, standby=standby)
@@ -85,7 +86,7 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
                 _tell(console, f'rl does not stand by: {left_out}')
             number = stack.enter_context(domain.reserved()) if domain_id is None else domain_id
             stack.enter_context(_terminable())
-            for kind in CLOCKS[clock]:
+            for kind in clocks:
                 chosen = actuators or ('direct' if kind == 'simulated' else 'emulated')
                 meta = {'task': task, 'conditions': conditions, 'seed': seed, 'actuators': chosen,
                         'clock': kind, 'robot': str(robot) if robot else 'params/robot.yaml',
@@ -98,12 +99,11 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
                 graph = Graph(parameters, folder, number, composed, kind == 'simulated')
                 try:
                     status = _fly(graph, controller, flown, meta, console,
-                                  may_be_slow=kind == CLOCKS[clock][-1])
+                                  may_be_slow=kind == clocks[-1])
                     break
                 except TooSlowError as error:
                     _tell(console, f'this computer is too slow for real time: {error}; again in '
                           'simulated time, which waits for the nodes, and without serial devices')
-                    actuators = None
                     shutil.rmtree(bag, ignore_errors=True)
                     for log in folder.glob('*.log'):
                         log.unlink()
@@ -118,7 +118,8 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
         return INTERRUPTED
 
 
-def _check_choices(actuators, clock):
+def _clocks(clock, actuators):
+    """Clocks to fly by, one after the other where the computer is too slow."""
     for key, value, known in (('actuators', actuators, (None, *ACTUATORS)),
                               ('clock', clock, CLOCKS)):
         if value not in known:
@@ -126,6 +127,7 @@ def _check_choices(actuators, clock):
     if clock == 'simulated' and actuators == 'emulated':
         raise ParameterError("actuators 'emulated': serial devices keep real time; expected "
                              "direct with clock 'simulated'")
+    return CLOCKS['system' if actuators == 'emulated' else clock]
 
 
 def _tell(console, text):

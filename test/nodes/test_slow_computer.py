@@ -108,6 +108,12 @@ def test_a_clock_that_was_asked_for_is_kept(attempts, tmp_path, clock):
         (clock == 'simulated', True)]
 
 
+def test_serial_devices_that_were_asked_for_stay_in_real_time(attempts, tmp_path):
+    fly.run_fly(actuators='emulated', bag=tmp_path / 'bag', domain_id=1,
+                console=Console(file=io.StringIO()))
+    assert [(graph.simulated, may) for graph, _, may in attempts] == [(False, True)]
+
+
 def test_simulated_time_with_serial_devices_is_refused(capsys):
     assert fly.run_fly(clock='simulated', actuators='emulated') == 2
     assert "actuators 'emulated': serial devices keep real time" in capsys.readouterr().err
