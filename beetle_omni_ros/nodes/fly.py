@@ -86,27 +86,22 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
                 _tell(console, f'rl does not stand by: {left_out}')
             number = stack.enter_context(domain.reserved()) if domain_id is None else domain_id
             stack.enter_context(_terminable())
+            meta = {'task': task, 'conditions': conditions, 'seed': seed,
+                    'robot': str(robot) if robot else 'params/robot.yaml',
+                    'plant': str(plant) if plant else None, 'version': __version__,
+                    'controller': controller, 'composed': composed}
+            parameters = _parameters(controllers, task, bag, seed, conditions, robot, plant)
+            parameters['supervisor_node']['controller'] = controller
             for kind in clocks:
-                chosen = actuators or ('direct' if kind == 'simulated' else 'emulated')
-                meta = {'task': task, 'conditions': conditions, 'seed': seed, 'actuators': chosen,
-                        'clock': kind, 'robot': str(robot) if robot else 'params/robot.yaml',
-                        'plant': str(plant) if plant else None, 'version': __version__,
-                        'controller': controller, 'composed': composed}
-                parameters = _parameters(controllers, task, bag, seed, conditions, robot, plant)
-                parameters['supervisor_node']['controller'] = controller
-                if chosen == 'emulated':
-                    _join(parameters, bridged(folder, parameters['ekf_node']))
-                graph = Graph(parameters, folder, number, composed, kind == 'simulated')
+                meta |= {'clock': kind, 'actuators': actuators or (
+                    'direct' if kind == 'simulated' else 'emulated')}
+                graph = _make_graph(parameters, meta, folder, number)
                 try:
                     status = _fly(graph, controller, flown, meta, console,
                                   may_be_slow=kind == clocks[-1])
                     break
                 except TooSlowError as error:
-                    _tell(console, f'this computer is too slow for real time: {error}; again in '
-                          'simulated time, which waits for the nodes, and without serial devices')
-                    shutil.rmtree(bag, ignore_errors=True)
-                    for log in folder.glob('*.log'):
-                        log.unlink()
+                    _clear(bag, folder, error, console)
             if not bag.exists():
                 return status or runner.FAILED
             return max(status, _report(bag, controller, flown, meta, json_path, console))
@@ -128,6 +123,23 @@ def _clocks(clock, actuators):
         raise ParameterError("actuators 'emulated': serial devices keep real time; expected "
                              "direct with clock 'simulated'")
     return CLOCKS['system' if actuators == 'emulated' else clock]
+
+
+def _make_graph(parameters, meta, folder, number):
+    """The graph for the clock and the actuators of ``meta``."""
+    parameters = dict(parameters)
+    if meta['actuators'] == 'emulated':
+        _join(parameters, bridged(folder, parameters['ekf_node']))
+    return Graph(parameters, folder, number, meta['composed'], meta['clock'] == 'simulated')
+
+
+def _clear(bag, folder, error, console):
+    """Say why a flight begins again, and remove what is left of the first attempt."""
+    _tell(console, f'this computer is too slow for real time: {error}; again in simulated time, '
+          'which waits for the nodes, and without serial devices')
+    shutil.rmtree(bag, ignore_errors=True)
+    for log in folder.glob('*.log'):
+        log.unlink()
 
 
 def _tell(console, text):

@@ -78,7 +78,7 @@ def attempts(monkeypatch):
     graphs = []
 
     def one(graph, controller, task, meta, console, may_be_slow):
-        graphs.append((graph, meta, may_be_slow))
+        graphs.append((graph, dict(meta), may_be_slow))
         if not may_be_slow and not graph.simulated:
             raise TooSlowError('the nodes use 99% of a core before the start')
         return 1        # flown, but no bag of it is there
