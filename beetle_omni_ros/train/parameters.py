@@ -166,8 +166,8 @@ class RewardWeights:
     joint_acceleration: float = parameter(-1.5e-5, doc='published')
     z_axis_align: float = parameter(-0.1, doc='published')
     thrust_allocation: float = parameter(-1e-5, doc='published')
-    attitude: float = parameter(-1.5, doc='own: slope far from the target')
-    near_position: float = parameter(2.0, doc='own: slope close to the target')
+    attitude: float = parameter(-2.5, doc='own: slope far from the target')
+    near_position: float = parameter(2.5, doc='own: slope close to the target')
     near_attitude: float = parameter(1.5, doc='own: slope close to the target')
     near_pose: float = parameter(1.5, doc='own: slope close to the target')
     exact_pose: float = parameter(1.5, doc='own: slope in the last centimetres')
@@ -253,7 +253,7 @@ class TrainParameters:
     """One training, completely: dumped beside its checkpoints."""
 
     seed: int = parameter(0, doc='of everything random', low=0, high=2**31 - 1)
-    iterations: int = parameter(10000, doc='PPO iterations', low=1, high=10**7)
+    iterations: int = parameter(7200, doc='PPO iterations', low=1, high=10**7)
     memory: bool = parameter(False, doc='whether the policy sees the estimated disturbance')
     log_every: int = parameter(50, doc='iterations between two rows of progress', low=1,
                                high=10**6)
