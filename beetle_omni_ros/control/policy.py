@@ -93,7 +93,7 @@ class PolicyController:
         self._hover = [robot.hover_thrust] * 4
         self._estimator = DisturbanceEstimator(
             robot, p, FunctionCall(model.integrator(robot), None)) if contract.memory else None
-        self._unwinding = Unwinding(p.unwinding)
+        self._unwinding = Unwinding(p.unwinding, robot.tilt_axes)
         self.reset()
 
     def reset(self) -> None:

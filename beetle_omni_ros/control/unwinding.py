@@ -9,6 +9,12 @@ near half a turn or push against their stops, and the robot stays 10 to 90 degre
 In a level hover each tilt is zero, and no other angle within the travel gives the same thrust. So
 a robot that is asked to be level, at the place where it shall be, unwinds all its joints; from
 there the target is reached as from a take-off.
+
+Which level attitude, its heading, decides about the turns there and back. A turn about an arm
+stands the two arms across upright half way: nothing of their thrust is any use there, their
+joints have to turn over by half a turn at that moment, and which way is left to chance. Half
+way between two arms all four turn along. So the heading is taken whose two turns keep the arms
+from standing upright.
 """
 
 from __future__ import annotations
@@ -16,6 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.robot import rotations
@@ -24,6 +31,9 @@ from beetle_omni_ros.robot.schema import parameter
 ARRIVED = 0.35    # [rad] from level: near enough to turn back
 UNWOUND = 2.0     # [rad] all tilts below: on the way to zero
 STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
+HEADINGS = 24     # level attitudes that are compared
+POINTS = 16       # of a turn at which its arms are looked at
+LEAST_USE = 0.2   # part of an arm's thrust that can hold weight, below which it counts as this
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,14 +59,16 @@ class Unwinding:
 
     Args:
         parameters: when.
+        axes: (4, 3) unit tilt axes in base_link.
 
     Attributes:
         attempts: since the last reset.
 
     """
 
-    def __init__(self, parameters: UnwindingParameters):
+    def __init__(self, parameters: UnwindingParameters, axes: np.ndarray):
         self._p = parameters
+        self._axes = np.asarray(axes, dtype=float)
         self.reset()
 
     def reset(self) -> None:
@@ -118,7 +130,8 @@ class Unwinding:
     def _through(self, state, given):
         position = given.position.copy()
         position[2] = max(position[2], self._p.height)
-        return replace(given, position=position, quaternion=levelled(state.quaternion))
+        return replace(given, position=position, quaternion=level_between(
+            state.quaternion, given.quaternion, self._axes))
 
     def _unwound(self, state):
         return rotations.geodesic_angle(state.quaternion, self._level.quaternion) < ARRIVED \
@@ -136,6 +149,55 @@ def levelled(quaternion: np.ndarray) -> np.ndarray:
         turn = axis / sine * np.arctan2(sine, up[2])
     return rotations.normalized(rotations.multiply(
         quaternion, rotations.conjugate(rotations.exp(turn))))
+
+
+def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """
+    Choose the level attitude by which a robot with tilting rotors best turns from one to another.
+
+    Args:
+        start: (4,) attitude, xyzw.
+        end: (4,) the same.
+        axes: (4, 3) unit tilt axes in base_link.
+
+    Returns:
+        (4,) the level attitude, xyzw, of the least :func:`turning_cost` there and on.
+
+    """
+    begin, goal = Rotation.from_quat(start), Rotation.from_quat(end)
+    heading = np.linspace(0.0, 2 * np.pi, HEADINGS, endpoint=False)
+    levels = Rotation.from_rotvec(heading[:, None] * STRAIGHT_UP) \
+        * Rotation.from_quat(levelled(start))
+    cost = turning_cost(begin, levels, axes) + turning_cost(levels, goal, axes)
+    return levels[int(np.argmin(cost))].as_quat()
+
+
+def turning_cost(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray:
+    """
+    Angle of the shortest turn between two attitudes, longer for each arm near upright [rad].
+
+    The thrust of a rotor is across its arm, so sqrt(1 - (arm . up)^2) of it can hold weight; the
+    angle is weighted with the inverse square of that for the worst arm.
+
+    Args:
+        start: one attitude or n of them.
+        end: the same.
+        axes: (4, 3) unit tilt axes in base_link.
+
+    Returns:
+        (n,) costs.
+
+    """
+    turn = np.atleast_2d((start.inv() * end).as_rotvec())
+    angle = np.linalg.norm(turn, axis=1)
+    axis = (turn / np.maximum(angle, 1e-9)[:, None])[:, None]               # (n, 1, 3)
+    up = np.atleast_2d(start.inv().apply(STRAIGHT_UP))[:, None]
+    part = (angle[:, None] * np.linspace(0.0, 1.0, POINTS))[..., None]      # (n, POINTS, 1)
+    along = (axis * up).sum(-1, keepdims=True)
+    seen = up * np.cos(part) - np.cross(axis, up) * np.sin(part) \
+        + axis * along * (1 - np.cos(part))         # world's z in the turning body
+    upright = np.max((seen @ axes.T) ** 2, axis=-1)
+    return angle * np.mean(1 / np.maximum(1 - upright, LEAST_USE ** 2), axis=1)
 
 
 def _same(a, b):

@@ -4,15 +4,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import PoseTarget, State
-from beetle_omni_ros.control.unwinding import levelled, Unwinding, UnwindingParameters
+from beetle_omni_ros.control.unwinding import (
+    level_between,
+    levelled,
+    turning_cost,
+    Unwinding,
+    UnwindingParameters,
+)
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 PARAMETERS = UnwindingParameters()
 ROBOT = RobotParameters.load()
+AXES = ROBOT.tilt_axes
 TARGET = PoseTarget(np.array([0.0, 0.0, 1.0]), rotations.from_rpy(1.2, 0.4, -2.0))
 OFF = rotations.multiply(TARGET.quaternion, rotations.exp(np.array([0.0, 0.4, 0.0])))
 WOUND = np.array([1.5, 3.8, -1.5, -3.7])
@@ -46,6 +54,35 @@ def test_the_level_attitude_is_level_and_the_nearest_one(quaternion):
         assert rotations.geodesic_angle(other, quaternion) >= way - 1e-6
 
 
+def uses(start, end):
+    """Part of its thrust with which the worst arm can hold weight, along the shortest turn."""
+    turn = rotations.log(rotations.multiply(rotations.conjugate(start), end))
+    for part in np.linspace(0, 1, 400):
+        attitude = rotations.matrix(rotations.multiply(start, rotations.exp(part * turn)))
+        yield min(np.linalg.norm(np.cross(attitude @ axis, [0, 0, 1])) for axis in AXES)
+
+
+@settings(max_examples=30, deadline=None)
+@given(quaternions, quaternions)
+def test_the_cost_of_a_turn_is_its_angle_weighted_with_what_its_arms_can_hold(start, end):
+    angle = rotations.geodesic_angle(start, end)
+    weighted = angle * np.mean([max(use, 0.2) ** -2 for use in uses(start, end)])
+    cost = turning_cost(Rotation.from_quat(start), Rotation.from_quat(end), AXES)
+    assert cost.shape == (1,) and cost[0] >= angle - 1e-6
+    assert cost[0] == pytest.approx(weighted, rel=0.35)    # 16 points of what peaks sharply
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(0.05, 0.5), st.floats(-np.pi, np.pi), st.floats(-np.pi, np.pi))
+def test_the_way_to_an_upside_down_attitude_stands_no_arm_upright(off, direction, yaw):
+    target = rotations.multiply(rotations.from_rpy(0, 0, yaw), rotations.from_rpy(2.98, 0.02, 0))
+    start = rotations.multiply(
+        target, rotations.exp(off * np.array([np.cos(direction), np.sin(direction), 0.0])))
+    level = level_between(start, target, AXES)
+    assert rotations.matrix(level)[2] == pytest.approx([0, 0, 1], abs=1e-7)
+    assert min(uses(start, level)) > 0.45 and min(uses(level, target)) > 0.45
+
+
 @pytest.mark.parametrize('tilt', [WOUND, np.full(4, 3.9), np.full(4, -3.9)])
 def test_a_level_hover_needs_all_joints_at_zero_however_they_were_wound(tilt):
     wanted = Allocator(ROBOT).hover(np.array([0.0, 0.0, 0.3, np.sqrt(0.91)]), tilt).tilt
@@ -54,7 +91,7 @@ def test_a_level_hover_needs_all_joints_at_zero_however_they_were_wound(tilt):
 
 
 def test_a_robot_stuck_at_a_stop_is_shown_level_above_the_same_place_after_its_patience():
-    unwinding = Unwinding(PARAMETERS)
+    unwinding = Unwinding(PARAMETERS, AXES)
     shown = fly(unwinding, 1.0)
     first = next(k for k, t in enumerate(shown) if t is not TARGET)
     assert 0.01 * first == pytest.approx(PARAMETERS.patience, abs=0.011)
@@ -68,12 +105,12 @@ def test_a_robot_stuck_at_a_stop_is_shown_level_above_the_same_place_after_its_p
     {'tilt': np.array([1.5, 2.3, -1.5, -2.3])}, {'quaternion': TARGET.quaternion},
     {'tilt': np.full(4, np.nan)}, {'quaternion': np.full(4, np.nan)}])
 def test_who_is_not_stuck_sees_the_target(changed):
-    assert all(t is TARGET for t in fly(Unwinding(PARAMETERS), 3.0, **changed))
+    assert all(t is TARGET for t in fly(Unwinding(PARAMETERS, AXES), 3.0, **changed))
 
 
 @pytest.mark.parametrize('rate, goes_through_level', [(1.0, False), (0.05, True)])
 def test_who_gets_nearer_sees_the_target(rate, goes_through_level):
-    unwinding = Unwinding(PARAMETERS)
+    unwinding = Unwinding(PARAMETERS, AXES)
     shown = []
     for k in range(200):
         angle = 1.5 * np.exp(-rate * 0.01 * k)
@@ -83,19 +120,19 @@ def test_who_gets_nearer_sees_the_target(rate, goes_through_level):
 
 
 def test_a_position_out_of_reach_counts_as_an_attitude_does():
-    shown = fly(Unwinding(PARAMETERS), 1.0, quaternion=TARGET.quaternion,
+    shown = fly(Unwinding(PARAMETERS, AXES), 1.0, quaternion=TARGET.quaternion,
                 position=TARGET.position + [0.0, 0.1, 0.0])
     assert shown[-1] is not TARGET
 
 
 def test_a_place_that_is_high_enough_stays():
     target = PoseTarget(np.array([0.5, 0.0, 1.7]), TARGET.quaternion)
-    shown = fly(Unwinding(PARAMETERS), 1.0, target=target, position=target.position)
+    shown = fly(Unwinding(PARAMETERS, AXES), 1.0, target=target, position=target.position)
     assert shown[-1] is not target and np.array_equal(shown[-1].position, target.position)
 
 
 def test_the_target_returns_once_the_joints_are_unwound():
-    unwinding = Unwinding(PARAMETERS)
+    unwinding = Unwinding(PARAMETERS, AXES)
     level = fly(unwinding, 1.0)[-1]
     assert fly(unwinding, 0.1, 1.0, quaternion=level.quaternion)[-1] is level    # still wound
     assert fly(unwinding, 0.1, 1.1, quaternion=level.quaternion,
@@ -103,7 +140,7 @@ def test_the_target_returns_once_the_joints_are_unwound():
 
 
 def test_who_stays_stuck_gets_the_target_back_and_no_more_attempts_than_allowed():
-    unwinding = Unwinding(PARAMETERS)
+    unwinding = Unwinding(PARAMETERS, AXES)
     shown = fly(unwinding, 30.0)
     away = sum(t is not TARGET for t in shown) * 0.01
     assert unwinding.attempts == PARAMETERS.attempts
@@ -112,22 +149,22 @@ def test_who_stays_stuck_gets_the_target_back_and_no_more_attempts_than_allowed(
 
 
 def test_a_new_target_is_followed_at_once_and_may_be_tried_again():
-    unwinding = Unwinding(PARAMETERS)
+    unwinding = Unwinding(PARAMETERS, AXES)
     fly(unwinding, 30.0)
     other = PoseTarget(TARGET.position + [0, 0, 0.2], TARGET.quaternion, 30.0)
     shown = fly(unwinding, 5.0, 30.0, other)
     assert shown[0] is other and unwinding.attempts > PARAMETERS.attempts
-    unwinding = Unwinding(PARAMETERS)
+    unwinding = Unwinding(PARAMETERS, AXES)
     assert fly(unwinding, 1.0)[-1] is not TARGET     # on its way through level
     assert fly(unwinding, 0.1, 1.0, other)[0] is other
 
 
 def test_the_same_pose_issued_again_does_not_begin_anew():
-    unwinding = Unwinding(PARAMETERS)
+    unwinding = Unwinding(PARAMETERS, AXES)
     shown = [unwinding.target(stuck(0.01 * k), PoseTarget(
         TARGET.position.copy(), TARGET.quaternion.copy(), 0.01 * k)) for k in range(100)]
     assert rotations.matrix(shown[-1].quaternion)[2, 2] == pytest.approx(1.0)
 
 
 def test_without_attempts_nothing_is_shown_but_the_target():
-    assert all(t is TARGET for t in fly(Unwinding(UnwindingParameters(attempts=0)), 5.0))
+    assert all(t is TARGET for t in fly(Unwinding(UnwindingParameters(attempts=0), AXES), 5.0))
