@@ -14,12 +14,15 @@ Which level attitude, its heading, decides about the turns there and back. A tur
 stands the two arms across upright half way: nothing of their thrust is any use there, their
 joints have to turn over by half a turn at that moment, and which way is left to chance. Half
 way between two arms all four turn along. So the heading is taken whose two turns keep the arms
-from standing upright.
+from standing upright. And it decides how the joints are wound at the target: a way that ends as
+they were wound when the target was missed is taken only where there is no other.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import dist
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,8 +31,8 @@ from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import parameter
 
-ARRIVED = 0.35    # [rad] from level: near enough to turn back
-UNWOUND = 2.0     # [rad] all tilts below: on the way to zero
+ARRIVED = 0.2     # [rad] from level: near enough to turn back
+UNWOUND = 0.6     # [rad] all tilts below: a robot that turns back earlier goes the way it came
 STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
 HEADINGS = 24     # level attitudes that are compared
 POINTS = 16       # of a turn at which its arms are looked at
@@ -80,6 +83,7 @@ class Unwinding:
     def _start(self):
         """A target that is new."""
         self._left = self._p.attempts
+        self._failed: list[np.ndarray] = []
         self._level: PoseTarget | None = None
         self._until = 0.0
         self._watch(-np.inf)
@@ -111,6 +115,7 @@ class Unwinding:
             self._left -= 1
             self.attempts += 1
             self._until = state.stamp + self._p.duration
+            self._failed.append(state.tilt.copy())
             self._level = self._through(state, given)
             return self._level
         return given
@@ -122,7 +127,7 @@ class Unwinding:
             self._watch(state.stamp)
             return False
         error = max(rotations.geodesic_angle(state.quaternion, given.quaternion) / p.angle,
-                    float(np.linalg.norm(given.position - state.position)) / p.distance)
+                    dist(given.position.tolist(), state.position.tolist()) / p.distance)
         if not error > max(1.0, p.progress * self._least):
             self._least, self._since = error, state.stamp
         return state.stamp - self._since >= p.patience
@@ -131,7 +136,7 @@ class Unwinding:
         position = given.position.copy()
         position[2] = max(position[2], self._p.height)
         return replace(given, position=position, quaternion=level_between(
-            state.quaternion, given.quaternion, self._axes))
+            state.quaternion, given.quaternion, self._axes, self._failed))
 
     def _unwound(self, state):
         return rotations.geodesic_angle(state.quaternion, self._level.quaternion) < ARRIVED \
@@ -151,7 +156,8 @@ def levelled(quaternion: np.ndarray) -> np.ndarray:
         quaternion, rotations.conjugate(rotations.exp(turn))))
 
 
-def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray) -> np.ndarray:
+def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
+                  failed: Sequence[np.ndarray] = ()) -> np.ndarray:
     """
     Choose the level attitude by which a robot with tilting rotors best turns from one to another.
 
@@ -159,6 +165,8 @@ def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray) -> np.nd
         start: (4,) attitude, xyzw.
         end: (4,) the same.
         axes: (4, 3) unit tilt axes in base_link.
+        failed: (4,) tilts [rad] with which the end was not held; ways that wind the joints into
+            none of them are preferred.
 
     Returns:
         (4,) the level attitude, xyzw, of the least :func:`turning_cost` there and on.
@@ -169,7 +177,9 @@ def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray) -> np.nd
     levels = Rotation.from_rotvec(heading[:, None] * STRAIGHT_UP) \
         * Rotation.from_quat(levelled(start))
     cost = turning_cost(begin, levels, axes) + turning_cost(levels, goal, axes)
-    return levels[int(np.argmin(cost))].as_quat()
+    tilts = tilts_at_end(levels, goal, axes)
+    again = [np.all(np.abs(tilts - other) < np.pi, axis=1) for other in failed]
+    return levels[int(np.lexsort((cost, np.sum(again, axis=0) * np.ones(HEADINGS)))[0])].as_quat()
 
 
 def turning_cost(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray:
@@ -188,16 +198,36 @@ def turning_cost(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray
         (n,) costs.
 
     """
+    angle, up = _turn(start, end)
+    upright = np.max((up @ axes.T) ** 2, axis=-1)
+    return angle * np.mean(1 / np.maximum(1 - upright, LEAST_USE ** 2), axis=1)
+
+
+def tilts_at_end(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray:
+    """
+    Tilts (n, 4) [rad] after the shortest turns from level attitudes, all thrusts kept upward.
+
+    Args:
+        start: n level attitudes, with all tilts zero.
+        end: one attitude or n of them.
+        axes: (4, 3) unit tilt axes in base_link.
+
+    """
+    up = _turn(start, end)[1]
+    across = np.cross(axes, STRAIGHT_UP)        # where a thrust points at a tilt of pi / 2
+    return np.unwrap(np.arctan2(up @ across.T, up[..., 2:]), axis=1)[:, -1]
+
+
+def _turn(start, end):
+    """Angles (n,) of the shortest turns, and world's z in the turning body (n, POINTS, 3)."""
     turn = np.atleast_2d((start.inv() * end).as_rotvec())
     angle = np.linalg.norm(turn, axis=1)
     axis = (turn / np.maximum(angle, 1e-9)[:, None])[:, None]               # (n, 1, 3)
     up = np.atleast_2d(start.inv().apply(STRAIGHT_UP))[:, None]
     part = (angle[:, None] * np.linspace(0.0, 1.0, POINTS))[..., None]      # (n, POINTS, 1)
     along = (axis * up).sum(-1, keepdims=True)
-    seen = up * np.cos(part) - np.cross(axis, up) * np.sin(part) \
-        + axis * along * (1 - np.cos(part))         # world's z in the turning body
-    upright = np.max((seen @ axes.T) ** 2, axis=-1)
-    return angle * np.mean(1 / np.maximum(1 - upright, LEAST_USE ** 2), axis=1)
+    return angle, up * np.cos(part) - np.cross(axis, up) * np.sin(part) \
+        + axis * along * (1 - np.cos(part))
 
 
 def _same(a, b):

@@ -49,7 +49,8 @@ def motion(log: FlightLog, series: str | None = None) -> Motion:
 
 def geodesic_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angles [rad] between the rotations of (N, 4) and (N, 4) or (4,) quaternions."""
-    x, y, z, w = rotations.multiply(rotations.conjugate(np.asarray(b).T), np.asarray(a).T)
+    bx, by, bz, bw = np.asarray(b).T
+    x, y, z, w = rotations.product(-bx, -by, -bz, bw, *np.asarray(a).T)
     return 2 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
 
 

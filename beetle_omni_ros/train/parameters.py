@@ -91,7 +91,7 @@ class RandomParameters:
     tilt_bias: float = parameter(0.0524, doc='each joint', unit='rad', low=0, high=0.5)
     tilt_noise: float = parameter(0.0349, doc='each joint', unit='rad', low=0, high=0.5)
     noise_power: float = parameter(
-        1.5, doc='noise and biases of a robot are scaled by u^power with u uniform in [0, 1]; 0: '
+        0.7, doc='noise and biases of a robot are scaled by u^power with u uniform in [0, 1]; 0: '
                  'every robot has them in full', low=0, high=10)
     velocity_latency: np.ndarray = parameter([0.0, 0.025], doc='age of velocity and rate',
                                              unit='s', shape=(2,), low=0, high=0.03)

@@ -1,6 +1,6 @@
 """The way off a joint's stop: when it is taken, where it leads, and that it ends."""
 
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.unwinding import (
     level_between,
     levelled,
+    tilts_at_end,
     turning_cost,
     Unwinding,
     UnwindingParameters,
@@ -57,7 +58,7 @@ def test_the_level_attitude_is_level_and_the_nearest_one(quaternion):
 def uses(start, end):
     """Part of its thrust with which the worst arm can hold weight, along the shortest turn."""
     turn = rotations.log(rotations.multiply(rotations.conjugate(start), end))
-    for part in np.linspace(0, 1, 400):
+    for part in np.linspace(0, 1, 200):
         attitude = rotations.matrix(rotations.multiply(start, rotations.exp(part * turn)))
         yield min(np.linalg.norm(np.cross(attitude @ axis, [0, 0, 1])) for axis in AXES)
 
@@ -81,6 +82,53 @@ def test_the_way_to_an_upside_down_attitude_stands_no_arm_upright(off, direction
     level = level_between(start, target, AXES)
     assert rotations.matrix(level)[2] == pytest.approx([0, 0, 1], abs=1e-7)
     assert min(uses(start, level)) > 0.45 and min(uses(level, target)) > 0.45
+
+
+def upward(attitude, tilts):
+    """World's z (..., 4) of the thrust directions at tilts (..., 4)."""
+    tilted = Rotation.from_rotvec((AXES * tilts[..., None]).reshape(-1, 3))
+    return (tilted.apply([0, 0, 1]) @ rotations.matrix(attitude)[2]).reshape(tilts.shape)
+
+
+@settings(max_examples=50, deadline=None)
+@given(quaternions, st.floats(-np.pi, np.pi))
+def test_at_the_end_of_a_turn_each_thrust_points_upward_as_far_as_its_arm_lets_it(end, yaw):
+    tilts = tilts_at_end(Rotation.from_euler('z', yaw), Rotation.from_quat(end), AXES)[0]
+    across = [np.linalg.norm(np.cross(rotations.matrix(end) @ axis, [0, 0, 1])) for axis in AXES]
+    assert upward(end, tilts) == pytest.approx(across, abs=1e-6)
+
+
+@settings(max_examples=20, deadline=None)
+@given(quaternions, st.floats(-np.pi, np.pi))
+def test_the_tilts_at_the_end_of_a_turn_are_those_that_a_slow_turn_ends_with(end, yaw):
+    start = rotations.from_rpy(0.0, 0.0, yaw)
+    turn = rotations.log(rotations.multiply(rotations.conjugate(start), end))
+    assume(np.linalg.norm(turn) < 3.1 and min(uses(start, end)) > 0.4)  # else there are two ways
+    tilts, steps = np.zeros(4), np.linspace(-0.5, 0.5, 101)[:, None]
+    for part in np.linspace(0, 1, 50):
+        attitude = rotations.multiply(start, rotations.exp(part * turn))
+        tilts = tilts + steps[upward(attitude, tilts + steps).argmax(axis=0), 0]
+    found = tilts_at_end(Rotation.from_quat(start), Rotation.from_quat(end), AXES)[0]
+    assert found == pytest.approx(tilts, abs=0.1)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-np.pi, np.pi))
+def test_joints_wound_in_a_way_that_failed_are_wound_in_another(roll, pitch, yaw):
+    target = rotations.multiply(rotations.from_rpy(np.pi, 0, yaw),
+                                rotations.from_rpy(roll, pitch, 0))
+    failed = []
+    for _ in range(2):
+        level = level_between(target, target, AXES, failed)
+        tilts = tilts_at_end(Rotation.from_quat(level), Rotation.from_quat(target), AXES)[0]
+        assert all(np.abs(tilts - other).max() > np.pi for other in failed)
+        failed.append(tilts)
+
+
+def test_where_every_way_winds_the_joints_alike_the_best_is_taken_again():
+    target, other = rotations.from_rpy(0.4, 0.2, 1.0), rotations.from_rpy(0.2, 0.4, 1.0)
+    best = level_between(other, target, AXES)
+    assert level_between(other, target, AXES, [np.zeros(4)]) == pytest.approx(best)
 
 
 @pytest.mark.parametrize('tilt', [WOUND, np.full(4, 3.9), np.full(4, -3.9)])
