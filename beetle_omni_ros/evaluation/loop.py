@@ -22,7 +22,7 @@ from beetle_omni_ros.sim.simulator import Simulator
 
 TAKEOFF_TIMEOUT = 30.0   # [s] of simulated time before a flight that does not start is given up
 COMPUTE_REPORT = 1.0     # [s] between two records of compute times, as the nodes report
-SWAP_CHARGE = 0.3         # [-] a pack below this is swapped at the next target
+SWAP_CHARGE = 0.3         # [-] a pack below this is swapped at the next target, or once warned of
 SETTLE_TIME = 0.5        # [s] on the ground before arming, in which the estimator starts
 
 
@@ -100,7 +100,7 @@ class FlightLoop:
             if moment.target is not None:
                 self._target = moment.target
                 self._recorder.write_target(moment.target)
-                if self._simulator.charge < SWAP_CHARGE:
+                if self._simulator.charge < SWAP_CHARGE or self._supervisor.vehicle.battery_low:
                     self._simulator.swap_battery()
             if moment.changed:
                 self._simulator.set_wrench(moment.force_world, moment.torque_body)

@@ -128,7 +128,9 @@ def test_a_force_task_ends_with_the_level_that_was_too_much():
     assert any(str(level) in json.dumps(lost) for level in levels)
 
 
-def test_an_empty_pack_is_swapped_at_the_next_target(tmp_path, monkeypatch):
+@pytest.mark.parametrize('charge', [0.3, 0.0])      # 0: by the supervisor's warning alone
+def test_an_empty_pack_is_swapped_at_the_next_target(charge, tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, 'SWAP_CHARGE', charge)
     small = SimulatorParameters.load()
     small = replace(small, battery=replace(small.battery, capacity=0.3))
     monkeypatch.setattr(command.SimulatorParameters, 'load', lambda: small)
