@@ -178,8 +178,11 @@ def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
         * Rotation.from_quat(levelled(start))
     cost = turning_cost(begin, levels, axes) + turning_cost(levels, goal, axes)
     tilts = tilts_at_end(levels, goal, axes)
-    again = [np.all(np.abs(tilts - other) < np.pi, axis=1) for other in failed]
-    return levels[int(np.lexsort((cost, np.sum(again, axis=0) * np.ones(HEADINGS)))[0])].as_quat()
+    failures = np.zeros(HEADINGS)
+    for wound in failed:
+        failures += np.all(np.abs(tilts - wound) < np.pi, axis=1)
+    best = np.lexsort((cost, failures))[0]      # by failures, then by cost
+    return levels[int(best)].as_quat()
 
 
 def turning_cost(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray:
