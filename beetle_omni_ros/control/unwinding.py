@@ -31,8 +31,8 @@ from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import parameter
 
-ARRIVED = 0.2     # [rad] from level: near enough to turn back
-UNWOUND = 0.6     # [rad] all tilts below: a robot that turns back earlier goes the way it came
+ARRIVED = 0.35    # [rad] from level: near enough to turn back
+UNWOUND = 1.0     # [rad] all tilts below: a robot that turns back earlier goes the way it came
 STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
 HEADINGS = 24     # level attitudes that are compared
 POINTS = 16       # of a turn at which its arms are looked at
@@ -50,7 +50,8 @@ class UnwindingParameters:
     distance: float = parameter(0.08, doc='the same, position', unit='m', low=0.005, high=10)
     progress: float = parameter(0.8, doc='an error below this part of the least so far is '
                                          'progress', low=0, high=1)
-    patience: float = parameter(0.8, doc='without progress', unit='s', low=0.05, high=100)
+    patience: float = parameter(0.8, doc='missed without progress, less the time held', unit='s',
+                                low=0.05, high=100)
     height: float = parameter(1.2, doc='of the way through level at least, in world', unit='m',
                               low=-1000, high=1000)
     duration: float = parameter(1.5, doc='longest way through level', unit='s', low=0.1, high=100)
@@ -90,7 +91,7 @@ class Unwinding:
 
     def _watch(self, now):
         """Wait for progress from now on."""
-        self._least, self._since = np.inf, now
+        self._least, self._missed, self._seen = np.inf, 0.0, now
 
     def target(self, state: State, given: PoseTarget) -> PoseTarget:
         """
@@ -128,9 +129,14 @@ class Unwinding:
             return False
         error = max(rotations.geodesic_angle(state.quaternion, given.quaternion) / p.angle,
                     dist(given.position.tolist(), state.position.tolist()) / p.distance)
-        if not error > max(1.0, p.progress * self._least):
-            self._least, self._since = error, state.stamp
-        return state.stamp - self._since >= p.patience
+        elapsed, self._seen = state.stamp - self._seen, state.stamp
+        if error > max(1.0, p.progress * self._least):
+            self._missed += elapsed
+        elif error > 1.0:
+            self._least, self._missed = error, 0.0
+        else:       # it may swing about its limit: what counts is the side on which it mostly is
+            self._missed = max(0.0, self._missed - elapsed)
+        return self._missed >= p.patience
 
     def _through(self, state, given):
         position = given.position.copy()

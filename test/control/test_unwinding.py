@@ -167,6 +167,20 @@ def test_who_gets_nearer_sees_the_target(rate, goes_through_level):
     assert any(t is not TARGET for t in shown) == goes_through_level
 
 
+@pytest.mark.parametrize('low, high, goes_through_level', [
+    (0.8, 1.4, True), (0.3, 0.95, False), (0.4, 1.4, False)])
+def test_who_swings_about_the_limit_has_missed_and_who_comes_near_has_not(low, high,
+                                                                         goes_through_level):
+    unwinding = Unwinding(PARAMETERS, AXES)
+    shown = []
+    for k in range(300):
+        part = low + (high - low) * (0.5 + 0.5 * np.sin(2 * np.pi * 0.01 * k))
+        attitude = rotations.multiply(TARGET.quaternion, rotations.exp(
+            np.array([0, part * PARAMETERS.angle, 0])))
+        shown.append(unwinding.target(stuck(0.01 * k, quaternion=attitude), TARGET))
+    assert any(t is not TARGET for t in shown) == goes_through_level
+
+
 def test_a_position_out_of_reach_counts_as_an_attitude_does():
     shown = fly(Unwinding(PARAMETERS, AXES), 1.0, quaternion=TARGET.quaternion,
                 position=TARGET.position + [0.0, 0.1, 0.0])
