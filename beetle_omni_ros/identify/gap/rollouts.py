@@ -21,6 +21,7 @@ from beetle_omni_ros.identify.gap.servo import simulate, Windows
 from beetle_omni_ros.identify.gap.signals import (
     FINE,
     matrices,
+    play,
     SMOOTH_IMU,
     SMOOTH_JOINT,
     SMOOTH_POSE,
@@ -32,6 +33,7 @@ STATES = ('position', 'velocity', 'orientation', 'rate', 'joint')
 UNITS = dict(zip(STATES, ('m', 'm/s', 'rad', 'rad/s', 'rad'), strict=True))
 LEAST = np.array([1e-3, 5e-3, 2e-3, 1e-2, 1e-3])   # floors of the floor, by state
 DRAWS = 200
+PLAY = 'joint_backlash.gap'
 
 
 @dataclass(frozen=True)
@@ -107,11 +109,11 @@ def free_runs(model: FlightModel, theta: dict[str, float], noise: Noise) -> Runs
 
 
 def _tilts(model, theta, starts, steps):
-    """Servos alone: angles and rates (S, K + 1, 4)."""
+    """Servos alone, and the rotors behind their play: angles and rates (S, K + 1, 4)."""
     s, p = model.signals, model.p
     per = round(p.grid / p.servo_step)
     count = (steps + 1) * per
-    tilt, rate, _, _ = s.joints(theta)
+    tilt, rate, _, _ = s.joints({**theta, PLAY: 0.0})
     edges = s.t[starts][:, None] + p.servo_step * np.arange(count + 1)
     index = np.clip(np.rint((edges[:, :-1] - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
     windows = Windows(tilt[starts], rate[starts], s.thrust(theta)[0][index].transpose(1, 0, 2),
@@ -120,7 +122,10 @@ def _tilts(model, theta, starts, steps):
     targets = s.tilt_targets(edges.ravel(), s.delays(theta)[0])
     targets = np.concatenate([targets, targets[-1:]]).reshape(*edges.shape, 4)[:, :-1]
     run = simulate(model.robot.joints, windows, targets.transpose(1, 0, 2)[None], [theta],
-                   {**model._own, 'modules': model.modules})[0].transpose(1, 0, 2)
+                   {**model._own, 'modules': model.modules})[0]             # (K + 1, S, 4)
+    if theta.get(PLAY, 0.0) > 0:
+        run = play(run, theta[PLAY] / 2, s.joints(theta)[0][starts])
+    run = run.transpose(1, 0, 2)
     return run, np.gradient(run, p.grid, axis=1)
 
 

@@ -82,9 +82,9 @@ def turned(quaternion, vector):
                      w * z2 + x * y2 - y * x2 + z * w2, w * w2 - x * x2 - y * y2 - z * z2], axis=1)
 
 
-def play(x, half):
-    """Output (N, n) of a play of +-``half`` behind each column."""
-    out, y = np.empty_like(x), x[0].copy()
+def play(x, half, first=None):
+    """Output (N, n) of a play of +-``half`` behind each column, ``first`` (n,) before it moves."""
+    out, y = np.empty_like(x), x[0] if first is None else first
     for k, row in enumerate(x):
         y = np.minimum(np.maximum(y, row - half), row + half)
         out[k] = y

@@ -1,0 +1,37 @@
+"""Free runs: the model alone, from measured states on."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.gap.noise import Noise
+from beetle_omni_ros.identify.gap.rollouts import free_runs, _tilts
+from flights import model, Motion, P
+
+GAP = 0.04
+STATES = {'position': 0, 'velocity': 1, 'orientation': 2, 'rate': 3, 'joint': 4}
+
+
+@pytest.fixture(scope='module')
+def made():
+    return model(Motion().flight())
+
+
+def test_rotors_follow_their_servos_through_the_play_between(made):
+    starts, steps = np.arange(0, 1200, 50), 100
+    tight, _ = _tilts(made, {}, starts, steps)
+    loose, rate = _tilts(made, {'joint_backlash.gap': GAP}, starts, steps)
+    seen = made.signals.joints({'joint_backlash.gap': GAP})[0]
+    np.testing.assert_allclose(loose[:, 0], seen[starts], atol=1e-3)
+    np.testing.assert_allclose(loose, seen[starts[:, None] + np.arange(steps + 1)], atol=4e-3)
+    assert np.abs(loose - tight).max() <= GAP / 2 + 1e-3
+    one_way = np.abs(np.sign(np.diff(tight, axis=1)).sum(axis=1)) == steps
+    turning = one_way & (np.abs(tight[:, -1] - tight[:, 0]) > GAP)  # so far, it touches a side
+    assert turning.sum() > 20
+    np.testing.assert_allclose(np.abs(loose - tight)[:, -1][turning], GAP / 2, atol=2e-3)
+
+
+def test_joints_with_play_are_foretold_as_well_as_without(made):
+    noise = Noise.white(P)
+    error = {gap: free_runs(made, {'joint_backlash.gap': gap}, noise).error[..., STATES['joint']]
+             for gap in (0.0, GAP)}
+    assert error[GAP].max() < error[0.0].max() + 2e-3
