@@ -6,12 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from beetle_omni_ros.identify.gap.bands import aside, disagreement
 from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
 from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
 from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.keys import SHAPES
-from beetle_omni_ros.identify.gap.trial import Found, TOO_SMALL, Trial
+from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, TOO_SMALL, Trial
 
 REFINED = 5             # candidates of each step that are fitted, not only estimated
 PROMISING = 0.25        # of the best linear gain
@@ -220,7 +221,9 @@ class Search:
             c = trial.candidate
             need = p.least_gain + p.parameter_price * (len(c.keys) - 1)
             trial.share = trial.gain / max(cost - floor, trial.gain, 1e-9)
-            if trial.gain < need:
+            if trial.refined and self._fought(trial, accepted):
+                trial.reason = FOUGHT
+            elif trial.gain < need:
                 trial.reason = 'explains too little'
             elif not trial.refined:
                 trial.reason = 'others explain more'
@@ -250,6 +253,17 @@ class Search:
         sure = trial.cross[0] >= 2 * trial.cross[1] or trial.positive >= 0.85
         return sure and trial.cross[0] >= 0.3 * trial.gain and trial.positive >= 0.55 \
             and trial.without_best >= max(0.05 * trial.cross[0], LEAST_ELSEWHERE)
+
+    def _fought(self, trial, accepted):
+        """Whether what shows in forces alone may be a controller's answers to gusts."""
+        c, point = trial.candidate, self._points[trial.candidate.label]
+        if not c.pushes(self.problem.keys):
+            return False
+        others = [name for name in self._involved(accepted) if name not in c.keys]
+        slopes = point.slopes[:, [point.index[name] for name in c.keys]]
+        apart, count = disagreement(self.problem, *aside(
+            self.problem, point, others, slopes, self._free(accepted)))
+        return apart > self.p.bands_free * count + self.p.bands_share * trial.gain
 
     def _at_bound(self, trial):
         keys = self.problem.keys

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
+from beetle_omni_ros.identify.gap.bands import disagreement
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel, THIN
 from beetle_omni_ros.identify.gap.series import matrices
@@ -107,10 +108,12 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
             both = [_whitened(problem, model, group, k, made)
                     for model, made in zip(problem.models, columns, strict=True)]
             x, smooth = (np.concatenate([pair[i] for pair in both]) for i in (0, 1))
-            held, scores, weights = _cross(x, fitted[rows], state.r[rows], problem.block[rows],
-                                           problem.blocks)
+            held, scores, weights, explained, r = _cross(
+                x, fitted[rows], state.r[rows], problem.block[rows], problem.blocks)
             name = CHANNELS[group][k]
             size[name] = float(np.sqrt(((smooth @ weights)**2).mean()))
+            if group == 'B' and _fought(problem, rows, explained, r, held.sum()):
+                continue
             gains[name] = float(held.sum())
             if held.sum() > 0:
                 total += held
@@ -121,6 +124,14 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
     frame = terms[0][0].partition(':')[0] if terms else 'body'
     return Remainder(float(total.sum()), float((total > 0).mean()), channels,
                      [(label.partition(': ')[2], g) for label, g in terms], frame, size)
+
+
+def _fought(problem, rows, explained, r, gain):
+    """Whether what was found in a channel of forces may be a controller's answers to gusts."""
+    x, rest = np.zeros((len(rows), 1)), np.zeros(len(rows))
+    x[rows, 0], rest[rows] = explained, r - explained
+    apart, count = disagreement(problem, x, rest)
+    return apart > problem.p.bands_free * count + problem.p.bands_share * max(gain, 0.0)
 
 
 def _whitened(problem, model, group, channel, columns):
@@ -143,7 +154,8 @@ def _cross(x, fitted, r, block, blocks):
     A ridge regression, judged on blocks left out.
 
     Returns:
-        gain of chi2 on each block, score of each feature, weights of the whole fit.
+        gain of chi2 on each block, score of each feature, weights of the whole fit; what these
+        explain of the whitened residual, and the residual without what is fitted already.
 
     """
     scale = np.sqrt((x**2).mean(axis=0)) + 1e-12
@@ -164,5 +176,6 @@ def _cross(x, fitted, r, block, blocks):
     scores = np.zeros(len(weight))
     scores[weight > 0.05] = all_g**2 / np.maximum(np.diag(all_h), 1e-9)
     weights = np.zeros(len(weight))
-    weights[weight > 0.05] = np.linalg.solve(all_h + ridge, all_g)
-    return held, scores, weights / scale
+    own = np.linalg.solve(all_h + ridge, all_g)
+    weights[weight > 0.05] = own
+    return held, scores, weights / scale, x @ own, r

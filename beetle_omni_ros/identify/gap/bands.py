@@ -1,0 +1,85 @@
+"""
+Whether slow and quick motion tell the same of an entry, or of what a controller answers to gusts.
+
+In closed loop a gust d and the motion go together: a controller with loop gain L leaves of it
+d / (1 + L), and answers with the rest. Where L is large, below about 1 Hz, the commands say -d
+and hardly anything moves: a fit takes that for an inertia twice as large, or a thrust half as
+strong. Above, nothing answers and nothing is seen. A number of the robot is the same at all
+frequencies. (Bias of closed-loop identification by frequency: Forssell and Ljung, Closed-loop
+identification revisited, Automatica 35, 1999.)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.identify.gap.fit import Problem, State
+from beetle_omni_ros.identify.gap.residual import THIN
+
+EDGES = (0.0, 0.3, 0.6, 1.2, 2.4, np.inf)   # [Hz] between the bands
+BODY = 6        # channels of the body's equations, the first ones
+
+
+def disagreement(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float, int]:
+    """
+    How differently the bands would have the numbers that were fitted to all of them.
+
+    Args:
+        problem: which channel and flight a sample belongs to.
+        x: (n, K) whitened slopes, without what other numbers could take over.
+        r: (n,) whitened residual of the fit, likewise.
+
+    Returns:
+        chi2 by which the bands, each with numbers of its own, would fit better; as many numbers
+        of noise alone, each of one.
+
+    """
+    gain, count = 0.0, 0
+    rows = [(problem.flight == f) & (problem.where == c)
+            for f in np.unique(problem.flight) for c in range(BODY)]
+    period = THIN * problem.p.grid * problem.p.body_every
+    spectra = [_spectrum(x[keep], r[keep], period) for keep in rows if keep.any()]
+    for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
+        score, information = np.zeros(x.shape[1]), np.zeros((x.shape[1],) * 2)
+        for frequency, slopes, rest in spectra:
+            band = (frequency >= low) & (frequency < high)
+            score += (slopes[band].conj().T @ rest[band]).real
+            information += (slopes[band].conj().T @ slopes[band]).real
+        own = np.linalg.pinv(information, rcond=1e-6, hermitian=True)
+        gain += float(score @ own @ score)
+        count += int(np.linalg.matrix_rank(information, hermitian=True))
+    return gain, max(count - x.shape[1], 1)
+
+
+def _spectrum(x, r, period):
+    """Frequencies [Hz], and spectra of the columns whose products add up to those in time."""
+    n = len(r)
+    frequency = np.fft.rfftfreq(n, period)
+    twice = np.where((frequency == 0) | (2 * np.arange(len(frequency)) == n), 1.0, 2.0)
+    weight = np.sqrt(twice / n)
+    return frequency, weight[:, None] * np.fft.rfft(x, axis=0), weight * np.fft.rfft(r)
+
+
+def aside(problem: Problem, state: State, names: list[str], columns: np.ndarray,
+          free: frozenset[str]) -> tuple[np.ndarray, np.ndarray]:
+    """
+    ``columns`` (n, K) and the residual (n,) of a fit, less what the named keys could take over.
+
+    Args:
+        problem: beliefs.
+        state: the fit, with slopes.
+        names: of the keys.
+        columns: whitened.
+        free: keys of which nothing is believed.
+
+    """
+    s = state.slopes[:, [state.index[name] for name in names]]
+    beliefs = [0.0 if name in free or name not in problem.beliefs
+               else problem.beliefs[name].slope(state.theta.get(name, 0.0))**2 for name in names]
+    h = s.T @ s + np.diag(beliefs)
+    scale = 1 / np.sqrt(np.maximum(np.diag(h), 1e-12))
+    inner = h * scale[:, None] * scale + 1e-9 * np.eye(len(names))
+    projected = np.linalg.solve(inner, scale[:, None] * (s.T @ np.column_stack(
+        [columns, state.r])))
+    left = np.column_stack([columns, state.r]) - s @ (scale[:, None] * projected)
+    return left[:, :-1], left[:, -1]
