@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from beetle_omni_ros.identify.gap.bands import aside, BODY, disagreement
+from beetle_omni_ros.identify.gap.bands import aside, disagreement
 from beetle_omni_ros.identify.gap.noise import _autoregression
 from beetle_omni_ros.identify.gap.residual import THIN
 
+BODY, OTHERS = 6, 10        # channels of the body's equations come first
 PERIOD = THIN * P.grid * P.body_every
 LENGTH = 900
-CHANNELS = BODY + 2         # two that are not the body's
+CHANNELS = BODY + OTHERS
 
 
 def problem(flights=2):

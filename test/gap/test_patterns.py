@@ -103,7 +103,7 @@ def test_what_is_too_small_to_matter_is_no_unknown(reason, verdict):
     key = 'joint_command_latency.delay'
     other = Trial(Candidate('joint_command_latency', (key,), label='latency'), 90.0,
                   {key: 8e-4}, True, reason=reason)
-    assert decided([wind()], left=120.0, trials=[other]).verdict == verdict
+    assert decided([wind()], left=P.least_left + 30.0, trials=[other]).verdict == verdict
 
 
 SURE = Pattern('the place', 90.0, 15.0, 1.0, (0.2, 0.0))

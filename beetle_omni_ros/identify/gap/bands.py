@@ -11,21 +11,55 @@ identification revisited, Automatica 35, 1999.)
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from beetle_omni_ros.identify.gap.fit import Problem, State
-from beetle_omni_ros.identify.gap.residual import THIN
+from beetle_omni_ros.identify.gap.residual import CHANNELS, THIN
 
 EDGES = (0.0, 0.3, 0.6, 1.2, 2.4, np.inf)   # [Hz] between the bands
-BODY = 6        # channels of the body's equations, the first ones
+
+
+def by_band(problem: Problem, x: np.ndarray, r: np.ndarray,
+            groups: str = 'B') -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """
+    Scores (K,) and information (K, K) of each band of each group of channels.
+
+    Their sums are ``x.T @ r`` and ``x.T @ x`` of these channels.
+
+    Args:
+        problem: which channel and flight a sample belongs to.
+        x: (n, K) whitened slopes.
+        r: (n,) whitened residual.
+        groups: of channels.
+
+    """
+    p, first = problem.p, 0
+    periods = {'B': THIN * p.grid * p.body_every, 'A': p.grid * p.world_every,
+               'W': p.grid * p.rate_every, 'J': p.grid * p.joint_every}
+    for group, channels in CHANNELS.items():
+        rows = [(problem.flight == f) & (problem.where == first + c)
+                for f in np.unique(problem.flight) for c in range(len(channels))]
+        first += len(channels)
+        if group not in groups:
+            continue
+        spectra = [_spectrum(x[keep], r[keep], periods[group]) for keep in rows if keep.any()]
+        for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
+            score, information = np.zeros(x.shape[1]), np.zeros((x.shape[1],) * 2)
+            for frequency, slopes, rest in spectra:
+                band = (frequency >= low) & (frequency < high)
+                score += (slopes[band].conj().T @ rest[band]).real
+                information += (slopes[band].conj().T @ slopes[band]).real
+            yield score, information
 
 
 def disagreement(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float, int]:
     """
-    How differently the bands would have the numbers that were fitted to all of them.
+    How differently the body's bands would have the numbers that were fitted to all of them.
 
     Args:
-        problem: which channel and flight a sample belongs to.
+        problem: as of :func:`by_band`.
         x: (n, K) whitened slopes, without what other numbers could take over.
         r: (n,) whitened residual of the fit, likewise.
 
@@ -35,16 +69,7 @@ def disagreement(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float,
 
     """
     gain, count = 0.0, 0
-    rows = [(problem.flight == f) & (problem.where == c)
-            for f in np.unique(problem.flight) for c in range(BODY)]
-    period = THIN * problem.p.grid * problem.p.body_every
-    spectra = [_spectrum(x[keep], r[keep], period) for keep in rows if keep.any()]
-    for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
-        score, information = np.zeros(x.shape[1]), np.zeros((x.shape[1],) * 2)
-        for frequency, slopes, rest in spectra:
-            band = (frequency >= low) & (frequency < high)
-            score += (slopes[band].conj().T @ rest[band]).real
-            information += (slopes[band].conj().T @ slopes[band]).real
+    for score, information in by_band(problem, x, r):
         own = np.linalg.pinv(information, rcond=1e-6, hermitian=True)
         gain += float(score @ own @ score)
         count += int(np.linalg.matrix_rank(information, hermitian=True))

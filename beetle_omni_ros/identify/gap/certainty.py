@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
+from beetle_omni_ros.identify.gap.bands import by_band
 from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import THIN
@@ -15,6 +16,8 @@ from beetle_omni_ros.robot.effects import CATALOGUE
 
 MODEL_ERROR = 0.005     # of a value: no form is exact
 BUS_DELAY = 0.002       # [s] that commands may differ by, when asking what could be seen
+DISAGREE = 1.5          # times what noise alone makes of it: then a scatter between bands counts
+LEAST_BANDS = 4         # that a number comes from, at least; a scatter of fewer says too little
 LEAST_SCALE = 0.3       # of the variance, where a floor made the data look noisier than they are
 
 
@@ -23,8 +26,10 @@ def deviations(problem: Problem, state: State, names: list[str],
     """
     Half widths of 95 % intervals.
 
-    The larger of two: noise and beliefs through the curvature of the objective, and the
-    scatter between blocks of the flights, which needs no noise model.
+    The largest of three: noise and beliefs through the curvature of the objective, the scatter
+    between blocks of the flights, and that between slow and quick motion, neither of which needs
+    a noise model. The last one sees what is the same in all flights: answers to gusts, and a
+    form that is not quite that of the robot.
     """
     columns = [state.index[name] for name in names]
     s = state.slopes[:, columns]
@@ -40,16 +45,26 @@ def deviations(problem: Problem, state: State, names: list[str],
     widths = {}
     blocks = [problem.block == b for b in range(problem.blocks)]
     scores = np.array([s[rows].T @ state.r[rows] for rows in blocks])
+    slow_to_quick = list(by_band(problem, s, state.r, 'BAWJ'))
     for k, name in enumerate(names):
         level = max(LEAST_SCALE, float((s[:, k]**2 * state.r**2).sum() / max(weights[k], 1e-12)))
         a = inverse[k]
         curvature = level * float(a @ data @ a) + float((a * a * belief).sum())
-        scatter = float(((scores @ a)**2).sum()) * len(blocks) / max(len(blocks) - 1, 1) \
-            if len(blocks) > 1 else 0.0
-        factor = student.ppf(0.975, max(len(blocks) - 1, 1)) if scatter > curvature else 1.96
-        x = state.theta.get(name, 0.0)
-        widths[name] = factor * np.sqrt(max(curvature, scatter)) + MODEL_ERROR * abs(x)
+        half = max(1.96 * np.sqrt(curvature), _scattered(scores @ a, len(blocks)))
+        shares = np.array([score @ a for score, _ in slow_to_quick])
+        expected = level * np.array([a @ information @ a for _, information in slow_to_quick])
+        if (shares**2).sum() > DISAGREE * expected.sum():
+            half = max(half, _scattered(shares, max(
+                LEAST_BANDS, expected.sum()**2 / max((expected**2).sum(), 1e-30))))
+        widths[name] = half + MODEL_ERROR * abs(state.theta.get(name, 0.0))
     return widths
+
+
+def _scattered(shares, count):
+    """Half width of a 95 % interval of a number that so many parts of the data make up."""
+    if count < 2:
+        return 0.0
+    return student.ppf(0.975, count - 1) * np.sqrt((shares**2).sum() * count / (count - 1))
 
 
 def liveliness(problem: Problem) -> float:

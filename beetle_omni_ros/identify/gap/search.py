@@ -252,7 +252,8 @@ class Search:
         """Whether blocks that were left out agree."""
         sure = trial.cross[0] >= 2 * trial.cross[1] or trial.positive >= 0.85
         return sure and trial.cross[0] >= 0.3 * trial.gain and trial.positive >= 0.55 \
-            and trial.without_best >= max(0.05 * trial.cross[0], LEAST_ELSEWHERE)
+            and trial.without_best >= max(0.05 * min(trial.cross[0], trial.gain),
+                                          LEAST_ELSEWHERE)
 
     def _fought(self, trial, accepted):
         """Whether what shows in forces alone may be a controller's answers to gusts."""

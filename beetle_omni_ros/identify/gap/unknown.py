@@ -48,7 +48,11 @@ class Remainder:
 
 
 def features(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarray]:
-    """Generic regressors (N,) on the common grid, by 'frame: name'."""
+    """
+    Generic regressors (N,) on the common grid, by 'frame: name'.
+
+    Rates of turn are none of them: where gusts are fought, they go with the gusts.
+    """
     x = model.inputs(theta)
     rotation, made = matrices(x['quaternion']), {}
     body = np.einsum('nji,nj->ni', rotation, x['velocity'])
@@ -57,7 +61,6 @@ def features(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarra
     for k in range(3):
         made[f'body: v_{axes[k]}'] = body[:, k]
         made[f'body: |v| v_{axes[k]}'] = np.linalg.norm(body, axis=1) * body[:, k]
-        made[f'body: w_{axes[k]}'] = x['rate'][:, k]
         for j in range(3):
             part = rotation[:, j, k]
             made[f'world: R_{axes[j]}{axes[k]}'] = part
