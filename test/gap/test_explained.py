@@ -105,6 +105,7 @@ def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch
         trial.cross, trial.positive, trial.without_best = (gain, gain / 10), 1.0, 0.9 * gain
 
     monkeypatch.setattr(Search, '_cross_validate', agreed)
+    monkeypatch.setattr(Search, '_fought', lambda self, trial, accepted: False)
     search = Search.__new__(Search)
     search.p, search.problem = P, type('Problem', (), {'keys': KEYS})()
     assert (search._judge([trial], 1000.0 + left, 1000.0, []) is trial) == named
