@@ -1,11 +1,11 @@
 """Free runs: the model alone, from measured states on."""
 
+from flights import model, Motion, P
 import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.noise import Noise
-from beetle_omni_ros.identify.gap.rollouts import free_runs, _tilts
-from flights import model, Motion, P
+from beetle_omni_ros.identify.gap.rollouts import _tilts, free_runs
 
 GAP = 0.04
 STATES = {'position': 0, 'velocity': 1, 'orientation': 2, 'rate': 3, 'joint': 4}

@@ -4,9 +4,9 @@ Whether slow and quick motion tell the same of an entry, or of what a controller
 In closed loop a gust d and the motion go together: a controller with loop gain L leaves of it
 d / (1 + L), and answers with the rest. Where L is large, below about 1 Hz, the commands say -d
 and hardly anything moves: a fit takes that for an inertia twice as large, or a thrust half as
-strong. Above, nothing answers and nothing is seen. A number of the robot is the same at all
-frequencies. (Bias of closed-loop identification by frequency: Forssell and Ljung, Closed-loop
-identification revisited, Automatica 35, 1999.)
+strong. Above, nothing answers, and what moves goes with the gust. A number of the robot is the
+same at all frequencies. (Bias of closed-loop identification by frequency: Forssell and Ljung,
+Closed-loop identification revisited, Automatica 35, 1999.)
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import CHANNELS, THIN
 
 EDGES = (0.0, 0.3, 0.6, 1.2, 2.4, np.inf)   # [Hz] between the bands
+SLOW = 1.2              # [Hz] below which controllers answer gusts
 
 
 def by_band(problem: Problem, x: np.ndarray, r: np.ndarray,
@@ -54,26 +55,28 @@ def by_band(problem: Problem, x: np.ndarray, r: np.ndarray,
             yield score, information
 
 
-def disagreement(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float, int]:
+def apart(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float, float]:
     """
-    How differently the body's bands would have the numbers that were fitted to all of them.
+    What numbers of the body's equations explain that hold in all motion, or in a part of it.
 
     Args:
         problem: as of :func:`by_band`.
         x: (n, K) whitened slopes, without what other numbers could take over.
-        r: (n,) whitened residual of the fit, likewise.
+        r: (n,) whitened residual without the numbers, likewise.
 
     Returns:
-        chi2 by which the bands, each with numbers of its own, would fit better; as many numbers
-        of noise alone, each of one.
+        chi2 gained by one set of numbers for all bands; by one for the bands below SLOW and none
+        above, or the other way round, whichever is more.
 
     """
-    gain, count = 0.0, 0
-    for score, information in by_band(problem, x, r):
-        own = np.linalg.pinv(information, rcond=1e-6, hermitian=True)
-        gain += float(score @ own @ score)
-        count += int(np.linalg.matrix_rank(information, hermitian=True))
-    return gain, max(count - x.shape[1], 1)
+    parts, edge = list(by_band(problem, x, r)), EDGES.index(SLOW)
+    everywhere, slow, quick = (_gain(*(sum(part[k] for part in some) for k in (0, 1)))
+                               for some in (parts, parts[:edge], parts[edge:]))
+    return everywhere, max(slow, quick)
+
+
+def _gain(score, information):
+    return float(score @ np.linalg.pinv(information, rcond=1e-8, hermitian=True) @ score)
 
 
 def _spectrum(x, r, period):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.bands import aside, disagreement
+from beetle_omni_ros.identify.gap.bands import apart, aside
 from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
 from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
@@ -261,10 +261,11 @@ class Search:
         if not c.pushes(self.problem.keys):
             return False
         others = [name for name in self._involved(accepted) if name not in c.keys]
-        slopes = point.slopes[:, [point.index[name] for name in c.keys]]
-        apart, count = disagreement(self.problem, *aside(
-            self.problem, point, others, slopes, self._free(accepted)))
-        return apart > self.p.bands_free * count + self.p.bands_share * trial.gain
+        slopes, r = aside(self.problem, point, others, point.slopes[
+            :, [point.index[name] for name in c.keys]], self._free(accepted))
+        everywhere, part = apart(self.problem, slopes, r - slopes @ [
+            trial.theta.get(name, 0.0) for name in c.keys])
+        return part > self.p.part_share * everywhere + self.p.part_free * len(c.keys)
 
     def _at_bound(self, trial):
         keys = self.problem.keys

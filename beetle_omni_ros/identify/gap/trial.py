@@ -8,7 +8,7 @@ from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import State
 
 TOO_SMALL = 'too small to matter'
-FOUGHT = 'slow and quick motion disagree, as where gusts are fought'
+FOUGHT = 'in slow or in quick motion alone, as gusts and answers to them'
 
 
 @dataclass

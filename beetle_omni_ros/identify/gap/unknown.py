@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from beetle_omni_ros.identify.gap.bands import disagreement
+from beetle_omni_ros.identify.gap.bands import apart
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel, THIN
 from beetle_omni_ros.identify.gap.series import matrices
@@ -115,7 +115,7 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
                 x, fitted[rows], state.r[rows], problem.block[rows], problem.blocks)
             name = CHANNELS[group][k]
             size[name] = float(np.sqrt(((smooth @ weights)**2).mean()))
-            if group == 'B' and _fought(problem, rows, explained, r, held.sum()):
+            if group == 'B' and _fought(problem, rows, explained, r):
                 continue
             gains[name] = float(held.sum())
             if held.sum() > 0:
@@ -129,12 +129,12 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
                      [(label.partition(': ')[2], g) for label, g in terms], frame, size)
 
 
-def _fought(problem, rows, explained, r, gain):
+def _fought(problem, rows, explained, r):
     """Whether what was found in a channel of forces may be a controller's answers to gusts."""
-    x, rest = np.zeros((len(rows), 1)), np.zeros(len(rows))
-    x[rows, 0], rest[rows] = explained, r - explained
-    apart, count = disagreement(problem, x, rest)
-    return apart > problem.p.bands_free * count + problem.p.bands_share * max(gain, 0.0)
+    x, all_r = np.zeros((len(rows), 1)), np.zeros(len(rows))
+    x[rows, 0], all_r[rows] = explained, r
+    everywhere, part = apart(problem, x, all_r)
+    return part > problem.p.part_share * everywhere + problem.p.part_free
 
 
 def _whitened(problem, model, group, channel, columns):
