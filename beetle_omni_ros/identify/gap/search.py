@@ -12,7 +12,7 @@ from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
 from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.keys import SHAPES
-from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, TOO_SMALL, Trial
+from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, NOT_HELD, TOO_SMALL, Trial
 
 REFINED = 5             # candidates of each step that are fitted, not only estimated
 PROMISING = 0.25        # of the best linear gain
@@ -62,6 +62,8 @@ class Search:
             trials = self._step(state, cost, [t.candidate for t in found.accepted])
             for trial in trials:
                 found.trials[trial.candidate.label] = trial
+            if not found.accepted:
+                alone = trials
             best = self._judge(trials, cost, floor, [t.candidate for t in found.accepted])
             if best is None or len(found.accepted) >= self.p.most_effects:
                 break
@@ -70,6 +72,7 @@ class Search:
                 # One explanation of a flight that cannot decide is enough.
                 self.candidates = [c for c in self.candidates if not c.pushes(problem.keys)]
             state, cost = self._settle(best.theta, [t.candidate for t in found.accepted])
+        state, cost = self._merge(found, alone, state, cost)
         state, cost = self._prune(found, state, cost)
         found.theta, found.state = dict(state.theta), state
         base_state, before = self._refit(State(found.base, problem.residual(found.base),
@@ -239,7 +242,7 @@ class Search:
                 self._cross_validate(trial, accepted)
                 sure = trial.cross[0] > 3 * trial.cross[1] and trial.positive >= 0.7
                 if not self._holds(trial):
-                    trial.reason = 'does not hold on data left out'
+                    trial.reason = NOT_HELD
                 elif trial.share < p.least_share and not (
                         sure and trial.share > p.weak_share and trial.gain > p.weak_gain * need):
                     trial.reason = 'explains too small a part of what is left'
@@ -304,6 +307,37 @@ class Search:
         trial.cross = float(held.sum()), error
         trial.positive = float((held > 0).mean())
         trial.without_best = float(held.sum() - held.max()) if len(held) > 1 else 0.0
+
+    def _merge(self, found, alone, state, cost):
+        """
+        Put one entry in the place of several that explain no more than it.
+
+        A late MoCap is an IMU that is early, with commands and encoders that are early as well:
+        by a hair the IMU may explain more at first, and the others follow.
+        """
+        if len(found.accepted) < 2:
+            return state, cost
+        for trial in alone[:REFINED]:
+            c = trial.candidate
+            if c.label == found.accepted[0].candidate.label or not trial.refined \
+                    or self._at_bound(trial):
+                continue
+            theta = {**found.base, **trial.theta}
+            start = State(theta, self.problem.residual(theta), state.slopes, state.names)
+            now, reached = self._refit(start, [c], MOST_ITERATIONS)
+            merged = Trial(c, trial.gain, dict(now.theta), True, share=trial.share)
+            if reached > cost + self.p.least_gain \
+                    or not c.large_enough(self.problem.keys, now.theta):
+                continue
+            self._points = {c.label: now}
+            self._cross_validate(merged, [])
+            if self._holds(merged):
+                for dropped in found.accepted:
+                    dropped.reason = f'{c.label} alone explains as much'
+                found.accepted[:] = [merged]
+                found.trials[c.label] = merged
+                return self._settle(now.theta, [c])
+        return state, cost
 
     def _prune(self, found, state, cost):
         """Drop what later steps, or the noise learnt after the last one, made superfluous."""

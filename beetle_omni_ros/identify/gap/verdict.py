@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.trial import FOUGHT, TOO_SMALL
+from beetle_omni_ros.identify.gap.trial import FOUGHT, NOT_HELD, TOO_SMALL
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 if TYPE_CHECKING:
@@ -27,9 +27,10 @@ def decide(a: Analysis, p: GapParameters) -> None:
     before, after, floor = found.cost
     # Everything at once also fits some noise: a chi2 of one for each number without a belief.
     floor += sum(name not in a.problem.beliefs for name in found.state.names)
-    # A latency of a millisecond is no unknown, however clearly it shows; nor is a gust.
-    small = max((t.gain for t in found.trials.values() if t.reason in (TOO_SMALL, FOUGHT)),
-                default=0.0)
+    # A latency of a millisecond is no unknown, however clearly it shows; nor is a gust, which
+    # differs from flight to flight, or the answers to it.
+    small = max((t.gain for t in found.trials.values()
+                 if t.reason in (TOO_SMALL, NOT_HELD, FOUGHT)), default=0.0)
     left = max(after - floor - small, 0.0)
     explained = (before - after) / max(before - after + left, 1e-9)
     out_of_sight = hidden(a, p)
