@@ -21,7 +21,7 @@ CONTROLLERS = ('rl', 'rl_memory', 'nmpc', 'nmpc_published')
 TASKS = ('random100', 'waypoints', 'lemniscate', 'force', 'torque', 'payload', 'hover')
 CONDITIONS = ('nominal', 'published')
 SEEDS = (0, 1)  # unless others are asked for; a long task is flown with the first alone
-LONG = 300.0  # [s]
+LONG = 50.0  # [s]
 
 # Core seconds for a simulated second, measured on one x86 core. They decide the order of the
 # flights and the remaining time shown, no result.
@@ -79,7 +79,7 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
         controllers: names.
         tasks: names, or paths of pose files.
         conditions: 'nominal', 'published'.
-        seeds: numbers from 0; None takes 0 and 1, and 0 alone for tasks of more than 300 s.
+        seeds: numbers from 0; None takes 0 and 1, and 0 alone for tasks of more than 50 s.
         policy: file in place of the shipped policy of 'rl'.
 
     Raises:
