@@ -15,6 +15,7 @@ from beetle_omni_ros.robot.resources import PACKAGE, share_path
 
 ROOMS = ('control', 'estimation', 'evaluation', 'robot', 'runs', 'safety', 'sim')
 LIBRARIES = ('casadi', 'filterpy', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
+NOT_FLOWN = ('gap.yaml', 'train.yaml')  # parameters that no flight reads
 LENGTH = 16  # hexadecimal digits kept
 
 
@@ -24,7 +25,8 @@ def code_fingerprint() -> str:
     package = Path(__file__).resolve().parents[1]
     files = [path for room in ROOMS for path in (package / room).rglob('*.*')
              if path.suffix in ('.py', '.c', '.h')]
-    files += [package / 'comparison' / 'flight.py', *share_path('params').glob('*.yaml')]
+    files += [package / 'comparison' / 'flight.py']
+    files += [path for path in share_path('params').glob('*.yaml') if path.name not in NOT_FLOWN]
     digest = hashlib.sha256()
     for path in sorted(files, key=lambda path: (path.parent.name, path.name)):
         digest.update(f'{path.parent.name}/{path.name}'.encode())

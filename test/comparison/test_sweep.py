@@ -3,6 +3,8 @@
 import importlib.util
 import io
 import json
+from pathlib import Path
+import shutil
 
 import pytest
 from rich.console import Console
@@ -11,6 +13,7 @@ from beetle_omni_ros.comparison import command, fingerprint, sweep
 from beetle_omni_ros.comparison import flight as flight_module
 from beetle_omni_ros.comparison.plan import CONDITIONS, CONTROLLERS, Flight, plan, TASKS
 from beetle_omni_ros.comparison.store import Store
+from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.tasks import make_task
 
@@ -148,6 +151,16 @@ def test_another_policy_file_is_another_flight(tmp_path):
     assert keys[0] != keys[1]
     (tmp_path / 'two.onnx').write_text('one')
     assert fingerprint.flight_key(flights[1]) == keys[0]
+
+
+@pytest.mark.parametrize('name, flies', [('rl.yaml', True), ('gap.yaml', False)])
+def test_parameters_that_no_flight_reads_do_not_fly_anything_again(tmp_path, monkeypatch, name,
+                                                                   flies):
+    copy = Path(shutil.copytree(share_path('params'), tmp_path / 'params'))
+    monkeypatch.setattr(fingerprint, 'share_path', lambda _: copy)
+    before = fingerprint.code_fingerprint.__wrapped__()
+    (copy / name).write_text((copy / name).read_text() + '\n')
+    assert (fingerprint.code_fingerprint.__wrapped__() != before) == flies
 
 
 def test_a_cut_off_file_is_flown_again(poses, tmp_path):
