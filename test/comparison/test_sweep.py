@@ -52,9 +52,10 @@ def test_a_plan_holds_every_combination_once_and_begins_with_the_longest():
 
 def test_only_short_tasks_are_flown_with_several_seeds_unless_asked():
     flights = plan(['nmpc'], conditions=['nominal'])
-    assert {flight.seed for flight in flights if flight.task == 'random100'} == {0}
-    assert all({flight.seed for flight in flights if flight.task == task} == {0, 1}
-               for task in TASKS if task != 'random100')
+    seeds = {task: {flight.seed for flight in flights if flight.task == task} for task in TASKS}
+    assert all(seeds[task] == ({0} if make_task(task).duration > 50 else {0, 1})
+               for task in TASKS)
+    assert seeds['random100'] == {0} and seeds['force'] == {0, 1}
 
 
 @pytest.mark.parametrize(('changes', 'named'), [
