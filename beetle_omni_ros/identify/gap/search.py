@@ -191,7 +191,7 @@ class Search:
             trials[k] = Trial(c, cost - reached, dict(new.theta), True)
             points[c.label] = new
         trials.sort(key=lambda t: -t.gain)
-        self._points = points
+        self._points, self._without = points, state
         return trials
 
     def _elsewhere(self, state, cost, c, names, free):
@@ -286,9 +286,9 @@ class Search:
         free = self._free(accepted)
         with_it = list(dict.fromkeys([*self._involved(accepted), *c.keys]))
         without = [name for name in with_it if name not in c.keys or name in problem.beliefs]
-        zero = dict.fromkeys(c.keys, 0.0)
-        other = State({**point.theta, **zero}, problem.residual({**point.theta, **zero}),
-                      point.slopes, point.names)
+        # Not the point with its keys at zero: far from its own fit a straight line promises more
+        # than it holds, where slopes are those of noise.
+        other = self._without
         held = np.zeros(problem.blocks)
         for names, at, loose, sign in ((with_it, point, free | set(c.keys), -1.0),
                                        (without, other, free, 1.0)):
@@ -317,6 +317,8 @@ class Search:
         """
         if len(found.accepted) < 2:
             return state, cost
+        base, _ = self._refit(State(found.base, self.problem.residual(found.base), state.slopes,
+                                    state.names), [])
         for trial in alone[:REFINED]:
             c = trial.candidate
             if c.label == found.accepted[0].candidate.label or not trial.refined \
@@ -329,7 +331,7 @@ class Search:
             if reached > cost + self.p.least_gain \
                     or not c.large_enough(self.problem.keys, now.theta):
                 continue
-            self._points = {c.label: now}
+            self._points, self._without = {c.label: now}, base
             self._cross_validate(merged, [])
             if self._holds(merged):
                 for dropped in found.accepted:
