@@ -112,24 +112,10 @@ def _resting(duration, numbers):
 
 
 def _told(robot_file, case):
-    """The robot file of a case: without what the flights are to show, where it would tell that."""
-    left_out = []
+    text = Path(robot_file).read_text()
     if case.damage == 'broken_robot':
-        left_out.append('mass')
-    if any(name == 'module_reaction' for name, *_ in case.effects):
-        left_out.append('multibody')
-    return without(Path(robot_file).read_text(), left_out)
-
-
-def without(text: str, keys: list[str]) -> str:
-    """A YAML file's text without some of its top-level entries."""
-    kept, skipping = [], False
-    for line in text.splitlines():
-        if line[:1].strip() and not line.startswith('#'):
-            skipping = line.partition(':')[0] in keys
-        if not skipping:
-            kept.append(line)
-    return '\n'.join(kept) + '\n'
+        return '\n'.join(line for line in text.splitlines() if not line.startswith('mass:')) + '\n'
+    return text
 
 
 def _write(path, content):

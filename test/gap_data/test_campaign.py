@@ -10,11 +10,10 @@ import sys
 from gap_data.campaign import make_report, run_campaign
 from gap_data.cases import Case, DAMAGED, KINDS, load_settings, make_cases
 from gap_data.effects import CATALOGUE, OUTSIDE
-from gap_data.make import make_case, ROBOT_FILE, without
+from gap_data.make import make_case
 from gap_data.page import html, markdown
 from gap_data.workflow import run_workflow, Workflow
 import pytest
-import yaml
 
 SETTINGS = load_settings()
 META = {'set': 'test', 'seed': 0, 'cases': 2, 'command_age': 0.01, 'command': 'none'}
@@ -143,20 +142,6 @@ def test_damaged_cases_are_made(tmp_path, damage):
     made = make_case(case, tmp_path / 'flights', tmp_path / 'sealed')
     assert (made / 'fit_1').is_dir()
     assert ('\nmass:' in (made / 'robot.yaml').read_text()) == (damage != 'broken_robot')
-
-
-@pytest.mark.parametrize('keys', [[], ['mass'], ['multibody'], ['mass', 'effects']])
-def test_a_told_robot_lacks_nothing_but_what_is_left_out(keys):
-    text = ROBOT_FILE.read_text()
-    whole, told = yaml.safe_load(text), yaml.safe_load(without(text, keys))
-    assert told == {key: value for key, value in whole.items() if key not in keys}
-
-
-def test_where_modules_are_the_effect_nobody_is_told_of_them(tmp_path):
-    case = Case('singles', 'clean', 5, effects=(('module_reaction', 1.0, 'plain'),),
-                multibody=True, duration=2.0, fit=1)
-    made = make_case(case, tmp_path / 'flights', tmp_path / 'sealed')
-    assert 'multibody' not in yaml.safe_load((made / 'robot.yaml').read_text())
 
 
 def test_a_baseline_finds_a_large_effect(tmp_path):
