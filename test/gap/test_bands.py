@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfilt
 
-from beetle_omni_ros.identify.gap.bands import apart, aside, by_band
+from beetle_omni_ros.identify.gap.bands import apart, aside, by_band, in_part_alone
 from beetle_omni_ros.identify.gap.noise import _autoregression
 from beetle_omni_ros.identify.gap.residual import THIN
 
@@ -93,9 +93,8 @@ def test_answers_to_gusts_are_told_from_an_inertia(gusts, wanted, true, passes):
         taps, sigma = _autoregression([rest], P.body_order)
         x[rows, 0] = lfilter(taps, 1, acceleration) / sigma
         r[rows] = lfilter(taps, 1, rest - true * acceleration) / sigma
-    everywhere, part = apart(p, x, r)
-    assert everywhere > P.least_gain
-    assert (part < P.part_share * everywhere + P.part_free) == passes
+    assert apart(p, x, r)[0] > P.least_gain
+    assert in_part_alone(p, x, r) != passes
 
 
 def test_what_others_could_take_over_is_no_evidence():
@@ -108,3 +107,13 @@ def test_what_others_could_take_over_is_no_evidence():
     np.testing.assert_allclose(slopes.T @ known, 0, atol=1e-3)
     np.testing.assert_allclose(rest @ known, 0, atol=1e-3)
     np.testing.assert_allclose(rest, slopes[:, 0], atol=1e-6)
+
+
+def test_a_gain_of_beliefs_is_not_held_against_the_noise_of_bands():
+    p = problem()
+    x = noise(len(p.where), 1)[:, None]
+    slowly = lfilter([0.05], [1, -0.95], x[:, 0])
+    r = 0.4 * slowly + noise(len(p.where), 2)
+    part = apart(p, x, r)[1]
+    assert in_part_alone(p, x, r)
+    assert not in_part_alone(p, x, r, gain=part)

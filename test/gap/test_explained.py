@@ -1,7 +1,5 @@
 """How much an effect explains is not counted against tolerances that no robot has."""
 
-from types import SimpleNamespace
-
 from flights import KEYS, P
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.keys import Belief, tolerances
 from beetle_omni_ros.identify.gap.search import BEYOND, Search
-from beetle_omni_ros.identify.gap.trial import Found, Trial
+from beetle_omni_ros.identify.gap.trial import Trial
 
 LAG, OTHER = 'rotor_lag.time_constant', 'inertia.inertia[0]'
 
@@ -111,29 +109,3 @@ def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch
     search = Search.__new__(Search)
     search.p, search.problem = P, type('Problem', (), {'keys': KEYS})()
     assert (search._judge([trial], 1000.0 + left, 1000.0, []) is trial) == named
-
-
-@pytest.mark.parametrize('alone, holds, merged', [
-    (1010.0, True, True), (1000.0 + P.least_gain + 1, True, False), (1010.0, False, False)])
-def test_one_entry_takes_the_place_of_several_that_explain_no_more(monkeypatch, alone, holds,
-                                                                  merged):
-    def tried(name, gain):
-        key = f'{name}.delay'
-        return Trial(Candidate(name, (key,), label=name), gain, {key: 0.01}, refined=True)
-
-    late, early, others = (tried(name, gain) for name, gain in (
-        ('mocap_time_offset', 280.0), ('imu_filter_lag', 290.0), ('joint_feedback_delay', 90.0)))
-    point = State({'mocap_time_offset.delay': 0.01}, np.zeros(1), np.zeros((1, 0)), [])
-    monkeypatch.setattr(Search, '_refit', lambda *_: (point, alone))
-    monkeypatch.setattr(Search, '_cross_validate', lambda *_: None)
-    monkeypatch.setattr(Search, '_holds', staticmethod(lambda trial: holds))
-    monkeypatch.setattr(Search, '_settle', lambda self, theta, accepted: (point, alone))
-    search = Search.__new__(Search)
-    search.p = P
-    search.problem = SimpleNamespace(keys=KEYS, residual=lambda theta: np.zeros(1))
-    found = Found(accepted=[early, others])
-    _, cost = search._merge(found, [early, late], point, 1000.0)
-    names = [trial.candidate.name for trial in found.accepted]
-    assert names == (['mocap_time_offset'] if merged else ['imu_filter_lag',
-                                                           'joint_feedback_delay'])
-    assert cost == (alone if merged else 1000.0)

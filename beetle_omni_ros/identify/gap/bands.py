@@ -75,6 +75,22 @@ def apart(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float, float]
     return everywhere, max(slow, quick)
 
 
+def in_part_alone(problem: Problem, x: np.ndarray, r: np.ndarray, gain: float = 0.0) -> bool:
+    """
+    Whether numbers explain far more in a part of the motion than in all.
+
+    Args:
+        problem: as of :func:`by_band`.
+        x: as of :func:`apart`.
+        r: likewise.
+        gain: of the objective in all, where beliefs are part of it: what tolerances beyond all
+            belief could take over, a mass by thrust, shows in no band and is none the less there.
+
+    """
+    everywhere, part = apart(problem, x, r)
+    return part > problem.p.part_share * max(everywhere, gain) + problem.p.part_free * x.shape[1]
+
+
 def _gain(score, information):
     return float(score @ np.linalg.pinv(information, rcond=1e-8, hermitian=True) @ score)
 

@@ -234,7 +234,7 @@ class Problem:
             step, _, _ = self.linear_step(now, names, free)
             better = False
             for halving in range(HALVINGS):
-                trial = self._moved(now.theta, names, 0.5**halving * step)
+                trial = self.moved(now.theta, names, 0.5**halving * step)
                 r = self.residual(trial)
                 new = float(r @ r) + self.prior(trial, free)
                 if new < cost - 1e-9:
@@ -254,7 +254,9 @@ class Problem:
                 break
         return now, cost
 
-    def _moved(self, theta, names, step):
+    def moved(self, theta: dict[str, float], names: list[str],
+              step: np.ndarray) -> dict[str, float]:
+        """``theta`` with the named keys changed by ``step`` (K,), within what is physical."""
         moved = dict(theta)
         for name, change in zip(names, step, strict=True):
             key = self.keys[name]

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.bands import apart, aside
 from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
 from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
+from beetle_omni_ros.identify.gap.gates import at_bound, cross_validate, fought, holds
 from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.keys import SHAPES
 from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, NOT_HELD, TOO_SMALL, Trial
@@ -19,7 +19,6 @@ PROMISING = 0.25        # of the best linear gain
 PROMISING_CURVED = 0.1  # likewise, of those that a straight line cannot judge
 MOST_TURNS = 4          # of fresh slopes, while a fit runs away from them
 FAR = 0.2               # typical sizes of a curved number
-LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
 BEYOND = 3.0            # standard deviations of a tolerance that no robot has ...
 ROUNDS = 3              # ... and how often others may take over from it
 MOST_ITERATIONS = 10    # of a fit, which ends by itself where it gains no more
@@ -62,8 +61,6 @@ class Search:
             trials = self._step(state, cost, [t.candidate for t in found.accepted])
             for trial in trials:
                 found.trials[trial.candidate.label] = trial
-            if not found.accepted:
-                alone = trials
             best = self._judge(trials, cost, floor, [t.candidate for t in found.accepted])
             if best is None or len(found.accepted) >= self.p.most_effects:
                 break
@@ -72,7 +69,6 @@ class Search:
                 # One explanation of a flight that cannot decide is enough.
                 self.candidates = [c for c in self.candidates if not c.pushes(problem.keys)]
             state, cost = self._settle(best.theta, [t.candidate for t in found.accepted])
-        state, cost = self._merge(found, alone, state, cost)
         state, cost = self._prune(found, state, cost)
         found.theta, found.state = dict(state.theta), state
         base_state, before = self._refit(State(found.base, problem.residual(found.base),
@@ -169,7 +165,7 @@ class Search:
                 theta = handed_over(state.theta, c)
                 step, reached, _ = problem.solve(theta, names, free | set(c.keys),
                                                  h[np.ix_(index, index)], g[index], chi2)
-                trial = Trial(c, cost - reached, problem._moved(theta, names, step))
+                trial = Trial(c, cost - reached, problem.moved(theta, names, step))
                 point = state if theta is state.theta else State(
                     theta, problem.residual(theta), state.slopes, state.names)
             trials.append(trial)
@@ -213,7 +209,7 @@ class Search:
             if c.name in LIMITS:
                 gain = min(gain, max(actual, 0.0) + 0.5 * max(gain, 0.0))
             if best is None or gain > best[0].gain:
-                best = Trial(c, gain, self.problem._moved(theta, names, step)), point
+                best = Trial(c, gain, self.problem.moved(theta, names, step)), point
         return best
 
     def _judge(self, trials, cost, floor, accepted):
@@ -234,14 +230,14 @@ class Search:
                 trial.reason = TOO_SMALL
             elif (c.name, c.member) in names_taken:
                 trial.reason = 'named already'
-            elif self._at_bound(trial):
+            elif at_bound(self.problem.keys, trial):
                 trial.reason = 'beyond what is physical'
             elif chosen is not None:
                 trial.reason = 'others explain more'
             else:
                 self._cross_validate(trial, accepted)
                 sure = trial.cross[0] > 3 * trial.cross[1] and trial.positive >= 0.7
-                if not self._holds(trial):
+                if not holds(trial):
                     trial.reason = NOT_HELD
                 elif trial.share < p.least_share and not (
                         sure and trial.share > p.weak_share and trial.gain > p.weak_gain * need):
@@ -250,96 +246,13 @@ class Search:
                     chosen = trial
         return chosen
 
-    @staticmethod
-    def _holds(trial):
-        """Whether blocks that were left out agree."""
-        sure = trial.cross[0] >= 2 * trial.cross[1] or trial.positive >= 0.85
-        return sure and trial.cross[0] >= 0.3 * trial.gain and trial.positive >= 0.55 \
-            and trial.without_best >= max(0.05 * min(trial.cross[0], trial.gain),
-                                          LEAST_ELSEWHERE)
-
     def _fought(self, trial, accepted):
-        """Whether what shows in forces alone may be a controller's answers to gusts."""
-        c, point = trial.candidate, self._points[trial.candidate.label]
-        if not c.pushes(self.problem.keys):
-            return False
-        others = [name for name in self._involved(accepted) if name not in c.keys]
-        slopes, r = aside(self.problem, point, others, point.slopes[
-            :, [point.index[name] for name in c.keys]], self._free(accepted))
-        everywhere, part = apart(self.problem, slopes, r - slopes @ [
-            trial.theta.get(name, 0.0) for name in c.keys])
-        return part > self.p.part_share * everywhere + self.p.part_free * len(c.keys)
-
-    def _at_bound(self, trial):
-        keys = self.problem.keys
-        for name in trial.candidate.keys:
-            x, key = trial.theta.get(name, 0.0), keys[name]
-            if x <= key.low or x >= key.high:
-                if not (x <= key.low and key.low == 0.0):   # zero is a bound of a friction, too
-                    return True
-        return False
+        return fought(self.problem, trial, self._points[trial.candidate.label],
+                      self._involved(accepted), self._free(accepted))
 
     def _cross_validate(self, trial, accepted):
-        """Gain on each block, with all numbers fitted to the others."""
-        problem, c = self.problem, trial.candidate
-        point = self._points[c.label]
-        free = self._free(accepted)
-        with_it = list(dict.fromkeys([*self._involved(accepted), *c.keys]))
-        without = [name for name in with_it if name not in c.keys or name in problem.beliefs]
-        # Not the point with its keys at zero: far from its own fit a straight line promises more
-        # than it holds, where slopes are those of noise.
-        other = self._without
-        held = np.zeros(problem.blocks)
-        for names, at, loose, sign in ((with_it, point, free | set(c.keys), -1.0),
-                                       (without, other, free, 1.0)):
-            columns = [at.index[name] for name in names]
-            s = at.slopes[:, columns]
-            per = [(s[rows].T @ s[rows], s[rows].T @ at.r[rows], float(at.r[rows] @ at.r[rows]))
-                   for rows in (problem.block == b for b in range(problem.blocks))]
-            total = [sum(part[k] for part in per) for k in range(3)]
-            for b, (h, g, chi2) in enumerate(per):
-                step, _, _ = problem.solve(at.theta, names, loose, total[0] - h, total[1] - g,
-                                           total[2] - chi2)
-                belief = problem.prior(problem._moved(at.theta, names, step), loose)
-                held[b] += sign * (chi2 + 2 * g @ step + step @ h @ step
-                                   + belief / problem.blocks)
-        error = float(held.std(ddof=1) * np.sqrt(len(held))) if len(held) > 1 else np.inf
-        trial.cross = float(held.sum()), error
-        trial.positive = float((held > 0).mean())
-        trial.without_best = float(held.sum() - held.max()) if len(held) > 1 else 0.0
-
-    def _merge(self, found, alone, state, cost):
-        """
-        Put one entry in the place of several that explain no more than it.
-
-        A late MoCap is an IMU that is early, with commands and encoders that are early as well:
-        by a hair the IMU may explain more at first, and the others follow.
-        """
-        if len(found.accepted) < 2:
-            return state, cost
-        base, _ = self._refit(State(found.base, self.problem.residual(found.base), state.slopes,
-                                    state.names), [])
-        for trial in alone[:REFINED]:
-            c = trial.candidate
-            if c.label == found.accepted[0].candidate.label or not trial.refined \
-                    or self._at_bound(trial):
-                continue
-            theta = {**found.base, **trial.theta}
-            start = State(theta, self.problem.residual(theta), state.slopes, state.names)
-            now, reached = self._refit(start, [c], MOST_ITERATIONS)
-            merged = Trial(c, trial.gain, dict(now.theta), True, share=trial.share)
-            if reached > cost + self.p.least_gain \
-                    or not c.large_enough(self.problem.keys, now.theta):
-                continue
-            self._points, self._without = {c.label: now}, base
-            self._cross_validate(merged, [])
-            if self._holds(merged):
-                for dropped in found.accepted:
-                    dropped.reason = f'{c.label} alone explains as much'
-                found.accepted[:] = [merged]
-                found.trials[c.label] = merged
-                return self._settle(now.theta, [c])
-        return state, cost
+        cross_validate(self.problem, trial, self._points[trial.candidate.label], self._without,
+                       self._involved(accepted), self._free(accepted))
 
     def _prune(self, found, state, cost):
         """Drop what later steps, or the noise learnt after the last one, made superfluous."""
@@ -381,11 +294,12 @@ class Search:
             for other in self._step(start, without, others):
                 if other.candidate.name == own.name and other.candidate.member == own.member:
                     continue
-                if not (other.refined and other.gain > gain - margin) or self._at_bound(other) \
+                if not (other.refined and other.gain > gain - margin) \
+                        or at_bound(self.problem.keys, other) \
                         or not other.candidate.large_enough(self.problem.keys, other.theta):
                     continue
                 self._cross_validate(other, others)
-                if self._holds(other):
+                if holds(other):
                     near.append(other)
             trial.gain = gain
             found.rivals[own.label] = near

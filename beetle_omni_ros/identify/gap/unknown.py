@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from beetle_omni_ros.identify.gap.bands import apart
+from beetle_omni_ros.identify.gap.bands import in_part_alone
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel, THIN
 from beetle_omni_ros.identify.gap.series import matrices
@@ -133,8 +133,7 @@ def _fought(problem, rows, explained, r):
     """Whether what was found in a channel of forces may be a controller's answers to gusts."""
     x, all_r = np.zeros((len(rows), 1)), np.zeros(len(rows))
     x[rows, 0], all_r[rows] = explained, r
-    everywhere, part = apart(problem, x, all_r)
-    return part > problem.p.part_share * everywhere + problem.p.part_free
+    return in_part_alone(problem, x, all_r)
 
 
 def _whitened(problem, model, group, channel, columns):

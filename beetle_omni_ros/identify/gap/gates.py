@@ -1,0 +1,93 @@
+"""What a step of the search must pass beside its gain: blocks left out, gusts, physical bounds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.identify.gap.bands import aside, in_part_alone
+from beetle_omni_ros.identify.gap.fit import Problem, State
+from beetle_omni_ros.identify.gap.keys import Key
+from beetle_omni_ros.identify.gap.trial import Trial
+
+LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
+
+
+def at_bound(keys: dict[str, Key], trial: Trial) -> bool:
+    """Whether a number is as far off as it can be; zero is a bound of a friction, too."""
+    for name in trial.candidate.keys:
+        x, key = trial.theta.get(name, 0.0), keys[name]
+        if x >= key.high or x <= key.low != 0.0:
+            return True
+    return False
+
+
+def holds(trial: Trial) -> bool:
+    """Whether blocks that were left out agree; see :func:`cross_validate`."""
+    sure = trial.cross[0] >= 2 * trial.cross[1] or trial.positive >= 0.85
+    return sure and trial.cross[0] >= 0.3 * trial.gain and trial.positive >= 0.55 \
+        and trial.without_best >= max(0.05 * min(trial.cross[0], trial.gain), LEAST_ELSEWHERE)
+
+
+def fought(problem: Problem, trial: Trial, point: State, involved: list[str],
+           free: frozenset[str]) -> bool:
+    """
+    Whether what shows in forces alone may be a controller's answers to gusts.
+
+    Args:
+        problem: flights, beliefs, noise.
+        trial: fitted.
+        point: of its fit.
+        involved: keys of the fit without the entry.
+        free: of which nothing is believed there.
+
+    """
+    c = trial.candidate
+    if not c.pushes(problem.keys):
+        return False
+    others = [name for name in involved if name not in c.keys]
+    slopes, r = aside(problem, point, others, point.slopes[
+        :, [point.index[name] for name in c.keys]], free)
+    return in_part_alone(problem, slopes, r - slopes @ [
+        trial.theta.get(name, 0.0) for name in c.keys], trial.gain)
+
+
+def cross_validate(problem: Problem, trial: Trial, point: State, without: State,
+                   involved: list[str], free: frozenset[str]) -> None:
+    """
+    Set a trial's gain on each block left out, with all numbers fitted to the others.
+
+    Args:
+        problem: flights, beliefs, noise.
+        trial: fitted.
+        point: of its fit.
+        without: the best fit without the entry. Not ``point`` with its keys at zero: far from its
+            own fit a straight line promises more than it holds, where slopes are those of noise.
+        involved: keys of that fit.
+        free: of which nothing is believed there.
+
+    """
+    c = trial.candidate
+    with_it = list(dict.fromkeys([*involved, *c.keys]))
+    held = _left_out(problem, without, [name for name in with_it if name not in c.keys
+                                        or name in problem.beliefs], free) \
+        - _left_out(problem, point, with_it, free | set(c.keys))
+    several = len(held) > 1
+    trial.cross = (float(held.sum()),
+                   float(held.std(ddof=1) * np.sqrt(len(held))) if several else np.inf)
+    trial.positive = float((held > 0).mean())
+    trial.without_best = float(held.sum() - held.max()) if several else 0.0
+
+
+def _left_out(problem, at, names, free):
+    """Objective (blocks,) on each block of a fit to the others."""
+    s = at.slopes[:, [at.index[name] for name in names]]
+    parts = [(s[rows].T @ s[rows], s[rows].T @ at.r[rows], float(at.r[rows] @ at.r[rows]))
+             for rows in (problem.block == b for b in range(problem.blocks))]
+    total = [sum(part[k] for part in parts) for k in range(3)]
+    costs = []
+    for h, g, chi2 in parts:
+        step, _, _ = problem.solve(at.theta, names, free, total[0] - h, total[1] - g,
+                                   total[2] - chi2)
+        belief = problem.prior(problem.moved(at.theta, names, step), free)
+        costs.append(chi2 + 2 * g @ step + step @ h @ step + belief / problem.blocks)
+    return np.array(costs)
