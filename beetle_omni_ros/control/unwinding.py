@@ -15,14 +15,17 @@ stands the two arms across upright half way: nothing of their thrust is any use 
 joints have to turn over by half a turn at that moment, and which way is left to chance. Half
 way between two arms all four turn along. So the heading is taken whose two turns keep the arms
 from standing upright. And it decides how the joints are wound at the target: a way that ends as
-they were wound when the target was missed is taken only where there is no other.
+they were wound when the target was missed is taken only where there is no other. Where the turn
+back is long, its half comes first: near half a turn a policy goes round either way, and the other
+one winds the joints otherwise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import dist
+from math import dist, inf
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -33,7 +36,10 @@ from beetle_omni_ros.robot.schema import parameter
 
 ARRIVED = 0.35    # [rad] from level: near enough to turn back
 UNWOUND = 1.0     # [rad] all tilts below: a robot that turns back earlier goes the way it came
+LONG_TURN = 2.0   # [rad] from level to the target: beyond, half of it is flown by itself ...
+HALF_WAY = 0.6    # [rad] ... until so near to its end
 STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
+STEP = 1.5        # of the limits, that counts as progress, or half of what is left
 HEADINGS = 24     # level attitudes that are compared
 POINTS = 16       # of a turn at which its arms are looked at
 LEAST_USE = 0.2   # part of an arm's thrust that can hold weight, below which it counts as this
@@ -54,7 +60,16 @@ class UnwindingParameters:
                                 low=0.05, high=100)
     height: float = parameter(1.2, doc='of the way through level at least, in world', unit='m',
                               low=-1000, high=1000)
-    duration: float = parameter(1.5, doc='longest way through level', unit='s', low=0.1, high=100)
+    duration: float = parameter(1.5, doc='longest way to level, and to half of a long turn back',
+                                unit='s', low=0.1, high=100)
+
+
+class _Stop(NamedTuple):
+    """On the way: what is shown, and how near, with what tilts, it counts as passed [rad]."""
+
+    target: PoseTarget
+    angle: float
+    tilt: float
 
 
 class Unwinding:
@@ -85,7 +100,7 @@ class Unwinding:
         """A target that is new."""
         self._left = self._p.attempts
         self._failed: list[np.ndarray] = []
-        self._level: PoseTarget | None = None
+        self._way: list[_Stop] = []
         self._until = 0.0
         self._watch(-np.inf)
 
@@ -106,19 +121,16 @@ class Unwinding:
             if self._given is None or not _same(given, self._given):
                 self._start()
             self._given = given
-        if self._level is not None:
-            if self._unwound(state) or state.stamp >= self._until:
-                self._level = None
-                self._watch(state.stamp)
-                return given
-            return self._level
+        if self._way:
+            self._go_on(state)
+            return self._way[0].target if self._way else given
         if self._left and self._stuck(state, given):
             self._left -= 1
             self.attempts += 1
             self._until = state.stamp + self._p.duration
             self._failed.append(state.tilt.copy())
-            self._level = self._through(state, given)
-            return self._level
+            self._way = self._through(state, given)
+            return self._way[0].target
         return given
 
     def _stuck(self, state, given):
@@ -130,7 +142,7 @@ class Unwinding:
         error = max(rotations.geodesic_angle(state.quaternion, given.quaternion) / p.angle,
                     dist(given.position.tolist(), state.position.tolist()) / p.distance)
         elapsed, self._seen = state.stamp - self._seen, state.stamp
-        if error > max(1.0, p.progress * self._least):
+        if error > max(1.0, self._progress()):
             self._missed += elapsed
         elif error > 1.0:
             self._least, self._missed = error, 0.0
@@ -138,15 +150,35 @@ class Unwinding:
             self._missed = max(0.0, self._missed - elapsed)
         return self._missed >= p.patience
 
+    def _progress(self):
+        """Error that is less than the least so far by enough."""
+        if self._least == inf:
+            return inf
+        return self._least - max((1 - self._p.progress) * self._least,
+                                 min(STEP, 0.5 * self._least))
+
     def _through(self, state, given):
         position = given.position.copy()
         position[2] = max(position[2], self._p.height)
-        return replace(given, position=position, quaternion=level_between(
-            state.quaternion, given.quaternion, self._axes, self._failed))
+        level = level_between(state.quaternion, given.quaternion, self._axes, self._failed)
+        way = [_Stop(replace(given, position=position, quaternion=level), ARRIVED, UNWOUND)]
+        turn = rotations.log(rotations.multiply(rotations.conjugate(level), given.quaternion))
+        if np.linalg.norm(turn) > LONG_TURN:
+            half = rotations.multiply(level, rotations.exp(0.5 * turn))
+            way.append(_Stop(replace(given, position=position, quaternion=half), HALF_WAY, inf))
+        return way
 
-    def _unwound(self, state):
-        return rotations.geodesic_angle(state.quaternion, self._level.quaternion) < ARRIVED \
-            and np.abs(state.tilt).max() < UNWOUND
+    def _go_on(self, state):
+        """Forget what is passed, or all of it where it takes too long."""
+        stop = self._way[0]
+        if state.stamp >= self._until:
+            self._way = []
+        elif rotations.geodesic_angle(state.quaternion, stop.target.quaternion) < stop.angle \
+                and np.abs(state.tilt).max() < stop.tilt:
+            self._way = self._way[1:]
+            self._until = state.stamp + self._p.duration
+        if not self._way:
+            self._watch(state.stamp)
 
 
 def levelled(quaternion: np.ndarray) -> np.ndarray:

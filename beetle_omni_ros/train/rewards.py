@@ -178,8 +178,14 @@ def hover_thrust_rate(m: Moment) -> torch.Tensor:
 
 
 def sinking(m: Moment) -> torch.Tensor:
-    """Below both start and target, where a floor may be; saturates, or an early end would pay."""
-    return m.depth / (1 + m.depth / SINKING_LIMIT)
+    """
+    Below both start and target, where a floor may be.
+
+    Hardly anything for a few centimetres, for any quick move sinks by these; saturates, or an
+    early end would pay.
+    """
+    squared = (m.depth / SINKING_LIMIT) ** 2
+    return SINKING_LIMIT * squared / (1 + squared)
 
 
 TERMS = {term.__name__: term for term in (

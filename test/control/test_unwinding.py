@@ -167,6 +167,17 @@ def test_who_gets_nearer_sees_the_target(rate, goes_through_level):
     assert any(t is not TARGET for t in shown) == goes_through_level
 
 
+@pytest.mark.parametrize('seconds_to_half, goes_through_level', [(1.3, True), (0.5, False)])
+def test_who_creeps_nearer_has_missed(seconds_to_half, goes_through_level):
+    unwinding = Unwinding(PARAMETERS, AXES)
+    shown = []
+    for k in range(150):
+        angle = 0.33 * 0.5 ** (0.01 * k / seconds_to_half)
+        attitude = rotations.multiply(TARGET.quaternion, rotations.exp(np.array([0, angle, 0])))
+        shown.append(unwinding.target(stuck(0.01 * k, quaternion=attitude), TARGET))
+    assert any(t is not TARGET for t in shown) == goes_through_level
+
+
 @pytest.mark.parametrize('low, high, goes_through_level', [
     (0.8, 1.4, True), (0.3, 0.95, False), (0.4, 1.4, False)])
 def test_who_swings_about_the_limit_has_missed_and_who_comes_near_has_not(low, high,
@@ -199,6 +210,38 @@ def test_the_target_returns_once_the_joints_are_unwound():
     assert fly(unwinding, 0.1, 1.0, quaternion=level.quaternion)[-1] is level    # still wound
     assert fly(unwinding, 0.1, 1.1, quaternion=level.quaternion,
                tilt=np.full(4, 0.5))[-1] is TARGET
+
+
+UPSIDE_DOWN = PoseTarget(np.array([0.0, 0.0, 1.5]), rotations.from_rpy(2.98, 0.02, 1.6))
+
+
+def missed(target, seconds=1.0):
+    """An unwinding that has just begun its way through level, the attitude, and what it shows."""
+    unwinding = Unwinding(PARAMETERS, AXES)
+    off = rotations.multiply(target.quaternion, rotations.exp(np.array([0.0, 0.3, 0.0])))
+    return unwinding, fly(unwinding, seconds, target=target, position=target.position,
+                          quaternion=off)[-1]
+
+
+def test_a_long_turn_back_is_flown_by_its_half_so_that_the_side_is_the_one_that_was_chosen():
+    unwinding, level = missed(UPSIDE_DOWN)
+    there = {'target': UPSIDE_DOWN, 'position': UPSIDE_DOWN.position, 'tilt': np.full(4, 0.5)}
+    half = fly(unwinding, 0.1, 1.0, quaternion=level.quaternion, **there)[-1]
+    turns = [rotations.geodesic_angle(a.quaternion, b.quaternion)
+             for a, b in ((level, half), (half, UPSIDE_DOWN), (level, UPSIDE_DOWN))]
+    assert turns[0] == pytest.approx(turns[1]) == pytest.approx(turns[2] / 2)
+    assert fly(unwinding, 0.1, 1.1, quaternion=level.quaternion, **there)[-1] is half
+    near = rotations.multiply(half.quaternion, rotations.exp(np.array([0.0, 0.0, 0.4])))
+    assert fly(unwinding, 0.1, 1.2, quaternion=near, **there)[-1] is UPSIDE_DOWN
+
+
+def test_who_never_gets_half_way_gets_the_target_back():
+    unwinding, level = missed(UPSIDE_DOWN)
+    shown = fly(unwinding, 3.0, 1.0, UPSIDE_DOWN, position=UPSIDE_DOWN.position,
+                quaternion=level.quaternion, tilt=np.full(4, 0.5))
+    away = sum(t is not UPSIDE_DOWN for t in shown) * 0.01
+    assert away == pytest.approx(PARAMETERS.duration, abs=0.05)
+    assert shown[-1] is UPSIDE_DOWN
 
 
 def test_who_stays_stuck_gets_the_target_back_and_no_more_attempts_than_allowed():
