@@ -8,6 +8,7 @@ import pytest
 
 from beetle_omni_ros.identify.gap.candidates import _torques, candidates
 from beetle_omni_ros.identify.gap.loads import spin_load
+from beetle_omni_ros.identify.gap.results import at_least
 
 MOTION = Motion(9, 12.0)
 FINE = 1e-4
@@ -22,7 +23,8 @@ def steps(t):
 
 
 def servo(delay=0.010, kp=JOINT.kp, kd=JOINT.kd, speed=JOINT.velocity_limit,
-          effort=JOINT.effort_limit, coulomb=0.0, stiction=0.0, bend=0.0):
+          effort=JOINT.effort_limit, coulomb=0.0, stiction=0.0, bend=0.0,
+          fading=1e-3):
     """(N, 4) joint angles at 200 Hz, by explicit steps of 0.1 ms."""
     sent = MOTION.t
     commands, thrust = steps(sent), MOTION.thrust
@@ -37,7 +39,8 @@ def servo(delay=0.010, kp=JOINT.kp, kd=JOINT.kd, speed=JOINT.velocity_limit,
         if coulomb:
             still = np.abs(v) < 1e-3
             held = still & (np.abs(torque) < max(coulomb, stiction))
-            torque = np.where(held, -v * JOINT.inertia / FINE, torque - coulomb * np.sign(
+            rubbing = coulomb + max(stiction - coulomb, 0.0) * np.exp(-(v / fading)**2)
+            torque = np.where(held, -v * JOINT.inertia / FINE, torque - rubbing * np.sign(
                 np.where(still, torque, v)))
         v = np.clip(v + FINE * torque / JOINT.inertia, -speed, speed)
         q = q + FINE * v
@@ -72,6 +75,25 @@ def test_a_servo_effect_is_recovered_from_commands_and_encoders(true, expected, 
     found = solved(model(flight(servo(**true))), list(expected), 'J', None, start, 6)
     for name, value in expected.items():
         assert KEYS[name].value(found[name]) == pytest.approx(value, abs=within)
+
+
+@pytest.mark.parametrize('fading, start', [(0.03, 0.012), (0.1, 0.004)])
+def test_stiction_is_found_from_below_and_from_above(fading, start):
+    names = ['joint_friction.coulomb', 'joint_friction.stiction']
+    flown = flight(servo(coulomb=0.007, stiction=0.010, fading=fading))
+    found = solved(model(flown), names, 'J', None, dict(zip(names, (0.008, start))), 8)
+    assert [found[name] for name in names] == pytest.approx([0.007, 0.010], abs=0.0015)
+
+
+@pytest.mark.parametrize('stiction, interval, expected', [
+    (0.004, [0.003, 0.0052], (0.006, [0.005, 0.007])),
+    (0.0058, [0.0036, 0.008], (0.006, [0.005, 0.008])),
+    (0.009, [0.008, 0.010], (0.009, [0.008, 0.010]))])
+def test_what_is_said_of_stiction_is_at_least_what_is_said_of_coulomb(stiction, interval,
+                                                                     expected):
+    said = {'value': stiction, 'interval': interval}
+    at_least(said, {'value': 0.006, 'interval': [0.005, 0.007]})
+    assert (said['value'], said['interval']) == expected
 
 
 def test_a_servo_as_in_the_file_leaves_no_residual():

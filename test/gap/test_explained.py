@@ -6,6 +6,7 @@ import pytest
 
 from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import Problem, State
+from beetle_omni_ros.identify.gap.gates import holds
 from beetle_omni_ros.identify.gap.keys import Belief, tolerances
 from beetle_omni_ros.identify.gap.search import BEYOND, Search
 from beetle_omni_ros.identify.gap.trial import Trial
@@ -93,19 +94,31 @@ def test_a_free_range_ends_beyond_itself():
     assert belief.within(-0.02, BEYOND) == pytest.approx(-0.0115)
 
 
-@pytest.mark.parametrize('gain, left, named', [
-    (60.0, 70.0, True), (60.0, 170.0, False), (600.0, 1700.0, True), (600.0, 6000.0, False),
-    (30.0, 31.0, False)])
+@pytest.mark.parametrize('gain, left, agreement, named', [
+    (60.0, 70.0, 4.0, True), (60.0, 170.0, 4.0, False), (60.0, 170.0, 10.0, True),
+    (60.0, 600.0, 10.0, False), (600.0, 1700.0, 4.0, True), (600.0, 1700.0, 2.5, False),
+    (600.0, 6000.0, 10.0, False), (30.0, 31.0, 10.0, False)])
 def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch, gain, left,
-                                                                     named):
+                                                                     agreement, named):
     drag = Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag')
     trial = Trial(drag, gain, {'rotor_drag.coefficient': 0.4}, refined=True)
 
     def agreed(self, trial, accepted):
-        trial.cross, trial.positive, trial.without_best = (gain, gain / 10), 1.0, 0.9 * gain
+        trial.cross, trial.positive = (gain, gain / agreement), 1.0
+        trial.without_best = 0.9 * gain
 
     monkeypatch.setattr(Search, '_cross_validate', agreed)
     monkeypatch.setattr(Search, '_fought', lambda self, trial, accepted: False)
     search = Search.__new__(Search)
     search.p, search.problem = P, type('Problem', (), {'keys': KEYS})()
     assert (search._judge([trial], 1000.0 + left, 1000.0, []) is trial) == named
+
+
+@pytest.mark.parametrize('gain, error, positive, believed', [
+    (100.0, 40.0, 0.6, True), (100.0, 80.0, 1.0, False), (1000.0, 800.0, 1.0, True),
+    (1000.0, 800.0, 0.75, False)])
+def test_what_gains_little_must_gain_it_evenly(gain, error, positive, believed):
+    drag = Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag')
+    trial = Trial(drag, gain, {}, cross=(gain, error), positive=positive,
+                  without_best=0.5 * gain)
+    assert holds(trial) == believed

@@ -14,10 +14,13 @@ from beetle_omni_ros.identify.gap.residual import THIN
 from beetle_omni_ros.identify.gap.series import matrices
 from beetle_omni_ros.robot.effects import CATALOGUE
 
-MODEL_ERROR = 0.005     # of a value: no form is exact ...
-# ... and these the least: a Stribeck curve or bristles fitted with two constants, a play that is a
-# spring as well, are off by so much in all flights alike (measured in the blind campaign).
-FORM_ERRORS = {'joint_friction': 0.1, 'joint_backlash': 0.05}
+MODEL_ERROR = 0.005     # of a deviation: no form is exact ...
+# ... and these the least: Stribeck curves or bristles fitted with two constants, a play that is a
+# spring as well, flapping blades, a shadow that is no parabola of the tilt are off by so much in
+# all flights alike (measured in the blind campaign).
+FORM_ERRORS = {'joint_friction': 0.1, 'joint_backlash': 0.1, 'tilt_thrust_loss': 0.1,
+               'rotor_drag': 0.1}
+LAG_ERROR = 0.1         # of a rotor's whole lag, of which a second one in series is delay to a fit
 BUS_DELAY = 0.002       # [s] that commands may differ by, when asking what could be seen
 DISAGREE = 1.5          # times what noise alone makes of it: then a scatter between bands counts
 LEAST_BANDS = 4         # that a number comes from, at least; a scatter of fewer says too little
@@ -60,7 +63,8 @@ def deviations(problem: Problem, state: State, names: list[str],
             half = max(half, _scattered(shares, max(
                 LEAST_BANDS, expected.sum()**2 / max((expected**2).sum(), 1e-30))))
         form = FORM_ERRORS.get(problem.keys[name].effect, MODEL_ERROR)
-        widths[name] = half + form * abs(state.theta.get(name, 0.0))
+        widths[name] = half + (LAG_ERROR if problem.keys[name].effect == 'rotor_lag'
+                               else form * abs(state.theta.get(name, 0.0)))
     return widths
 
 

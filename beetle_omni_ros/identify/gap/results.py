@@ -91,8 +91,18 @@ def parameters(a: Analysis, name: str, free: tuple[str, ...], theta: dict[str, f
             entry['interval'] = spans if len(spans) > 1 else spans[0]
         made[parameter] = entry
     if name == 'joint_friction':
-        made['stiction']['value'] = max(made['stiction']['value'], made['coulomb']['value'])
+        at_least(made['stiction'], made['coulomb'])
     return made
+
+
+def at_least(stiction: dict, coulomb: dict) -> None:
+    """Raise what is said of a joint that stands to what one that slides holds."""
+    if stiction['value'] >= coulomb['value']:
+        return
+    stiction['value'] = coulomb['value']
+    if 'interval' in stiction:
+        low, high = coulomb['interval']
+        stiction['interval'] = [low, max(high, stiction['interval'][1])]
 
 
 def evidence(a: Analysis, trial: Trial) -> dict:

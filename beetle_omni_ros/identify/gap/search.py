@@ -236,11 +236,12 @@ class Search:
                 trial.reason = 'others explain more'
             else:
                 self._cross_validate(trial, accepted)
-                sure = trial.cross[0] > 3 * trial.cross[1] and trial.positive >= 0.7
+                much = p.weak_agreement if trial.gain > p.weak_gain * need else p.strong_agreement
+                sure = trial.cross[0] > much * trial.cross[1] and trial.positive >= 0.7
                 if not holds(trial):
                     trial.reason = NOT_HELD
                 elif trial.share < p.least_share and not (
-                        sure and trial.share > p.weak_share and trial.gain > p.weak_gain * need):
+                        sure and trial.share > p.weak_share):
                     trial.reason = 'explains too small a part of what is left'
                 else:
                     chosen = trial

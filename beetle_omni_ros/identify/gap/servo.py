@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beetle_omni_ros.robot.effects_actuator import SLIDING_RATE
 from beetle_omni_ros.robot.parameters import JointParameters
 
 GYROSCOPIC = 'propeller_gyroscopic_torque'
-CREEP = 0.02    # [rad/s] below which stiction counts as standing
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
     inertia = joint.inertia * column('swing.ratio', np.exp)
     damping = 0.5 * h * kd / inertia
     keep, gain = (1 - damping) / (1 + damping), h / inertia / (1 + damping)
-    sliding, holding = coulomb * gain, np.maximum(stiction, coulomb) * gain
-    rubs, bends, loaded = sliding.any() or holding.any(), soft.any(), share.any()
+    sliding, more = coulomb * gain, (stiction - coulomb) * gain
+    rubs, bends, loaded = sliding.any() or more.any(), soft.any(), share.any()
     spins = momentum.any()
     # The clip of the torque matters only where the largest error could meet it.
     reach = kp * np.abs(targets - windows.start).max() * 1.5 + kd * speed
@@ -115,7 +115,7 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
         else:
             new = keep * v + force
         if rubs:
-            friction = np.where(np.abs(v) < CREEP, holding, sliding)
+            friction = sliding + more * np.exp(-(v / SLIDING_RATE)**2)
             new -= np.minimum(np.maximum(new, -friction), friction)
         v = np.minimum(np.maximum(new, -speed), speed)
         q += 0.5 * h * v
