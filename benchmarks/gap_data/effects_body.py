@@ -7,9 +7,12 @@ from math import cos, exp, pi, radians, sin, sqrt, tanh
 import numpy as np
 
 from gap_data.hidden import Hidden
+from gap_data.mjcf import main_body
 from gap_data.truth import Robot
 
 NOTHING = (0.0, 0.0, 0.0)
+DRAWS = 1000      # of an inertia, until a body can have it ...
+ROOM = 0.95       # ... with room for tolerances of 3 %
 
 
 def direction(rng: np.random.Generator) -> np.ndarray:
@@ -32,13 +35,18 @@ def centre_of_mass(robot, hidden, size, shape, rng):
 
 def inertia(robot, hidden, size, shape, rng):
     """Each axis off by up to ``size`` [1], the worst by exactly that."""
-    share = rng.uniform(-1, 1, 3)
-    share[2] = min(max(share[2], -0.5), 0.5)
-    share = size * share / np.abs(share).max()
-    # a body's largest moment is at most the sum of the others, with room for the modules
-    robot.inertia = robot.inertia * (1 + share)
-    robot.inertia[2] = min(robot.inertia[2], 0.9 * (robot.inertia[0] + robot.inertia[1]))
-    return {'inertia': robot.inertia}
+    told = robot.inertia
+    for _ in range(DRAWS):
+        share = rng.uniform(-1, 1, 3)
+        share[2] = min(max(share[2], -0.5), 0.5)
+        share = size * share / np.abs(share).max()
+        robot.inertia = told * (1 + share)
+        robot.inertia[2] = min(robot.inertia[2], 0.9 * (robot.inertia[0] + robot.inertia[1]))
+        # no moment is more than the others together, nor what the modules leave of it
+        main = np.linalg.eigvalsh(main_body(robot)[2])
+        if main[0] > 0 and main[2] < ROOM * (main[0] + main[1]):
+            return {'inertia': robot.inertia}
+    raise ValueError(f'no robot is off by {size:g} in its inertia')
 
 
 def thrust_coefficient(robot, hidden, size, shape, rng):

@@ -85,11 +85,10 @@ def _shafts(robot, loss):
         '</body>' for i in range(4))
 
 
-def _main_inertial(robot, taken):
-    """The main body: what the modules and the ball leave of the totals."""
+def main_body(robot, taken=0.0):
+    """The main body, what the modules and the ball leave of the totals: mass, place, inertia."""
     parts = robot.numbers['parts']
-    others = [(parts['ball_mass'], np.array([0, 0, parts['ball_height']]),
-               0.4 * parts['ball_mass'] * parts['ball_radius'] ** 2 * np.eye(3))]
+    others = [(parts['ball_mass'], np.array([0, 0, parts['ball_height']]), _ball_inertia(parts))]
     for arm in robot.arms:
         turn = np.array([[arm[0], -arm[1], 0], [arm[1], arm[0], 0], [0, 0, 1]])
         place = _joint_place(parts, arm) + turn @ np.array(parts['module_centre'])
@@ -101,13 +100,23 @@ def _main_inertial(robot, taken):
              - taken * np.array([0, 0, parts['gravity_centre_height']])) / mass
     inertia = np.diag(robot.inertia) - sum(j + _shift(m, p - centre) for m, p, j in others)
     inertia -= _shift(mass, place - centre)
-    place = place - [0, 0, parts['gravity_centre_height']]
+    return mass, place - [0, 0, parts['gravity_centre_height']], inertia
+
+
+def _ball_inertia(parts):
+    return 0.4 * parts['ball_mass'] * parts['ball_radius'] ** 2 * np.eye(3)
+
+
+def _main_inertial(robot, taken):
+    parts = robot.numbers['parts']
+    mass, place, inertia = main_body(robot, taken)
     full = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2],
             inertia[1, 2]]
-    ball = parts['ball_height'] - parts['gravity_centre_height']
+    height = parts['ball_height'] - parts['gravity_centre_height']
+    ball = _vector(np.diag(_ball_inertia(parts)))
     return (f'<inertial pos="{_vector(place)}" mass="{mass:.9g}" fullinertia="{_vector(full)}"/>'
-            f'<body name="ball" pos="0 0 {ball:.9g}"><inertial pos="0 0 0" '
-            f'mass="{parts["ball_mass"]}" diaginertia="{_vector(np.diag(others[0][2]))}"/></body>')
+            f'<body name="ball" pos="0 0 {height:.9g}"><inertial pos="0 0 0" '
+            f'mass="{parts["ball_mass"]}" diaginertia="{ball}"/></body>')
 
 
 def _joint_place(parts, arm):

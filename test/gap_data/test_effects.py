@@ -4,8 +4,10 @@ from gap_data.cases import Case, load_settings
 from gap_data.effects import CATALOGUE, inject, OUTSIDE, SHAPES
 from gap_data.hidden import Hidden, Snapshot
 from gap_data.make import build
+from gap_data.mjcf import model_xml
 from gap_data.plant import Plant
 from gap_data.truth import Robot
+import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -251,3 +253,15 @@ def test_a_case_always_has_the_same_truth():
                 tolerance=True)
     (_, _, one), (_, _, two) = build(case), build(case)
     assert one == two
+
+
+def test_an_inertia_that_is_far_off_is_still_that_of_bodies():
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        robot, nominal = Robot.nominal().within_tolerance(rng), Robot.nominal().inertia
+        before = robot.inertia
+        inject('inertia', robot, Hidden(), 0.3, 'plain', rng)
+        assert np.abs(robot.inertia[:2] / before[:2] - 1).max() <= 0.3 + 1e-9
+        assert np.abs(robot.inertia / nominal - 1).max() > 0.2
+        for multibody in (False, True):     # what no bodies can have is refused here
+            mujoco.MjModel.from_xml_string(model_xml(robot, multibody=multibody))
