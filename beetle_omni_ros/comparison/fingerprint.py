@@ -15,18 +15,28 @@ from beetle_omni_ros.robot.resources import PACKAGE, share_path
 
 ROOMS = ('control', 'estimation', 'evaluation', 'robot', 'runs', 'safety', 'sim')
 LIBRARIES = ('casadi', 'filterpy', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
+OF_POLICIES = ('observation.py', 'policy.py', 'policy_file.py', 'policy_network.py',
+               'turning.py', 'unwinding.py', 'rl.yaml')  # no other controller reads these
 NOT_FLOWN = ('gap.yaml', 'train.yaml')  # parameters that no flight reads
 LENGTH = 16  # hexadecimal digits kept
 
 
 @cache
-def code_fingerprint() -> str:
-    """Digest of the code that flies and judges, its parameters and its libraries."""
+def code_fingerprint(policy: bool = True) -> str:
+    """
+    Digest of the code that flies and judges, its parameters and its libraries.
+
+    Args:
+        policy: whether a policy flies; else without what only policies are flown with.
+
+    """
     package = Path(__file__).resolve().parents[1]
     files = [path for room in ROOMS for path in (package / room).rglob('*.*')
              if path.suffix in ('.py', '.c', '.h')]
     files += [package / 'comparison' / 'flight.py']
     files += [path for path in share_path('params').glob('*.yaml') if path.name not in NOT_FLOWN]
+    if not policy:
+        files = [path for path in files if path.name not in OF_POLICIES]
     digest = hashlib.sha256()
     for path in sorted(files, key=lambda path: (path.parent.name, path.name)):
         digest.update(f'{path.parent.name}/{path.name}'.encode())
@@ -74,7 +84,8 @@ def policy_file(controller: str, other: str | Path | None = None) -> Path | None
 
 def flight_key(flight: Flight) -> str:
     """Digest of all that determines a flight's numbers."""
-    parts = [code_fingerprint(), flight.controller, flight.conditions, str(flight.seed)]
+    parts = [code_fingerprint(flight.controller in POLICIES), flight.controller,
+             flight.conditions, str(flight.seed)]
     is_file = Path(flight.task).is_file()
     parts.append(file_digest(flight.task) if is_file else flight.task)
     if policy := policy_file(flight.controller, flight.policy):

@@ -14,6 +14,7 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.control.observation import disturbed, observed
 from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.control.turning import raised, TurningParameters
 from beetle_omni_ros.control.unwinding import Unwinding, UnwindingParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import schema
@@ -51,6 +52,8 @@ class PolicyParameters:
         DisturbanceParameters, 'what a policy with memory sees')
     unwinding: UnwindingParameters = group(
         UnwindingParameters, 'through a level attitude where joints end at their stops')
+    turning: TurningParameters = group(
+        TurningParameters, 'low targets are turned to above them')
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> PolicyParameters:
@@ -66,7 +69,8 @@ class PolicyController:
     another controller leaves off. Targets are cut to the limits of the actuators, as they were
     in training; an output that is not finite or absurdly large goes out as it is, for the
     supervisor to refuse. Where the joints are wound so that a pose stays out of reach, it is shown
-    a level attitude first (:mod:`control.unwinding`).
+    a level attitude first (:mod:`control.unwinding`), and while it has far to turn, low targets
+    are shown higher (:mod:`control.turning`).
 
     Args:
         robot: what the controller believes about the robot.
@@ -130,7 +134,8 @@ class PolicyController:
         """Numbers for the network, or None when one of them is not finite."""
         time = state.stamp
         if isinstance(target, PoseTarget):
-            target = self._unwinding.target(state, target)
+            target = raised(state, self._unwinding.target(state, target),
+                            self._parameters.turning)
         else:
             time += self._parameters.trajectory_lookahead
         observation = observed(state, target.at(time), self._previous_action(state))

@@ -174,7 +174,7 @@ class RewardWeights:
     joint_winding: float = parameter(-3.0, doc='own: joints beyond half a turn')
     hover_tilt_rate: float = parameter(-5.0, doc='own: smooth commands at the target')
     hover_thrust_rate: float = parameter(-0.15, doc='own: smooth commands at the target')
-    sinking: float = parameter(-20.0, doc='own: below both start and target')
+    sinking: float = parameter(-26.0, doc='own: below both start and target')
     termination: float = parameter(-800.0, doc='own: less than the worst flight would cost')
     scale: float = parameter(0.01, doc='of the sum')
 

@@ -5,6 +5,8 @@ import io
 import json
 from pathlib import Path
 import shutil
+import subprocess
+import sys
 
 import pytest
 from rich.console import Console
@@ -138,7 +140,7 @@ def test_a_kept_flight_counts_only_for_what_it_was_flown_with(poses, tmp_path, m
         file.write('0,0,1,0,0,0\n')
     assert store.load(flight) is None
     store.save(flight, {'failure': None, 'metrics': {}, 'trace': {}})
-    monkeypatch.setattr(fingerprint, 'code_fingerprint', lambda: 'other code')
+    monkeypatch.setattr(fingerprint, 'code_fingerprint', lambda policy: 'other code')
     assert store.load(flight) is None
 
 
@@ -154,14 +156,25 @@ def test_another_policy_file_is_another_flight(tmp_path):
     assert fingerprint.flight_key(flights[1]) == keys[0]
 
 
-@pytest.mark.parametrize('name, flies', [('rl.yaml', True), ('gap.yaml', False)])
+@pytest.mark.parametrize('name, policy, flies', [
+    ('rl.yaml', True, True), ('rl.yaml', False, False), ('nmpc.yaml', False, True),
+    ('gap.yaml', True, False)])
 def test_parameters_that_no_flight_reads_do_not_fly_anything_again(tmp_path, monkeypatch, name,
-                                                                   flies):
+                                                                   policy, flies):
     copy = Path(shutil.copytree(share_path('params'), tmp_path / 'params'))
     monkeypatch.setattr(fingerprint, 'share_path', lambda _: copy)
-    before = fingerprint.code_fingerprint.__wrapped__()
+    before = fingerprint.code_fingerprint.__wrapped__(policy)
     (copy / name).write_text((copy / name).read_text() + '\n')
-    assert (fingerprint.code_fingerprint.__wrapped__() != before) == flies
+    assert (fingerprint.code_fingerprint.__wrapped__(policy) != before) == flies
+
+
+def test_other_controllers_import_nothing_that_is_left_out_of_their_fingerprint():
+    code = 'import sys, beetle_omni_ros.control.nmpc, beetle_omni_ros.control.hover; ' \
+        'print(*(name for name in sys.modules if name.startswith("beetle_omni_ros.control")))'
+    loaded = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                            check=True, timeout=60).stdout.split()
+    assert 'beetle_omni_ros.control.nmpc' in loaded
+    assert not {f'{name.rpartition(".")[2]}.py' for name in loaded} & {*fingerprint.OF_POLICIES}
 
 
 def test_a_cut_off_file_is_flown_again(poses, tmp_path):
