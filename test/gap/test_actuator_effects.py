@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
-from flights import KEYS, model, Motion, ROBOT, solved, STEP
+from flights import KEYS, model, Motion, P, ROBOT, solved, STEP
 import numpy as np
 import pytest
 
+from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import _torques, candidates
+from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
 from beetle_omni_ros.identify.gap.loads import spin_load
+from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.identify.gap.results import at_least
 
 MOTION = Motion(9, 12.0)
@@ -94,6 +97,17 @@ def test_what_is_said_of_stiction_is_at_least_what_is_said_of_coulomb(stiction, 
     said = {'value': stiction, 'interval': interval}
     at_least(said, {'value': 0.006, 'interval': [0.005, 0.007]})
     assert (said['value'], said['interval']) == expected
+
+
+@pytest.mark.parametrize('stiction', [0.0, 0.002])
+def test_a_file_whose_stiction_is_below_coulomb_friction_holds_a_joint_by_the_latter(stiction):
+    robot = replace(ROBOT, effects={'joint_friction': {'coulomb': 0.007, 'stiction': stiction}})
+    keys = {**all_keys(robot), **extra_keys()}
+    assert keys['joint_friction.stiction'].base == 0.007
+    rest = FlightModel(flight(servo(coulomb=0.007, stiction=0.007)), robot,
+                       BodyModel(robot, keys, (0.0, 0.0)), keys, P).residual({}, 'J')['J']
+    without = model(flight(servo(coulomb=0.007, stiction=0.007))).residual({}, 'J')['J']
+    assert rest.std() < 0.1 * without.std()
 
 
 def test_a_servo_as_in_the_file_leaves_no_residual():

@@ -90,15 +90,24 @@ def _own(robot: RobotParameters) -> dict[str, float | np.ndarray]:
             'effort_limit': joints.effort_limit}
 
 
+def friction(robot: RobotParameters) -> tuple[float, float]:
+    """Coulomb friction and stiction [N m] of the file, whose stiction is at least the former."""
+    own = robot.effects.get('joint_friction', {'coulomb': 0.0, 'stiction': 0.0})
+    return own['coulomb'], max(own['stiction'], own['coulomb'])
+
+
 def all_keys(robot: RobotParameters) -> dict[str, Key]:
     """Every scalar of the catalogue around what ``robot`` has, by name."""
     own, keys = _own(robot), {}
+    effects = dict(robot.effects)
+    if 'joint_friction' in effects:
+        effects['joint_friction'] = dict(zip(('coulomb', 'stiction'), friction(robot)))
     for name, effect in CATALOGUE.items():
         for parameter, spec in effect.parameters.items():
             neutral = np.atleast_1d(np.array(spec.neutral, dtype=float))
             absent = bool(np.isnan(neutral).any())
             relative = absent or parameter == 'scale'
-            base = np.atleast_1d(np.array(robot.effects.get(name, {}).get(
+            base = np.atleast_1d(np.array(effects.get(name, {}).get(
                 parameter, own.get(parameter) if absent else spec.neutral), dtype=float))
             scalar = np.ndim(spec.neutral) == 0
             for k, value in enumerate(base):

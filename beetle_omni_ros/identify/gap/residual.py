@@ -16,7 +16,7 @@ import numpy as np
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.filters import low_pass
 from beetle_omni_ros.identify.gap.ingest import Flight
-from beetle_omni_ros.identify.gap.keys import Key
+from beetle_omni_ros.identify.gap.keys import friction, Key
 from beetle_omni_ros.identify.gap.loads import module_load, spin_load
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import matrices
@@ -78,8 +78,8 @@ class FlightModel:
         self._made: dict[tuple, tuple] = {}
         self._mask = self._trusted()
         own = robot.effects
-        self._own = {'coulomb': own.get('joint_friction', {}).get('coulomb', 0.0),
-                     'stiction': own.get('joint_friction', {}).get('stiction', 0.0),
+        coulomb, stiction = friction(robot)
+        self._own = {'coulomb': coulomb, 'stiction': stiction,
                      'deflection': own.get('joint_deflection', {}).get(
                          'deflection_per_newton', 0.0),
                      'momentum': own.get(GYROSCOPIC, {}).get('angular_momentum_at_hover', 0.0),
