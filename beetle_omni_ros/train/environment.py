@@ -26,8 +26,15 @@ from beetle_omni_ros.train.observations import (
 )
 from beetle_omni_ros.train.parameters import TrainParameters
 from beetle_omni_ros.train.physics import Physics
+from beetle_omni_ros.train.replays import (
+    MISSED_ATTITUDE,
+    MISSED_DEPTH,
+    MISSED_POSITION,
+    Replays,
+    spread,
+)
 
-NUMBERS = 138       # random numbers of a robot and a step
+NUMBERS = 141       # random numbers of a robot and a step
 REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] as the task metrics
 
 
@@ -81,6 +88,9 @@ class TiltableQuadrotorEnv(VecEnv):
                       for name, value in self._starts.draw(batch.Draw(numbers)).items()}
         age = torch.rand(self.num_envs, device=self.device) * self.max_episode_length
         self.state['age'] = age.floor()
+        self._replays = Replays(self.state, parameters.episode.replay_share,
+                                parameters.episode.target_time[1] / parameters.episode.period)
+        self.state.update(self._replays.state(self.state))
         # sums since the last reading: targets finished, reached, errors, rewards, ends
         self.tally = torch.zeros(8 + len(rewards.TERMS), device=self.device)
         self._finish = self._after
@@ -143,9 +153,10 @@ class TiltableQuadrotorEnv(VecEnv):
         moment = self._moment(s, x, asked, rotation, target)
         terms = rewards.terms(moment)
         broken = ~torch.isfinite(x).all(-1)
+        calm = s['disturbed'][:, 0] < 0.5
         died = broken | (moment.position_error > limits.position_limit) \
             | (moment.speed > limits.velocity_limit) | (moment.rate > limits.rate_limit) \
-            | ((moment.depth > self.depth_limit) & (s['disturbed'][:, 0] < 0.5))
+            | ((moment.depth > self.depth_limit) & calm)
         reward = torch.where(broken, 0.0, terms @ weights) \
             + died * (self.cfg.reward.termination * self.cfg.reward.scale)
         age = s['age'] + 1
@@ -154,17 +165,19 @@ class TiltableQuadrotorEnv(VecEnv):
         due = (s['target_left'] <= 1) & ~done
         reached = (moment.position_error < REACHED_POSITION) \
             & (moment.attitude_error < REACHED_ATTITUDE)
-        finished = due & (s['disturbed'][:, 0] < 0.5)
+        finished = due & calm & (s['source'] < 0)
         tally = torch.cat([torch.stack([
             finished.sum(), (finished & reached).sum(),
             (finished * moment.position_error).sum(), (finished * moment.attitude_error).sum(),
             reward.sum(), died.sum(), timeout.sum(), torch.ones_like(reward).sum()]),
             torch.where(broken[:, None], 0.0, terms).sum(0)])
-        new = self._carry_on(s, x, command, rotation, age)
+        new = self._carry_on(s, x, command, rotation, age, moment.depth)
+        missed = calm & ((died & ~broken) | due & (
+            (moment.position_error > MISSED_POSITION) | (moment.attitude_error > MISSED_ATTITUDE)
+            | (new['deepest'] > MISSED_DEPTH)))
         new = self._retarget(new, due, rotation, draw)
-        fresh = self._starts.draw(draw)
-        new = {name: torch.where(_spread(done, value), fresh[name], value)
-               for name, value in new.items()}
+        new = self._replays.step(s, new, self._starts.draw(draw),
+                                 {'due': due, 'done': done, 'missed': missed}, draw)
         observation, critic = self._observe(new, draw)
         return new, observation, critic, reward, done, timeout, tally
 
@@ -193,7 +206,7 @@ class TiltableQuadrotorEnv(VecEnv):
             tilt_limit=self.robot.joints.position_limit,
             thrust_limit=self.robot.rotors.thrust_max)
 
-    def _carry_on(self, s, x, command, rotation, age):
+    def _carry_on(self, s, x, command, rotation, age, depth):
         """The state after a step in which nothing ended."""
         new = dict(s)
         old = batch.matrix(s['x'][:, model.QUATERNION])
@@ -201,7 +214,7 @@ class TiltableQuadrotorEnv(VecEnv):
                             s['x'][:, model.RATE]), -1)
         new.update(
             x=x, previous=command, older=s['previous'], age=age,
-            target_left=s['target_left'] - 1,
+            target_left=s['target_left'] - 1, deepest=torch.maximum(s['deepest'], depth),
             past_motion=torch.cat((motion[:, None], s['past_motion'][:, :3]), 1),
             past_tilt=torch.cat((s['x'][:, None, model.TILT], s['past_tilt'][:, :1]), 1),
             estimate=self._follow(s, x, rotation))
@@ -246,7 +259,7 @@ class TiltableQuadrotorEnv(VecEnv):
                                      new['x'][:, model.QUATERNION])
         changed = dict(new)
         for name, value in target.items():
-            changed[name] = torch.where(_spread(due, value), value, new[name])
+            changed[name] = torch.where(spread(due, value), value, new[name])
         return changed
 
     def _observe(self, s, draw):
@@ -270,8 +283,3 @@ class TiltableQuadrotorEnv(VecEnv):
         for name, value in zip(rewards.TERMS, values[8:]):
             result[f'reward/{name}'] = value / steps * getattr(self.cfg.reward, name)
         return result
-
-
-def _spread(mask, like):
-    """Mask (N,) shaped to select rows of ``like`` (N, ...)."""
-    return mask.view(-1, *[1] * (like.dim() - 1))

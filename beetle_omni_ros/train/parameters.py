@@ -41,6 +41,9 @@ class EpisodeParameters:
                                   high=200)
     hold_targets: float = parameter(0.1, doc='share of new targets that are near the present '
                                              'pose, so that holding is trained', low=0, high=1)
+    replay_share: float = parameter(
+        0.3, doc='share of the episodes, at most, that begin with a situation that was missed',
+        low=0, high=0.9)
 
     def __post_init__(self):
         """Refuse ranges in the wrong order."""

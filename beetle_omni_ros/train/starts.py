@@ -110,7 +110,8 @@ class Starts:
         target = torch.where(near, turned, d.attitude())
         return {'target_position': place, 'target_attitude': target,
                 'target_left': torch.floor(d.uniform(1, *self._target_time))[:, 0],
-                'floor': torch.minimum(place[:, 2:], position[:, 2:])}
+                'floor': torch.minimum(place[:, 2:], position[:, 2:]),
+                'deepest': torch.zeros_like(place[:, 2])}
 
     def _randomisation(self, d):
         r = self._p.random

@@ -34,8 +34,10 @@ def environment(changes=None, robots=64, seed=0, robot=ROBOT, **more):
 
 
 def quiet(changes=None, **more):
-    """:func:`environment` in which everything is known."""
-    return environment({**QUIET, **(changes or {})}, **more)
+    """:func:`environment` in which everything is known, all episodes at their begin."""
+    env = environment({**QUIET, **(changes or {})}, **more)
+    env.state['age'].zero_()
+    return env
 
 
 def only(stratum):

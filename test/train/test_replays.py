@@ -1,0 +1,181 @@
+"""Situations that were missed are stored, flown again as they were, and forgotten when flown."""
+
+from dataclasses import replace
+
+from learning import only, quiet
+import pytest
+import torch
+
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.train import batch
+from beetle_omni_ros.train.replays import Replays
+
+COUNT = 8
+
+
+def states(seed=0, count=COUNT):
+    g = torch.Generator().manual_seed(seed)
+    return {'x': torch.randn(count, 3, generator=g), 'age': torch.rand(count, generator=g),
+            'past': torch.randn(count, 2, 2, generator=g),
+            'target_left': torch.rand(count, generator=g)}
+
+
+def flags(**rows):
+    """Ends of a step: name -> rows in which they hold."""
+    result = {name: torch.zeros(COUNT, dtype=torch.bool) for name in ('due', 'done', 'missed')}
+    for name, places in rows.items():
+        result[name][places] = True
+    return result
+
+
+def step(replays, s, new, fresh, ends, numbers=None):
+    numbers = torch.full((COUNT, 3), 0.5) if numbers is None else numbers
+    return replays.step(s, dict(new), fresh, ends, batch.Draw(numbers))
+
+
+def store(share=1.0):
+    """A store of which row 2 holds a situation, and that situation."""
+    first = states()
+    replays = Replays(first, share, 800)
+    s = {**first, **replays.state(first)}
+    return replays, step(replays, s, states(1), states(2), flags(due=[2, 3], missed=[2])), first
+
+
+def test_the_state_in_which_a_missed_target_began_is_what_is_stored():
+    replays, s, first = store()
+    assert s['filled'].tolist() == [0, 0, 1, 0, 0, 0, 0, 0]
+    for name, value in replays.unpacked(s['stored']).items():
+        torch.testing.assert_close(value[2], first[name][2])
+        assert value.shape == first[name].shape
+
+
+def test_the_next_target_begins_where_the_last_one_ended():
+    replays, s, first = store()
+    begun = replays.unpacked(s['begun'])
+    for row, expected in ((2, states(1)), (3, states(1)), (4, first)):
+        torch.testing.assert_close(begun['past'][row], expected['past'][row])
+
+
+def test_an_episode_begins_with_a_stored_situation_and_the_longest_time():
+    replays, s, first = store()
+    after = step(replays, s, states(3), states(4), flags(done=[0, 5]))
+    for row in (0, 5):
+        torch.testing.assert_close(after['x'][row], first['x'][2])
+        torch.testing.assert_close(after['past'][row], first['past'][2])
+        assert after['age'][row] == 0 and after['target_left'][row] == 800
+        assert after['source'][row] == 2
+    torch.testing.assert_close(after['x'][1], states(3)['x'][1])
+    assert after['source'][1] == -1
+
+
+@pytest.mark.parametrize('case', ['nothing stored', 'no share'])
+def test_without_store_or_share_episodes_begin_as_drawn(case):
+    replays, s, _ = store(share=0.0 if case == 'no share' else 1.0)
+    if case == 'nothing stored':
+        s['filled'] = torch.zeros(COUNT)
+    after = step(replays, s, states(3), states(4), flags(done=[0]),
+                 numbers=torch.zeros(COUNT, 3))
+    torch.testing.assert_close(after['x'][0], states(4)['x'][0])
+    assert after['source'][0] == -1
+
+
+def test_picks_are_spread_over_what_is_stored_and_nothing_else():
+    replays, s, _ = store()
+    s['filled'] = torch.tensor([0.0, 1, 0, 0, 1, 1, 0, 0])
+    numbers = torch.full((COUNT, 3), 0.0)
+    numbers[:, 1] = torch.arange(COUNT) / COUNT
+    after = step(replays, s, states(3), states(4), flags(done=list(range(COUNT))), numbers)
+    assert after['source'].tolist() == [1, 1, 1, 4, 4, 4, 5, 5]
+
+
+@pytest.mark.parametrize(('missed', 'chance', 'left'), [
+    (False, 0.45, 0), (False, 0.55, 1), (True, 0.05, 0), (True, 0.15, 1)])
+def test_what_was_flown_is_dropped_sooner_than_what_was_missed_again(missed, chance, left):
+    replays, s, first = store()
+    s = step(replays, s, states(3), states(4), flags(done=[0]))
+    numbers = torch.full((COUNT, 3), chance)
+    ends = flags(due=[0], missed=[0] if missed else [])
+    after = step(replays, s, states(5), states(6), ends, numbers)
+    assert after['filled'][2] == left
+    # a replay is not stored a second time
+    assert after['filled'][0] == 0 and after['source'][0] == -1
+
+
+def test_a_replay_cut_short_says_nothing():
+    replays, s, _ = store()
+    s = step(replays, s, states(3), states(4), flags(done=[0]))
+    s['filled'][2] = 1.0
+    after = step(replays, s, states(5), states(6), flags(done=[0]), torch.zeros(COUNT, 3))
+    assert after['filled'][2] == 1
+
+
+def test_robots_of_the_environment_meet_again_what_they_missed():
+    env = quiet({**only('hover'), 'episode.replay_share': 0.9, 'episode.hold_targets': 0.0,
+                 'episode.target_time': [1.0, 1.0], 'episode.duration': 2.0,
+                 'episode.rate_limit': 200.0, 'episode.velocity_limit': 100.0}, robots=16)
+    begun = {name: value.clone() for name, value in env.state.items()}
+    still = torch.zeros(16, 8)
+    for _ in range(99):
+        env.advance(still)
+        assert not env.state['filled'].any()
+    env.advance(still)
+    missed = env.state['filled'] > 0
+    assert missed.any()
+    kept = env._replays.unpacked(env.state['stored'])
+    for name in ('x', 'target_attitude', 'body', 'delays', 'bias'):
+        torch.testing.assert_close(kept[name][missed], begun[name][missed])
+    while not (env.state['source'] >= 0).any():
+        assert env.state['age'].max() < 199.5
+        kept = env._replays.unpacked(env.state['stored'].clone())
+        env.advance(still)
+    again = env.state['source'] >= 0
+    place = env.state['source'][again].long()
+    for name in ('x', 'target_position', 'target_attitude', 'body', 'delays', 'bias'):
+        torch.testing.assert_close(env.state[name][again], kept[name][place])
+    assert (env.state['target_left'][again] == 100).all()
+
+
+def test_the_tally_counts_no_replays():
+    env = quiet({**only('hover'), 'episode.target_time': [1.0, 1.0]}, robots=16)
+    env.state['target_left'].fill_(1.0)
+    env.state['source'][:10] = 3.0
+    env.advance(torch.zeros(16, 8))
+    assert env.read_tally()['targets'] == 6
+
+
+def test_disturbed_robots_are_not_stored():
+    env = quiet({**only('hover'), 'episode.target_time': [1.0, 1.0]}, robots=16)
+    env.state['target_left'].fill_(1.0)
+    env.state['x'][:, model.POSITION] += 1.0
+    env.state['disturbed'][:7] = 1.0
+    env.advance(torch.zeros(16, 8))
+    assert env.state['filled'].tolist() == [0.0] * 7 + [1.0] * 9
+
+
+def test_a_deep_dive_is_a_miss_wherever_it_ends():
+    env = quiet({**only('hold'), 'episode.target_time': [1.0, 1.0]}, robots=4)
+    env.state['target_position'].copy_(env.state['x'][:, model.POSITION])
+    env.state['deepest'][1] = 0.5
+    env.state['target_left'].fill_(1.0)
+    env.advance((env.state['previous'] - env.offset) / env.scale)
+    assert env.state['filled'].tolist() == [0, 1, 0, 0]
+    assert not env.state['deepest'].any()
+
+
+def test_assessments_replay_nothing():
+    from beetle_omni_ros.train import assess
+    seen = []
+    original = assess.TiltableQuadrotorEnv
+
+    class Watched(original):
+        def __init__(self, parameters, *rest, **more):
+            seen.append(parameters.episode.replay_share)
+            super().__init__(parameters, *rest, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(assess, 'TiltableQuadrotorEnv', Watched)
+        patch.setattr(assess, 'SEGMENT', 1.0)
+        env = quiet(robots=2)
+        assess.assess(lambda seen: torch.zeros(2, 8),
+                      replace(env.cfg), env.robot, 'cpu', 'nominal', robots=2, segments=1)
+    assert seen == [0.0]
