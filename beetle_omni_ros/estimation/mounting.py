@@ -59,14 +59,21 @@ class Mounting:
             readings: (stamp, specific force, rate, shaken) of the IMU up to the node's.
 
         """
-        age = node.time_offset
-        if age > SIGNIFICANT * sqrt(node.covariance[TIME_OFFSET, TIME_OFFSET]):
-            node = self._aged(node, age, self.trend(readings))
+        age, then = node.time_offset, node
+        late = age > SIGNIFICANT * sqrt(node.covariance[TIME_OFFSET, TIME_OFFSET])
+        if late:
+            node = self._aged(then, age, self.trend(readings))
         rate = node.rate - node.gyroscope_bias
         position, velocity = node.position, node.velocity
-        covariance = node.covariance[:ERROR_STATES, :ERROR_STATES]
         if self._arm is not None:
-            position, velocity, covariance = self._at_base(node, rate, covariance)
+            position = position - node.rotation @ self._arm
+            velocity = velocity - node.rotation @ np.cross(rate, self._arm)
+
+        def covariance():
+            found = self._aged_covariance(then, node, age) if late else node.covariance
+            found = found[:ERROR_STATES, :ERROR_STATES]
+            return found if self._arm is None else self._covariance_at_base(node, rate, found)
+
         return Estimate(node.stamp, position, velocity, node.quaternion, rate,
                         node.accelerometer_bias, node.gyroscope_bias, covariance)
 
@@ -92,25 +99,31 @@ class Mounting:
         rate = node.rate - node.gyroscope_bias + 0.5 * age * trend
         acceleration = (node.rotation @ (node.force - node.accelerometer_bias) - self._gravity)
         quaternion = rotations.multiply(node.quaternion, rotations.exp(age * rate))
-        turned = rotations.matrix(quaternion)
-        jacobian = np.eye(STATES)
-        jacobian[POSITION, VELOCITY] = age * np.eye(3)
-        jacobian[POSITION, TIME_OFFSET] = node.velocity
-        jacobian[VELOCITY, TIME_OFFSET] = acceleration
-        jacobian[VELOCITY, ATTITUDE] = -age * rotations.skew(acceleration) @ node.rotation
-        jacobian[VELOCITY, ACCELEROMETER_BIAS] = -age * node.rotation
-        jacobian[ATTITUDE, ATTITUDE] = turned.T @ node.rotation
-        jacobian[ATTITUDE, GYROSCOPE_BIAS] = -age * np.eye(3)
-        jacobian[ATTITUDE, TIME_OFFSET] = rate
         return replace(
             node, rate=node.rate + age * trend,
             position=node.position + age * node.velocity + 0.5 * age ** 2 * acceleration,
-            velocity=node.velocity + age * acceleration, quaternion=quaternion, rotation=turned,
-            covariance=jacobian @ node.covariance @ jacobian.T)
+            velocity=node.velocity + age * acceleration, quaternion=quaternion,
+            rotation=rotations.matrix(quaternion))
 
-    def _at_base(self, node, rate, covariance):
+    def _aged_covariance(self, before, after, age) -> np.ndarray:
+        """(16, 16) covariance of ``after``, which is ``before`` carried on by :meth:`_aged`."""
+        acceleration = before.rotation @ (before.force - before.accelerometer_bias) - self._gravity
+        # the mean rate, which half of the trend is in
+        rate = 0.5 * (before.rate + after.rate) - before.gyroscope_bias
+        jacobian = np.eye(STATES)
+        jacobian[POSITION, VELOCITY] = age * np.eye(3)
+        jacobian[POSITION, TIME_OFFSET] = before.velocity
+        jacobian[VELOCITY, TIME_OFFSET] = acceleration
+        jacobian[VELOCITY, ATTITUDE] = -age * rotations.skew(acceleration) @ before.rotation
+        jacobian[VELOCITY, ACCELEROMETER_BIAS] = -age * before.rotation
+        jacobian[ATTITUDE, ATTITUDE] = after.rotation.T @ before.rotation
+        jacobian[ATTITUDE, GYROSCOPE_BIAS] = -age * np.eye(3)
+        jacobian[ATTITUDE, TIME_OFFSET] = rate
+        return jacobian @ before.covariance @ jacobian.T
+
+    def _covariance_at_base(self, node, rate, covariance):
         """
-        Move a state from the IMU to base_link's origin.
+        Move a state's covariance (15, 15) from the IMU to base_link's origin.
 
         With arm r, rate w: p = p_imu - R r and v = v_imu - R (w x r). The noise of the rate
         sample itself enters the velocity through the arm.
@@ -123,5 +136,4 @@ class Mounting:
         jacobian[VELOCITY, GYROSCOPE_BIAS] = -arm
         covariance = jacobian @ covariance @ jacobian.T
         covariance[VELOCITY, VELOCITY] += self._rate_noise * arm @ arm.T
-        return (node.position - node.rotation @ self._arm, node.velocity - node.rotation @ swing,
-                covariance)
+        return covariance

@@ -1,6 +1,8 @@
 """What goes into the estimator and what comes out."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -61,7 +63,8 @@ class Estimate:
         angular_velocity: (3,) in base_link, bias removed [rad/s].
         accelerometer_bias: (3,) in base_link axes [m/s^2].
         gyroscope_bias: (3,) in base_link axes [rad/s].
-        covariance: (15, 15) of the error, in the order of this module's slices.
+        covariance: (15, 15) of the error, in the order of this module's slices; worked out when
+            first asked for.
 
     """
 
@@ -72,4 +75,9 @@ class Estimate:
     angular_velocity: np.ndarray
     accelerometer_bias: np.ndarray
     gyroscope_bias: np.ndarray
-    covariance: np.ndarray
+    find_covariance: Callable[[], np.ndarray] = field(repr=False)
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """See the class."""
+        return self.find_covariance()

@@ -142,10 +142,10 @@ class FlightLoop:
             state = self._state(estimate)
             supervisor.on_state(state, self._estimator.status)
             self._control(state, now)
+            covariances = () if not recorder.keeps_covariances else (
+                pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
             recorder.write_odom(estimate.stamp, estimate.position, estimate.quaternion,
-                                estimate.velocity, estimate.angular_velocity,
-                                pose_covariance(estimate),
-                                twist_covariance(estimate, self._gyroscope_noise))
+                                estimate.velocity, estimate.angular_velocity, *covariances)
         command = supervisor.update(now)
         if command is None:
             self._command = None

@@ -29,6 +29,8 @@ class BagWriter:
     messages; a topic that turns up later starts a new chunk.
     """
 
+    keeps_covariances = True
+
     def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
                  topics: Sequence[str] = tuple(TOPICS)):
         """

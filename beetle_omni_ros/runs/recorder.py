@@ -17,7 +17,15 @@ from beetle_omni_ros.runs.log import Commands, COMPUTE_KEYS, Diagnostic, FlightL
 
 
 class LogRecorder:
-    """Collects a :class:`FlightLog` from ``write_*`` calls; see there for units and frames."""
+    """
+    Collects a :class:`FlightLog` from ``write_*`` calls; see there for units and frames.
+
+    Attributes:
+        keeps_covariances: whether ``write_odom`` does anything with them.
+
+    """
+
+    keeps_covariances = False
 
     def __init__(self, meta: dict | None = None):
         self._rows = {name: array('d') for name in SERIES}  # flat: hours of flight fit
@@ -145,6 +153,7 @@ class Tee:
 
     def __init__(self, *recorders):
         self._recorders = recorders
+        self.keeps_covariances = any(recorder.keeps_covariances for recorder in recorders)
 
     def __getattr__(self, name):
         """Look the method up in every recorder."""

@@ -17,7 +17,7 @@ def drawn():
     mix = rng.standard_normal((15, 15)) * 1e-3
     estimate = Estimate(0.0, np.array([1.0, 2.0, 3.0]), np.array([2.0, -1.0, 0.5]),
                         Rotation.from_rotvec([2.0, -1.0, 1.5]).as_quat(),
-                        np.array([1.0, -2.0, 0.5]), np.zeros(3), np.zeros(3), mix @ mix.T)
+                        np.array([1.0, -2.0, 0.5]), np.zeros(3), np.zeros(3), lambda: mix @ mix.T)
     return estimate, rng.standard_normal((DRAWS, 15)) @ mix.T, rng
 
 
