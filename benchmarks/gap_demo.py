@@ -29,7 +29,7 @@ from beetle_omni_ros.robot.resources import share_path
 HIDDEN = {
     'tilt_thrust_loss': 'tilt_thrust_loss: {loss_at_60deg: 0.08}',
     'rotor_drag': 'rotor_drag: {coefficient: 1.2}',
-    'joint_command_latency': 'joint_command_latency: {delay: 0.03}',
+    'joint_command_latency': 'joint_command_latency: {delay: 0.045}',
 }
 FLIGHTS, POSES = 3, 7       # of 8 s each: the last flight judges
 

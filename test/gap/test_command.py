@@ -68,6 +68,17 @@ def test_what_makes_flights_held_out_worse_is_not_named(made):
     assert results['gap_after'] == results['gap_before']
 
 
+def test_what_leaves_most_of_a_large_gap_is_not_named(made):
+    folder, robot = made[0], RobotParameters.load()
+    strong = replace(robot, effects={'wind': {'force': 6 * np.array(TRUE)}})
+    fly('hover', make_task(str(folder / 'poses.csv'), 0), robot=robot, plant=strong, seed=3,
+        bag=folder / 'storm')
+    results = gap_results([folder / 'flight0'], [folder / 'storm'], console=quiet())
+    assert results['gap_before'] > 10
+    assert results['verdict'] == 'unknown' and results['effects'] == []
+    assert 'wind' in results['reason'] and 'leaves most' in results['reason']
+
+
 def test_the_json_holds_what_the_interfaces_fix(made):
     results = json.loads((made[0] / 'gap.json').read_text())
     for key in ('verdict', 'effects', 'where', 'gap_before', 'gap_after', 'noise_floor',

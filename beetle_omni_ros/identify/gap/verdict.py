@@ -73,7 +73,9 @@ def decide(a: Analysis, p: GapParameters) -> None:
 
 def withdraw(a: Analysis, gap: dict[str, float]) -> None:
     """
-    Take back what makes flights that were not fitted worse: such a model is not to be flown with.
+    Take back what makes flights that were not fitted worse, or leaves most of a large gap.
+
+    Such a model is not to be flown with, and such an effect is not what differs.
 
     Args:
         a: decided, with something named.
@@ -82,7 +84,9 @@ def withdraw(a: Analysis, gap: dict[str, float]) -> None:
     """
     names = ' and '.join(t.candidate.name for t in a.accepted)
     a.verdict, a.partial = 'unknown', list(a.found.accepted)
-    a.reason = (f'{names} would explain the fitted flights and makes the held-out ones worse: '
+    worse = 'makes the held-out ones worse' if gap['after'] > gap['before'] else \
+        'leaves most of what free runs show'
+    a.reason = (f'{names} would explain the fitted flights and {worse}: '
                 f'{gap["before"]:.2f} to {gap["after"]:.2f} noise floors in free runs')
     a.found.accepted.clear()
     a.experiment = _experiment(a, [], [])
