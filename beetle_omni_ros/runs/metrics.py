@@ -146,6 +146,7 @@ def _judge(log, task, flown, expected):
         result[name] = {key: _reduced(reduce, [pose[key] for pose in poses]) for key in POSE_KEYS}
     result['success_rate'] = float(np.mean([p['reached'] for p in poses])) if poses else None
     result['crashed'] = _crashed(log, body, flown)
+    result['lowest'] = _lowest(log, body, flown)
     compute = log.compute.get(flown.name, {})
     result['compute_ms'] = {key: compute.get(key)
                             for key in ('median', 'p99', 'max', 'deadline_misses')}
@@ -198,6 +199,17 @@ def _crashed(log, body, flown):
                for t, state in zip(log.state_t, log.states, strict=True)):
             return True
     return False
+
+
+def _lowest(log, body, flown):
+    """How low base_link came, and during which of the flight's poses; {} without a height."""
+    rows = np.flatnonzero(inside(body.t, flown.intervals))
+    rows = rows[np.isfinite(body.position[rows, 2])]
+    if not len(rows):
+        return {}
+    row = rows[np.argmin(body.position[rows, 2])]
+    begun = [n for n, k in enumerate(flown.poses) if log.targets[k].stamp <= body.t[row]]
+    return {'height_m': float(body.position[row, 2]), 'pose': begun[-1] if begun else None}
 
 
 def _effort(log, intervals, windows):

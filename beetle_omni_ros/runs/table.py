@@ -103,7 +103,8 @@ def _summary(judged, task):
             for text, path, digits in ERROR_ROWS]
     rows += [['poses reached', *(_reached(column) for column in columns)],
              ['crashed', *({True: 'yes', False: 'no'}.get(column.get('crashed'), ABSENT)
-                           for column in columns)]]
+                           for column in columns)],
+             ['lowest point [m]', *(_lowest(column) for column in columns)]]
     rows += [[text, *(_number(_at(column, path), digits) for column in columns)]
              for text, path, digits in EFFORT_ROWS]
     if any('stamp_to_command_ms' in column for column in columns):
@@ -113,6 +114,12 @@ def _summary(judged, task):
     return Grid('U: hovering, 7.0 to 7.5 s after each target; L: on the way, 1 to 7 s',
                 ['', *judged, *(f'published {name}' for name in others)], rows,
                 faint_columns=frozenset(range(first, first + len(others))))
+
+
+def _lowest(result):
+    found = result.get('lowest') or {}
+    pose = found.get('pose')
+    return _number(found.get('height_m'), 2) + ('' if pose is None else f' (pose {pose + 1})')
 
 
 def _at(result, path):

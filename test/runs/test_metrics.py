@@ -91,6 +91,22 @@ def test_mean_median_and_max_are_over_the_poses():
     assert [pose['target'] for pose in result['poses']] == [list(p) for p in task.poses]
 
 
+def test_the_lowest_point_is_told_with_the_pose_that_was_flown_then():
+    task, recorder = make_task('random3'), LogRecorder()
+    recorder.write_state(0.0, 'flying:nmpc')
+    for k, target in enumerate(task.targets(1.0)):
+        recorder.write_target(target)
+        for t in target.stamp + np.arange(0, 8, 0.005):
+            dip = 0.4 if k == 1 and 3 < t - target.stamp < 3.1 else 0.0
+            recorder.write_truth(t, np.array([0, 0, 0.7 - dip]), target.quaternion, np.zeros(3),
+                                 np.zeros(3))
+    # on the ground before and after, which says nothing of the flight
+    recorder.write_truth(30.0, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
+    result = metrics(recorder.log(), task)
+    assert result['lowest'] == {'height_m': pytest.approx(0.3), 'pose': 1}
+    assert metrics(LogRecorder().log())['lowest'] == {}
+
+
 def test_effort_is_command_minus_joint_and_mean_thrust():
     recorder = LogRecorder()
     recorder.write_target(pose_target(np.array([0, 0, 1, 0, 0, 0.0]), 0.0))
