@@ -204,7 +204,8 @@ def _vector(value, size):
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):
         return None
-    return array if array.shape == (size,) and np.all(np.abs(array) < ABSURD) else None
+    small = array.shape == (size,) and all(abs(number) < ABSURD for number in array.tolist())
+    return array if small else None
 
 
 def _shortened(vector, limit):

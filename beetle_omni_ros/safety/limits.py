@@ -107,10 +107,10 @@ class CommandStream:
             return NOT_A_COMMAND, None
         if tilt.shape != (ROTORS,) or thrust.shape != (ROTORS,):
             return SHAPE, None
-        if not (isfinite(stamp) and np.isfinite(tilt).all() and np.isfinite(thrust).all()):
+        if not all(map(isfinite, (stamp, *tilt.tolist(), *thrust.tolist()))):
             return NOT_FINITE, None
-        clean = Command(stamp, np.clip(tilt, -self._tilt_limit, self._tilt_limit),
-                        np.clip(thrust, self._rotors.thrust_min, self._rotors.thrust_max))
+        clean = Command(stamp, _cut(tilt, -self._tilt_limit, self._tilt_limit),
+                        _cut(thrust, self._rotors.thrust_min, self._rotors.thrust_max))
         return self._check_stamp(stamp, now) or self._check_range(tilt, thrust, clean), clean
 
     def _check_stamp(self, stamp, now):
@@ -124,16 +124,16 @@ class CommandStream:
 
     def _check_range(self, tilt, thrust, clean):
         tolerance = self._limits.limit_tolerance
-        if np.abs(thrust - clean.thrust).max() > tolerance:
+        if _farthest(thrust, clean.thrust) > tolerance:
             return THRUST
-        if np.abs(tilt - clean.tilt).max() > tolerance:
+        if _farthest(tilt, clean.tilt) > tolerance:
             return TILT
         before, self._offered = self._offered, clean
         # Against the previous one offered, not accepted: a lone spike is refused, a real step
         # costs one period.
         if before is not None and clean.stamp - before.stamp <= self._limits.timeout and (
-                np.abs(clean.tilt - before.tilt).max() > self._limits.tilt_step
-                or np.abs(clean.thrust - before.thrust).max() > self._limits.thrust_step):
+                _farthest(clean.tilt, before.tilt) > self._limits.tilt_step
+                or _farthest(clean.thrust, before.thrust) > self._limits.thrust_step):
             return JUMP
         return ''
 
@@ -149,9 +149,18 @@ def within_limits(command: Command, robot: RobotParameters, stopped: bool = Fals
         stopped: whether zero thrust is meant, below the smallest thrust of flight.
 
     """
-    if not (np.isfinite(command.tilt).all() and np.isfinite(command.thrust).all()):
+    if not all(map(isfinite, (*command.tilt.tolist(), *command.thrust.tolist()))):
         return None
     limit = robot.joints.position_limit
     low = 0.0 if stopped else robot.rotors.thrust_min
-    return Command(command.stamp, np.clip(command.tilt, -limit, limit),
-                   np.clip(command.thrust, low, robot.rotors.thrust_max))
+    return Command(command.stamp, _cut(command.tilt, -limit, limit),
+                   _cut(command.thrust, low, robot.rotors.thrust_max))
+
+
+def _cut(values, low, high):
+    """As np.clip, for a fraction of its time."""
+    return np.minimum(np.maximum(values, low), high)
+
+
+def _farthest(a, b):
+    return max(map(abs, (a - b).tolist()))

@@ -39,7 +39,8 @@ class SupportGauge:
                 / (self._allocator.mass * self._gravity)
         self.thrust += (1.0 - exp(-dt / self._lag)) * (now - self.thrust)
         if learn and specific_force_up is not None and self.thrust > LEAST_THRUST:
-            ratio = np.clip(specific_force_up / self._gravity / self.thrust, *BASELINE_RANGE)
+            low, high = BASELINE_RANGE
+            ratio = min(max(specific_force_up / self._gravity / self.thrust, low), high)
             self._baseline += min(1.0, dt / BASELINE_TIME) * (ratio - self._baseline)
         self.lift = self._baseline * self.thrust
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from itertools import chain
+from math import isfinite, nan
 
 import numpy as np
 
@@ -87,14 +89,17 @@ class Vehicle:
 
         Only a complete one ends the joints' silence.
         """
-        known = np.isfinite(position) if np.shape(position) == (4,) else np.zeros(4, dtype=bool)
-        if not (np.isfinite(stamp) and stamp > self.tilt_stamp and known.any()
-                and np.abs(np.where(known, position, 0.0)).max() < ABSURD):
+        position, velocity = _numbers(position, 4), _numbers(velocity, 4) or [nan] * 4
+        known = [isfinite(angle) for angle in position or ()]
+        if not (isfinite(stamp) and stamp > self.tilt_stamp and any(known)
+                and all(abs(angle) < ABSURD for angle in position if isfinite(angle))):
             return False
-        self.tilt, self.tilt_stamp = np.where(known, position, self.tilt), float(stamp)
-        moving = known & np.isfinite(velocity) if np.shape(velocity) == (4,) else False
-        self.tilt_velocity = np.where(moving, velocity, 0.0)
-        if known.all():
+        self.tilt = np.array([new if there else old for new, there, old in zip(
+            position, known, self.tilt.tolist())])
+        self.tilt_stamp = float(stamp)
+        self.tilt_velocity = np.array([rate if there and isfinite(rate) else 0.0
+                                       for rate, there in zip(velocity, known)])
+        if all(known):
             self.joints.heard()
         return True
 
@@ -180,14 +185,15 @@ class Vehicle:
 
     def _check_state(self, state, status, now):
         limits = self._parameters.state
-        if not (_finite(state.position, 3) and _finite(state.velocity, 3)
-                and _finite(state.quaternion, 4) and _finite(state.angular_velocity, 3)
-                and np.isfinite(state.stamp)):
+        motion = [_numbers(v, 3) for v in (state.position, state.velocity,
+                                           state.angular_velocity)]
+        quaternion = _numbers(state.quaternion, 4)
+        if not (quaternion and all(motion) and isfinite(state.stamp)
+                and all(map(isfinite, chain(quaternion, *motion)))):
             return 'not finite'
-        if max(np.abs(v).max() for v in (state.position, state.velocity,
-                                         state.angular_velocity)) > ABSURD:
+        if max(map(abs, chain(*motion))) > ABSURD:
             return 'absurdly large'
-        if abs(float(np.dot(state.quaternion, state.quaternion)) - 1) > UNIT_TOLERANCE:
+        if abs(sum(part * part for part in quaternion) - 1) > UNIT_TOLERANCE:
             return 'no unit quaternion'
         if now is not None and now - state.stamp > limits.stale_after:
             return 'stale stamp'
@@ -200,9 +206,10 @@ class Vehicle:
         return ''
 
 
-def _finite(value, size):
+def _numbers(value, size):
+    """``value`` as so many floats, finite or not; None where it is something else."""
     try:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
-        return False
-    return array.shape == (size,) and bool(np.isfinite(array).all())
+        return None
+    return array.tolist() if array.shape == (size,) else None
