@@ -23,6 +23,9 @@ BEYOND = 3.0            # standard deviations of a tolerance that no robot has .
 ROUNDS = 3              # ... and how often others may take over from it
 MOST_ITERATIONS = 10    # of a fit, which ends by itself where it gains no more
 WIDE = 4.0              # typical sizes, within which anything is sought
+# Two forms of one response: where one is joined and the other still gains beside it, the response
+# has a shape that neither holds, such as a lag of second order, and which number is wrong is open.
+ONE_RESPONSE = {'rotor_lag', 'rotor_dead_time'}
 
 
 
@@ -295,7 +298,9 @@ class Search:
             for other in self._step(start, without, others):
                 if other.candidate.name == own.name and other.candidate.member == own.member:
                     continue
-                if not (other.refined and other.gain > gain - margin) \
+                near_enough = other.gain > gain - margin \
+                    or neither_holds(found, own.name, other.candidate.name, self.p.rival_gain)
+                if not (other.refined and near_enough) \
                         or at_bound(self.problem.keys, other) \
                         or not other.candidate.large_enough(self.problem.keys, other.theta):
                     continue
@@ -304,3 +309,19 @@ class Search:
                     near.append(other)
             trial.gain = gain
             found.rivals[own.label] = near
+
+
+def neither_holds(found: Found, own: str, other: str, least: float) -> bool:
+    """
+    Whether two entries are forms of one response, whose shape is neither's.
+
+    Args:
+        found: with the trials beside what is accepted.
+        own: name of an accepted entry.
+        other: name of the entry that might be meant as well.
+        least: of chi2, that the other gains beside it.
+
+    """
+    beside = found.trials.get(other)
+    return ONE_RESPONSE == {own, other} and beside is not None and beside.gain > least \
+        and beside not in found.accepted
