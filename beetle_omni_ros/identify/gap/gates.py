@@ -7,13 +7,16 @@ import numpy as np
 from beetle_omni_ros.identify.gap.bands import aside, in_part_alone
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.keys import Key
-from beetle_omni_ros.identify.gap.trial import Trial
+from beetle_omni_ros.identify.gap.trial import Found, Trial
 
 LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
 # Of chi2, from which blocks may gain unevenly as long as they gain. In the blind campaign what
 # gained less, and that unevenly, was not there (4 of 4, up to 97); what gained more was (7 of 7,
 # from 708).
 LEAST_UNEVEN = 300.0
+# Two forms of one response: where one is joined and the other still gains beside it, the response
+# has a shape that neither holds, such as a lag of second order, and which number is wrong is open.
+ONE_RESPONSE = {'rotor_lag', 'rotor_dead_time'}
 
 
 def at_bound(keys: dict[str, Key], trial: Trial) -> bool:
@@ -31,6 +34,22 @@ def holds(trial: Trial) -> bool:
         or trial.positive >= 0.85 and trial.gain >= LEAST_UNEVEN
     return sure and trial.cross[0] >= 0.3 * trial.gain and trial.positive >= 0.55 \
         and trial.without_best >= max(0.05 * min(trial.cross[0], trial.gain), LEAST_ELSEWHERE)
+
+
+def neither_holds(found: Found, own: str, other: str, least: float) -> bool:
+    """
+    Whether two entries are forms of one response, whose shape is neither's.
+
+    Args:
+        found: with the trials beside what is accepted.
+        own: name of an accepted entry.
+        other: name of the entry that might be meant as well.
+        least: of chi2, that the other gains beside it.
+
+    """
+    beside = found.trials.get(other)
+    return ONE_RESPONSE == {own, other} and beside is not None and beside.gain > least \
+        and beside not in found.accepted
 
 
 def fought(problem: Problem, trial: Trial, point: State, involved: list[str],

@@ -9,7 +9,13 @@ import numpy as np
 from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
 from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
-from beetle_omni_ros.identify.gap.gates import at_bound, cross_validate, fought, holds
+from beetle_omni_ros.identify.gap.gates import (
+    at_bound,
+    cross_validate,
+    fought,
+    holds,
+    neither_holds,
+)
 from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.keys import SHAPES
 from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, NOT_HELD, TOO_SMALL, Trial
@@ -23,9 +29,6 @@ BEYOND = 3.0            # standard deviations of a tolerance that no robot has .
 ROUNDS = 3              # ... and how often others may take over from it
 MOST_ITERATIONS = 10    # of a fit, which ends by itself where it gains no more
 WIDE = 4.0              # typical sizes, within which anything is sought
-# Two forms of one response: where one is joined and the other still gains beside it, the response
-# has a shape that neither holds, such as a lag of second order, and which number is wrong is open.
-ONE_RESPONSE = {'rotor_lag', 'rotor_dead_time'}
 
 
 
@@ -309,19 +312,3 @@ class Search:
                     near.append(other)
             trial.gain = gain
             found.rivals[own.label] = near
-
-
-def neither_holds(found: Found, own: str, other: str, least: float) -> bool:
-    """
-    Whether two entries are forms of one response, whose shape is neither's.
-
-    Args:
-        found: with the trials beside what is accepted.
-        own: name of an accepted entry.
-        other: name of the entry that might be meant as well.
-        least: of chi2, that the other gains beside it.
-
-    """
-    beside = found.trials.get(other)
-    return ONE_RESPONSE == {own, other} and beside is not None and beside.gain > least \
-        and beside not in found.accepted
