@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -14,6 +15,7 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.control.observation import disturbed, observed
 from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.control.trimming import Trimming, TrimmingParameters
 from beetle_omni_ros.control.turning import raised, TurningParameters
 from beetle_omni_ros.control.unwinding import Unwinding, UnwindingParameters
 from beetle_omni_ros.robot import dynamics as model
@@ -23,6 +25,7 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
 
 DEFAULT = 'policies/rl.onnx'
+LATEST = 10     # steps within which a command comes back as the one in force
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +57,8 @@ class PolicyParameters:
         UnwindingParameters, 'through a level attitude where joints end at their stops')
     turning: TurningParameters = group(
         TurningParameters, 'low targets are turned to above them')
+    trimming: TrimmingParameters = group(
+        TrimmingParameters, 'the steady error at a target is taken off')
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> PolicyParameters:
@@ -98,6 +103,7 @@ class PolicyController:
         self._estimator = DisturbanceEstimator(
             robot, p, FunctionCall(model.integrator(robot), None)) if contract.memory else None
         self._unwinding = Unwinding(p.unwinding, robot.tilt_axes)
+        self._trimming = Trimming(p.trimming)
         self.reset()
 
     def reset(self) -> None:
@@ -105,6 +111,8 @@ class PolicyController:
         self._command: Command | None = None
         self._steps = self._rejected = self._faults = self._cut = 0
         self._unwinding.reset()
+        self._trimming.reset()
+        self._latest: deque[list[float]] = deque(maxlen=LATEST)
         if self._estimator:
             self._estimator.reset()
 
@@ -117,6 +125,7 @@ class PolicyController:
             return self._repeated(state)
         values = self._targets(self._network(observation))
         self._command = Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
+        self._latest.appendleft(values)
         return self._command
 
     def diagnostics(self) -> dict[str, float | int | str]:
@@ -134,8 +143,7 @@ class PolicyController:
         """Numbers for the network, or None when one of them is not finite."""
         time = state.stamp
         if isinstance(target, PoseTarget):
-            target = raised(state, self._unwinding.target(state, target),
-                            self._parameters.turning)
+            target = self._shown(state, target)
         else:
             time += self._parameters.trajectory_lookahead
         observation = observed(state, target.at(time), self._previous_action(state))
@@ -149,6 +157,20 @@ class PolicyController:
                 self._estimator.reset()
             observation += disturbed(state, self._estimator.disturbance)
         return observation
+
+    def _shown(self, state, target):
+        """The pose target that the policy sees."""
+        shown = raised(state, self._unwinding.target(state, target), self._parameters.turning)
+        if shown is target:
+            return self._trimming.target(state, target, self._in_charge(state))
+        self._trimming.reset()      # on its way elsewhere; joints may come back wound otherwise
+        return shown
+
+    def _in_charge(self, state):
+        """Whether the command in force is one of this controller's latest."""
+        command = state.command
+        return command is not None and command.tilt.tolist() + command.thrust.tolist() \
+            in self._latest
 
     def _previous_action(self, state):
         """The command in force, before the first the measured tilts and hover thrust."""

@@ -51,7 +51,7 @@ class UnwindingParameters:
 
     attempts: int = parameter(2, doc='for one target; 0: never', low=0, high=100)
     tilt: float = parameter(2.4, doc='a joint beyond is wound', unit='rad', low=0.5, high=10)
-    angle: float = parameter(0.1, doc='attitude error from which the target counts as missed',
+    angle: float = parameter(0.14, doc='attitude error from which the target counts as missed',
                              unit='rad', low=0.01, high=3)
     distance: float = parameter(0.08, doc='the same, position', unit='m', low=0.005, high=10)
     progress: float = parameter(0.8, doc='an error below this part of the least so far is '

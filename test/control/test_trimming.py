@@ -1,0 +1,133 @@
+"""The steady error at a target ends; what is no steady error moves nothing."""
+
+from dataclasses import replace
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from plant import Plant
+import pytest
+
+from beetle_omni_ros.control.base import Command, PoseTarget, State
+from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
+from beetle_omni_ros.control.trimming import Trimming, TrimmingParameters
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+P = TrimmingParameters()
+ROBOT = RobotParameters.load()
+TARGET = PoseTarget(np.array([0.4, -0.3, 1.5]), rotations.from_rpy(0.8, -0.5, 2.0), stamp=3.0)
+SMALL = st.tuples(*[st.floats(-0.03, 0.03)] * 3).map(np.array)
+
+
+def state(stamp, way=(0, 0, 0), turn=(0, 0, 0), target=TARGET, **changed):
+    """A robot short of a target by a way in world and a turn."""
+    values = {'position': target.position - np.array(way), 'velocity': np.zeros(3),
+              'quaternion': rotations.multiply(target.quaternion, rotations.conjugate(
+                  rotations.exp(np.array(turn, dtype=float)))),
+              'angular_velocity': np.zeros(3), **changed}
+    return State(stamp, **values, tilt=np.zeros(4), tilt_velocity=np.zeros(4), tilt_stamp=stamp)
+
+
+def wait(trimming, seconds, begin=0.0, target=TARGET, **where):
+    for k in range(round(100 * seconds) + 1):
+        shown = trimming.target(state(begin + 0.01 * k, target=target, **where), target)
+    return shown
+
+
+@settings(max_examples=20, deadline=None)
+@given(SMALL, SMALL)
+def test_a_robot_that_flies_where_it_is_shown_and_a_little_beside_ends_at_its_target(way, turn):
+    """Its answer is quick against the integral: it follows with 0.3 s."""
+    trimming = Trimming(P)
+    position, lag = np.zeros(3), np.zeros(3)
+    for k in range(700):
+        shown = trimming.target(state(0.01 * k, way - position, turn - lag), TARGET)
+        asked = rotations.log(rotations.multiply(
+            rotations.conjugate(TARGET.quaternion), shown.quaternion))
+        position += 0.01 / 0.3 * (shown.position - TARGET.position - position)
+        lag += 0.01 / 0.3 * (asked - lag)
+    assert np.linalg.norm(way - position) < 0.03 * max(np.linalg.norm(way), 1e-3)
+    assert np.linalg.norm(turn - lag) < 0.03 * max(np.linalg.norm(turn), 1e-3)
+    assert shown.stamp == TARGET.stamp
+
+
+@pytest.mark.parametrize('where', [
+    {'way': (0.2, 0, 0)}, {'turn': (0, 0.5, 0)},
+    {'way': (0.01, 0, 0), 'velocity': np.array([0, 0.3, 0])},
+    {'turn': (0.01, 0, 0), 'angular_velocity': np.array([0, 0, 1.0])},
+    {'position': np.full(3, np.nan)}, {'quaternion': np.full(4, np.nan)},
+    {'velocity': np.full(3, np.inf)}, {'angular_velocity': np.full(3, np.nan)}])
+def test_who_is_on_the_way_or_no_number_teaches_nothing(where):
+    trimming = Trimming(P)
+    shown = wait(trimming, 2.0, **where)
+    assert shown.position == pytest.approx(TARGET.position)
+    assert shown.quaternion == pytest.approx(TARGET.quaternion)
+
+
+def test_an_error_that_never_ends_moves_the_target_by_no_more_than_is_allowed():
+    trimming = Trimming(P)
+    shown = wait(trimming, 20.0, way=(0.05, -0.05, 0.02), turn=(0.1, 0.1, 0.0))
+    assert np.linalg.norm(shown.position - TARGET.position) == pytest.approx(P.distance)
+    assert rotations.geodesic_angle(shown.quaternion, TARGET.quaternion) \
+        == pytest.approx(P.angle, abs=1e-3)
+
+
+def test_what_was_found_holds_for_the_same_target_again_and_nearby_but_not_elsewhere():
+    trimming = Trimming(P)
+    wait(trimming, 3.0, way=(0.02, 0, 0))
+    found = list(trimming.position)
+    again = PoseTarget(TARGET.position.copy(), TARGET.quaternion.copy(), stamp=9.0)
+    near = replace(TARGET, position=TARGET.position + [0, 0.05, 0])
+    for target in (again, near):
+        shown = trimming.target(state(9.0, target=target), target)
+        assert shown.position - target.position == pytest.approx(found)
+    far = replace(TARGET, position=TARGET.position + [0, 0.5, 0])
+    assert trimming.target(state(9.0, target=far), far).position == pytest.approx(far.position)
+
+
+def test_nothing_is_learnt_over_a_pause_in_which_nobody_looked():
+    trimming = Trimming(P)
+    for stamp in (0.0, 5.0, 10.0, 9.0, 9.0):
+        shown = trimming.target(state(stamp, way=(0.05, 0, 0)), TARGET)
+    assert shown.position == pytest.approx(TARGET.position)
+
+
+def test_a_rate_of_zero_leaves_targets_as_they_are():
+    shown = wait(Trimming(replace(P, rate=0.0)), 3.0, way=(0.02, 0, 0), turn=(0, 0.02, 0))
+    assert shown.position == pytest.approx(TARGET.position)
+    assert shown.quaternion == pytest.approx(TARGET.quaternion)
+
+
+def hovering(mass_scale, **changed):
+    """A policy's steady error of position [m] on a plant of another mass."""
+    pytest.importorskip('onnx')
+    from hover_policy import write_hover_policy
+    parameters = PolicyParameters.load()
+    path = changed.pop('folder') / 'hover.onnx'
+    write_hover_policy(path)
+    controller = PolicyController(ROBOT, replace(parameters, policy=str(path), trimming=replace(
+        parameters.trimming, **changed)))
+    goal = PoseTarget(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]))
+    plant, command = Plant(ROBOT, goal.position, goal.quaternion, np.zeros(4), mass_scale), None
+    for _ in range(800):
+        command = controller.step(plant.state(command), goal)
+        plant.advance(command, 0.01)
+    return np.linalg.norm(plant.position - goal.position)
+
+
+def test_a_policy_carries_more_than_it_knows_without_sagging(tmp_path):
+    assert hovering(1.015, folder=tmp_path, rate=0.0) > 0.03
+    assert hovering(1.015, folder=tmp_path) < 0.003
+
+
+def test_a_policy_in_waiting_learns_nothing_of_the_error_of_another(tmp_path):
+    """Where its own command is not the one in force, the error is none of its own."""
+    controller, targets = PolicyController(ROBOT), []
+    others = Command(0.0, np.zeros(4), np.full(4, ROBOT.hover_thrust))
+    for k in range(300):
+        at = replace(state(0.01 * k, way=(0.05, 0, 0)), command=others)
+        targets.append(controller.step(at, TARGET).tilt)
+    fresh = PolicyController(ROBOT)
+    same = replace(state(2.99, way=(0.05, 0, 0)), command=others)
+    assert targets[-1] == pytest.approx(fresh.step(same, TARGET).tilt, abs=1e-9)
