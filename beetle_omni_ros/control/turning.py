@@ -18,7 +18,7 @@ from beetle_omni_ros.robot.schema import parameter
 class TurningParameters:
     """Where a robot turns that has far to turn."""
 
-    height: float = parameter(0.9, doc='of a target at least, in world, ...', unit='m', low=-1000,
+    height: float = parameter(1.0, doc='of a target at least, in world, ...', unit='m', low=-1000,
                               high=1000)
     angle: float = parameter(1.0, doc='... while the attitude is farther off', unit='rad',
                              low=0.1, high=4)

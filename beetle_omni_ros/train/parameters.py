@@ -154,7 +154,7 @@ class EstimateParameters:
 class RewardWeights:
     """Weights of the terms in :mod:`train.rewards`, by the terms' names."""
 
-    position: float = parameter(-1.0, doc='published')
+    position: float = parameter(-2.0, doc='published -1')
     pose: float = parameter(2.0, doc='published')
     reach_position: float = parameter(1.0, doc='published')
     reach_pose: float = parameter(0.75, doc='published')

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
@@ -31,6 +33,7 @@ SMOOTH_READING = 35.0
 # The IMU's clock is everybody's: what it is late by, all else is early by. Shifting the IMU itself
 # would sample its noise elsewhere, which changes chi2 by more than a delay is worth.
 IMU_LAG = 'imu_filter_lag.delay'
+MEMORY = 0.9            # [s] of rotors and commands before the first sample
 EDGE = 1.0              # [s] at both ends that smoothing and history need
 
 
@@ -60,6 +63,7 @@ class Signals:
         pad = 0.5
         self._fine = np.arange(EDGE - pad, self.t[-1] + pad + FINE / 2, FINE)
         self._lead = round(pad / FINE)
+        self._step, self._begin = FINE / 2, self._fine[0] - MEMORY    # of the rotors' filter
         # Not straight lines: between two readings those would halve the noise's power, and a fit
         # would shift the IMU to where that pays.
         self._imu = CubicSpline(*filled(*spread(flight.imu_t, flight.imu)))
@@ -103,6 +107,13 @@ class Signals:
         first = self._lead - kernel.margin
         return y[first:first + self._ratio * len(self.t):self._ratio]
 
+    @cached_property
+    def _own_imu(self):
+        """Specific force, rates and their derivative (N, 3) each, as the IMU says."""
+        fine = self._imu(np.clip(self._fine, self.flight.imu_t[0], self.flight.imu_t[-1]))
+        return (self._smooth(fine[:, :3], SMOOTH_IMU), self._smooth(fine[:, 3:], SMOOTH_IMU),
+                self._smooth(fine[:, 3:], SMOOTH_IMU, 1))
+
     def imu(self, theta):
         """Specific force, rates and their derivative (N, 3) each, of base_link."""
         names = [f'{e}[{k}]' for e in (
@@ -111,11 +122,8 @@ class Signals:
         values = np.array([theta.get(name, 0.0) for name in names])
 
         def make():
-            fine = self._imu(np.clip(self._fine, self.flight.imu_t[0],
-                                     self.flight.imu_t[-1])) - values[:6]
-            force, rate = (self._smooth(fine[:, part], SMOOTH_IMU)
-                           for part in (slice(0, 3), slice(3, 6)))
-            turning = self._smooth(fine[:, 3:], SMOOTH_IMU, 1)
+            force, rate, turning = self._own_imu
+            force, rate = force - values[:3], rate - values[3:6]
             if values[6:9].any():
                 rotation = turn(values[6:9]).T
                 force, rate, turning = force @ rotation, rate @ rotation, turning @ rotation
@@ -130,21 +138,24 @@ class Signals:
         names = ['mocap_time_offset.delay', IMU_LAG, *(f'mocap_misalignment.rotation[{k}]'
                                               for k in range(3))]
         values = [theta.get(name, 0.0) for name in names]
+        position, quaternion, velocity = self._cached(
+            'pose', theta, names[:2], lambda: self._shifted_pose(values[0] - values[1]))
+        if any(values[2:]):
+            quaternion = turned(quaternion, -np.array(values[2:]))
+        return position, quaternion, velocity
 
-        def make():
-            fine = self._pose(np.clip(self._fine + values[0] - values[1], self.flight.pose_t[0],
-                                      self.flight.pose_t[-1]))
-            position = fine[self._lead::self._ratio][:len(self.t), :3]
-            quaternion = self._smooth(fine[:, 3:], 10.0)
-            quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
-            if self.position_noise > self.p.coarse_noise:
-                velocity = self._fused(self._smooth(fine[:, :3], SMOOTH_POSE), quaternion)
-            else:
-                velocity = self._smooth(fine[:, :3], SMOOTH_POSE, 1)
-            if any(values[2:]):
-                quaternion = turned(quaternion, -np.array(values[2:]))
-            return position, quaternion, velocity
-        return self._cached('pose', theta, names, make)
+    def _shifted_pose(self, shift):
+        """As :meth:`pose`, of a MoCap that is aligned."""
+        fine = self._pose(np.clip(self._fine + shift, self.flight.pose_t[0],
+                                  self.flight.pose_t[-1]))
+        position = fine[self._lead::self._ratio][:len(self.t), :3]
+        quaternion = self._smooth(fine[:, 3:], 10.0)
+        quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+        if self.position_noise > self.p.coarse_noise:
+            velocity = self._fused(self._smooth(fine[:, :3], SMOOTH_POSE), quaternion)
+        else:
+            velocity = self._smooth(fine[:, :3], SMOOTH_POSE, 1)
+        return position, quaternion, velocity
 
     def _fused(self, position, quaternion):
         """Velocity (N, 3): slow changes as positions (N, 3) show them, quick ones by the IMU."""
@@ -200,23 +211,26 @@ class Signals:
         delay = self.delays(theta)[1]
 
         def make():
-            rotors, h = self.robot.rotors, FINE / 2
-            # The file's own limit cuts no earlier than commands are: it is the command's.
-            most = rotors.thrust_max * np.exp(limit) if limit else np.inf
-            asked = np.clip(self._command[:, 4:], rotors.thrust_min, most)
-            tau = rotors.time_constant * np.exp(lag + np.array(own))
-            begin = self._fine[0] - 0.9
-            count = round((self.t[-1] - begin) / h) + 2
-            edges = begin + h * np.arange(count + 1)
-            mean = np.diff(held_at(edges - delay, self._command_t, *integral(
-                self._command_t, asked)), axis=0) / h
-            keep = np.exp(-h / tau)
+            mean = self._cached(('asked', delay), theta, names[1:2],
+                                lambda: self._asked(delay, limit))
+            tau = self.robot.rotors.time_constant * np.exp(lag + np.array(own))
+            keep = np.exp(-self._step / tau)
             lagged = np.stack([lfilter([1 - k], [1, -k], column, zi=k * column[:1])[0]
                                for k, column in zip(keep, mean.T, strict=True)], axis=1)
-            places = np.rint((self.t - begin) / h).astype(int) - 1
+            places = np.rint((self.t - self._begin) / self._step).astype(int) - 1
             force = lagged[places]
             return force, (mean[places + 1] - force) / tau
         return self._cached(('thrust', delay), theta, names, make)
+
+    def _asked(self, delay, limit):
+        """Mean thrust commands (K, 4) between the steps of the rotors' filter [N]."""
+        rotors, h = self.robot.rotors, self._step
+        # The file's own limit cuts no earlier than commands are: it is the command's.
+        most = rotors.thrust_max * np.exp(limit) if limit else np.inf
+        asked = np.clip(self._command[:, 4:], rotors.thrust_min, most)
+        edges = self._begin + h * np.arange(round((self.t[-1] - self._begin) / h) + 3)
+        return np.diff(held_at(edges - delay, self._command_t, *integral(
+            self._command_t, asked)), axis=0) / h
 
     def tilt_targets(self, edges, delay):
         """(K, 4) mean tilt commands between ``edges`` (K + 1,) [s], acting after ``delay``."""
