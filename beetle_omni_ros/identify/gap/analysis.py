@@ -11,6 +11,7 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.certainty import deviations, Visibility, visibility
 from beetle_omni_ros.identify.gap.fit import Problem
+from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, Key, tolerances
 from beetle_omni_ros.identify.gap.parameters import GapParameters
@@ -198,13 +199,15 @@ def _falsify(a, wide):
     plain = _plain(a, reached, keys)
     points |= {'file': plain, 'effects_alone': {**plain, **{n: found.theta[n] for n in keys}},
                'placebo': _placebo(a)}
-    noise = {m: a.problem.noise_of(m, found.theta, wide) for m in {*a.models[0], *judges}}
+    everyone = list(dict.fromkeys([*a.models[0], *judges]))
+    noise = dict(zip(everyone, forked(
+        lambda m: a.problem.noise_of(m, found.theta, wide), everyone), strict=True))
     for name, theta in points.items():
         if found.accepted or name in ('before', 'file'):
-            a.runs[name] = [free_runs(m, theta, noise[m]) for m in judges]
+            a.runs[name] = forked(lambda m, at=theta: free_runs(m, at, noise[m]), judges)
     for name, same in (('after', 'before'), ('placebo', 'before'), ('effects_alone', 'file')):
         a.runs.setdefault(name, a.runs[same])
-    trim = trimmed([free_runs(m, found.theta, noise[m]) for m in a.models[0]])
+    trim = trimmed(forked(lambda m: free_runs(m, found.theta, noise[m]), a.models[0]))
     _measure(a, trim)
     judged = a.gaps[HORIZONS[JUDGED]]
     worse = a.held_out and judged['after'] > max(AT_FLOOR, WORSE * judged['before'])

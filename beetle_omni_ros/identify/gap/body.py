@@ -76,37 +76,54 @@ class BodyModel:
     def _function(self):
         return ca.Function('body', [*self._x.values(), self._p], [self._out])
 
-    def _mapped(self, what, count, make):
+    def _over(self, what, count, make):
+        """The function over so many samples, and how it is called; see :func:`_called`."""
         if (what, count) not in self._maps:
             function = make()
             self._maps[what, count] = function.map(
-                f'{function.name()}_{count}', 'serial', count, [len(WIDTHS)], [])
+                f'{function.name()}_{count}', 'serial', count, [len(WIDTHS)], []).buffer()
         return self._maps[what, count]
 
     def __call__(self, inputs: dict[str, np.ndarray], theta: dict[str, float]) -> np.ndarray:
         """(N, 6) specific force [m/s^2] and angular acceleration [rad/s^2] of the samples."""
-        columns = self._columns(inputs)
-        mapped = self._mapped('', columns[0].shape[1], lambda: self._function)
-        return np.array(mapped(*columns, self._vector(theta))).T
+        count = len(inputs['voltage'])
+        return _called(self._over('', count, lambda: self._function), inputs,
+                       self._vector(theta), np.empty((count, 6)))
 
     def derivatives(self, inputs: dict[str, np.ndarray], theta: dict[str, float],
                     names: tuple[str, ...]) -> np.ndarray:
         """(N, 6, len(names)) exact derivatives by the named keys."""
-        columns = self._columns(inputs)
-        count = columns[0].shape[1]
+        count = len(inputs['voltage'])
         chosen = [self._index[name] for name in names]
 
         def make():
             jacobian = ca.densify(ca.jacobian(self._out, self._p[chosen]))
             return ca.Function('slopes', [*self._x.values(), self._p], [ca.cse(ca.vec(jacobian))])
 
-        mapped = self._mapped(names, count, make)
-        flat = np.array(mapped(*columns, self._vector(theta))).T
-        return flat.reshape(count, len(names), 6).transpose(0, 2, 1)
-
-    def _columns(self, inputs):
-        return [np.ascontiguousarray(inputs[name].reshape(-1, width).T)
-                for name, width in WIDTHS.items()]
+        flat = _called(self._over(names, count, make), inputs, self._vector(theta),
+                       np.empty((count, len(names), 6)))
+        return flat.transpose(0, 2, 1)
 
     def _vector(self, theta):
         return np.array([theta.get(name, 0.0) for name in self.names])
+
+
+def _called(function, inputs, vector, result):
+    """
+    Evaluate in place: CasADi's own conversion of arrays takes longer than the equations.
+
+    Args:
+        function: buffer and evaluation of a mapped function.
+        inputs: by name, (N, width); a sample is a row here and a column there, which is the
+            same in memory.
+        vector: parameters.
+        result: (N, ...) to write to.
+
+    """
+    buffer, evaluate = function
+    arrays = [np.ascontiguousarray(inputs[name], dtype=float) for name in WIDTHS]
+    for index, array in enumerate((*arrays, vector)):
+        buffer.set_arg(index, memoryview(array))
+    buffer.set_res(0, memoryview(result))
+    evaluate()
+    return result

@@ -9,6 +9,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from beetle_omni_ros.identify.gap.analysis import analyse, Analysis
 from beetle_omni_ros.identify.gap.apply import write_corrected
+from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
 from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log
 from beetle_omni_ros.identify.gap.page import gap_page
@@ -85,12 +86,20 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
 
 def _analysed(runs, holdout, robot, p, progress):
     findings, flights = [], {}
-    for path in [*runs, *holdout]:
+
+    def loaded(path):
         try:
-            flights[path] = load_flight(path, robot, p)
-            findings += flights[path].findings
+            return load_flight(path, robot, p)
         except UnusableFlight as error:
-            findings.append(str(error))
+            return error
+
+    paths = [*runs, *holdout]
+    for path, flight in zip(paths, forked(loaded, paths), strict=True):
+        if isinstance(flight, UnusableFlight):
+            findings.append(str(flight))
+        else:
+            flights[path] = flight
+            findings += flight.findings
     fitted = [flights[r] for r in runs if r in flights]
     judging = [flights[h] for h in holdout if h in flights]
     if not fitted:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.keys import Belief, Key
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.parameters import GapParameters
@@ -17,6 +18,8 @@ TIMES = ('delay', 'split')
 LEAST_BLOCKS = 6        # of all flights together
 HALVINGS = 4
 RIDGE = 1e-9
+# Deviations, residual, columns that changed and their slopes: what a state is beside another.
+Difference = tuple[dict[str, float], np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass
@@ -41,6 +44,21 @@ class State:
     def __post_init__(self):
         """Index the columns."""
         self.index = {name: k for k, name in enumerate(self.names)}
+
+    def beside(self, other: State) -> Difference:
+        """What of this state differs from another one with the same names."""
+        changed = [] if self.slopes is other.slopes else np.flatnonzero(
+            (self.slopes != other.slopes).any(axis=0))
+        return self.theta, self.r, changed, self.slopes[:, changed]
+
+    def with_difference(self, difference: Difference) -> State:
+        """The state of which :meth:`beside` this one told the difference."""
+        theta, r, changed, columns = difference
+        slopes = self.slopes
+        if len(changed):
+            slopes = slopes.copy()
+            slopes[:, changed] = columns
+        return State(theta, r, slopes, self.names)
 
 
 class Problem:
@@ -87,13 +105,17 @@ class Problem:
 
     def residual(self, theta: dict[str, float]) -> np.ndarray:
         """(n,) whitened."""
-        return np.concatenate([self.noise.whiten(m.residual(theta)) for m in self.models])
+        return np.concatenate(forked(lambda m: self.noise.whiten(m.residual(theta)), self.models))
+
+    def slopes(self, theta: dict[str, float], names: list[str]) -> np.ndarray:
+        """(n, len(names)) whitened."""
+        return np.concatenate(forked(lambda m: self.noise.whiten(m.slopes(theta, names)),
+                                     self.models))
 
     def state(self, theta: dict[str, float], names: list[str]) -> State:
         """Residual and slopes at a point."""
-        raw = [m.residual(theta) for m in self.models]
-        slopes = [m.slopes(theta, names) for m in self.models]
-        self._raw = [(r, s, names, theta) for r, s in zip(raw, slopes, strict=True)]
+        self._raw = forked(lambda m: (m.residual(theta), m.slopes(theta, names), names, theta),
+                           self.models)
         return self._whitened()
 
     def guide(self, theta: dict[str, float]) -> None:
@@ -245,10 +267,8 @@ class Problem:
             gain, cost = cost - new, new
             slopes = now.slopes
             if curved and iteration + 1 < iterations and gain > 0.5:
-                fresh = np.concatenate([self.noise.whiten(m.slopes(trial, curved))
-                                        for m in self.models])
                 slopes = slopes.copy()
-                slopes[:, [now.index[name] for name in curved]] = fresh
+                slopes[:, [now.index[name] for name in curved]] = self.slopes(trial, curved)
             now = State(trial, r, slopes, now.names)
             if gain < 0.5:
                 break

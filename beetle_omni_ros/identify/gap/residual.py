@@ -76,6 +76,7 @@ class FlightModel:
         self._starts = np.arange(0, count - self._length + 1, self._length) \
             + round(p.servo_warm_up / p.grid)
         self._made: dict[tuple, tuple] = {}
+        self._last: tuple = (None, {})      # point of the last residual, and that by group
         self._mask = self._trusted()
         own = robot.effects
         coulomb, stiction = friction(robot)
@@ -130,6 +131,15 @@ class FlightModel:
 
     def residual(self, theta: dict[str, float], groups: str = 'BAWJ') -> dict[str, np.ndarray]:
         """Group -> (M, channels) measured minus expected."""
+        point = (self.modules, theta)
+        if self._last[0] != point:
+            self._last = (self.modules, dict(theta)), {}
+        made = self._last[1]
+        made.update(self._residual(theta, ''.join(g for g in groups if g not in made)))
+        return {group: made[group] for group in groups}
+
+    def _residual(self, theta, groups):
+        """As :meth:`residual`, whatever was worked out before."""
         made = {}
         if 'B' in groups:
             force, _, turning = self.signals.imu(theta)
@@ -194,6 +204,7 @@ class FlightModel:
         tilts[self._starts[0]:self._starts[0] + len(run)] = run
         s.follow(tilts)
         self._made.clear()
+        self._last = (None, {})
 
     def _reading(self, theta):
         """Encoders (K, 4) in the windows of the servos, one after the other."""
@@ -274,17 +285,17 @@ class FlightModel:
             smooth = -self._mask[:, None, None] * self.filters['B'](exact)
             for k, name in enumerate(body):
                 made['B'][:, :, names.index(name)] = smooth[:, :, k]
-        signal = [name for name in names if not self.keys[name].body]
-        now = self.residual(theta, 'BAW')
-        for name in signal:
+        signal = {name: self.keys[name].groups.replace('J', '') for name in names
+                  if not self.keys[name].body}
+        now = self.residual(theta, ''.join(dict.fromkeys(''.join(signal.values()))))
+        for name, groups in signal.items():
             h = STEPS[self.keys[name].parameter]
             h = -h if theta.get(name, 0.0) + h > self.keys[name].high else h
-            groups = self.keys[name].groups.replace('J', '')
             if groups:
                 here, other, width = theta.get(name, 0.0), now, h
                 if self.keys[name].parameter in BOTH_SIDES:
-                    other, width = self.residual({**theta, name: here - h}, groups), 2 * h
-                moved = self.residual({**theta, name: here + h}, groups)
+                    other, width = self._residual({**theta, name: here - h}, groups), 2 * h
+                moved = self._residual({**theta, name: here + h}, groups)
                 for group, values in moved.items():
                     made[group][:, :, names.index(name)] = (values - other[group]) / width
         turning = [name for name in names if 'J' in self.keys[name].groups]

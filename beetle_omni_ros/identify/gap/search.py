@@ -9,6 +9,7 @@ import numpy as np
 from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
 from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
+from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.gates import (
     at_bound,
     cross_validate,
@@ -160,41 +161,54 @@ class Search:
         taken = {c.label for c in accepted}
         h, g = state.slopes.T @ state.slopes, state.slopes.T @ state.r
         chi2, trials, points = float(state.r @ state.r), [], {}
-        for c in self.candidates:
-            if c.label in taken or any(key in free for key in c.keys):
-                continue
+        asked = [c for c in self.candidates
+                 if c.label not in taken and not any(key in free for key in c.keys)]
+
+        def at_first(c):
             names = list(dict.fromkeys([*involved, *c.keys]))
             if c.starts or c.fixed:
                 trial, point = self._elsewhere(state, cost, c, names, free)
-            else:
-                index = [state.index[name] for name in names]
-                theta = handed_over(state.theta, c)
-                step, reached, _ = problem.solve(theta, names, free | set(c.keys),
-                                                 h[np.ix_(index, index)], g[index], chi2)
-                trial = Trial(c, cost - reached, problem.moved(theta, names, step))
-                point = state if theta is state.theta else State(
-                    theta, problem.residual(theta), state.slopes, state.names)
+                return trial, point.beside(state)
+            index = [state.index[name] for name in names]
+            theta = handed_over(state.theta, c)
+            step, reached, _ = problem.solve(theta, names, free | set(c.keys),
+                                             h[np.ix_(index, index)], g[index], chi2)
+            trial = Trial(c, cost - reached, problem.moved(theta, names, step))
+            return trial, None if theta is state.theta else State(
+                theta, problem.residual(theta), state.slopes, state.names).beside(state)
+
+        for c, (trial, difference) in zip(asked, forked(at_first, asked), strict=True):
             trials.append(trial)
-            points[c.label] = point
+            points[c.label] = state.with_difference(difference) if difference else state
         trials.sort(key=lambda t: -t.gain)
-        best = max(trials[0].gain, 1.0) if trials else 1.0
-        count = 0
-        for k, trial in enumerate(trials):
-            c = trial.candidate
-            curved = any(problem.keys[n].parameter in CURVED for n in c.keys)
-            if trial.gain < (PROMISING_CURVED if curved else PROMISING) * best \
-                    or trial.gain < 0.5 * self.p.least_gain or count >= REFINED + 3:
-                continue
-            if count >= REFINED and not curved:
-                continue
-            count += 1
+        chosen = self._promising(trials)
+
+        def refined(k):
+            c = trials[k].candidate
             names = list(dict.fromkeys([*involved, *c.keys]))
             new, reached = problem.refine(points[c.label], names, free | set(c.keys), 4)
-            trials[k] = Trial(c, cost - reached, dict(new.theta), True)
-            points[c.label] = new
+            return new.beside(state), reached
+
+        for k, (difference, reached) in zip(chosen, forked(refined, chosen), strict=True):
+            c = trials[k].candidate
+            points[c.label] = state.with_difference(difference)
+            trials[k] = Trial(c, cost - reached, dict(points[c.label].theta), True)
         trials.sort(key=lambda t: -t.gain)
         self._points, self._without = points, state
         return trials
+
+    def _promising(self, trials):
+        """Indices of the trials, best first, that are worth a fit of their own."""
+        best = max(trials[0].gain, 1.0) if trials else 1.0
+        chosen = []
+        for k, trial in enumerate(trials):
+            curved = any(self.problem.keys[n].parameter in CURVED for n in trial.candidate.keys)
+            if trial.gain < (PROMISING_CURVED if curved else PROMISING) * best \
+                    or trial.gain < 0.5 * self.p.least_gain or len(chosen) >= REFINED + 3:
+                continue
+            if len(chosen) < REFINED or curved:
+                chosen.append(k)
+        return chosen
 
     def _elsewhere(self, state, cost, c, names, free):
         """A candidate whose slopes must be taken somewhere else than at zero."""
@@ -203,10 +217,9 @@ class Search:
             theta = {**state.theta, **c.fixed, **dict(zip(c.keys, start, strict=True))}
             moved = any(start)
             r = self.problem.residual(theta) if moved else state.r
-            fresh = np.concatenate([self.problem.noise.whiten(m.slopes(theta, list(c.keys)))
-                                    for m in self.problem.models])
             slopes = state.slopes.copy()
-            slopes[:, [state.index[name] for name in c.keys]] = fresh
+            slopes[:, [state.index[name] for name in c.keys]] = self.problem.slopes(
+                theta, list(c.keys))
             point = State(theta, r, slopes, state.names)
             step, reached, _ = self.problem.linear_step(point, names, free | set(c.keys))
             # A straight line must not promise what the point itself shows it has not.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import orth
 from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.bands import in_part_alone
@@ -14,6 +15,7 @@ from beetle_omni_ros.identify.gap.series import matrices
 
 RIDGE = 3.0             # of a whitened and scaled regression
 TERMS_SHOWN = 4
+ALIKE = 1e-6            # singular values of slopes, of the largest, below which they say the same
 
 
 @dataclass(frozen=True)
@@ -162,8 +164,10 @@ def _cross(x, fitted, r, block, blocks):
     """
     scale = np.sqrt((x**2).mean(axis=0)) + 1e-12
     x = x / scale
-    used = (fitted**2).sum(axis=0) > 1e-6
-    basis = np.linalg.qr(fitted[:, used])[0] if used.any() else np.zeros((len(r), 0))
+    size = np.sqrt((fitted**2).sum(axis=0))
+    used = size > 1e-3
+    # Not QR: where columns say the same, its further ones are rounding.
+    basis = orth(fitted[:, used] / size[used], ALIKE) if used.any() else np.zeros((len(r), 0))
     x, r = x - basis @ (basis.T @ x), r - basis @ (basis.T @ r)
     weight = np.sqrt((x**2).mean(axis=0))
     x = x[:, weight > 0.05]

@@ -1,0 +1,88 @@
+"""Work on several cores gives what one core gives, whatever happens to a child."""
+
+import os
+from pathlib import Path
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.gap import forks
+from beetle_omni_ros.identify.gap.forks import forked, width
+
+pytestmark = pytest.mark.skipif(sys.platform != 'linux', reason='forks on Linux only')
+
+
+def children():
+    return {process for tasks in Path('/proc/self/task').glob('*/children')
+            for process in tasks.read_text().split()}
+
+
+@pytest.fixture(params=[1, 2, 3])
+def cores(request, monkeypatch):
+    monkeypatch.setattr(forks, 'width', lambda: request.param)
+    return request.param
+
+
+def test_results_come_in_the_order_of_the_items(cores):
+    rng = np.random.default_rng(0)
+    big = rng.normal(size=(200, 5000))      # more than a pipe holds
+    made = forked(lambda k: (k, big[:, :k] + k), range(7))
+    assert [k for k, _ in made] == list(range(7))
+    assert all(np.array_equal(array, big[:, :k] + k) for k, array in made)
+    assert forked(lambda k: k, []) == []
+
+
+def test_children_do_the_work_and_end(cores):
+    parent = os.getpid()
+    by = forked(lambda _: os.getpid(), range(6))
+    assert by[0] == parent and len(set(by)) == cores
+    for process in set(by) - {parent}:
+        with pytest.raises(ChildProcessError):
+            os.waitpid(process, 0)
+
+
+def test_a_child_does_not_split_its_own_work(cores, monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: set(range(cores)))
+    monkeypatch.delenv('OMP_NUM_THREADS', raising=False)
+    inner = forked(lambda _: width(), range(cores))
+    assert inner[1:] == [1] * (cores - 1) and inner[0] == cores
+
+
+@pytest.mark.parametrize('bad', [0, 1, 2])
+def test_an_error_of_any_item_is_raised_and_nobody_is_left(cores, bad):
+    def work(k):
+        if k == bad:
+            raise ValueError(f'item {k}')
+        time.sleep(0.01)
+        return k
+
+    before = children()
+    with pytest.raises(ValueError, match=f'item {bad}'):
+        forked(work, range(6))
+    assert children() == before
+
+
+def test_what_a_dead_child_leaves_is_done_here(cores):
+    parent = os.getpid()
+
+    def work(k):
+        if os.getpid() != parent:
+            os.kill(os.getpid(), 9)
+        return k * k
+
+    assert forked(work, range(5)) == [0, 1, 4, 9, 16]
+
+
+def test_what_cannot_be_sent_is_made_again_here(cores):
+    made = forked(lambda k: (lambda: k), range(4))
+    assert [function() for function in made] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize('threads, expected', [('1', 1), ('2', 2), ('99', 3), ('', 3), ('x', 3)])
+def test_who_limits_threads_limits_processes(monkeypatch, threads, expected):
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: {0, 1, 2})
+    monkeypatch.setenv('OMP_NUM_THREADS', threads)
+    assert width() == expected
