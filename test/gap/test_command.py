@@ -3,6 +3,8 @@
 from dataclasses import replace
 from io import StringIO
 import json
+import os
+import sys
 
 import numpy as np
 import pytest
@@ -49,6 +51,16 @@ def test_the_hidden_wind_is_named_with_its_size(made):
     assert np.allclose(force['value'][:2], TRUE[:2], atol=0.1)
     assert all(low < high for low, high in force['interval'])
     assert force['unit'] == 'N'
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='forks on Linux only')
+def test_on_two_cores_it_says_the_same_as_on_one(made, monkeypatch):
+    folder, results, _ = made
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda process: {0, 1})
+    monkeypatch.setenv('OMP_NUM_THREADS', '2')
+    again = gap_results([folder / 'flight0'], [folder / 'flight1'], console=quiet())
+    for name in results.keys() - {'meta'}:
+        assert again[name] == results[name], name
 
 
 def test_the_gap_on_the_flight_held_out_shrinks_and_a_placebo_does_not_help(made):
