@@ -79,7 +79,7 @@ def test_the_file_is_complete_and_accepted_on_board(tmp_path, memory):
     assert contract.training['seconds'] == 12.5
     assert contract.training['random.mass_scale'] == parameters.random.mass_scale
     assert contract.training['ppo.robots'] == parameters.ppo.robots
-    assert contract.training['reward.position'] == -1.0
+    assert contract.training['reward.position'] == parameters.reward.position
     action = PolicyNetwork(path, ROBOT)([0.1] * contract.observation_size)
     with torch.no_grad():
         expected = network.mean(torch.full((1, contract.observation_size), 0.1))[0]
