@@ -6,10 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
+from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
-from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.gates import (
     at_bound,
     cross_validate,
@@ -17,20 +16,16 @@ from beetle_omni_ros.identify.gap.gates import (
     holds,
     neither_holds,
 )
-from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.keys import SHAPES
-from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, NOT_HELD, TOO_SMALL, Trial
+from beetle_omni_ros.identify.gap.proposals import proposed
+from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, NOT_HELD, TOO_SMALL
 
-REFINED = 5             # candidates of each step that are fitted, not only estimated
-PROMISING = 0.25        # of the best linear gain
-PROMISING_CURVED = 0.1  # likewise, of those that a straight line cannot judge
 MOST_TURNS = 4          # of fresh slopes, while a fit runs away from them
 FAR = 0.2               # typical sizes of a curved number
 BEYOND = 3.0            # standard deviations of a tolerance that no robot has ...
 ROUNDS = 3              # ... and how often others may take over from it
 MOST_ITERATIONS = 10    # of a fit, which ends by itself where it gains no more
 WIDE = 4.0              # typical sizes, within which anything is sought
-
 
 
 class Search:
@@ -157,79 +152,13 @@ class Search:
 
     def _step(self, state, cost, accepted):
         """Trials of all candidates beside the accepted ones, the best of them fitted."""
-        problem, involved, free = self.problem, self._involved(accepted), self._free(accepted)
-        taken = {c.label for c in accepted}
-        h, g = state.slopes.T @ state.slopes, state.slopes.T @ state.r
-        chi2, trials, points = float(state.r @ state.r), [], {}
+        taken, free = {c.label for c in accepted}, self._free(accepted)
         asked = [c for c in self.candidates
                  if c.label not in taken and not any(key in free for key in c.keys)]
-
-        def at_first(c):
-            names = list(dict.fromkeys([*involved, *c.keys]))
-            if c.starts or c.fixed:
-                trial, point = self._elsewhere(state, cost, c, names, free)
-                return trial, point.beside(state)
-            index = [state.index[name] for name in names]
-            theta = handed_over(state.theta, c)
-            step, reached, _ = problem.solve(theta, names, free | set(c.keys),
-                                             h[np.ix_(index, index)], g[index], chi2)
-            trial = Trial(c, cost - reached, problem.moved(theta, names, step))
-            return trial, None if theta is state.theta else State(
-                theta, problem.residual(theta), state.slopes, state.names).beside(state)
-
-        for c, (trial, difference) in zip(asked, forked(at_first, asked), strict=True):
-            trials.append(trial)
-            points[c.label] = state.with_difference(difference) if difference else state
-        trials.sort(key=lambda t: -t.gain)
-        chosen = self._promising(trials)
-
-        def refined(k):
-            c = trials[k].candidate
-            names = list(dict.fromkeys([*involved, *c.keys]))
-            new, reached = problem.refine(points[c.label], names, free | set(c.keys), 4)
-            return new.beside(state), reached
-
-        for k, (difference, reached) in zip(chosen, forked(refined, chosen), strict=True):
-            c = trials[k].candidate
-            points[c.label] = state.with_difference(difference)
-            trials[k] = Trial(c, cost - reached, dict(points[c.label].theta), True)
-        trials.sort(key=lambda t: -t.gain)
-        self._points, self._without = points, state
+        trials, self._points = proposed(self.problem, asked, state, cost,
+                                        self._involved(accepted), free)
+        self._without = state
         return trials
-
-    def _promising(self, trials):
-        """Indices of the trials, best first, that are worth a fit of their own."""
-        best = max(trials[0].gain, 1.0) if trials else 1.0
-        chosen = []
-        for k, trial in enumerate(trials):
-            curved = any(self.problem.keys[n].parameter in CURVED for n in trial.candidate.keys)
-            if trial.gain < (PROMISING_CURVED if curved else PROMISING) * best \
-                    or trial.gain < 0.5 * self.p.least_gain or len(chosen) >= REFINED + 3:
-                continue
-            if len(chosen) < REFINED or curved:
-                chosen.append(k)
-        return chosen
-
-    def _elsewhere(self, state, cost, c, names, free):
-        """A candidate whose slopes must be taken somewhere else than at zero."""
-        best = None
-        for start in c.starts or ((0.0,) * len(c.keys),):
-            theta = {**state.theta, **c.fixed, **dict(zip(c.keys, start, strict=True))}
-            moved = any(start)
-            r = self.problem.residual(theta) if moved else state.r
-            slopes = state.slopes.copy()
-            slopes[:, [state.index[name] for name in c.keys]] = self.problem.slopes(
-                theta, list(c.keys))
-            point = State(theta, r, slopes, state.names)
-            step, reached, _ = self.problem.linear_step(point, names, free | set(c.keys))
-            # A straight line must not promise what the point itself shows it has not.
-            actual = cost - float(r @ r) - self.problem.prior(theta, free | set(c.keys))
-            gain = cost - reached
-            if c.name in LIMITS:
-                gain = min(gain, max(actual, 0.0) + 0.5 * max(gain, 0.0))
-            if best is None or gain > best[0].gain:
-                best = Trial(c, gain, self.problem.moved(theta, names, step)), point
-        return best
 
     def _judge(self, trials, cost, floor, accepted):
         """The first trial that passes every gate; the others get their reason."""
