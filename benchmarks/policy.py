@@ -28,7 +28,6 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.control.observation import blocks, disturbed, observed, size
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
-from beetle_omni_ros.control.policy_network import PolicyNetwork
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
@@ -86,7 +85,7 @@ def measure(parameters: PolicyParameters, poses: int, seed: int) -> tuple[Clock,
     """Fly; return the times and what the policy is."""
     robot, estimator, clock = RobotParameters.load(), EkfParameters.load(), Clock()
     policy = PolicyController(robot, parameters)
-    network = PolicyNetwork(parameters.policy, robot, parameters.allow_other_robot)
+    network = policy.network    # a second one would take its place in the caches
     previous = [0.0] * 8
     told = disturbed if network.contract.memory else lambda *_: []
 

@@ -82,6 +82,7 @@ class PolicyController:
         parameters: which policy and how.
 
     Attributes:
+        network: what the policy's file computes.
         contract: what the policy's file says about itself.
 
     Raises:
@@ -92,8 +93,8 @@ class PolicyController:
     def __init__(self, robot: RobotParameters, parameters: PolicyParameters | None = None):
         """Load the policy and run it a few times."""
         p = self._parameters = parameters or PolicyParameters.load()
-        self._network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
-        self.contract = contract = self._network.contract
+        self.network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
+        self.contract = contract = self.network.contract
         self.name = 'rl_memory' if contract.memory else 'rl'
         self.period = 1 / contract.rate_hz
         self._scale, self._offset = contract.action_scale.tolist(), contract.action_offset.tolist()
@@ -123,7 +124,7 @@ class PolicyController:
         if observation is None:
             self._rejected += 1
             return self._repeated(state)
-        values = self._targets(self._network(observation))
+        values = self._targets(self.network(observation))
         self._command = Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
         self._latest.appendleft(values)
         return self._command

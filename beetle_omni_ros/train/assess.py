@@ -61,7 +61,7 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
     Returns:
         means U_*, L_* of robots never lost, share of poses reached, share of robots lost,
         command change in the U windows, share of joints at a stop there, mean thrust, how far
-        the worst hundredth of the moves sank below start and target.
+        the worst hundredth and thousandth of the moves sank below start and target.
 
     """
     start = {entry.name: 0.0 for entry in fields(StartParameters)}
@@ -119,9 +119,16 @@ def _fly(mean, env, length, segments, period):
               'tilt_change_rad': float((change[0] / count).sqrt()),
               'thrust_change_N': float((change[1] / count).sqrt()),
               'at_stop': float(stopped / count), 'thrust_N': float(thrust),
-              'depth_p99_m': float(depth[1:].flatten().quantile(0.99))}
+              'depth_p99_m': _quantile(depth[1:], 0.99),
+              'depth_p999_m': _quantile(depth[1:], 0.999)}
     for key, value in kept.items():
         angle = key.endswith('attitude')
         result[f'{key}_deg' if angle else f'{key}_m'] = float(
             torch.rad2deg(value.mean()) if angle else value.mean())
     return {key: value for key, value in result.items() if np.isfinite(value)}
+
+
+def _quantile(values, share):
+    """Like torch.quantile, for any number of values."""
+    ordered = values.flatten().sort().values
+    return float(ordered[round(share * (len(ordered) - 1))])

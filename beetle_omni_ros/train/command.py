@@ -28,7 +28,7 @@ POLICY_FILE = 'policy.onnx'
 # A run that shows within a minute on a CPU that everything fits together; it learns nothing.
 SMOKE = {'iterations': 3, 'log_every': 1, 'save_every': 2, 'ppo.robots': 32, 'ppo.steps': 8,
          'ppo.epochs': 2, 'ppo.minibatches': 2, 'network.hidden': [32, 16, 16]}
-ROBOTS, CPU_ROBOTS = 1024, 64            # of the final assessment
+ROBOTS, CPU_ROBOTS = 8192, 64            # of the final assessment
 COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}'),
            ('samples_per_second', 'samples/s', '{:.2e}'), ('reward', 'reward', '{:+.4f}'),
            ('success_rate', 'reached', '{:.1%}'), ('position_error_m', 'error m', '{:.3f}'),

@@ -135,59 +135,97 @@ class ExportedPolicy(torch.nn.Module):
     """
     What the ONNX file holds: raw observation in, mean action out, in few operations.
 
-    The same function as :meth:`ActorModel.mean`, written for a single observation on one core:
-    features in groups that share an operation, all scales folded into the first and the last
-    layer. On board it takes half the time of the original.
+    The same function as :meth:`ActorModel.mean`, written for a single observation on one core,
+    where an operation costs more than its arithmetic: whatever is linear between two products is
+    one constant matrix, and all scales and the carried action are in such matrices, too.
     """
 
     def __init__(self, actor: ActorModel):
         super().__init__()
-        self.carry = actor.carry
+        size = actor.obs_dim
         self.mlp: MLP = copy.deepcopy(actor.mlp).cpu()
-        sizes = dict(BLOCKS[:len(BLOCKS) if actor.obs_dim > ACTOR_SIZE else -2])
+        known = size + len(CROSSED[0])
+        self.register_buffer('left', _matrix(_left, known))
+        self.register_buffer('right', _matrix(_right, known))
+        self.register_buffer('linear', _matrix(_linear, known + self.left.shape[1]).T)
+        self.splits = [self.linear.shape[0] - 14, 6, 8]
+        self.register_buffer('offset', torch.zeros(self.linear.shape[0]))
+        self.offset[-4:] = 0.5 * torch.pi       # cosines are sines
+        self.register_buffer('norms', torch.block_diag(torch.ones(3, 3), torch.ones(3, 3)))
+        self.register_buffer('near', torch.full((6,), NEAR ** 2))
+        last = self.mlp[-1]
+        self.register_buffer('carry', torch.zeros(last.out_features, size))
+        self.carry[:, ACTION] = actor.carry * torch.eye(last.out_features)
+        sizes = dict(BLOCKS[:len(BLOCKS) if size > ACTOR_SIZE else -2])
         first = dict(zip(sizes, torch.arange(sum(sizes.values())).split(list(sizes.values()))))
-        order = torch.cat([first[name] for name in GROUPED if name in first])
-        scale = torch.cat([torch.full((size,), SCALES.get(name, 1.0))
-                           for name, size in sizes.items()])
+        order = torch.cat([first[name] for name in sizes if name not in NOT_LINEAR]
+                          + [first[name] for name in NOT_LINEAR])
         with torch.no_grad():
-            weight = self.mlp[0].weight * scale
-            self.mlp[0].weight.copy_(weight[:, order])
-            self.mlp[-1].weight.mul_(actor.output_scale)
-            self.mlp[-1].bias.mul_(actor.output_scale)
+            self.mlp[0].weight.copy_(self.mlp[0].weight[:, order])
+            last.weight.mul_(actor.output_scale)
+            last.bias.mul_(actor.output_scale)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """(1, 8) action of a (1, 33 or 39) observation."""
-        out = self.mlp(grouped_features(observation))
-        return out + self.carry * observation[:, ACTION] if self.carry else out
+        first, second = (torch.index_select(observation, -1, torch.tensor(places))
+                         for places in CROSSED)
+        known = torch.cat((observation, first * second), -1)
+        known = torch.cat((known, (known @ self.left) * (known @ self.right)), -1)
+        features, errors, angles = torch.nn.functional.linear(
+            known, self.linear, self.offset).split(self.splits, -1)
+        norms = torch.sqrt(torch.nn.functional.linear(errors * errors, self.norms, self.near))
+        features = torch.cat((features, errors / norms, torch.sin(angles)), -1)
+        *hidden, last = self.mlp
+        for layer in hidden:
+            features = layer(features)
+        return torch.nn.functional.linear(torch.cat((features, observation), -1),
+                                          torch.cat((last.weight, self.carry), -1), last.bias)
 
 
-# Blocks of :func:`features` with their sizes, and the order in which the exported graph makes
-# them, without the scales.
+# Blocks of :func:`features` with their sizes, and those that come last in the exported graph.
 BLOCKS = (('velocity', 3), ('rate', 3), ('target', 3), ('target_fine', 3), ('relative', 9),
           ('turn_fine', 3), ('up', 3), ('target_up', 3), ('tilt', 4), ('sine', 4), ('cosine', 4),
           ('tilt_action', 4), ('thrust_action', 4), ('force', 3), ('torque', 3))
-GROUPED = ('velocity', 'rate', 'target', 'target_fine', 'turn_fine', 'relative', 'up',
-           'target_up', 'sine', 'cosine', 'tilt', 'tilt_action', 'thrust_action', 'force',
-           'torque')
-SCALES = {'rate': RATE, 'tilt_action': TILT_ACTION, 'thrust_action': THRUST_ACTION,
-          'force': FORCE, 'torque': TORQUE}
+NOT_LINEAR = ('target_fine', 'turn_fine', 'sine', 'cosine')
+# Places of the observation whose products make y = z x x of body and target: first the six that
+# count positively.
+CROSSED = ((13, 14, 12, 19, 20, 18, 14, 12, 13, 20, 18, 19),
+           (11, 9, 10, 17, 15, 16, 10, 11, 9, 16, 17, 15))
 
 
-def grouped_features(o: torch.Tensor) -> torch.Tensor:
-    """(1, 50 or 56) features of one observation, unscaled, in the order ``GROUPED``."""
-    def take(values, *places):
-        return torch.index_select(values, -1, torch.tensor(places))
+def _matrix(function, size):
+    """Matrix (size, m) of a linear function of rows."""
+    return function(torch.eye(size))
 
-    # y = z x x of body and target, entry by entry: both axes rotated once and twice
-    y = take(o, 13, 14, 12, 19, 20, 18) * take(o, 11, 9, 10, 17, 15, 16) \
-        - take(o, 14, 12, 13, 20, 18, 19) * take(o, 10, 11, 9, 16, 17, 15)
-    axes = torch.cat((o[:, ATTITUDE], o[:, TARGET_ATTITUDE], y), -1)    # x z, x* z*, y y*
-    body = take(axes, 0, 1, 2, 12, 13, 14, 3, 4, 5).reshape(3, 3)
-    goal = take(axes, 6, 15, 9, 7, 16, 10, 8, 17, 11).reshape(3, 3)
-    relative = (body @ goal).reshape(1, 9)
-    turn = 0.5 * (take(relative, 7, 2, 3) - take(relative, 5, 6, 1))
-    errors = torch.cat((o[:, TARGET], turn), 0)
-    up = take(axes, 2, 14, 5, 8, 17, 11)
-    tilt = o[:, TILT]
-    return torch.cat((o[:, :9], _fine(errors).reshape(1, 6), relative, up, torch.sin(tilt),
-                      torch.cos(tilt), o[:, 21:]), -1)
+
+def _axes(known):
+    """Axes of body and target from the observation and the products after it."""
+    x, z, x_goal, z_goal = known[:, 9:21].split(3, -1)
+    y, y_goal = (known[:, -12:-6] - known[:, -6:]).split(3, -1)
+    return (x, y, z), (x_goal, y_goal, z_goal)
+
+
+def _left(known):
+    """Entries of the body's axes, each of which is multiplied ..."""
+    body, goals = _axes(known)
+    return torch.cat([axis for axis in body for _ in goals], -1)
+
+
+def _right(known):
+    """... with one of a target's axis."""
+    body, goals = _axes(known)
+    return torch.cat([goal for _ in body for goal in goals], -1)
+
+
+def _linear(known):
+    """Features that are linear in observation and products; errors (6) and angles (8)."""
+    o, products = known[:, :-27], known[:, -27:]
+    body, goals = _axes(o)
+    relative = products.reshape(-1, 9, 3).sum(-1)
+    turn = 0.5 * (relative[:, (7, 2, 3)] - relative[:, (5, 6, 1)])
+    target, tilt, action = o[:, TARGET], o[:, TILT], o[:, ACTION]
+    return torch.cat((
+        o[:, VELOCITY], RATE * o[:, ANGULAR_VELOCITY], target, relative,
+        *(axis[:, 2:] for axis in (*body, *goals)), tilt,
+        TILT_ACTION * action[:, :4], THRUST_ACTION * action[:, 4:],
+        *_disturbance(o[:, ACTOR_SIZE:-12]), target, turn, tilt, tilt), -1)
