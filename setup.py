@@ -50,6 +50,7 @@ REQUIREMENTS = [
     'rich>=13.7',
     'rosbags>=0.11,<0.12',
     'scipy>=1.11,<2',
+    'threadpoolctl>=3.1',
     'typer>=0.12',
     # Comes with mujoco 3. From 1.14 on it needs Python 3.11; where an index does not say so,
     # the pip 23.0 of Python 3.10 searches without end.

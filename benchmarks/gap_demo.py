@@ -5,7 +5,7 @@ A plant gets an effect that the workflow is not told. Three flights of it are re
 NMPC, `beetle_omni gap` runs on the bags, and the robot file that it writes is tried: held-out free
 runs before and after, and the lemniscate under the NMPC with the old and with the corrected model.
 The first effect is flown in real time through the ROS graph and both buses, the others by
-`beetle_omni evaluate --bag`, which is the same loop and faster.
+`beetle_omni evaluate --bag`, which is the same loop and faster, on all cores.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from pathlib import Path
 import shutil
 import sys
 
+import joblib
 import numpy as np
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from beetle_omni_ros.evaluation.command import run_evaluate
 from beetle_omni_ros.identify.gap.command import gap_results
@@ -46,50 +47,83 @@ def poses(path: Path, seed: int) -> Path:
     return path
 
 
-def record(folder: Path, plant: Path, name: str, through_ros: bool, console: Console) -> list:
-    """Fly and record; bags."""
-    bags = []
-    for k in range(FLIGHTS):
-        bag, task = folder / f'{name}_{k + 1}', poses(folder / f'poses_{k + 1}.csv', 100 + k)
-        shutil.rmtree(bag, ignore_errors=True)
-        console.print(f'{name}: flight {k + 1} of {FLIGHTS}'
-                      + (', in real time through ROS' if through_ros else ''))
-        quiet = Console(quiet=True)
-        if through_ros:
-            from beetle_omni_ros.nodes.fly import run_fly
-            if run_fly(task=str(task), plant=plant, bag=bag, seed=k, console=quiet):
-                sys.exit(f'{name}: flight {k + 1} failed')
-        else:
-            run_evaluate(controllers=['nmpc'], task=str(task), plant=plant, bag=bag, seed=k,
-                         console=quiet)
-        bags.append(bag)
-    return bags
+def plant_file(folder: Path, name: str) -> Path:
+    """Write the robot with the hidden effect."""
+    plant = folder / f'{name}_plant.yaml'
+    plant.write_text(f"extends: {share_path('params/robot.yaml')}\neffects: {{{HIDDEN[name]}}}\n")
+    return plant
 
 
-def lemniscate(plant: Path, believed: Path | None) -> float:
+def record(folder: Path, name: str, k: int, through_ros: bool = False) -> None:
+    """Fly and record a flight of the plant with the effect ``name``."""
+    bag, task = folder / f'{name}_{k}', folder / f'poses_{k}.csv'
+    shutil.rmtree(bag, ignore_errors=True)
+    given = {'task': str(task), 'plant': folder / f'{name}_plant.yaml', 'bag': bag, 'seed': k - 1,
+             'console': Console(quiet=True)}
+    if through_ros:
+        from beetle_omni_ros.nodes.fly import run_fly
+        if run_fly(**given):
+            sys.exit(f'{name}: flight {k} failed')
+    else:
+        run_evaluate(controllers=['nmpc'], **given)
+
+
+def lemniscate(plant: Path, believed: Path) -> float:
     """Mean position error of the NMPC on the lemniscate [m]; nan after a crash."""
-    found = run_evaluate(controllers=['nmpc'], task='lemniscate', plant=plant,
-                         robot=believed or share_path('params/robot.yaml'),
+    found = run_evaluate(controllers=['nmpc'], task='lemniscate', plant=plant, robot=believed,
                          console=Console(quiet=True))['nmpc']
     return float('nan') if found['crashed'] else found['trajectory']['position_mean_m']
 
 
-def show(name: str, folder: Path, through_ros: bool, console: Console) -> dict:
-    """One hidden effect from flights to the corrected model; what came of it."""
-    plant, corrected = folder / f'{name}_plant.yaml', folder / f'{name}_robot.yaml'
-    plant.write_text(f"extends: {share_path('params/robot.yaml')}\neffects: {{{HIDDEN[name]}}}\n")
-    corrected.unlink(missing_ok=True)
-    *fitted, judge = record(folder, plant, name, through_ros, console)
-    found = gap_results(fitted, [judge], None, corrected, folder / f'{name}_gap.json',
-                        folder / f'{name}_gap.html', console)
-    before = lemniscate(plant, None)
-    after = lemniscate(plant, corrected) if corrected.exists() else float('nan')
-    return {'hidden': HIDDEN[name], 'verdict': found['verdict'],
+def on_all_cores(calls: dict, console: Console) -> dict:
+    """Call each; results by the names of ``calls``, which are said as they are done."""
+    def named(name, function, arguments):
+        return name, function(*arguments)
+
+    results, flights = {}, joblib.Parallel(n_jobs=-1, return_as='generator_unordered')(
+        joblib.delayed(named)(name, *call) for name, call in calls.items())
+    for name, result in flights:
+        console.print(f'{name}: flown')
+        results[name] = result
+    return results
+
+
+def show(names: list[str], folder: Path, through_ros: bool, console: Console) -> dict:
+    """Each hidden effect from flights to the corrected model; what came of it, by name."""
+    plants = {name: plant_file(folder, name) for name in names}
+    corrected = {name: folder / f'{name}_robot.yaml' for name in names}
+    numbers = range(1, FLIGHTS + 1)
+    for k in numbers:
+        poses(folder / f'poses_{k}.csv', 99 + k)
+    if through_ros:     # alone on the computer: in real time
+        for k in numbers:
+            console.print(f'{names[0]}: flight {k} of {FLIGHTS}, in real time through ROS')
+            record(folder, names[0], k, True)
+    told = share_path('params/robot.yaml')
+    flown = on_all_cores({
+        **{f'{name}: lemniscate': (lemniscate, (plants[name], told)) for name in names},
+        **{f'{name}: flight {k} of {FLIGHTS}': (record, (folder, name, k))
+           for name in names[1 if through_ros else 0:] for k in numbers}}, console)
+    results = {}
+    for name in names:
+        corrected[name].unlink(missing_ok=True)
+        *fitted, judge = [folder / f'{name}_{k}' for k in numbers]
+        found = gap_results(fitted, [judge], None, corrected[name], folder / f'{name}_gap.json',
+                            folder / f'{name}_gap.html', console)
+        results[name] = {
+            'hidden': HIDDEN[name], 'verdict': found['verdict'],
             'named': [' or '.join(effect['names']) for effect in found['effects']],
             'parameters': [effect['parameters'] for effect in found['effects']],
             'gap_before': found['gap_before'], 'gap_after': found['gap_after'],
-            'closure': found['closure'], 'lemniscate_before_m': before,
-            'lemniscate_after_m': after, 'through_ros': through_ros}
+            'closure': found['closure'], 'through_ros': through_ros and name == names[0],
+            'lemniscate_before_m': flown[f'{name}: lemniscate'],
+            'lemniscate_after_m': float('nan')}
+    again = on_all_cores({f'{name}: lemniscate with what was found':
+                          (lemniscate, (plants[name], corrected[name]))
+                          for name in names if corrected[name].exists()}, console)
+    for call, error in again.items():
+        results[call.split(':')[0]]['lemniscate_after_m'] = error
+    return results
 
 
 def main():
@@ -103,11 +137,10 @@ def main():
     if unknown := set(names) - set(HIDDEN):
         arguments.error(f"unknown effect {', '.join(sorted(unknown))}; known: {', '.join(HIDDEN)}")
     given.output.mkdir(parents=True, exist_ok=True)
-    console, results = Console(), {}
-    for k, name in enumerate(names):
-        results[name] = show(name, given.output, k == 0 and not given.no_ros, console)
-    table = Table('hidden', 'named', 'gap before', 'after', 'closure', 'lemniscate before [m]',
-                  'after [m]')
+    console = Console()
+    results = show(names, given.output, not given.no_ros, console)
+    table = Table(Column('hidden', overflow='fold'), Column('named', overflow='fold'),
+                  'gap before', 'after', 'closure', 'lemniscate before [m]', 'after [m]')
     for result in results.values():
         numbers = (result['gap_before'], result['gap_after'], result['closure'])
         table.add_row(result['hidden'], ', '.join(result['named']) or result['verdict'],

@@ -11,7 +11,7 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.certainty import deviations, Visibility, visibility
 from beetle_omni_ros.identify.gap.fit import Problem
-from beetle_omni_ros.identify.gap.forks import forked
+from beetle_omni_ros.identify.gap.forks import forked, team
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, Key, tolerances
 from beetle_omni_ros.identify.gap.parameters import GapParameters
@@ -105,6 +105,11 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
         progress: called with a short text at each stage.
 
     """
+    with team() as first:
+        return _analysed(fitted, judging, robot, p, progress if first else lambda text: None)
+
+
+def _analysed(fitted, judging, robot, p, progress):
     a = Analysis(held_out=bool(judging))
     a.keys = {**all_keys(robot), **extra_keys()}
     body = BodyModel(robot, a.keys, _modules(robot))
@@ -202,9 +207,12 @@ def _falsify(a, wide):
     everyone = list(dict.fromkeys([*a.models[0], *judges]))
     noise = dict(zip(everyone, forked(
         lambda m: a.problem.noise_of(m, found.theta, wide), everyone), strict=True))
-    for name, theta in points.items():
-        if found.accepted or name in ('before', 'file'):
-            a.runs[name] = forked(lambda m, at=theta: free_runs(m, at, noise[m]), judges)
+    if not found.accepted:
+        points = {name: points[name] for name in ('before', 'file')}
+    flown = iter(forked(lambda pair: free_runs(pair[1], pair[0], noise[pair[1]]),
+                        [(theta, m) for theta in points.values() for m in judges]))
+    for name in points:
+        a.runs[name] = [next(flown) for _ in judges]
     for name, same in (('after', 'before'), ('placebo', 'before'), ('effects_alone', 'file')):
         a.runs.setdefault(name, a.runs[same])
     trim = trimmed(forked(lambda m: free_runs(m, found.theta, noise[m]), a.models[0]))
