@@ -32,6 +32,7 @@ HIDDEN = {
     'rotor_drag': 'rotor_drag: {coefficient: 1.2}',
     'joint_command_latency': 'joint_command_latency: {delay: 0.045}',
 }
+WIDTH = 120                 # columns that the table needs
 FLIGHTS, POSES = 3, 7       # of 8 s each: the last flight judges
 
 
@@ -139,15 +140,16 @@ def main():
     given.output.mkdir(parents=True, exist_ok=True)
     console = Console()
     results = show(names, given.output, not given.no_ros, console)
-    table = Table(Column('hidden', overflow='fold'), Column('named', overflow='fold'),
-                  'gap before', 'after', 'closure', 'lemniscate before [m]', 'after [m]')
+    table = Table(Column('hidden', no_wrap=True), Column('named', overflow='fold'),
+                  'gap before', 'after', 'closure', 'lemniscate before [mm]', 'after [mm]')
     for result in results.values():
         numbers = (result['gap_before'], result['gap_after'], result['closure'])
-        table.add_row(result['hidden'], ', '.join(result['named']) or result['verdict'],
+        table.add_row(result['hidden'].replace(': {', ' ').rstrip('}'),
+                      ', '.join(result['named']) or result['verdict'],
                       *('–' if n is None else f'{n:.2f}' for n in numbers),
-                      f"{result['lemniscate_before_m']:.4f}",
-                      f"{result['lemniscate_after_m']:.4f}")
-    console.print(table)
+                      f"{1e3 * result['lemniscate_before_m']:.1f}",
+                      f"{1e3 * result['lemniscate_after_m']:.1f}")
+    Console(width=max(console.width, WIDTH)).print(table)
     (given.output / 'results.json').write_text(json.dumps(results, indent=1) + '\n')
     console.print(f'pages and robot files: {given.output}')
     found = [name in ' '.join(result['named']) for name, result in results.items()]

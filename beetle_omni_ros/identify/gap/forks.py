@@ -58,25 +58,8 @@ def forked(function: Callable[[Any], T], items: Iterable[Any]) -> list[T]:
         return [function(item) for item in items]
     if _team:
         return _team.share(function, items)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    living = [_child(function, items[first::jobs]) for first in range(1, jobs)]
-    try:
-        shares = [[function(item) for item in items[::jobs]]]
-        while living:
-            shares.append(_answer(*living.pop(0)))
-    except BaseException:
-        for process, pipe in living:
-            os.kill(process, signal.SIGKILL)
-            pipe.close()
-            os.waitpid(process, 0)
-        raise
-    results: list = [None] * len(items)
-    for first, share in enumerate(shares):
-        if share is None:       # the child died
-            share = [function(item) for item in items[first::jobs]]
-        results[first::jobs] = share
-    return results
+    with _together(jobs) as gathered:
+        return gathered.share(function, items, tell=False)
 
 
 @contextmanager
@@ -92,22 +75,27 @@ def team() -> Iterator[bool]:
         whether this is the first process.
 
     """
-    global _team
     size = width()
     if size < 2 or _team or threadpool_limits is None:
         yield not _team or _team.rank == 0
         return
+    with threadpool_limits(1), _together(size) as gathered:
+        yield gathered.rank == 0
+
+
+@contextmanager
+def _together(size):
+    global _team
     sys.stdout.flush()
     sys.stderr.flush()
-    with threadpool_limits(1):
-        _team = _gathered(size)
-        try:
-            yield _team.rank == 0
-        finally:
-            if _team.rank:
-                os._exit(0)
-            _team.dismiss()
-            _team = None
+    _team = _gathered(size)
+    try:
+        yield _team
+    finally:
+        if _team.rank:
+            os._exit(0)     # nothing of the first's is closed or written a second time
+        _team.dismiss()
+        _team = None
 
 
 def _gathered(size):
@@ -115,7 +103,10 @@ def _gathered(size):
     others = []
     for rank in range(1, size):
         ours, theirs = socket.socketpair()
-        process = _forked_process()
+        with warnings.catch_warnings():
+            # Threads of the parent, such as a progress bar's, hold nothing that a child uses.
+            warnings.simplefilter('ignore', DeprecationWarning)
+            process = os.fork()
         if not process:
             for _, other in others:
                 other.close()
@@ -126,13 +117,6 @@ def _gathered(size):
         others.append((process, ours.makefile('rwb')))
         ours.close()
     return _Team(0, size, others)
-
-
-def _forked_process():
-    with warnings.catch_warnings():
-        # Threads of the parent, such as a progress bar's, hold nothing that a child uses.
-        warnings.simplefilter('ignore', DeprecationWarning)
-        return os.fork()
 
 
 def _silence():
@@ -156,8 +140,8 @@ class _Team:
         self.rank, self.size, self.others = rank, size, others
         self._calls = 0
 
-    def share(self, function, items):
-        """Do as :func:`forked`."""
+    def share(self, function, items, tell=True):
+        """Do as :func:`forked`; ``tell``: the others need the results, too."""
         global _inside
         self._calls += 1
         call = self._calls, len(items)
@@ -170,7 +154,7 @@ class _Team:
             else:
                 for rank, (_, pipe) in enumerate(self.others, 1):
                     shares[rank] = _received(pipe, call)
-                if None in shares or not self._told(call, shares):
+                if None in shares or tell and not self._told(call, shares):
                     self.dismiss()      # a process died or went its own way; go on alone
                     shares = [share or _made(function, items[rank::self.size])
                               for rank, share in enumerate(shares)]
@@ -235,34 +219,3 @@ def _received(pipe, call):
     except (OSError, EOFError, pickle.UnpicklingError):
         return None
     return message if of == call else None
-
-
-def _child(function, items):
-    """Process number and readable end of the pipe of a child that does these items."""
-    read, write = os.pipe()
-    process = _forked_process()
-    if process:
-        os.close(write)
-        return process, os.fdopen(read, 'rb')
-    try:
-        os.close(read)
-        global _inside
-        _inside = True
-        with os.fdopen(write, 'wb') as pipe:
-            pickle.dump(_made(function, items), pipe, protocol=pickle.HIGHEST_PROTOCOL)
-    finally:
-        os._exit(0)     # nothing of the parent's is closed or written a second time
-
-
-def _answer(process, pipe):
-    """What a child made, or None where it died."""
-    try:
-        with pipe:
-            good, made = pickle.load(pipe)
-    except (EOFError, pickle.UnpicklingError):
-        good, made = True, None
-    finally:
-        os.waitpid(process, 0)
-    if not good:
-        raise made
-    return made
