@@ -21,7 +21,7 @@ NEAR = 0.1           # [m or rad] below which an error's fine feature is linear
 RATE, FORCE, TORQUE, THRUST, TILT_ACTION, THRUST_ACTION = 0.5, 0.1, 2.0, 0.1, 0.25, 0.1
 # Blocks of the observation; the critic has eight rotor columns between tilt and action.
 VELOCITY, ANGULAR_VELOCITY, TARGET = slice(0, 3), slice(3, 6), slice(6, 9)
-ATTITUDE, TARGET_ATTITUDE, TILT = slice(9, 15), slice(15, 21), slice(21, 25)
+ATTITUDES, TILT = slice(9, 21), slice(21, 25)     # of body and target; joints
 ACTION, ACTOR_SIZE = slice(25, 33), 33
 ROTORS, CRITIC_ACTION, CRITIC_SIZE = slice(25, 33), slice(33, 41), 41
 
@@ -200,7 +200,7 @@ def _matrix(function, size):
 
 def _axes(known):
     """Axes of body and target from the observation and the products after it."""
-    x, z, x_goal, z_goal = known[:, 9:21].split(3, -1)
+    x, z, x_goal, z_goal = known[:, ATTITUDES].split(3, -1)
     y, y_goal = (known[:, -12:-6] - known[:, -6:]).split(3, -1)
     return (x, y, z), (x_goal, y_goal, z_goal)
 
