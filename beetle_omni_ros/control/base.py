@@ -87,6 +87,11 @@ class PoseTarget:
         """The reference at ``time``: the same pose at rest."""
         return Reference(self.position, self.quaternion, np.zeros(3), np.zeros(3))
 
+    def same_pose(self, other: PoseTarget) -> bool:
+        """Whether another target asks for the same."""
+        return np.array_equal(self.position, other.position) \
+            and np.array_equal(self.quaternion, other.quaternion)
+
 
 @dataclass(frozen=True)
 class TrajectoryTarget:

@@ -15,8 +15,9 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.control.observation import disturbed, observed
 from beetle_omni_ros.control.policy_network import PolicyNetwork
+from beetle_omni_ros.control.routing import Routing, RoutingParameters
 from beetle_omni_ros.control.trimming import Trimming, TrimmingParameters
-from beetle_omni_ros.control.turning import raised, TurningParameters
+from beetle_omni_ros.control.turning import Turning, TurningParameters
 from beetle_omni_ros.control.unwinding import Unwinding, UnwindingParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import schema
@@ -55,8 +56,10 @@ class PolicyParameters:
         DisturbanceParameters, 'what a policy with memory sees')
     unwinding: UnwindingParameters = group(
         UnwindingParameters, 'through a level attitude where joints end at their stops')
+    routing: RoutingParameters = group(
+        RoutingParameters, 'round where the shortest turn ends at joint stops')
     turning: TurningParameters = group(
-        TurningParameters, 'low targets are turned to above them')
+        TurningParameters, 'where targets are shown while there is far to turn')
     trimming: TrimmingParameters = group(
         TrimmingParameters, 'the steady error at a target is taken off')
 
@@ -74,8 +77,9 @@ class PolicyController:
     another controller leaves off. Targets are cut to the limits of the actuators, as they were
     in training; an output that is not finite or absurdly large goes out as it is, for the
     supervisor to refuse. Where the joints are wound so that a pose stays out of reach, it is shown
-    a level attitude first (:mod:`control.unwinding`), and while it has far to turn, low targets
-    are shown higher (:mod:`control.turning`).
+    a level attitude first (:mod:`control.unwinding`); where the shortest turn would wind them so,
+    an attitude on a way round (:mod:`control.routing`); and while there is far to turn, targets
+    are shown nearer and higher (:mod:`control.turning`).
 
     Args:
         robot: what the controller believes about the robot.
@@ -104,6 +108,8 @@ class PolicyController:
         self._estimator = DisturbanceEstimator(
             robot, p, FunctionCall(model.integrator(robot), None)) if contract.memory else None
         self._unwinding = Unwinding(p.unwinding, robot.tilt_axes)
+        self._routing = Routing(p.routing, robot.tilt_axes)
+        self._turning = Turning(p.turning)
         self._trimming = Trimming(p.trimming)
         self.reset()
 
@@ -111,8 +117,8 @@ class PolicyController:
         """Forget the last command, the estimate and all counts."""
         self._command: Command | None = None
         self._steps = self._rejected = self._faults = self._cut = 0
-        self._unwinding.reset()
-        self._trimming.reset()
+        for shaping in (self._unwinding, self._routing, self._turning, self._trimming):
+            shaping.reset()
         self._latest: deque[list[float]] = deque(maxlen=LATEST)
         if self._estimator:
             self._estimator.reset()
@@ -133,7 +139,8 @@ class PolicyController:
         """Counts since reset, and what a policy with memory estimates."""
         told = {'policy': self.contract.name, 'steps': self._steps,
                 'rejected_states': self._rejected, 'faulty_actions': self._faults,
-                'steps_at_a_limit': self._cut, 'unwound': self._unwinding.attempts}
+                'steps_at_a_limit': self._cut, 'unwound': self._unwinding.attempts,
+                'routed': self._routing.routed}
         if self._estimator:
             d = self._estimator.disturbance
             told['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
@@ -161,7 +168,10 @@ class PolicyController:
 
     def _shown(self, state, target):
         """The pose target that the policy sees."""
-        shown = raised(state, self._unwinding.target(state, target), self._parameters.turning)
+        aim = self._unwinding.target(state, target)
+        if aim is target:
+            aim = self._routing.target(state, target)
+        shown = self._turning.target(state, target, aim)
         if shown is target:
             return self._trimming.target(state, target, self._in_charge(state))
         self._trimming.reset()      # on its way elsewhere; joints may come back wound otherwise

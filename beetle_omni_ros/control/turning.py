@@ -1,13 +1,18 @@
 """
-Low targets are turned to above them.
+Large turns without a dive: where a policy is shown its target while it turns.
 
-A large turn may cost lift: joints that have half a turn to go leave a robot half a second without,
-and one turn of some hundred sinks by half a metre. Over a low target that is the floor.
+While joints turn over, thrust is missing: the robot sinks, deepest where it also accelerates
+sideways while upside down. So targets are shown no farther than a carrot while there is far to
+turn, low ones higher, and a robot that is about to sink below where it was and shall be is shown
+one above, for as long as it sinks.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import dist, inf
+
+import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.robot import rotations
@@ -18,25 +23,66 @@ from beetle_omni_ros.robot.schema import parameter
 class TurningParameters:
     """Where a robot turns that has far to turn."""
 
-    height: float = parameter(1.0, doc='of a target at least, in world, ...', unit='m', low=-1000,
-                              high=1000)
-    angle: float = parameter(1.0, doc='... while the attitude is farther off', unit='rad',
+    angle: float = parameter(1.0, doc='from the target: while farther off, ...', unit='rad',
                              low=0.1, high=4)
+    height: float = parameter(1.0, doc='... a target is shown at least so high, in world, ...',
+                              unit='m', low=-1000, high=1000)
+    distance: float = parameter(2.0, doc='... and no farther away', unit='m', low=0.1, high=1000)
+    settled: float = parameter(0.5, doc='from the target: while farther off, ...', unit='rad',
+                               low=0.1, high=4)
+    depth: float = parameter(0.1, doc='... who sinks so far below start and target ...', unit='m',
+                             low=0, high=1000)
+    outlook: float = parameter(0.3, doc='... within this time ...', unit='s', low=0, high=5)
+    climb: float = parameter(2.0, doc='... sees the target so far above; 0: never', unit='m',
+                             low=0, high=10)
 
 
-def raised(state: State, target: PoseTarget, parameters: TurningParameters) -> PoseTarget:
+class Turning:
     """
-    Give the target, or one above it.
+    Moves pose targets while a robot has far to turn.
 
     Args:
-        state: of the robot; one that is not finite sees the target.
-        target: a pose.
-        parameters: how high and for how long.
+        parameters: where to.
 
     """
-    if target.position[2] >= parameters.height or not rotations.geodesic_angle(
-            state.quaternion, target.quaternion) > parameters.angle:
-        return target
-    position = target.position.copy()
-    position[2] = parameters.height
-    return replace(target, position=position)
+
+    def __init__(self, parameters: TurningParameters):
+        self._p = parameters
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget where the way to the target began."""
+        self._given: PoseTarget | None = None
+        self._lowest = -inf
+
+    def target(self, state: State, given: PoseTarget, aim: PoseTarget | None = None) -> PoseTarget:
+        """
+        What to fly towards: ``aim``, or its attitude at another place.
+
+        Args:
+            state: of the robot; one that is not finite sees ``aim``.
+            given: the target.
+            aim: on the way to it, where that is another; then there is far to turn.
+
+        """
+        z, p = float(state.position[2]), self._p
+        if given is not self._given:
+            if self._given is None or not given.same_pose(self._given):
+                self._lowest = min(float(given.position[2]), z)
+            self._given = given
+        passing = aim is not None and aim is not given
+        left = rotations.geodesic_angle(state.quaternion, given.quaternion)
+        if not (passing or left > min(p.settled, p.angle)):
+            return given
+        aim = aim if passing else given
+        place = aim.position.tolist()
+        if passing or left > p.angle:
+            place[2] = max(place[2], p.height)
+            at = state.position.tolist()
+            far = dist(place, at)
+            if far > p.distance:
+                place = [a + p.distance / far * (b - a) for a, b in zip(at, place)]
+        if (passing or left > p.settled) \
+                and z + p.outlook * float(state.velocity[2]) < self._lowest - p.depth and p.climb:
+            place[2] = max(place[2], z) + p.climb
+        return aim if place == aim.position.tolist() else replace(aim, position=np.array(place))

@@ -31,6 +31,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import PoseTarget, State
+from beetle_omni_ros.control.turns import STRAIGHT_UP, tilts_at_end, turning_cost
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import parameter
 
@@ -38,11 +39,8 @@ ARRIVED = 0.35    # [rad] from level: near enough to turn back
 UNWOUND = 1.0     # [rad] all tilts below: a robot that turns back earlier goes the way it came
 LONG_TURN = 2.0   # [rad] from level to the target: beyond, half of it is flown by itself ...
 HALF_WAY = 0.6    # [rad] ... until so near to its end
-STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
 STEP = 1.5        # of the limits, that counts as progress, or half of what is left
 HEADINGS = 24     # level attitudes that are compared
-POINTS = 16       # of a turn at which its arms are looked at
-LEAST_USE = 0.2   # part of an arm's thrust that can hold weight, below which it counts as this
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +116,7 @@ class Unwinding:
 
         """
         if given is not self._given:
-            if self._given is None or not _same(given, self._given):
+            if self._given is None or not given.same_pose(self._given):
                 self._start()
             self._given = given
         if self._way:
@@ -221,55 +219,3 @@ def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
         failures += np.all(np.abs(tilts - wound) < np.pi, axis=1)
     best = np.lexsort((cost, failures))[0]      # by failures, then by cost
     return levels[int(best)].as_quat()
-
-
-def turning_cost(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray:
-    """
-    Angle of the shortest turn between two attitudes, longer for each arm near upright [rad].
-
-    The thrust of a rotor is across its arm, so sqrt(1 - (arm . up)^2) of it can hold weight; the
-    angle is weighted with the inverse square of that for the worst arm.
-
-    Args:
-        start: one attitude or n of them.
-        end: the same.
-        axes: (4, 3) unit tilt axes in base_link.
-
-    Returns:
-        (n,) costs.
-
-    """
-    angle, up = _turn(start, end)
-    upright = np.max((up @ axes.T) ** 2, axis=-1)
-    return angle * np.mean(1 / np.maximum(1 - upright, LEAST_USE ** 2), axis=1)
-
-
-def tilts_at_end(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray:
-    """
-    Tilts (n, 4) [rad] after the shortest turns from level attitudes, all thrusts kept upward.
-
-    Args:
-        start: n level attitudes, with all tilts zero.
-        end: one attitude or n of them.
-        axes: (4, 3) unit tilt axes in base_link.
-
-    """
-    up = _turn(start, end)[1]
-    across = np.cross(axes, STRAIGHT_UP)        # where a thrust points at a tilt of pi / 2
-    return np.unwrap(np.arctan2(up @ across.T, up[..., 2:]), axis=1)[:, -1]
-
-
-def _turn(start, end):
-    """Angles (n,) of the shortest turns, and world's z in the turning body (n, POINTS, 3)."""
-    turn = np.atleast_2d((start.inv() * end).as_rotvec())
-    angle = np.linalg.norm(turn, axis=1)
-    axis = (turn / np.maximum(angle, 1e-9)[:, None])[:, None]               # (n, 1, 3)
-    up = np.atleast_2d(start.inv().apply(STRAIGHT_UP))[:, None]
-    part = (angle[:, None] * np.linspace(0.0, 1.0, POINTS))[..., None]      # (n, POINTS, 1)
-    along = (axis * up).sum(-1, keepdims=True)
-    return angle, up * np.cos(part) - np.cross(axis, up) * np.sin(part) \
-        + axis * along * (1 - np.cos(part))
-
-
-def _same(a, b):
-    return np.array_equal(a.position, b.position) and np.array_equal(a.quaternion, b.quaternion)

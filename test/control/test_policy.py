@@ -9,6 +9,7 @@ from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryT
 from beetle_omni_ros.control.observation import observation
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.control.policy_file import PolicyContract
+from beetle_omni_ros.control.routing import RoutingParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -264,7 +265,8 @@ def test_a_contract_of_the_trainer_loads(tmp_path):
 def test_a_wound_robot_that_stays_off_its_pose_is_flown_through_level_but_not_off_a_trajectory(
         tmp_path):
     # the last two tilts asked for are z of the target's x and z axes in world
-    policy = controller(write(tmp_path / 'p.onnx', weights=selecting([0, 1, 17, 20, 4, 5, 6, 7])))
+    policy = controller(write(tmp_path / 'p.onnx', weights=selecting([0, 1, 17, 20, 4, 5, 6, 7])),
+                        routing=RoutingParameters(tilt=100.0))
     scale = policy.contract.action_scale[3]
     on_its_head = PoseTarget(np.array([0.0, 0.0, 1.5]), np.array([1.0, 0.0, 0.0, 0.0]))
     times = np.array([0.0, 10.0])

@@ -1,4 +1,6 @@
-"""Low targets are turned to above them, and nothing else changes."""
+"""Where targets are shown while there is far to turn, and that nothing else changes."""
+
+from dataclasses import replace
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -7,23 +9,30 @@ import pytest
 
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
-from beetle_omni_ros.control.turning import raised, TurningParameters
+from beetle_omni_ros.control.turning import Turning, TurningParameters
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 P = TurningParameters()
+LEVEL = rotations.from_rpy(0.0, 0.0, 0.0)
+FAR, NEAR = rotations.from_rpy(2.0, 0.0, 0.0), rotations.from_rpy(0.3, 0.0, 0.0)
 
 
-def state(quaternion, height=1.0):
-    return State(0.0, np.array([0.0, 0.0, height]), np.zeros(3), np.asarray(quaternion, float),
-                 np.zeros(3), np.zeros(4), np.zeros(4), tilt_stamp=0.0)
+def state(quaternion, height=1.0, sinking=0.0, place=(0.0, 0.0)):
+    return State(0.0, np.array([*place, height]), np.array([0.0, 0.0, -sinking]),
+                 np.asarray(quaternion, float), np.zeros(3), np.zeros(4), np.zeros(4),
+                 tilt_stamp=0.0)
+
+
+def pose(height=1.5, quaternion=LEVEL, place=(0.3, -0.4)):
+    return PoseTarget(np.array([*place, height]), quaternion)
 
 
 @given(st.floats(0.2, 2.5), st.floats(0.0, 3.1), st.floats(-3, 3))
 def test_only_a_low_target_far_to_turn_to_is_shown_higher(height, angle, yaw):
-    target = PoseTarget(np.array([0.3, -0.4, height]), rotations.from_rpy(0.0, 0.0, yaw))
+    target = pose(height, rotations.from_rpy(0.0, 0.0, yaw))
     away = rotations.multiply(target.quaternion, rotations.exp(np.array([angle, 0.0, 0.0])))
-    shown = raised(state(away), target, P)
+    shown = Turning(P).target(state(away), target)
     if height >= P.height or angle < P.angle - 1e-6:
         assert shown is target
     elif angle > P.angle + 1e-6:
@@ -31,9 +40,63 @@ def test_only_a_low_target_far_to_turn_to_is_shown_higher(height, angle, yaw):
         assert shown.quaternion is target.quaternion and target.position[2] == height
 
 
-def test_a_state_that_is_not_finite_sees_the_target():
-    target = PoseTarget(np.array([0.0, 0.0, 0.4]), rotations.from_rpy(0.0, 0.0, 0.0))
-    assert raised(state(np.full(4, np.nan)), target, P) is target
+@given(st.floats(-5, 5), st.floats(-5, 5), st.floats(1.0, 4.0), st.floats(0.0, 3.1))
+def test_a_target_far_to_turn_to_is_shown_on_the_way_and_no_farther_than_stated(x, y, z, angle):
+    target, now = pose(z, place=(x, y)), state(rotations.from_rpy(angle, 0.0, 0.0), 1.0)
+    shown, way = Turning(P).target(now, target), target.position - now.position
+    if angle < P.angle - 1e-6 or np.linalg.norm(way) <= P.distance:
+        assert shown is target
+    elif angle > P.angle + 1e-6:
+        step = shown.position - now.position
+        assert np.linalg.norm(step) == pytest.approx(P.distance)
+        assert np.cross(step, way) == pytest.approx(np.zeros(3), abs=1e-9) and step @ way > 0
+
+
+@pytest.mark.parametrize('attitude, height, sinking, begin, caught', [
+    (FAR, 1.25, 0.0, 1.3, False),        # above where it began, less the depth
+    (FAR, 1.15, 0.0, 1.3, True),
+    (FAR, 1.3, 0.5, 1.3, True),          # it will be
+    (FAR, 1.3, 0.3, 1.3, False),
+    (FAR, 1.3, 0.5, 1.1, False),         # it began lower
+    (FAR, 1.45, 0.1, 2.0, False),        # the target is lower than where it began
+    (FAR, 1.35, 0.5, 2.0, True),
+    (NEAR, 1.15, 0.5, 1.3, False),       # hardly anything to turn
+], ids=str)
+def test_who_is_about_to_sink_below_start_and_target_is_shown_one_above(attitude, height, sinking,
+                                                                        begin, caught):
+    turning, target = Turning(P), pose(1.5)
+    turning.target(state(attitude, begin), target)
+    shown = turning.target(state(attitude, height, sinking), target)
+    assert shown.position[:2] == pytest.approx([0.3, -0.4])
+    assert shown.position[2] == pytest.approx(1.5 + P.climb if caught else 1.5)
+    off = Turning(replace(P, climb=0.0))
+    off.target(state(attitude, begin), target)
+    assert off.target(state(attitude, height, sinking), target) is target
+
+
+def test_a_new_target_begins_where_the_robot_is_and_the_same_one_again_does_not():
+    turning = Turning(P)
+    turning.target(state(FAR, 1.3), pose(1.5))
+    assert turning.target(state(FAR, 1.1), pose(1.5)).position[2] > 1.5
+    assert turning.target(state(FAR, 1.1), pose(1.5, place=(0.5, 0.0))).position[2] == 1.5
+    turning.reset()
+    assert turning.target(state(FAR, 0.7), pose(1.5)).position[2] == 1.5
+
+
+def test_an_attitude_on_the_way_is_shown_at_the_same_places():
+    turning, target = Turning(P), pose(0.4, LEVEL)
+    between = replace(target, quaternion=NEAR)
+    shown = turning.target(state(NEAR), target, between)
+    assert shown.quaternion is NEAR and shown.position[2] == P.height
+    assert turning.target(state(NEAR), target, target) is target
+
+
+@pytest.mark.parametrize('broken', ['quaternion', 'height'])
+def test_a_state_that_is_not_finite_sees_the_target(broken):
+    target, turning = pose(0.4), Turning(P)
+    bad = state(np.full(4, np.nan)) if broken == 'quaternion' else state(LEVEL, np.nan)
+    assert turning.target(bad, target) is target
+    assert turning.target(state(FAR, 0.2), target).position[2] == P.height + P.climb
 
 
 @pytest.mark.parametrize('angle, climbs', [(2.0, True), (0.5, False)])

@@ -7,11 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import PoseTarget, State
+from beetle_omni_ros.control.turns import tilts_at_end, turning_cost
 from beetle_omni_ros.control.unwinding import (
     level_between,
     levelled,
-    tilts_at_end,
-    turning_cost,
     Unwinding,
     UnwindingParameters,
 )
