@@ -12,13 +12,14 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, PoseTarget, State, Target
 from beetle_omni_ros.control.call import FunctionCall
 from beetle_omni_ros.control.disturbance import DisturbanceEstimator
+from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.control.observation import disturbed, observed
 from beetle_omni_ros.control.policy_network import PolicyNetwork
-from beetle_omni_ros.control.routing import Routing, RoutingParameters
-from beetle_omni_ros.control.trimming import Trimming, TrimmingParameters
-from beetle_omni_ros.control.turning import Turning, TurningParameters
-from beetle_omni_ros.control.unwinding import Unwinding, UnwindingParameters
+from beetle_omni_ros.control.routing import RoutingParameters
+from beetle_omni_ros.control.trimming import TrimmingParameters
+from beetle_omni_ros.control.turning import TurningParameters
+from beetle_omni_ros.control.unwinding import UnwindingParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -76,10 +77,8 @@ class PolicyController:
     Its previous action is the command in force, whoever gave it, so that it takes over where
     another controller leaves off. Targets are cut to the limits of the actuators, as they were
     in training; an output that is not finite or absurdly large goes out as it is, for the
-    supervisor to refuse. Where the joints are wound so that a pose stays out of reach, it is shown
-    a level attitude first (:mod:`control.unwinding`); where the shortest turn would wind them so,
-    an attitude on a way round (:mod:`control.routing`); and while there is far to turn, targets
-    are shown nearer and higher (:mod:`control.turning`).
+    supervisor to refuse. Pose targets are shown as :mod:`control.guidance` moves them: a way round
+    where the joints would wind to their stops, without dives, without steady errors.
 
     Args:
         robot: what the controller believes about the robot.
@@ -107,18 +106,14 @@ class PolicyController:
         self._hover = [robot.hover_thrust] * 4
         self._estimator = DisturbanceEstimator(
             robot, p, FunctionCall(model.integrator(robot), None)) if contract.memory else None
-        self._unwinding = Unwinding(p.unwinding, robot.tilt_axes)
-        self._routing = Routing(p.routing, robot.tilt_axes)
-        self._turning = Turning(p.turning)
-        self._trimming = Trimming(p.trimming)
+        self._guidance = Guidance(p, robot.tilt_axes)
         self.reset()
 
     def reset(self) -> None:
         """Forget the last command, the estimate and all counts."""
         self._command: Command | None = None
         self._steps = self._rejected = self._faults = self._cut = 0
-        for shaping in (self._unwinding, self._routing, self._turning, self._trimming):
-            shaping.reset()
+        self._guidance.reset()
         self._latest: deque[list[float]] = deque(maxlen=LATEST)
         if self._estimator:
             self._estimator.reset()
@@ -139,8 +134,8 @@ class PolicyController:
         """Counts since reset, and what a policy with memory estimates."""
         told = {'policy': self.contract.name, 'steps': self._steps,
                 'rejected_states': self._rejected, 'faulty_actions': self._faults,
-                'steps_at_a_limit': self._cut, 'unwound': self._unwinding.attempts,
-                'routed': self._routing.routed}
+                'steps_at_a_limit': self._cut,
+                **self._guidance.diagnostics()}
         if self._estimator:
             d = self._estimator.disturbance
             told['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
@@ -151,7 +146,7 @@ class PolicyController:
         """Numbers for the network, or None when one of them is not finite."""
         time = state.stamp
         if isinstance(target, PoseTarget):
-            target = self._shown(state, target)
+            target = self._guidance.target(state, target, self._in_charge(state))
         else:
             time += self._parameters.trajectory_lookahead
         observation = observed(state, target.at(time), self._previous_action(state))
@@ -165,17 +160,6 @@ class PolicyController:
                 self._estimator.reset()
             observation += disturbed(state, self._estimator.disturbance)
         return observation
-
-    def _shown(self, state, target):
-        """The pose target that the policy sees."""
-        aim = self._unwinding.target(state, target)
-        if aim is target:
-            aim = self._routing.target(state, target)
-        shown = self._turning.target(state, target, aim)
-        if shown is target:
-            return self._trimming.target(state, target, self._in_charge(state))
-        self._trimming.reset()      # on its way elsewhere; joints may come back wound otherwise
-        return shown
 
     def _in_charge(self, state):
         """Whether the command in force is one of this controller's latest."""

@@ -1,0 +1,259 @@
+"""
+Thousands of moves of a policy from random pose to random pose: how deep it dives, how often.
+
+    python benchmarks/policy_moves.py [--policy FILE] [--robots 2048] [--moves 5] [--seed 0]
+                                      [--conditions nominal|published] [--without PART ...]
+                                      [--jobs -1] [--json FILE]
+
+Rare failures need more moves than flights of the whole simulation give in an hour. Here the
+robots of the training environment fly (one rigid body and its moments, no estimator, no floor)
+with everything that stands around a policy on board: each robot has its own guidance, which sees
+the true state. `--without` leaves parts of it out (unwinding, routing, turning, trimming). Poses
+are drawn as random100's are; the first move of each robot, from its start, is not counted. Needs
+torch, rsl-rl-lib and onnx (the `train` extra).
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import fields, replace
+import json
+from pathlib import Path
+import sys
+
+from joblib import delayed, Parallel
+import numpy as np
+import onnx
+import onnxruntime
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+import torch
+
+from beetle_omni_ros.control.base import Command, PoseTarget, State
+from beetle_omni_ros.control.guidance import Guidance
+from beetle_omni_ros.control.policy import PolicyParameters
+from beetle_omni_ros.control.policy_network import find, PolicyNetwork
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.tasks import pose_target, random_poses
+from beetle_omni_ros.train.assess import conditions
+from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
+from beetle_omni_ros.train.parameters import StartParameters, TrainParameters
+
+SEGMENT, AT_TARGET, ON_THE_WAY = 750, (700, 750), (100, 700)    # steps of 10 ms
+DEPTHS, HEIGHT = (0.15, 0.25, 0.4), 0.3      # [m] counted: below start and target; above ground
+REACHED = (0.1, np.radians(10))
+PART = 512      # robots of one piece of work
+OFF = {'unwinding': {'attempts': 0}, 'routing': {'tilt': 100.0}, 'trimming': {'rate': 0.0},
+       'turning': {'height': -1000.0, 'distance': 1000.0, 'climb': 0.0}}
+
+
+class Batched:
+    """
+    A policy's file for any number of observations.
+
+    Graphs that were written for a single one with fixed shapes are called row by row.
+
+    Args:
+        path: of the ONNX file.
+
+    """
+
+    def __init__(self, path: Path):
+        graph = onnx.load(path)
+        self._single = _session(graph)
+        for value in (*graph.graph.input, *graph.graph.output):
+            value.type.tensor_type.shape.dim[0].dim_param = 'robots'
+        del graph.graph.value_info[:]
+        self._many = _session(graph)
+        size = self._single.get_inputs()[0].shape[1]
+        try:
+            self._call(self._many, np.zeros((2, size), np.float32))
+        except onnxruntime.capi.onnxruntime_pybind11_state.Fail:
+            self._many = None
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """(N, 8) actions of (N, 33 or 39) observations."""
+        if self._many:
+            return self._call(self._many, observations)
+        return np.vstack([self._call(self._single, row[None]) for row in observations])
+
+    def _call(self, session, observations):
+        return session.run(['action'], {'observation': observations})[0]
+
+
+def _session(graph):
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.log_severity_level = 4      # what fails is raised
+    return onnxruntime.InferenceSession(graph.SerializeToString(), options,
+                                        providers=['CPUExecutionProvider'])
+
+
+def environment(robots: int, name: str, memory: bool, robot: RobotParameters):
+    """Robots that hover, whose targets are set from outside."""
+    p = TrainParameters.load()
+    still = {entry.name: 0.0 for entry in fields(StartParameters)}
+    env = TiltableQuadrotorEnv(replace(
+        p, memory=memory, ppo=replace(p.ppo, robots=robots),
+        episode=replace(p.episode, duration=1e6, hold_targets=0.0, replay_share=0.0,
+                        target_time=np.array([1e3, 1e3]), position_limit=99.0),
+        start=StartParameters(**{**still, 'hold': 1.0}),
+        random=conditions(name, p.random)), robot, compiled=False)
+    env.state['age'].zero_()
+    env.state['target_left'].fill_(1e6)
+    return env
+
+
+class Fleet:
+    """
+    Robots with their guidance.
+
+    Args:
+        env: where they fly.
+        parameters: of the policy.
+        axes: (4, 3) tilt axes.
+
+    """
+
+    def __init__(self, env, parameters, axes):
+        self.env = env
+        self._guidance = [Guidance(parameters, axes) for _ in range(env.num_envs)]
+        self._steps = 0
+
+    def show(self, targets: list[PoseTarget]) -> None:
+        """Put what each policy is to see into the environment."""
+        s, stamp = self.env.state, 0.01 * self._steps
+        self._steps += 1
+        x = s['x'].double().numpy()
+        given = s['previous'].double().numpy()
+        position, attitude = np.empty((len(targets), 3)), np.empty((len(targets), 4))
+        for i, (guidance, target) in enumerate(zip(self._guidance, targets)):
+            state = State(stamp, x[i, model.POSITION], x[i, model.VELOCITY],
+                          x[i, model.QUATERNION], x[i, model.RATE], x[i, model.TILT],
+                          x[i, model.TILT_RATE], stamp, Command(stamp, given[i, :4], given[i, 4:]))
+            shown = guidance.target(state, target)
+            position[i], attitude[i] = shown.position, shown.quaternion
+        s['target_position'].copy_(torch.from_numpy(position))
+        s['target_attitude'].copy_(torch.from_numpy(attitude))
+
+
+def fly_part(path, robots, name, memory, parameters, moves, seed):
+    """Fly some of the robots, on one core."""
+    torch.set_num_threads(1)
+    robot = RobotParameters.load()
+    fleet = Fleet(environment(robots, name, memory, robot), parameters, robot.tilt_axes)
+    return fly(fleet, Batched(path), moves, seed)
+
+
+@torch.no_grad()
+def fly(fleet: Fleet, policy: Batched, moves: int, seed: int) -> dict[str, np.ndarray]:
+    """
+    Fly one move that is not counted and then ``moves``.
+
+    Returns:
+        name -> (moves, N): errors in the windows of the task metrics [m], [rad], depth below
+        start and target and lowest height [m]; and `lost` (N,), robots that were started anew.
+
+    """
+    env, count = fleet.env, fleet.env.num_envs
+    torch.manual_seed(seed)
+    poses = random_poses(count * (moves + 2), seed).reshape(moves + 2, count, 6)
+    env.state['x'][:, model.POSITION] = torch.from_numpy(poses[0, :, :3]).float()
+    result = {name: np.zeros((moves + 1, count)) for name in (
+        'U_position', 'U_attitude', 'L_position', 'L_attitude', 'depth', 'lowest')}
+    lost = np.zeros(count, dtype=bool)
+    for k in range(moves + 1):
+        targets = [pose_target(pose) for pose in poses[k + 1]]
+        place = np.array([target.position for target in targets])
+        attitude = np.array([target.quaternion for target in targets])
+        low = np.full(count, np.inf)
+        floor = np.minimum(place[:, 2], env.state['x'][:, 2].numpy())
+        for step in range(SEGMENT):
+            fleet.show(targets)
+            env.advance(torch.from_numpy(policy(env.observation.numpy())))
+            lost |= env.done.numpy()
+            x = env.state['x'].double().numpy()
+            low = np.minimum(low, x[:, 2])
+            for name, (first, end) in (('U', AT_TARGET), ('L', ON_THE_WAY)):
+                if first <= step < end:
+                    share = 1 / (end - first)
+                    result[f'{name}_position'][k] += share * np.linalg.norm(
+                        x[:, :3] - place, axis=1)
+                    result[f'{name}_attitude'][k] += share * angles(
+                        x[:, model.QUATERNION], attitude)
+        result['depth'][k], result['lowest'][k] = floor - low, low
+    return {**{name: values[1:] for name, values in result.items()}, 'lost': lost}
+
+
+def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(N,) angles [rad] between attitudes (N, 4)."""
+    x, y, z, w = rotations.product(*(a * [-1, -1, -1, 1]).T, *b.T)
+    return 2 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
+
+
+def summary(flown: dict[str, np.ndarray]) -> dict[str, float]:
+    """Means and counts of robots that were never lost."""
+    kept = {name: values[:, ~flown['lost']].ravel() for name, values in flown.items()
+            if name != 'lost'}
+    reached = (kept['U_position'] < REACHED[0]) & (kept['U_attitude'] < REACHED[1])
+    told = {'moves': len(reached), 'robots_lost': int(flown['lost'].sum()),
+            'missed': int((~reached).sum())}
+    for name in ('U_position', 'U_attitude', 'L_position', 'L_attitude'):
+        mean = float(kept[name].mean())
+        told.update({f'{name}_deg': np.degrees(mean)} if 'attitude' in name
+                    else {f'{name}_m': mean})
+    told.update({f'deeper_than_{limit}_m': int((kept['depth'] > limit).sum())
+                 for limit in DEPTHS})
+    told.update({f'below_{HEIGHT}_m': int((kept['lowest'] < HEIGHT).sum()),
+                 'deepest_m': float(kept['depth'].max()),
+                 'lowest_m': float(kept['lowest'].min())})
+    return told
+
+
+def main() -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--policy', help='ONNX file; default: the shipped one')
+    parser.add_argument('--robots', type=int, default=2048)
+    parser.add_argument('--moves', type=int, default=5, help='of each robot that count')
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--conditions', choices=('nominal', 'published'), default='nominal')
+    parser.add_argument('--without', nargs='*', choices=sorted(OFF), default=[])
+    parser.add_argument('--jobs', type=int, default=-1, help='processes; -1: one for each core')
+    parser.add_argument('--json', type=Path)
+    given = parser.parse_args()
+    robot, parameters = RobotParameters.load(), PolicyParameters.load()
+    parameters = replace(parameters, **{part: replace(getattr(parameters, part), **OFF[part])
+                                        for part in given.without})
+    path = given.policy or parameters.policy
+    try:
+        contract = PolicyNetwork(path, robot).contract
+    except ParameterError as error:
+        print(error, file=sys.stderr)
+        return 1
+    sizes = [min(PART, given.robots - first) for first in range(0, given.robots, PART)]
+    seeds = np.random.SeedSequence(given.seed).generate_state(len(sizes))
+    parts = Parallel(n_jobs=given.jobs, return_as='generator')(
+        delayed(fly_part)(find(path), size, given.conditions, contract.memory, parameters,
+                          given.moves, int(seed)) for size, seed in zip(sizes, seeds))
+    parts = list(track(parts, 'flying', len(sizes), console=Console(stderr=True), transient=True))
+    result = summary({name: np.concatenate([part[name] for part in parts], axis=-1)
+                      for name in parts[0]})
+    table = Table(title=f'{contract.name}, {given.conditions}, seed {given.seed}'
+                  + ''.join(f', without {part}' for part in given.without))
+    table.add_column('')
+    table.add_column('', justify='right')
+    for name, value in result.items():
+        table.add_row(name, f'{value:.4g}')
+    Console().print(table)
+    if given.json:
+        given.json.write_text(json.dumps({**vars(given), **result}, default=str, indent=1) + '\n')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
