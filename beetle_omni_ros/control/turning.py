@@ -2,9 +2,9 @@
 Large turns without a dive: where a policy is shown its target while it turns.
 
 While joints turn over, thrust is missing: the robot sinks, deepest where it also accelerates
-sideways while upside down. So targets are shown no farther than a carrot while there is far to
-turn, low ones higher, and a robot that is about to sink below where it was and shall be is shown
-one above, for as long as it sinks.
+sideways while upside down. So while there is far to turn, low targets are shown higher, and to
+who is upside down no farther than a carrot; a robot that is about to sink below where it was and
+shall be is shown one above, for as long as it sinks.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ class TurningParameters:
                              low=0.1, high=4)
     height: float = parameter(1.0, doc='... a target is shown at least so high, in world, ...',
                               unit='m', low=-1000, high=1000)
-    distance: float = parameter(2.0, doc='... and no farther away', unit='m', low=0.1, high=1000)
+    distance: float = parameter(2.0, doc='... and to who is upside down no farther away',
+                                unit='m', low=0.1, high=1000)
     settled: float = parameter(0.5, doc='from the target: while farther off, ...', unit='rad',
                                low=0.1, high=4)
     depth: float = parameter(0.1, doc='... who sinks so far below start and target ...', unit='m',
@@ -80,9 +81,15 @@ class Turning:
             place[2] = max(place[2], p.height)
             at = state.position.tolist()
             far = dist(place, at)
-            if far > p.distance:
+            if far > p.distance and _upside_down(state):
                 place = [a + p.distance / far * (b - a) for a, b in zip(at, place)]
         if (passing or left > p.settled) \
                 and z + p.outlook * float(state.velocity[2]) < self._lowest - p.depth and p.climb:
             place[2] = max(place[2], z) + p.climb
         return aim if place == aim.position.tolist() else replace(aim, position=np.array(place))
+
+
+def _upside_down(state):
+    """Whether the body's upper side looks down."""
+    x, y = state.quaternion[:2].tolist()
+    return x * x + y * y > 0.5

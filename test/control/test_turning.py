@@ -41,15 +41,21 @@ def test_only_a_low_target_far_to_turn_to_is_shown_higher(height, angle, yaw):
 
 
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(1.0, 4.0), st.floats(0.0, 3.1))
-def test_a_target_far_to_turn_to_is_shown_on_the_way_and_no_farther_than_stated(x, y, z, angle):
+def test_upside_down_a_target_far_to_turn_to_is_shown_no_farther_than_stated(x, y, z, angle):
     target, now = pose(z, place=(x, y)), state(rotations.from_rpy(angle, 0.0, 0.0), 1.0)
     shown, way = Turning(P).target(now, target), target.position - now.position
-    if angle < P.angle - 1e-6 or np.linalg.norm(way) <= P.distance:
+    if angle < np.pi / 2 - 1e-6 or np.linalg.norm(way) <= P.distance:
         assert shown is target
-    elif angle > P.angle + 1e-6:
+    elif angle > np.pi / 2 + 1e-6:
         step = shown.position - now.position
         assert np.linalg.norm(step) == pytest.approx(P.distance)
         assert np.cross(step, way) == pytest.approx(np.zeros(3), abs=1e-9) and step @ way > 0
+
+
+def test_upside_down_with_little_left_to_turn_a_far_target_is_shown_where_it_is():
+    turned = rotations.from_rpy(3.0, 0.0, 0.0)
+    target = pose(1.5, rotations.from_rpy(2.5, 0.0, 0.0), place=(4.0, 0.0))
+    assert Turning(P).target(state(turned), target) is target
 
 
 @pytest.mark.parametrize('attitude, height, sinking, begin, caught', [
