@@ -1,13 +1,21 @@
 """How much an effect explains is not counted against tolerances that no robot has."""
 
-from flights import KEYS, P
+from dataclasses import replace
+
+from flights import KEYS, P, ROBOT
 import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import Problem, State
-from beetle_omni_ros.identify.gap.gates import holds
-from beetle_omni_ros.identify.gap.keys import Belief, tolerances
+from beetle_omni_ros.identify.gap.gates import at_bound, holds
+from beetle_omni_ros.identify.gap.keys import (
+    all_keys,
+    Belief,
+    THRUST_BUS,
+    TILT_BUS,
+    tolerances,
+)
 from beetle_omni_ros.identify.gap.search import BEYOND, Search
 from beetle_omni_ros.identify.gap.trial import Trial
 
@@ -94,14 +102,19 @@ def test_a_free_range_ends_beyond_itself():
     assert belief.within(-0.02, BEYOND) == pytest.approx(-0.0115)
 
 
-@pytest.mark.parametrize('gain, left, agreement, named', [
-    (60.0, 70.0, 4.0, True), (60.0, 170.0, 4.0, False), (60.0, 170.0, 10.0, True),
-    (60.0, 600.0, 10.0, False), (600.0, 1700.0, 4.0, True), (600.0, 1700.0, 2.5, False),
-    (600.0, 6000.0, 10.0, False), (30.0, 31.0, 10.0, False)])
+@pytest.mark.parametrize('gain, left, agreement, of_beliefs, named', [
+    (60.0, 70.0, 4.0, 0.0, True), (60.0, 170.0, 4.0, 0.0, False), (60.0, 170.0, 10.0, 0.0, True),
+    (60.0, 600.0, 10.0, 0.0, False), (600.0, 1700.0, 4.0, 0.0, True),
+    (600.0, 1700.0, 2.5, 0.0, False), (600.0, 6000.0, 10.0, 0.0, False),
+    (30.0, 31.0, 10.0, 0.0, False), (30.0, 31.0, 10.0, 20.0, False),
+    (30.0, 31.0, 10.0, 28.0, True), (30.0, 130.0, 1.5, 28.0, True),
+    (20.0, 21.0, 10.0, 40.0, False), (60.0, 600.0, 10.0, 60.0, False)])
 def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch, gain, left,
-                                                                     agreement, named):
+                                                                     agreement, of_beliefs,
+                                                                     named):
     drag = Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag')
-    trial = Trial(drag, gain, {'rotor_drag.coefficient': 0.4}, refined=True)
+    trial = Trial(drag, gain, {'rotor_drag.coefficient': 0.4}, refined=True,
+                  believed=of_beliefs)
 
     def agreed(self, trial, accepted):
         trial.cross, trial.positive = (gain, gain / agreement), 1.0
@@ -114,11 +127,38 @@ def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch
     assert (search._judge([trial], 1000.0 + left, 1000.0, []) is trial) == named
 
 
-@pytest.mark.parametrize('gain, error, positive, believed', [
-    (100.0, 40.0, 0.6, True), (100.0, 80.0, 1.0, False), (1000.0, 800.0, 1.0, True),
-    (1000.0, 800.0, 0.75, False)])
-def test_what_gains_little_must_gain_it_evenly(gain, error, positive, believed):
+@pytest.mark.parametrize('gain, error, positive, of_beliefs, held', [
+    (100.0, 40.0, 0.6, 0.0, True), (100.0, 80.0, 1.0, 0.0, False), (1000.0, 800.0, 1.0, 0.0, True),
+    (1000.0, 800.0, 0.75, 0.0, False), (100.0, 80.0, 1.0, 90.0, True),
+    (100.0, 80.0, 0.75, 90.0, False), (100.0, 80.0, 1.0, 10.0, False)])
+def test_what_gains_little_must_gain_it_evenly(gain, error, positive, of_beliefs, held):
     drag = Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag')
     trial = Trial(drag, gain, {}, cross=(gain, error), positive=positive,
-                  without_best=0.5 * gain)
-    assert holds(trial) == believed
+                  without_best=0.5 * gain, believed=of_beliefs)
+    assert holds(trial, P) == held
+
+
+@pytest.mark.parametrize('name, delay, physical', [
+    ('imu_filter_lag', -0.003, False), ('joint_feedback_delay', -0.003, False),
+    ('joint_feedback_delay', 0.003, True), ('mocap_time_offset', -0.003, True)])
+def test_a_reading_is_not_younger_than_its_stamp(name, delay, physical):
+    key = f'{name}.delay'
+    trial = Trial(Candidate(name, (key,), label=name), 100.0, {key: delay})
+    assert at_bound(KEYS, trial) != physical
+
+
+def test_a_reading_may_be_younger_than_the_robot_file_says():
+    late = all_keys(replace(ROBOT, effects={'joint_feedback_delay': {'delay': 0.01}}))
+    key = 'joint_feedback_delay.delay'
+    trial = Trial(Candidate('joint_feedback_delay', (key,), label='late'), 100.0, {key: -0.004})
+    assert not at_bound(late, trial) and at_bound(KEYS, trial)
+
+
+@pytest.mark.parametrize('tilt, thrust, usual', [
+    (0.0, 0.0, True), (0.004, -0.009, True), (-0.009, 0.004, True), (0.011, 0.0, False),
+    (0.0, 0.011, False), (-0.014, 0.0, False)])
+def test_each_bus_is_late_within_its_own_range(tilt, thrust, usual):
+    beliefs = tolerances(P)
+    beyond = [abs(beliefs[name].residual(x)) for name, x in
+              ((TILT_BUS, tilt), (THRUST_BUS, thrust))]
+    assert (max(beyond) < 5.0) == usual

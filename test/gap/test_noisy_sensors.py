@@ -121,7 +121,8 @@ def test_an_only_step_goes_too_if_the_fit_does_not_miss_it(monkeypatch, loss, ke
     search = Search.__new__(Search)
     search.p = P
     search.problem = type('Problem', (), {'keys': KEYS, 'beliefs': {},
-                                          'residual': lambda self, theta: np.zeros(1)})()
+                                          'residual': lambda self, theta: np.zeros(1),
+                                          'prior': lambda self, theta, free: 0.0})()
     state = State(dict(trial.theta), np.zeros(1), np.zeros((1, 0)), [])
     monkeypatch.setattr(search, '_refit', lambda start, rest, n: (start, 100.0 + loss),
                         raising=False)
@@ -167,12 +168,13 @@ def test_slopes_by_a_servos_own_gain_are_what_its_joint_does(gain):
 
 
 def test_delays_that_data_cannot_tell_apart_have_the_same_slopes():
-    names = ['base.delay', 'base.split', 'command_latency.delay', 'rotor_dead_time.delay',
-             'joint_command_latency.delay']
+    names = ['command_latency.delay', 'base.tilt_delay', 'joint_command_latency.delay',
+             'base.thrust_delay', 'rotor_dead_time.delay']
     slopes = model(MOTION.flight()).slopes({}, names)
-    for group, split, own in (('B', -2, 3), ('J', 2, 4)):
+    for group, moved, still in (('B', (3, 4), (1, 2)), ('J', (1, 2), (3, 4))):
         late = slopes[group][:, :, 0]
         assert rms(late) > 0.1
-        for other in (split * slopes[group][:, :, 1], slopes[group][:, :, 2],
-                      slopes[group][:, :, own]):
-            assert rms(other - late) < 1e-6 * rms(late)
+        for k in moved:
+            assert rms(slopes[group][:, :, k] - late) < 1e-6 * rms(late)
+        for k in still:
+            assert rms(slopes[group][:, :, k]) < 1e-6 * rms(late)

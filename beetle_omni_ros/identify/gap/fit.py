@@ -12,9 +12,8 @@ from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.residual import FlightModel
 
-CURVED = ('delay', 'split', 'rotation', 'time_constant', 'kp', 'kd', 'velocity_limit',
+CURVED = ('delay', 'rotation', 'time_constant', 'kp', 'kd', 'velocity_limit',
           'effort_limit', 'coulomb', 'stiction', 'gap', 'thrust_max', 'deflection_per_newton')
-TIMES = ('delay', 'split')
 LEAST_BLOCKS = 6        # of all flights together
 HALVINGS = 4
 RIDGE = 1e-9
@@ -247,10 +246,10 @@ class Problem:
         """
         theta, r = dict(state.theta), state.r
         slopes, cost = state.slopes, float(r @ r) + self.prior(theta, free)
-        timing = any(self.keys[name].parameter in TIMES for name in free)
+        timing = any(self.keys[name].parameter == 'delay' for name in free)
         curved = [name for name in names if self.keys[name].parameter in CURVED and (
             name not in self.beliefs or name in free
-            or timing and self.keys[name].parameter in TIMES)]
+            or timing and self.keys[name].parameter == 'delay')]
         now = State(theta, r, slopes, state.names)
         for iteration in range(iterations):
             step, _, _ = self.linear_step(now, names, free)

@@ -7,6 +7,7 @@ import numpy as np
 from beetle_omni_ros.identify.gap.bands import aside, in_part_alone
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.keys import Key
+from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.trial import Found, Trial
 
 LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
@@ -14,24 +15,60 @@ LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
 # gained less, and that unevenly, was not there (4 of 4, up to 97); what gained more was (7 of 7,
 # from 708).
 LEAST_UNEVEN = 300.0
+AGES = ('imu_filter_lag.delay', 'joint_feedback_delay.delay')   # of readings at their stamps
 # Two forms of one response: where one is joined and the other still gains beside it, the response
 # has a shape that neither holds, such as a lag of second order, and which number is wrong is open.
 ONE_RESPONSE = {'rotor_lag', 'rotor_dead_time'}
 
 
+def enough(p: GapParameters, gain: float, of_beliefs: float, price: float = 0.0) -> bool:
+    """
+    Whether a step gains enough to be no chance.
+
+    Args:
+        p: parameters.
+        gain: of the objective.
+        of_beliefs: part of it.
+        price: of numbers beyond the first.
+
+    """
+    return gain >= p.least_gain + price or believed(p, gain, of_beliefs, price)
+
+
+def believed(p: GapParameters, gain: float, of_beliefs: float, price: float = 0.0) -> bool:
+    """
+    Whether what a step gains is of beliefs, and enough of it.
+
+    What data gain may be gusts and the answers to them. Beliefs gain where tolerances would have
+    to be farther off than robots are: that is no noise, and less of it says as much.
+
+    Args:
+        p: parameters.
+        gain: of the objective.
+        of_beliefs: part of it.
+        price: of numbers beyond the first.
+
+    """
+    return min(gain, of_beliefs) >= p.least_believed + price
+
+
 def at_bound(keys: dict[str, Key], trial: Trial) -> bool:
-    """Whether a number is as far off as it can be; zero is a bound of a friction, too."""
+    """
+    Whether a number is as far off as it can be; zero is a bound of a friction, too.
+
+    Readings that would be younger than their stamps are beyond it.
+    """
     for name in trial.candidate.keys:
         x, key = trial.theta.get(name, 0.0), keys[name]
-        if x >= key.high or x <= key.low != 0.0:
+        if x >= key.high or x <= key.low != 0.0 or name in AGES and key.value(x) < 0:
             return True
     return False
 
 
-def holds(trial: Trial) -> bool:
+def holds(trial: Trial, p: GapParameters) -> bool:
     """Whether blocks that were left out agree; see :func:`cross_validate`."""
-    sure = trial.cross[0] >= 2 * trial.cross[1] \
-        or trial.positive >= 0.85 and trial.gain >= LEAST_UNEVEN
+    sure = trial.cross[0] >= 2 * trial.cross[1] or trial.positive >= 0.85 and (
+        trial.gain >= LEAST_UNEVEN or trial.believed >= p.least_believed)
     return sure and trial.cross[0] >= 0.3 * trial.gain and trial.positive >= 0.55 \
         and trial.without_best >= max(0.05 * min(trial.cross[0], trial.gain), LEAST_ELSEWHERE)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from beetle_omni_ros.identify.gap.keys import THRUST_BUS, TILT_BUS
+
 COMMANDS = ('command_latency', 'joint_command_latency', 'rotor_dead_time')
 SENSORS = ('imu_filter_lag.delay', 'mocap_time_offset.delay', 'joint_feedback_delay.delay')
 
@@ -26,9 +28,10 @@ def handed_over(theta, candidate):
     # All sensors late by the same is all commands early by it: an exact gauge.
     late = float(np.mean([theta.get(name, 0.0) for name in SENSORS]))
     made = {**theta, **{name: theta.get(name, 0.0) - late for name in SENSORS}}
-    delay, split = theta.get('base.delay', 0.0) + late, theta.get('base.split', 0.0)
-    own, delay, split = {
-        'command_latency': (delay, 0.0, split),
-        'joint_command_latency': (split, delay - split / 2, 0.0),
-        'rotor_dead_time': (-split, delay + split / 2, 0.0)}[candidate.name]
-    return {**made, key: own, 'base.delay': delay, 'base.split': split}
+    tilt, thrust = (theta.get(name, 0.0) + late for name in (TILT_BUS, THRUST_BUS))
+    both = (tilt + thrust) / 2
+    own, tilt, thrust = {
+        'command_latency': (both, tilt - both, thrust - both),
+        'joint_command_latency': (tilt - thrust, thrust, thrust),
+        'rotor_dead_time': (thrust - tilt, tilt, tilt)}[candidate.name]
+    return {**made, key: own, TILT_BUS: tilt, THRUST_BUS: thrust}

@@ -23,6 +23,9 @@ SMALLEST = 0.02         # ratio to the file's own number ...
 # ... but of a limit so far above all that is asked for that a real one is hundreds of times less:
 # the file's 3 N m against the 0.05 N m of quick poses.
 SMALLEST_OF = {'effort_limit': 1e-3}
+TILT_BUS, THRUST_BUS = 'base.tilt_delay', 'base.thrust_delay'   # of commands on their way
+# Within its range a bus may be as late as it likes, and a little rather at its nominal delay [s].
+BUS_NEAR, BUS_NEAR_COARSE = 0.0035, 0.006
 GROUPS = {  # signal-layer entries -> channel groups in which they show
     'rotor_lag': 'B', 'rotor_dead_time': 'B', 'thrust_saturation': 'B', 'command_latency': 'BJ',
     'joint_command_latency': 'J', 'joint_bandwidth': 'J', 'joint_velocity_limit': 'J',
@@ -184,15 +187,16 @@ def tolerances(p: GapParameters, coarse: bool = False,
     beliefs = {name: Belief(deviation) for name, deviation in made.items()}
     beliefs['imu_filter_lag.delay'] = Belief(p.tolerance_delay, 0.0, p.imu_averaging, 0.002)
     reach, nominal = p.command_delay_range, p.command_delay
-    beliefs['base.delay'] = Belief(5e-4, nominal, reach / 2, 0.003)
-    beliefs['base.split'] = Belief(5e-4, reach, reach, 0.004)
+    for bus in (TILT_BUS, THRUST_BUS):
+        beliefs[bus] = Belief(5e-4, nominal, reach / 2, BUS_NEAR)
     near = p.tolerance_swing
     beliefs['swing.ratio'] = Belief(p.tolerance_lag, near, max(swing, near), swing + near)
     if coarse:
         imu, joint = p.coarse_latency
         beliefs['imu_filter_lag.delay'] = Belief(p.tolerance_delay, 0.0, imu, imu)
         beliefs['joint_feedback_delay.delay'] = Belief(p.tolerance_delay, 0.0, joint, joint)
-        beliefs['base.split'] = Belief(5e-4, reach, reach, reach)
+        for bus in (TILT_BUS, THRUST_BUS):
+            beliefs[bus] = Belief(5e-4, nominal, reach / 2, BUS_NEAR_COARSE)
     return beliefs
 
 
@@ -212,7 +216,6 @@ def extra_keys() -> dict[str, Key]:
         for gain in ('kp', 'kd'):
             name = f'servo.{gain}[{k}]'
             keys[name] = Key(name, 'servo', gain, k, 0.0, False, -1, 1, 0.3, 0.0, False)
-    for part in ('delay', 'split'):
-        keys[f'base.{part}'] = Key(f'base.{part}', 'base', part, None, 0.0, False, -0.05, 0.05,
-                                   0.005, 0.0, False)
+    for name in (TILT_BUS, THRUST_BUS):
+        keys[name] = Key(name, 'base', 'delay', None, 0.0, False, -0.05, 0.05, 0.005, 0.0, False)
     return keys

@@ -66,7 +66,9 @@ def proposed(problem: Problem, candidates: list[Candidate], state: State, cost: 
     for k, (difference, reached) in zip(chosen, forked(refined, chosen), strict=True):
         c = trials[k].candidate
         points[c.label] = state.with_difference(difference)
-        trials[k] = Trial(c, cost - reached, dict(points[c.label].theta), True)
+        theta = dict(points[c.label].theta)
+        believed = problem.prior(state.theta, free) - problem.prior(theta, names_with(c)[1])
+        trials[k] = Trial(c, cost - reached, theta, True, believed)
     trials.sort(key=lambda t: -t.gain)
     return trials, points
 

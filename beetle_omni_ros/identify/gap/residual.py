@@ -35,12 +35,12 @@ TIMING = ('imu_filter_lag.delay', 'joint_feedback_delay.delay')     # of what lo
 SHIFTS = {'imu_filter_lag.delay': -1.0, 'joint_feedback_delay.delay': 1.0}
 # Taken to both sides, by the same shift of a command: one-sided, delays that data cannot tell
 # apart would differ by the second derivative, and a straight line through all would fit that.
-BOTH_SIDES = ('delay', 'split')
+BOTH_SIDES = 'delay'
 THIN = 2        # grid points to each at which the body's equations are evaluated
 STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
          'kp': 0.01, 'kd': 0.01, 'velocity_limit': 0.01, 'effort_limit': 0.01, 'coulomb': 5e-4,
          'stiction': 5e-4, 'deflection_per_newton': 1e-4, 'gap': 1e-3, 'thrust_max': 0.01,
-         'share': 0.05, 'split': 2e-3, 'ratio': 0.01, 'lag': 0.02,
+         'share': 0.05, 'ratio': 0.01, 'lag': 0.02,
          'angular_momentum_at_hover': 5e-3}
 
 
@@ -293,7 +293,7 @@ class FlightModel:
             h = -h if theta.get(name, 0.0) + h > self.keys[name].high else h
             if groups:
                 here, other, width = theta.get(name, 0.0), now, h
-                if self.keys[name].parameter in BOTH_SIDES:
+                if self.keys[name].parameter == BOTH_SIDES:
                     other, width = self._residual({**theta, name: here - h}, groups), 2 * h
                 moved = self._residual({**theta, name: here + h}, groups)
                 for group, values in moved.items():

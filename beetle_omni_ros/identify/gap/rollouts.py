@@ -63,7 +63,8 @@ def free_runs(model: FlightModel, theta: dict[str, float], noise: Noise) -> Runs
     starts = starts[fine] if fine.any() else starts
     inputs = model.inputs(theta)
     grid = starts[:, None] + np.arange(steps + 1)
-    tilt, rate = _tilts(model, theta, starts, steps)
+    seen_shaft, shaft, tilt = _tilts(model, theta, starts, steps)
+    rate = np.gradient(tilt, h, axis=1)
     acceleration = np.gradient(rate, h, axis=1)
     position = inputs['position'][starts].copy()
     velocity = inputs['velocity'][starts].copy()
@@ -104,12 +105,19 @@ def free_runs(model: FlightModel, theta: dict[str, float], noise: Noise) -> Runs
                 np.linalg.norm(inputs['velocity'][at] - velocity, axis=1),
                 np.arccos(np.clip(cosine, -1, 1)),
                 np.linalg.norm(inputs['rate'][at] - turning, axis=1),
-                np.linalg.norm(inputs['tilt'][at] - tilt[:, k + 1], axis=1)], axis=1))
+                np.linalg.norm(seen_shaft[at] - shaft[:, k + 1], axis=1)], axis=1))
     return Runs(np.array(errors), _regimes(inputs, grid), noise_floor(model, noise))
 
 
 def _tilts(model, theta, starts, steps):
-    """Servos alone, and the rotors behind their play: angles and rates (S, K + 1, 4)."""
+    """
+    Angles of the joints.
+
+    Returns:
+        (N, 4) as encoders see them, (S, K + 1, 4) the same of servos alone, and of the rotors
+        behind their play.
+
+    """
     s, p = model.signals, model.p
     per = round(p.grid / p.servo_step)
     count = (steps + 1) * per
@@ -123,10 +131,9 @@ def _tilts(model, theta, starts, steps):
     targets = np.concatenate([targets, targets[-1:]]).reshape(*edges.shape, 4)[:, :-1]
     run = simulate(model.robot.joints, windows, targets.transpose(1, 0, 2)[None], [theta],
                    {**model._own, 'modules': model.modules})[0]             # (K + 1, S, 4)
-    if theta.get(PLAY, 0.0) > 0:
-        run = play(run, theta[PLAY] / 2, s.joints(theta)[0][starts])
-    run = run.transpose(1, 0, 2)
-    return run, np.gradient(run, p.grid, axis=1)
+    behind = play(run, theta[PLAY] / 2, s.joints(theta)[0][starts]) \
+        if theta.get(PLAY, 0.0) > 0 else run
+    return tilt, run.transpose(1, 0, 2), behind.transpose(1, 0, 2)
 
 
 def _turned(quaternion, vector):

@@ -11,7 +11,9 @@ from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
 from beetle_omni_ros.identify.gap.gates import (
     at_bound,
+    believed,
     cross_validate,
+    enough,
     fought,
     holds,
     neither_holds,
@@ -166,11 +168,12 @@ class Search:
         names_taken = {(c.name, c.member) for c in accepted}
         for trial in trials:
             c = trial.candidate
-            need = p.least_gain + p.parameter_price * (len(c.keys) - 1)
+            price = p.parameter_price * (len(c.keys) - 1)
+            need = p.least_gain + price
             trial.share = trial.gain / max(cost - floor, trial.gain, 1e-9)
             if trial.refined and self._fought(trial, accepted):
                 trial.reason = FOUGHT
-            elif trial.gain < need:
+            elif not enough(p, trial.gain, trial.believed, price):
                 trial.reason = 'explains too little'
             elif not trial.refined:
                 trial.reason = 'others explain more'
@@ -185,8 +188,9 @@ class Search:
             else:
                 self._cross_validate(trial, accepted)
                 much = p.weak_agreement if trial.gain > p.weak_gain * need else p.strong_agreement
-                sure = trial.cross[0] > much * trial.cross[1] and trial.positive >= 0.7
-                if not holds(trial):
+                sure = trial.cross[0] > much * trial.cross[1] and trial.positive >= 0.7 \
+                    or believed(p, trial.gain, trial.believed, price)
+                if not holds(trial, p):
                     trial.reason = NOT_HELD
                 elif trial.share < p.least_share and not (
                         sure and trial.share > p.weak_share):
@@ -206,19 +210,22 @@ class Search:
     def _prune(self, found, state, cost):
         """Drop what later steps, or the noise learnt after the last one, made superfluous."""
         while found.accepted:
-            losses = []
+            losses, of_beliefs = [], []
+            everything = [t.candidate for t in found.accepted]
             for trial in found.accepted:
                 rest = [t.candidate for t in found.accepted if t is not trial]
                 zero = {n: 0.0 for n in trial.candidate.keys
                         if n not in self.problem.beliefs}
                 theta = {**state.theta, **zero}
                 start = State(theta, self.problem.residual(theta), state.slopes, state.names)
-                _, reached = self._refit(start, rest, 2)
+                there, reached = self._refit(start, rest, 2)
                 losses.append(reached - cost)
+                of_beliefs.append(self.problem.prior(there.theta, self._free(rest))
+                                  - self.problem.prior(state.theta, self._free(everything)))
             weakest = int(np.argmin(losses))
             small = not found.accepted[weakest].candidate.large_enough(self.problem.keys,
                                                                        state.theta)
-            if losses[weakest] > self.p.least_gain and not small:
+            if enough(self.p, losses[weakest], of_beliefs[weakest]) and not small:
                 break
             dropped = found.accepted.pop(weakest)
             dropped.reason = 'superfluous beside the others'
@@ -250,7 +257,7 @@ class Search:
                         or not other.candidate.large_enough(self.problem.keys, other.theta):
                     continue
                 self._cross_validate(other, others)
-                if holds(other):
+                if holds(other, self.p):
                     near.append(other)
             trial.gain = gain
             found.rivals[own.label] = near

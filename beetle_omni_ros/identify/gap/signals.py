@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.filters import low_pass
 from beetle_omni_ros.identify.gap.ingest import Flight
+from beetle_omni_ros.identify.gap.keys import THRUST_BUS, TILT_BUS
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import (
     derivatives,
@@ -196,12 +197,13 @@ class Signals:
 
     def delays(self, theta):
         """Delays of tilt and thrust commands [s]."""
-        split, common = theta.get('base.split', 0.0), theta.get('base.delay', 0.0)
-        common += self.p.command_delay + theta.get('command_latency.delay', 0.0) \
+        common = self.p.command_delay + theta.get('command_latency.delay', 0.0) \
             + theta.get(IMU_LAG, 0.0)
         tilt, thrust = self.robot.command_delays
-        return (tilt + common + split / 2 + theta.get('joint_command_latency.delay', 0.0),
-                thrust + common - split / 2 + theta.get('rotor_dead_time.delay', 0.0))
+        return (tilt + common + theta.get(TILT_BUS, 0.0)
+                + theta.get('joint_command_latency.delay', 0.0),
+                thrust + common + theta.get(THRUST_BUS, 0.0)
+                + theta.get('rotor_dead_time.delay', 0.0))
 
     def thrust(self, theta):
         """Thrusts after delay, limits and lag, and their rates of change (N, 4)."""

@@ -22,6 +22,7 @@ class Trial:
         gain: of the objective.
         theta: all numbers with it.
         refined: whether fitted, else a straight line's estimate.
+        believed: part of the gain that is of beliefs: tolerances which stray less beside it.
         cross: gain on blocks left out, and its standard error.
         positive: part of the blocks that gain.
         without_best: gain on blocks left out but for the best: one event is no effect.
@@ -34,6 +35,7 @@ class Trial:
     gain: float
     theta: dict[str, float]
     refined: bool = False
+    believed: float = 0.0
     cross: tuple[float, float] = (0.0, 1.0)
     positive: float = 0.0
     without_best: float = 0.0
