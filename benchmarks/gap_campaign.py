@@ -33,7 +33,8 @@ else:
     sys.path.extend(place for place in PLACES if place not in sys.path)
 
 from gap_data.campaign import code_key, make_report, run_campaign  # noqa: E402
-from gap_data.cases import load_settings, make_cases  # noqa: E402
+from gap_data.cases import DIFFICULTIES, KINDS, load_settings, make_cases  # noqa: E402
+from gap_data.effects import CATALOGUE, OUTSIDE  # noqa: E402
 from gap_data.make import ROBOT_FILE  # noqa: E402
 from gap_data.page import html, markdown, number, target  # noqa: E402
 from gap_data.truth import load_numbers  # noqa: E402
@@ -50,7 +51,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--set', default='fast', help='fast, full or smoke')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--cases', type=int, help='only so many, spread over the set')
-    parser.add_argument('--only', help='only these kinds or effects, separated by commas')
+    parser.add_argument('--only', help='only these kinds, difficulties and effects, separated by '
+                                       'commas: of each sort that is named, one must fit')
     parser.add_argument('--workflow', action='append', metavar='[NAME=]TEXT',
                         help='MODULE:FUNCTION, or a command with {runs} {holdout} {robot} '
                              f'{{apply}} {{json}} {{page}}; again for more (default {WORKFLOW})')
@@ -102,11 +104,25 @@ def check_exists(workflow: Workflow) -> None:
 
 
 def select(cases, only: str | None):
-    """Cases whose kind, difficulty or an effect is in a list of names."""
+    """
+    Cases that fit a list of kinds, difficulties and effects: of each sort that it names, one.
+
+    Raises:
+        WorkflowError: a name of no sort.
+
+    """
     if only is None:
         return cases
     names = set(only.split(','))
-    return [c for c in cases if names & {c.kind, c.difficulty, *(e[0] for e in c.effects)}]
+    unknown = names - {*KINDS, *DIFFICULTIES, *CATALOGUE, *OUTSIDE}
+    if unknown:
+        raise WorkflowError(f"--only '{only}': no kind, difficulty or effect is called "
+                            f"{', '.join(sorted(unknown))}")
+    kinds, difficulties = names & set(KINDS), names & set(DIFFICULTIES)
+    effects = names - kinds - difficulties
+    return [c for c in cases if c.kind in (kinds or KINDS)
+            and c.difficulty in (difficulties or DIFFICULTIES)
+            and (not effects or effects & {e[0] for e in c.effects})]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -124,14 +140,14 @@ def main(arguments: list[str] | None = None) -> int:
                                 f"{', '.join(settings['sets'])}")
         if not given.robot.is_file():
             raise WorkflowError(f"--robot '{given.robot}': no such file")
+        cases = select(make_cases(settings, given.set, given.seed, given.command_age),
+                       given.only)
         workflows = choose_workflows(given)
         from beetle_omni_ros.comparison.sweep import check_backend, workers
         check_backend(given.backend)
     except ValueError as error:
         console.print(str(error), style='red', markup=False)
         return 2
-    cases = make_cases(settings, given.set, given.seed, given.command_age, None)
-    cases = select(cases, given.only)
     if given.cases is not None and given.cases < len(cases):
         step = (len(cases) - 1) / max(1, given.cases - 1)
         cases = [cases[round(k * step)] for k in range(given.cases)]

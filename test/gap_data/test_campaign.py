@@ -158,13 +158,27 @@ def test_a_baseline_finds_a_large_effect(tmp_path):
     assert run_workflow(Workflow.parse('bic'), made)['answer']['verdict'] == 'bad_data'
 
 
+@pytest.mark.parametrize('only, fits', [
+    ('singles,hard', lambda c: c.kind == 'singles' and c.difficulty == 'hard'),
+    ('none,pairs,hard', lambda c: c.kind in ('none', 'pairs') and c.difficulty == 'hard'),
+    ('clean', lambda c: c.difficulty == 'clean'),
+    ('mass,wake', lambda c: {'mass', 'wake'} & {e[0] for e in c.effects}),
+    ('singles,mass', lambda c: c.kind == 'singles' and c.effects[0][0] == 'mass')])
+def test_of_each_sort_that_is_named_a_case_must_fit_one(only, fits):
+    import gap_campaign
+    cases = make_cases(load_settings(), 'full', 0, 0.0)
+    chosen = gap_campaign.select(cases, only)
+    assert chosen == [c for c in cases if fits(c)] and 0 < len(chosen) < len(cases)
+
+
 def test_the_command_refuses_what_it_cannot_run(capsys, monkeypatch):
     import gap_campaign
     monkeypatch.setenv('PYTHONPATH', '')
     for arguments, text in ((['--set', 'huge'], "--set 'huge'"),
                             (['--robot', 'nowhere.yaml'], 'no such file'),
                             (['--workflow', 'no.such:thing'], 'no module no.such'),
-                            (['--backend', 'mars'], 'expected processes or ray')):
+                            (['--backend', 'mars'], 'expected processes or ray'),
+                            (['--only', 'singles,bananas'], 'effect is called bananas')):
         more = [] if '--workflow' in arguments else ['--workflow', 'bic']
         assert gap_campaign.main([*more, *arguments, '--cases', '0']) == 2
         assert text in ' '.join(capsys.readouterr().err.split())
