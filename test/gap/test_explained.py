@@ -8,7 +8,7 @@ import pytest
 
 from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import Problem, State
-from beetle_omni_ros.identify.gap.gates import at_bound, holds
+from beetle_omni_ros.identify.gap.gates import at_bound, cross_validate, holds
 from beetle_omni_ros.identify.gap.keys import (
     all_keys,
     Belief,
@@ -162,3 +162,36 @@ def test_each_bus_is_late_within_its_own_range(tilt, thrust, usual):
     beyond = [abs(beliefs[name].residual(x)) for name, x in
               ((TILT_BUS, tilt), (THRUST_BUS, thrust))]
     assert (max(beyond) < 5.0) == usual
+
+
+class Capped(Problem):
+    """A speed that is cut off in one block of eight; in each of the others one bad reading."""
+
+    KEY = 'joint_velocity_limit.velocity_limit'
+
+    def __init__(self):
+        self.keys, self.p, self.beliefs, self.blocks = KEYS, P, {}, 8
+        rng = np.random.default_rng(0)
+        self.block = np.repeat(np.arange(8), 250)
+        self.speed = rng.uniform(0.0, 1.0, 2000) * np.where(self.block == 3, 1.6, 0.95)
+        self.noise = 0.01 * rng.standard_normal(2000)
+        bad = np.setdiff1d(np.arange(0, 2000, 250), [750])
+        self.speed[bad], self.noise[bad] = 1.02, 0.3
+
+    def residual(self, theta):
+        cap = np.exp(theta.get(self.KEY, 3.0))      # far above at first
+        return (np.minimum(self.speed, 1.0) + self.noise - np.minimum(self.speed, cap)) / 0.01
+
+    def at(self, x):
+        slope = (self.residual({self.KEY: x + 0.01}) - self.residual({self.KEY: x - 0.01})) / 0.02
+        return State({self.KEY: x}, self.residual({self.KEY: x}), slope[:, None], [self.KEY])
+
+
+def test_a_limit_that_one_block_alone_knows_is_without_it_no_limit_at_worst():
+    problem = Capped()
+    point, without = problem.at(0.019), problem.at(3.0)     # where bad readings pull it
+    trial = Trial(Candidate('joint_velocity_limit', (problem.KEY,), label='limit'), 1.0,
+                  dict(point.theta))
+    cross_validate(problem, trial, point, without, [], frozenset())
+    missed = ((without.r**2)[problem.block == 3]).sum()
+    assert missed > 1e4 and trial.cross[0] > -0.01 * missed

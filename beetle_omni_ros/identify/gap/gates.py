@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bands import aside, in_part_alone
-from beetle_omni_ros.identify.gap.fit import Problem, State
+from beetle_omni_ros.identify.gap.candidates import LIMITS
+from beetle_omni_ros.identify.gap.fit import HALVINGS, Problem, State
 from beetle_omni_ros.identify.gap.keys import Key
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.trial import Found, Trial
@@ -131,7 +132,7 @@ def cross_validate(problem: Problem, trial: Trial, point: State, without: State,
     with_it = list(dict.fromkeys([*involved, *c.keys]))
     held = _left_out(problem, without, [name for name in with_it if name not in c.keys
                                         or name in problem.beliefs], free) \
-        - _left_out(problem, point, with_it, free | set(c.keys))
+        - _left_out(problem, point, with_it, free | set(c.keys), c.name in LIMITS)
     several = len(held) > 1
     trial.cross = (float(held.sum()),
                    float(held.std(ddof=1) * np.sqrt(len(held))) if several else np.inf)
@@ -139,16 +140,39 @@ def cross_validate(problem: Problem, trial: Trial, point: State, without: State,
     trial.without_best = float(held.sum() - held.max()) if several else 0.0
 
 
-def _left_out(problem, at, names, free):
-    """Objective (blocks,) on each block of a fit to the others."""
+def _left_out(problem, at, names, free, bent=False):
+    """Objective (blocks,) on each block of a fit to the others; ``bent``: no straight line."""
     s = at.slopes[:, [at.index[name] for name in names]]
     parts = [(s[rows].T @ s[rows], s[rows].T @ at.r[rows], float(at.r[rows] @ at.r[rows]))
              for rows in (problem.block == b for b in range(problem.blocks))]
     total = [sum(part[k] for part in parts) for k in range(3)]
     costs = []
-    for h, g, chi2 in parts:
+    for block, (h, g, chi2) in enumerate(parts):
         step, _, _ = problem.solve(at.theta, names, free, total[0] - h, total[1] - g,
                                    total[2] - chi2)
+        if bent:
+            costs.append(_reached(problem, at, names, free, step, problem.block == block))
+            continue
         belief = problem.prior(problem.moved(at.theta, names, step), free)
         costs.append(chi2 + 2 * g @ step + step @ h @ step + belief / problem.blocks)
     return np.array(costs)
+
+
+def _reached(problem, at, names, free, step, rows):
+    """
+    Objective on ``rows`` after a step, by the residual itself.
+
+    A limit that acts in one block most is hardly known without it: there a straight line
+    promises anything. The step is as long as the other rows gain by it.
+    """
+    def objective(theta, r, some):
+        return float(r[some] @ r[some]) + problem.prior(theta, free)
+
+    theta, r = at.theta, at.r
+    for halving in range(HALVINGS):
+        moved = problem.moved(at.theta, names, 0.5**halving * step)
+        there = problem.residual(moved)
+        if objective(moved, there, ~rows) <= objective(at.theta, at.r, ~rows):
+            theta, r = moved, there
+            break
+    return float(r[rows] @ r[rows]) + problem.prior(theta, free) / problem.blocks
