@@ -179,7 +179,7 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
     gyro = float(np.sqrt(((np.median(np.abs(np.diff(rate, 3, axis=0)), axis=0) / 0.6745)**2
                           / 20).sum()))
     # Readings at 100 Hz, interpolated to the fine grid: neighbours share their noise.
-    share = np.sqrt(2 * FINE / np.median(np.diff(model.flight.imu_t)) if False else 2.0)
+    share = np.sqrt(2.0)
     coarse = model.signals.position_noise > model.p.coarse_noise
     slope = low_pass(model.p.velocity_edge if coarse else SMOOTH_POSE, 1, FINE)
     velocity0 = position * share * np.linalg.norm(
