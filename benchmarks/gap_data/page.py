@@ -39,7 +39,7 @@ def target(row: dict) -> str:
 
 
 def markdown(report: dict) -> str:
-    """The criteria of every workflow side by side, and the confusions of the first."""
+    """The criteria and power of every workflow side by side, and the first one's confusions."""
     names = list(report['workflows'])
     lines = ['# Blind campaign', '', _describe(report), '']
     for difficulty in ('clean', 'hard'):
@@ -54,7 +54,7 @@ def markdown(report: dict) -> str:
             lines.append(f'| {rows[0]["name"]} | {target(rows[0])} | ' + ' | '.join(cells) + ' |')
         lines.append('')
     lines += ['`**` misses its target; in brackets the 95 % interval, in parentheses the number '
-              'of cases or values.', '']
+              'of cases or values.', '', *_power_table(report, names)]
     for difficulty, table in report['workflows'][names[0]]['confusion'].items():
         if table:
             lines += [f'## What {names[0]} answered, {difficulty}', '', '| truth | answers |',
@@ -65,6 +65,18 @@ def markdown(report: dict) -> str:
                 for truth, counts in table.items()]
             lines.append('')
     return '\n'.join(lines)
+
+
+def _power_table(report, names):
+    rows = list(zip(*(report['workflows'][n]['power'] for n in names)))
+    if not rows:
+        return []
+    return ['## Power: share named, by multiples of the detection limit, hard flights', '',
+            '| times the limit | ' + ' | '.join(f'{n} | {n}, wrong name' for n in names) + ' |',
+            '|---|' + '---|---|' * len(names),
+            *(f'| {same[0]["multiple"]:g} | ' + ' | '.join(
+                f'{number(row["named"])} | {number(row["wrong"])}' for row in same) + ' |'
+              for same in rows), '']
 
 
 def _describe(report):

@@ -120,6 +120,14 @@ def test_a_campaign_judges_workflows_side_by_side(folder, stub):
     report = json.loads(json.dumps(make_report(judged, META)))
     assert '<svg' in html(report) and 'single: named' in html(report)
     assert '| none: false alarm | <= 0.05 |' in markdown(report)
+    assert 'Power' not in markdown(report)
+    for rows in judged.values():
+        rows[:] = [{**row, 'kind': 'power', 'multiple': 3.0} for row in rows if row['truth']]
+    table = markdown(make_report(judged, META)).partition('## Power')[2].splitlines()
+    assert table[2] == '| times the limit | right | right, wrong name | silent | ' \
+                       'silent, wrong name |'
+    assert [cell.split()[0] for cell in table[4].strip('| ').split(' | ')] == \
+        ['3', '1', '0', '0', '0']
 
 
 def test_a_bug_in_the_workflow_is_counted_and_does_not_stop_the_campaign(folder, stub):
