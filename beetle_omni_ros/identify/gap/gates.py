@@ -169,10 +169,11 @@ def _reached(problem, at, names, free, step, rows):
         return float(r[some] @ r[some]) + problem.prior(theta, free)
 
     theta, r = at.theta, at.r
+    before = objective(theta, r, ~rows)
     for halving in range(HALVINGS):
         moved = problem.moved(at.theta, names, 0.5**halving * step)
         there = problem.residual(moved)
-        if objective(moved, there, ~rows) <= objective(at.theta, at.r, ~rows):
+        if objective(moved, there, ~rows) <= before:
             theta, r = moved, there
             break
     return float(r[rows] @ r[rows]) + problem.prior(theta, free) / problem.blocks
