@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Command, PoseTarget, State, Target
+from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
 from beetle_omni_ros.control.call import FunctionCall
 from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.guidance import Guidance
@@ -121,14 +121,29 @@ class PolicyController:
     def step(self, state: State, target: Target) -> Command:
         """One command for one state; a non-finite state repeats the last command."""
         self._steps += 1
-        observation = self._observe(state, target)
-        if observation is None:
+        values = self.infer(state, self._reference(state, target))
+        if values is None:
             self._rejected += 1
             return self._repeated(state)
-        values = self._targets(self.network(observation))
         self._command = Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
         self._latest.appendleft(values)
         return self._command
+
+    def infer(self, state: State, reference: Reference) -> list[float] | None:
+        """
+        Observe, ask the network, cut its answer to the limits of the actuators.
+
+        Args:
+            state: of the robot.
+            reference: what to follow; of a pose target as the guidance moves it.
+
+        Returns:
+            Tilt targets (4) [rad] and thrust targets (4) [N], or None where a number that the
+            network would see is not finite.
+
+        """
+        observation = self._observe(state, reference)
+        return None if observation is None else self._targets(self.network(observation))
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Counts since reset, and what a policy with memory estimates."""
@@ -142,14 +157,15 @@ class PolicyController:
             told['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
         return told
 
-    def _observe(self, state, target):
-        """Numbers for the network, or None when one of them is not finite."""
-        time = state.stamp
+    def _reference(self, state, target):
+        """What the policy is to follow from this state on."""
         if isinstance(target, PoseTarget):
-            target = self._guidance.target(state, target, self._in_charge(state))
-        else:
-            time += self._parameters.trajectory_lookahead
-        observation = observed(state, target.at(time), self._previous_action(state))
+            return self._guidance.target(state, target, self._in_charge(state)).at(state.stamp)
+        return target.at(state.stamp + self._parameters.trajectory_lookahead)
+
+    def _observe(self, state, reference):
+        """Numbers for the network, or None when one of them is not finite."""
+        observation = observed(state, reference, self._previous_action(state))
         if not isfinite(sum(observation)):
             return None
         if self._estimator:

@@ -134,6 +134,30 @@ class MultibodyParameters:
     centre_of_gravity_height: float = parameter(
         doc='of the robot above the main body origin', unit='m', low=-5, high=5)
 
+    @classmethod
+    def undescribed(cls, inertia: np.ndarray, module_inertia: float = 0.0,
+                    mass_moment: float = 0.0) -> MultibodyParameters:
+        """
+        Parts of a robot of which only the totals and the effect ``module_reaction`` are known.
+
+        Args:
+            inertia: (3,) diagonal of the whole robot [kg m^2].
+            module_inertia: of a tilting module about its joint axis [kg m^2]; half of it is
+                taken for its own, half for its mass below the axis.
+            mass_moment: of that mass [kg m].
+
+        """
+        depth = 0.5 * module_inertia / mass_moment if mass_moment else 0.0
+        own = module_inertia - mass_moment * depth
+        nowhere = np.zeros(3)
+        return cls(main_body=MainBodyParameters(centre_of_mass=nowhere, inertia=inertia),
+                   module=ModuleParameters(
+                       mass=mass_moment / depth if depth else 0.0, joint_offset=0.0,
+                       joint_height=0.0, centre_of_mass=np.array([0.0, 0.0, -depth]),
+                       inertia=np.full(3, own), rotor_offset=0.0),
+                   end_effector=EndEffectorParameters(mass=0.0, height=0.0),
+                   centre_of_gravity_height=0.0)
+
 
 @dataclass(frozen=True, kw_only=True)
 class RobotParameters:
@@ -154,7 +178,8 @@ class RobotParameters:
     rotors: RotorParameters = parameter(doc='rotors')
     joints: JointParameters = parameter(doc='tilt servos')
     battery: BatteryParameters = parameter(doc='battery')
-    multibody: MultibodyParameters = parameter(doc='parts')
+    multibody: MultibodyParameters | None = parameter(
+        None, doc='parts; without them nothing that tilts weighs anything')
     name: str = parameter('robot', doc='name of the robot')
     effects: dict = parameter({}, doc='known deviations from the model, by catalogue name')
     provenance: dict = parameter({}, doc='where a written file comes from; free text')
@@ -184,6 +209,12 @@ class RobotParameters:
         """
         path = Path(path) if path else share_path('params/robot.yaml')
         return schema.bind(cls, _merged(path, ()), str(path))
+
+    @property
+    def parts(self) -> MultibodyParameters:
+        """The parts as described, or as the effect ``module_reaction`` alone has them."""
+        return self.multibody or MultibodyParameters.undescribed(
+            self.inertia, **self.effects.get('module_reaction', {}))
 
     @property
     def tilt_axes(self) -> np.ndarray:

@@ -116,14 +116,20 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
                 raise ParameterError(f'{_at(where, key)}: missing'
                                      f'{_unit_text(entry)}')
             continue
-        if is_dataclass(hints[name]):
-            values[name] = bind(hints[name], mapping[name], where, key)
+        nested = _nested(hints[name])
+        if nested and not (mapping[name] is None and nested is not hints[name]):
+            values[name] = bind(nested, mapping[name], where, key)
         else:
             values[name] = check(entry, hints[name], mapping[name], _at(where, key))
     try:
         return cls(**values)
     except ParameterError as error:
         raise ParameterError(f'{_at(where, prefix)}: {error}' if where else str(error)) from None
+
+
+def _nested(hint):
+    """Dataclass that a field holds, perhaps as ``Class | None``, else None."""
+    return next((part for part in (hint, *get_args(hint)) if is_dataclass(part)), None)
 
 
 def check(entry, hint: type, value: Any, at: str) -> Any:

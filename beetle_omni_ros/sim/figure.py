@@ -67,8 +67,8 @@ class Figure:
 
     def _main_body(self):
         origin, parts, plant = self._parts.main_origin, self._parts, self._plant
-        height = self._robot.multibody.module.joint_height
-        ball = origin + [0, 0, self._robot.multibody.end_effector.height]
+        height = self._robot.parts.module.joint_height
+        ball = origin + [0, 0, self._robot.parts.end_effector.height]
         shapes = [
             self._geom('cylinder', (HUB, 0.003), CARBON, origin + [0, 0, height + 0.014]),
             self._geom('cylinder', (HUB, 0.003), CARBON, origin + [0, 0, height - 0.014]),
@@ -98,7 +98,7 @@ class Figure:
         mujoco.mju_mat2Quat(axis_turn, self._parts.module_rotations[k].ravel())
         mujoco.mju_axisAngle2Quat(turn, np.array([1.0, 0, 0]), tilt)
         mujoco.mju_mulQuat(quaternion, axis_turn, turn)
-        rotor = np.array([self._robot.multibody.module.rotor_offset, 0, 0])
+        rotor = np.array([self._robot.parts.module.rotor_offset, 0, 0])
         radius = self._plant.propeller_radius
         disc = DISC_FRONT if self._robot.tilt_axes[k][0] > 0 else DISC_REAR
         hub = rotor + [0, 0, 0.012]

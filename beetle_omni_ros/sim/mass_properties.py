@@ -95,7 +95,7 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
 
     """
     variation = variation or Variation()
-    parts = robot.multibody
+    parts = robot.parts
     outward = robot.tilt_axes
     up = np.tile([0.0, 0.0, 1.0], (4, 1))
     module_rotations = np.stack([outward, np.cross(up, outward), up], axis=2)

@@ -74,7 +74,7 @@ def _reflect_servo_inertia(model, robot):
     joint's armature, an inner torque between module and body: response and stiffness are
     then those identified, and momentum still balances.
     """
-    module = robot.multibody.module
+    module = robot.parts.module
     sideways, up = module.centre_of_mass[1:]
     own = module.inertia[0] + module.mass * (sideways ** 2 + up ** 2)
     model.dof_armature[6:] = robot.joints.inertia - own
@@ -91,7 +91,7 @@ def _inertial(part: RigidPart) -> str:
 
 
 def _module(robot, plant, parts, k):
-    module, joints = robot.multibody.module, robot.joints
+    module, joints = robot.parts.module, robot.joints
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, parts.module_rotations[k].ravel())
     inertia = np.maximum(module.inertia, TINY_INERTIA)
@@ -139,7 +139,7 @@ def _mjcf(robot, plant, variation, scenery):
                    f'pos="{_text(x * plant.foot_spread, y * plant.foot_spread, foot_z)}"/>\n'
                    for k, (x, y) in enumerate([(1, 1), (-1, 1), (-1, -1), (1, -1)]))
     modules = ''.join(_module(robot, plant, parts, k) for k in range(4))
-    ball = parts.main_origin + [0, 0, robot.multibody.end_effector.height]
+    ball = parts.main_origin + [0, 0, robot.parts.end_effector.height]
     return f"""
 <mujoco model="{robot.name}">
   <compiler angle="radian" autolimits="true" inertiafromgeom="false"/>

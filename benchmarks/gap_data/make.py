@@ -10,6 +10,7 @@ import shutil
 import tempfile
 
 import numpy as np
+import yaml
 
 from gap_data.bags import DAMAGES, write_bag
 from gap_data.cases import Case
@@ -115,6 +116,10 @@ def _told(robot_file, case):
     text = Path(robot_file).read_text()
     if case.damage == 'broken_robot':
         return '\n'.join(line for line in text.splitlines() if not line.startswith('mass:')) + '\n'
+    if any(name == 'module_reaction' for name, _, _ in case.effects):
+        content = yaml.safe_load(text)
+        content.pop('multibody', None)      # described, it would hide nothing
+        return yaml.safe_dump(content, sort_keys=False)
     return text
 
 

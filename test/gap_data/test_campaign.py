@@ -15,6 +15,8 @@ from gap_data.page import html, markdown
 from gap_data.workflow import run_workflow, Workflow
 import pytest
 
+from beetle_omni_ros.robot.parameters import RobotParameters
+
 SETTINGS = load_settings()
 META = {'set': 'test', 'seed': 0, 'cases': 2, 'command_age': 0.01, 'command': 'none'}
 STUB = """
@@ -100,6 +102,16 @@ def test_a_case_is_made_once_and_the_same_again(folder, tmp_path):
     label = json.loads((folder / 'sealed' / f'{SMALL.key()}.json').read_text())
     assert label['effects'][0]['parameters']['mass'] == pytest.approx(3.0386 + 0.3, abs=0.02)
     assert not [p for p in first.rglob('*') if p.suffix == '.json']
+
+
+@pytest.mark.parametrize('name', ['mass', 'module_reaction'])
+def test_the_told_file_describes_no_effect_that_is_hidden(tmp_path, name):
+    case = replace(SMALL, effects=((name, 0.3 if name == 'mass' else 1.0, 'plain'),), fit=1,
+                   duration=2.0)
+    made = make_case(case, tmp_path / 'flights', tmp_path / 'sealed')
+    told = RobotParameters.load(made / 'robot.yaml')
+    assert (told.multibody is None) == (name == 'module_reaction')
+    assert not told.effects
 
 
 def test_a_campaign_judges_workflows_side_by_side(folder, stub):

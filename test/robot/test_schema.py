@@ -26,6 +26,7 @@ class Outer:
     count: int = parameter(3, doc='count', low=1, high=9)
     active: bool = parameter(True, doc='switch')
     inner: Inner = group(Inner)
+    perhaps: Inner | None = parameter(None, doc='a group that may be absent')
 
 
 def write(tmp_path, text):
@@ -66,6 +67,22 @@ def test_a_mistake_is_named_with_file_and_key_in_one_line(tmp_path, text, says):
     assert says in str(error.value)
     assert str(path) in str(error.value)
     assert '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize('text, gain', [
+    ('mass: 1\n', None), ('mass: 1\nperhaps: null\n', None),
+    ('mass: 1\nperhaps: {gain: 2}\n', 2.0), ('mass: 1\nperhaps: {}\n', 1.0)])
+def test_an_optional_group_may_be_absent(tmp_path, text, gain):
+    found = schema.load(Outer, write(tmp_path, text)).perhaps
+    assert (found and found.gain) == gain
+
+
+@pytest.mark.parametrize('text, says', [
+    ('mass: 1\nperhaps: 3\n', "key 'perhaps': expected a mapping"),
+    ('mass: 1\nperhaps: {gain: 11}\n', "key 'perhaps.gain': 11 is outside 0 to 10 1/s")])
+def test_a_mistake_in_an_optional_group_is_named(tmp_path, text, says):
+    with pytest.raises(ParameterError, match=says):
+        schema.load(Outer, write(tmp_path, text))
 
 
 def test_a_missing_file_is_named(tmp_path):

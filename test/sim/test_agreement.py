@@ -42,6 +42,14 @@ def difference(found, expected):
     return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
+def module_reaction():
+    """What the described modules are as an effect, by Steiner's theorem."""
+    module = ROBOT.multibody.module
+    depth = -module.centre_of_mass[2]
+    return {'module_inertia': module.inertia[0] + module.mass * depth ** 2,
+            'mass_moment': module.mass * depth}
+
+
 @pytest.mark.parametrize('name', EFFECTS)
 def test_plant_without_module_inertia_agrees_with_casadi(name):
     robot = massless_modules(effects=EFFECTS[name])
@@ -53,6 +61,31 @@ def test_plant_without_module_inertia_agrees_with_casadi(name):
         assert difference(found[3:6], np.array(angular).ravel()) < 1e-6
 
 
+def test_a_robot_without_described_modules_flies_as_one_rigid_body():
+    robot = replace(ROBOT, multibody=None)
+    made, model = plant(robot), body_acceleration(robot)
+    for p, q, v, w, tilt, tilt_rate, thrust in random_states(20, seed=6):
+        linear, angular = model(v, q, w, tilt, thrust)
+        found = made.acceleration(p, q, v, w, tilt, tilt_rate, thrust)
+        assert difference(found[:3], np.array(linear).ravel()) < 1e-6
+        assert difference(found[3:6], np.array(angular).ravel()) < 1e-6
+
+
+def test_modules_known_by_their_effect_alone_act_as_the_described_ones():
+    """From a file without parts but with the effect, the plant moves like the whole one."""
+    described = plant(ROBOT)
+    by_effect, rigid = (plant(replace(ROBOT, multibody=None, effects=e))
+                        for e in ({'module_reaction': module_reaction()}, {}))
+    missed, without = [], []
+    for state in random_states(30, seed=7):
+        true, found, bare = (made.acceleration(*state)[:6]
+                             for made in (described, by_effect, rigid))
+        missed.append(found - true)
+        without.append(bare - true)
+    missed, without = (np.linalg.norm(rows, axis=0) for rows in (missed, without))
+    assert (missed < 0.2 * without).all()
+
+
 def held_target(made, state, tilt):
     """Tilt targets at which no joint accelerates: the response to a target is linear."""
     rest = made.acceleration(*state, tilt_target=tilt)[6:]
@@ -62,10 +95,7 @@ def held_target(made, state, tilt):
 
 
 def test_module_reaction_is_how_the_tilting_modules_shift_the_centre_of_mass():
-    module = ROBOT.multibody.module
-    depth = -module.centre_of_mass[2]
-    effects = {'module_reaction': {'module_inertia': module.inertia[0] + module.mass * depth ** 2,
-                                   'mass_moment': module.mass * depth}}
+    effects = {'module_reaction': module_reaction()}
     made = plant(ROBOT)
     plain, shifted = (body_acceleration(replace(ROBOT, effects=e)) for e in ({}, effects))
     for p, q, v, _, tilt, _, thrust in random_states(20, seed=4):

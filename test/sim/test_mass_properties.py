@@ -31,6 +31,23 @@ def test_variation_moves_the_totals():
                                atol=1e-15)
 
 
+@pytest.mark.parametrize('effects', [
+    {}, {'module_reaction': {'module_inertia': 9.9e-5, 'mass_moment': 2.1e-3}},
+    {'module_reaction': {'module_inertia': 9.9e-5, 'mass_moment': 0.0}}],
+    ids=['rigid', 'with reaction', 'inertia only'])
+def test_totals_hold_for_a_robot_whose_parts_are_not_described(effects):
+    properties = mass_properties(replace(ROBOT, multibody=None, effects=effects))
+    total = whole(properties)
+    assert total.mass == pytest.approx(ROBOT.mass, rel=1e-12)
+    np.testing.assert_allclose(total.inertia, np.diag(ROBOT.inertia), atol=1e-15)
+    told = effects.get('module_reaction', {})
+    for module, joint in zip(properties.modules, properties.joint_origins):
+        lever = module.centre - joint
+        assert module.mass * -lever[2] == pytest.approx(told.get('mass_moment', 0.0))
+        assert module.inertia_about(joint)[0, 0] == pytest.approx(
+            told.get('module_inertia', 0.0))
+
+
 def test_parts_agree_with_the_published_description():
     """Numbers that the residual does not use: main body's mass and centre, joint origins."""
     properties, parts = mass_properties(ROBOT), ROBOT.multibody
