@@ -10,12 +10,12 @@ import numpy as np
 from beetle_omni_ros.control import ocp
 from beetle_omni_ros.control.base import Command, State, Target
 from beetle_omni_ros.control.call import FunctionCall
-from beetle_omni_ros.control.compiler import CompilerError
 from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.references import ReferencePlanner
 from beetle_omni_ros.control.rti import CompiledRti, InterpretedRti
 from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot.native import CompilerError
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 log = logging.getLogger(__name__)

@@ -4,9 +4,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from beetle_omni_ros.control import compiler, ocp
+from beetle_omni_ros.control import ocp
 from beetle_omni_ros.control.nmpc_parameters import NmpcWeights
 from beetle_omni_ros.control.rti import BOUNDED_STATES, CompiledRti, InterpretedRti
+from beetle_omni_ros.robot import native
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
@@ -16,7 +17,7 @@ SOFT = (10.0, 100.0)
 REACH = 0.15   # [rad]
 REACHES = 2
 needs_compiler = pytest.mark.skipif(
-    not compiler.shutil.which('gcc') and not compiler.shutil.which('cc'), reason='no C compiler')
+    not native.shutil.which('gcc') and not native.shutil.which('cc'), reason='no C compiler')
 
 
 @pytest.fixture(scope='module')
@@ -115,11 +116,11 @@ def test_compiled_and_interpreted_iterations_are_the_same(problem, tmp_path, mon
 def test_a_compiled_solver_is_built_once_and_found_again(problem, tmp_path, monkeypatch):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
-    built = {p: p.stat().st_mtime_ns for p in compiler.cache_folder().iterdir()}
+    built = {p: p.stat().st_mtime_ns for p in native.cache_folder().iterdir()}
     CompiledRti(problem, INTERVALS[:2], None, 1e-6, 50)
-    assert {p: p.stat().st_mtime_ns for p in compiler.cache_folder().iterdir()} == built
+    assert {p: p.stat().st_mtime_ns for p in native.cache_folder().iterdir()} == built
     CompiledRti(ocp.build(ROBOT, 0.05, True), INTERVALS, SOFT, 1e-6, 50, REACHES)
-    assert len(list(compiler.cache_folder().iterdir())) == 2
+    assert len(list(native.cache_folder().iterdir())) == 2
 
 
 def test_an_unsolved_qp_leaves_the_plan_as_it_was(problem):
@@ -151,7 +152,7 @@ def test_inputs_stay_inside_their_bounds(problem):
 def test_an_unusable_compiler_is_named(problem, tmp_path, monkeypatch, compilers, says):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     monkeypatch.setenv('CC', compilers)
-    with pytest.raises(compiler.CompilerError, match=says):
+    with pytest.raises(native.CompilerError, match=says):
         CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
 
 
@@ -160,5 +161,5 @@ def test_an_unwritable_cache_is_named(problem, tmp_path, monkeypatch):
     blocked = tmp_path / 'file'
     blocked.write_text('')
     monkeypatch.setenv('XDG_CACHE_HOME', str(blocked))
-    with pytest.raises(compiler.CompilerError, match='cannot build in'):
+    with pytest.raises(native.CompilerError, match='cannot build in'):
         CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.identify.gap.keys import Key
-from beetle_omni_ros.robot import dynamics
+from beetle_omni_ros.robot import dynamics, native
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -74,7 +74,7 @@ class BodyModel:
 
     @cached_property
     def _function(self):
-        return ca.Function('body', [*self._x.values(), self._p], [self._out])
+        return native.compiled(ca.Function('body', [*self._x.values(), self._p], [self._out]))
 
     def _over(self, what, count, make):
         """The function over so many samples, and how it is called; see :func:`_called`."""

@@ -1,0 +1,98 @@
+"""CasADi functions as machine code: generated C, compiled once and cached."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import hashlib
+import logging
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import tempfile
+
+import casadi as ca
+
+log = logging.getLogger(__name__)
+FLAGS = ('-O2', '-fPIC', '-shared', '-std=gnu99', '-w')
+EXACT = ('-ffp-contract=off', '-lm')     # each operation rounded, as the interpreter does it
+
+
+class CompilerError(RuntimeError):
+    """No usable C compiler, or it failed; the text says which and its first complaint."""
+
+
+def cache_folder() -> Path:
+    """Where compiled code is kept: $XDG_CACHE_HOME (or ~/.cache) / beetle_omni_ros."""
+    base = os.environ.get('XDG_CACHE_HOME') or os.path.join(os.path.expanduser('~'), '.cache')
+    return Path(base) / 'beetle_omni_ros'
+
+
+def generated(functions: Sequence[ca.Function]) -> str:
+    """C source of CasADi functions, each under its own name."""
+    with tempfile.TemporaryDirectory() as folder:
+        generator = ca.CodeGenerator('model.c', {'with_header': False})
+        for function in functions:
+            generator.add(function)
+        generator.generate(folder + os.sep)
+        return (Path(folder) / 'model.c').read_text()
+
+
+def built(name: str, source: str, options: Sequence[str] = ()) -> Path:
+    """
+    Compile C source to a shared library, if that has not been done before.
+
+    The cache key covers the source, the compiler, its flags and the casadi version.
+
+    Args:
+        name: first part of the library's.
+        source: C.
+        options: of the compiler, beyond ``FLAGS``, which stand after the source.
+
+    Returns:
+        the library's path.
+
+    Raises:
+        CompilerError: no compiler, no write access to a cache, or compilation failed.
+
+    """
+    compiler = os.environ.get('CC') or shutil.which('gcc') or shutil.which('cc')
+    if not compiler or not shutil.which(compiler.split()[0]):
+        raise CompilerError('no C compiler found (looked for $CC, gcc, cc)')
+    key = '\n'.join((source, compiler, ' '.join((*FLAGS, *options)), ca.__version__))
+    library = cache_folder() / f'{name}_{hashlib.sha256(key.encode()).hexdigest()[:20]}.so'
+    if not library.is_file():
+        _compile(compiler.split(), source, options, library)
+    return library
+
+
+def compiled(function: ca.Function) -> ca.Function:
+    """
+    Same function from machine code, to the last digit, or itself where nothing compiles.
+
+    CasADi's interpreter takes some six times as long.
+    """
+    try:
+        return ca.external(function.name(),
+                           str(built(function.name(), generated([function]), EXACT)))
+    except (CompilerError, RuntimeError) as error:     # the latter: casadi cannot load it
+        log.info('%s stays interpreted: %s', function.name(), str(error).splitlines()[0])
+        return function
+
+
+def _compile(compiler, source, options, library):
+    try:
+        library.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=library.parent) as build:
+            path = Path(build) / 'source.c'
+            path.write_text(source)
+            output = Path(build) / library.name
+            log.info('compiling %s (once for this model and these options)', library.stem)
+            done = subprocess.run([*compiler, *FLAGS, str(path), '-o', str(output), *options],
+                                  capture_output=True, text=True, timeout=300)
+            if done.returncode:
+                lines = done.stderr.strip().splitlines() or ['no message']
+                raise CompilerError(f'{compiler[0]} failed: {lines[0]}')
+            os.replace(output, library)  # atomic: another process may build the same
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise CompilerError(f'cannot build in {library.parent}: {error}') from None

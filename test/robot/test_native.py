@@ -1,0 +1,65 @@
+"""Functions as machine code: the same numbers, built once, and never a must."""
+
+import shutil
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from beetle_omni_ros.robot import native
+from beetle_omni_ros.robot.dynamics import body_acceleration
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+needs_compiler = pytest.mark.skipif(
+    not shutil.which('gcc') and not shutil.which('cc'), reason='no C compiler')
+X = ca.SX.sym('x', 3)
+FUNCTION = ca.Function('thing', [X], [ca.sin(X) * ca.exp(X[0]) / X[1]])
+STATE = np.array([0.3, -1.7, 2.2])
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """An empty cache."""
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    return tmp_path / 'beetle_omni_ros'
+
+
+@needs_compiler
+def test_machine_code_gives_the_numbers_of_the_interpreter_to_the_last_digit():
+    interpreted = body_acceleration(RobotParameters.load())
+    compiled, generator = native.compiled(interpreted), np.random.default_rng(0)
+    assert compiled.is_a('External') and not interpreted.is_a('External')
+    for _ in range(20):
+        arguments = [generator.normal(size=interpreted.numel_in(i))
+                     for i in range(interpreted.n_in())]
+        for found, expected in zip(compiled.call(arguments), interpreted.call(arguments)):
+            assert np.array_equal(np.array(found), np.array(expected))
+
+
+@needs_compiler
+def test_code_is_built_once_and_anew_when_it_changes(cache):
+    native.compiled(FUNCTION)
+    first = {path: path.stat().st_mtime_ns for path in cache.iterdir()}
+    assert len(first) == 1
+    native.compiled(ca.Function('thing', [X], FUNCTION.call([X])))
+    assert {path: path.stat().st_mtime_ns for path in cache.iterdir()} == first
+    native.compiled(ca.Function('thing', [X], [2 * ca.sin(X)]))
+    assert len(list(cache.iterdir())) == 2
+
+
+@pytest.mark.parametrize('obstacle', ['no compiler', 'a compiler that fails', 'a blocked cache',
+                                      'a library that is none'])
+def test_without_machine_code_the_interpreter_goes_on(tmp_path, monkeypatch, obstacle):
+    if obstacle == 'no compiler':
+        monkeypatch.setenv('CC', 'no-such-cc')
+    elif obstacle == 'a compiler that fails':
+        monkeypatch.setenv('CC', 'false')
+    elif obstacle == 'a blocked cache':
+        (tmp_path / 'file').write_text('')
+        monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'file'))
+    else:
+        (tmp_path / 'broken.so').write_text('no library')
+        monkeypatch.setattr(native, 'built', lambda *_: tmp_path / 'broken.so')
+    found = native.compiled(FUNCTION)
+    assert found is FUNCTION
+    assert np.all(np.isfinite(np.array(found(STATE))))
