@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from beetle_omni_ros.identify.gap.candidates import LIMITS
 from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.keys import Belief, Key
 from beetle_omni_ros.identify.gap.noise import Noise
@@ -234,11 +235,19 @@ class Problem:
         return step, float(cost), h
 
     def refine(self, state: State, names: list[str], free: frozenset[str],
-               iterations: int = 3) -> tuple[State, float]:
+               iterations: int = 3, apart: bool = False) -> tuple[State, float]:
         """
         Fit the named keys.
 
         Slopes of keys that act almost linearly are kept; those of curved ones are renewed.
+
+        Args:
+            state: where to begin, with residual and slopes.
+            names: keys that may change.
+            free: of which nothing is believed.
+            iterations: at most.
+            apart: whether, where no part of a step of all is better, keys whose slopes are smooth
+                go on without those of friction, play and limits.
 
         Returns:
             the point reached, and the objective there.
@@ -250,19 +259,16 @@ class Problem:
         curved = [name for name in names if self.keys[name].parameter in CURVED and (
             name not in self.beliefs or name in free
             or timing and self.keys[name].parameter == 'delay')]
+        smooth = [name for name in names if not (
+            name in free and self.keys[name].effect in LIMITS)]
         now = State(theta, r, slopes, state.names)
         for iteration in range(iterations):
-            step, _, _ = self.linear_step(now, names, free)
-            better = False
-            for halving in range(HALVINGS):
-                trial = self.moved(now.theta, names, 0.5**halving * step)
-                r = self.residual(trial)
-                new = float(r @ r) + self.prior(trial, free)
-                if new < cost - 1e-9:
-                    better = True
-                    break
-            if not better:
+            found = self._descended(now, names, free, cost)
+            if found is None and apart and len(smooth) < len(names):
+                found = self._descended(now, smooth, free, cost)
+            if found is None:
                 break
+            trial, r, new = found
             gain, cost = cost - new, new
             slopes = now.slopes
             if curved and iteration + 1 < iterations and gain > 0.5:
@@ -272,6 +278,17 @@ class Problem:
             if gain < 0.5:
                 break
         return now, cost
+
+    def _descended(self, now, names, free, cost):
+        """Keys, residual and objective after the longest tried part of a step that is better."""
+        step, _, _ = self.linear_step(now, names, free)
+        for halving in range(HALVINGS):
+            trial = self.moved(now.theta, names, 0.5**halving * step)
+            r = self.residual(trial)
+            new = float(r @ r) + self.prior(trial, free)
+            if new < cost - 1e-9:
+                return trial, r, new
+        return None
 
     def moved(self, theta: dict[str, float], names: list[str],
               step: np.ndarray) -> dict[str, float]:

@@ -92,9 +92,9 @@ class Search:
     def _involved(self, accepted):
         return list(dict.fromkeys([*self.always, *(n for c in accepted for n in c.keys)]))
 
-    def _refit(self, state, accepted, iterations=3):
+    def _refit(self, state, accepted, iterations=3, apart=False):
         return self.problem.refine(state, self._involved(accepted), self._free(accepted),
-                                   iterations)
+                                   iterations, apart)
 
     def _believable(self, state, cost):
         """
@@ -137,7 +137,7 @@ class Search:
             state = problem.learn_noise(self.wide, 2)
         state = problem.learn_noise(self.wide, 2)
         # To the end: what this fit leaves on the way is a gain of every candidate's.
-        return self._refit(state, accepted, MOST_ITERATIONS)
+        return self._refit(state, accepted, MOST_ITERATIONS, apart=True)
 
     def _far(self, a, b):
         """Whether slopes taken at one point are of little use at the other."""
@@ -188,12 +188,12 @@ class Search:
             else:
                 self._cross_validate(trial, accepted)
                 much = p.weak_agreement if trial.gain > p.weak_gain * need else p.strong_agreement
-                sure = trial.cross[0] > much * trial.cross[1] and trial.positive >= 0.7 \
-                    or believed(p, trial.gain, trial.believed, price)
+                sure = trial.cross[0] > much * trial.cross[1] and trial.positive >= 0.7
                 if not holds(trial, p):
                     trial.reason = NOT_HELD
                 elif trial.share < p.least_share and not (
-                        sure and trial.share > p.weak_share):
+                        sure and trial.share > p.weak_share) \
+                        and not believed(p, trial.gain, trial.believed, price):
                     trial.reason = 'explains too small a part of what is left'
                 else:
                     chosen = trial
