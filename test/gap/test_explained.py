@@ -64,6 +64,39 @@ def test_a_slow_fit_leaves_nothing_for_others_to_gain():
     assert cost - again < 1.0
 
 
+class Rough(Straight):
+    """A line of two tolerances beside a friction whose slope promises what it does not hold."""
+
+    FRICTION = 'joint_friction.coulomb'
+
+    def residual(self, theta):
+        rubbed = 100.0 + 1e7 * abs(theta.get(self.FRICTION, 0.0) - 0.005)
+        return np.append(super().residual(theta), rubbed)
+
+    def slopes(self, theta, names):
+        made = np.zeros((2001, len(names)))
+        made[2000] = [1e7 if name == self.FRICTION else 0.0 for name in names]
+        return made
+
+    def start(self):
+        """State at which friction is already right; its slope says one way is down."""
+        theta, names = {self.FRICTION: 0.005}, [LAG, OTHER, self.FRICTION]
+        slopes = self.slopes(theta, names)
+        slopes[:2000, :2] = self.columns
+        return State(theta, self.residual(theta), slopes, names)
+
+
+@pytest.mark.parametrize('apart', [False, True])
+def test_a_rough_slope_need_not_hold_up_the_others(apart):
+    problem = Rough(0.02, 0.0)
+    start, free = problem.start(), frozenset({Rough.FRICTION})
+    state, cost = problem.refine(start, [LAG, OTHER, Rough.FRICTION], free, 5, apart)
+    assert state.theta[Rough.FRICTION] == 0.005
+    assert (cost < float(start.r @ start.r) - 100.0) == apart
+    if apart:
+        assert state.theta[LAG] == pytest.approx(0.02, abs=0.005)
+
+
 def before(truth, overlap=0.0):
     """Objective without effects: as fitted, and with believable tolerances only."""
     problem = Straight(truth, overlap)
@@ -108,7 +141,8 @@ def test_a_free_range_ends_beyond_itself():
     (600.0, 1700.0, 2.5, 0.0, False), (600.0, 6000.0, 10.0, 0.0, False),
     (30.0, 31.0, 10.0, 0.0, False), (30.0, 31.0, 10.0, 20.0, False),
     (30.0, 31.0, 10.0, 28.0, True), (30.0, 130.0, 1.5, 28.0, True),
-    (20.0, 21.0, 10.0, 40.0, False), (60.0, 600.0, 10.0, 60.0, False)])
+    (20.0, 21.0, 10.0, 40.0, False), (60.0, 600.0, 10.0, 20.0, False),
+    (60.0, 600.0, 10.0, 60.0, True)])
 def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch, gain, left,
                                                                      agreement, of_beliefs,
                                                                      named):
