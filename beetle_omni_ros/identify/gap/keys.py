@@ -53,6 +53,7 @@ class Key:
         typical: realistic deviation.
         smallest: worth naming.
         body: whether the body's equations hold it, else a signal does.
+        turns: whether it also loads the joints.
 
     """
 
@@ -67,6 +68,7 @@ class Key:
     typical: float
     smallest: float
     body: bool
+    turns: bool = False
 
     def value(self, deviation: float) -> float:
         """Catalogue value of a deviation."""
@@ -79,9 +81,9 @@ class Key:
     @property
     def groups(self) -> str:
         """Channel groups that depend on it."""
-        if self.effect == 'propeller_gyroscopic_torque':
-            return 'BJ'
-        return 'B' if self.body else GROUPS[self.effect]
+        if self.body:
+            return 'BJ' if self.turns else 'B'
+        return GROUPS[self.effect]
 
 
 def _own(robot: RobotParameters) -> dict[str, float | np.ndarray]:
@@ -105,6 +107,9 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
     effects = dict(robot.effects)
     if 'joint_friction' in effects:
         effects['joint_friction'] = dict(zip(('coulomb', 'stiction'), friction(robot)))
+    # described modules load the joints with their share, and this entry is what goes beyond
+    turning = {'propeller_gyroscopic_torque'} | (
+        {'module_reaction'} if robot.multibody is None else set())
     for name, effect in CATALOGUE.items():
         for parameter, spec in effect.parameters.items():
             neutral = np.atleast_1d(np.array(spec.neutral, dtype=float))
@@ -122,7 +127,7 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
                                  relative, low, high,
                                  0.5 if math.isnan(spec.typical) else spec.typical,
                                  0.0 if math.isnan(spec.smallest) else spec.smallest,
-                                 effect.apply is not None)
+                                 effect.apply is not None, name in turning)
     return keys
 
 

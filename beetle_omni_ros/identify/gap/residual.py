@@ -17,10 +17,10 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.filters import low_pass
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import friction, Key
-from beetle_omni_ros.identify.gap.loads import module_load, spin_load
+from beetle_omni_ros.identify.gap.loads import module_load, spin_load, undescribed_load
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import matrices
-from beetle_omni_ros.identify.gap.servo import GYROSCOPIC, simulate, Windows
+from beetle_omni_ros.identify.gap.servo import GYROSCOPIC, MODULES, simulate, Windows
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -40,7 +40,7 @@ THIN = 2        # grid points to each at which the body's equations are evaluate
 STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
          'kp': 0.01, 'kd': 0.01, 'velocity_limit': 0.01, 'effort_limit': 0.01, 'coulomb': 5e-4,
          'stiction': 5e-4, 'deflection_per_newton': 1e-4, 'gap': 1e-3, 'thrust_max': 0.01,
-         'share': 0.05, 'ratio': 0.01, 'lag': 0.02,
+         'share': 0.05, 'ratio': 0.01, 'lag': 0.02, 'mass_moment': 2e-4, 'module_inertia': 2e-5,
          'angular_momentum_at_hover': 5e-3}
 
 
@@ -78,13 +78,15 @@ class FlightModel:
         self._made: dict[tuple, tuple] = {}
         self._last: tuple = (None, {})      # point of the last residual, and that by group
         self._mask = self._trusted()
-        own = robot.effects
+        own, hanging = robot.effects, robot.effects.get(MODULES, {})
         coulomb, stiction = friction(robot)
         self._own = {'coulomb': coulomb, 'stiction': stiction,
                      'deflection': own.get('joint_deflection', {}).get(
                          'deflection_per_newton', 0.0),
                      'momentum': own.get(GYROSCOPIC, {}).get('angular_momentum_at_hover', 0.0),
-                     'joint_share': own.get(GYROSCOPIC, {}).get('joint_share', 0.0)}
+                     'joint_share': own.get(GYROSCOPIC, {}).get('joint_share', 0.0),
+                     'mass_moment': hanging.get('mass_moment', 0.0),
+                     'module_inertia': hanging.get('module_inertia', 0.0)}
 
     def _trusted(self):
         """(M,) 0 for body samples at the rotors' limit for the voltage, or on the floor."""
@@ -272,7 +274,8 @@ class FlightModel:
         windows = Windows(tilt[at], rate[at], thrust[index].transpose(1, 0, 2),
                           load[index].transpose(1, 0, 2),
                           spin_load(s, theta)[index].transpose(1, 0, 2), p.servo_step, skip,
-                          per)
+                          per, tuple(each[index].transpose(1, 0, 2)
+                                     for each in undescribed_load(s, theta)))
         return windows, edges
 
     def slopes(self, theta: dict[str, float], names: list[str]) -> dict[str, np.ndarray]:

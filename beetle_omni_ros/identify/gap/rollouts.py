@@ -14,7 +14,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.filters import low_pass
-from beetle_omni_ros.identify.gap.loads import module_load, spin_load
+from beetle_omni_ros.identify.gap.loads import module_load, spin_load, undescribed_load
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
 from beetle_omni_ros.identify.gap.servo import simulate, Windows
@@ -126,7 +126,8 @@ def _tilts(model, theta, starts, steps):
     index = np.clip(np.rint((edges[:, :-1] - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
     windows = Windows(tilt[starts], rate[starts], s.thrust(theta)[0][index].transpose(1, 0, 2),
                       module_load(s, theta)[index].transpose(1, 0, 2),
-                      spin_load(s, theta)[index].transpose(1, 0, 2), p.servo_step, 0, per)
+                      spin_load(s, theta)[index].transpose(1, 0, 2), p.servo_step, 0, per,
+                      tuple(each[index].transpose(1, 0, 2) for each in undescribed_load(s, theta)))
     targets = s.tilt_targets(edges.ravel(), s.delays(theta)[0])
     targets = np.concatenate([targets, targets[-1:]]).reshape(*edges.shape, 4)[:, :-1]
     run = simulate(model.robot.joints, windows, targets.transpose(1, 0, 2)[None], [theta],

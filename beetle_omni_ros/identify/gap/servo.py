@@ -17,7 +17,7 @@ import numpy as np
 from beetle_omni_ros.robot.effects_actuator import SLIDING_RATE
 from beetle_omni_ros.robot.parameters import JointParameters
 
-GYROSCOPIC = 'propeller_gyroscopic_torque'
+GYROSCOPIC, MODULES = 'propeller_gyroscopic_torque', 'module_reaction'
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,8 @@ class Windows:
         step: [s].
         skip: steps of run-in.
         every: steps from one sample to the next.
+        undescribed: (K, W, 4) torques of modules that the file does not describe, for each kg m
+            of their mass moment and each kg m^2 of their inertia, or nothing.
 
     """
 
@@ -45,6 +47,7 @@ class Windows:
     step: float
     skip: int
     every: int
+    undescribed: tuple[np.ndarray, ...] = ()
 
 
 def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
@@ -57,8 +60,8 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
         windows: of one flight.
         targets: (P, K, W, 4) [rad] for each set.
         sets: of deviations by key name.
-        base: values of the robot file's own effects: coulomb, stiction, deflection; share of its
-            modules.
+        base: values of the robot file's own effects: coulomb, stiction, deflection, mass_moment,
+            module_inertia, momentum and joint_share; share of its modules.
 
     Returns:
         (P, M, W, 4) positions [rad] after the run-in.
@@ -81,6 +84,9 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
     share = base['modules'] + column('modules.share')
     momentum = (base['momentum'] + column(f'{GYROSCOPIC}.angular_momentum_at_hover')) * (
         base['joint_share'] + column(f'{GYROSCOPIC}.joint_share'))
+    hanging = [(torque, base[name] + column(f'{MODULES}.{name}')) for torque, name in
+               zip(windows.undescribed, ('mass_moment', 'module_inertia'), strict=False)]
+    hanging = [(torque, size) for torque, size in hanging if size.any()]
     inertia = joint.inertia * column('swing.ratio', np.exp)
     damping = 0.5 * h * kd / inertia
     keep, gain = (1 - damping) / (1 + damping), h / inertia / (1 + damping)
@@ -107,6 +113,8 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
         force = stiff * error
         if loaded:
             force += gain * share * windows.load[k]
+        for torque, size in hanging:
+            force += gain * size * torque[k]
         if spins:
             force += gain * momentum * windows.spin[k]
         if weak:

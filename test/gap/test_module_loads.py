@@ -1,0 +1,52 @@
+"""Modules load their joints, whether the robot file describes them or an effect does."""
+
+from flights import Motion, P, ROBOT
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.gap.keys import all_keys
+from beetle_omni_ros.identify.gap.loads import module_load, undescribed_load
+from beetle_omni_ros.identify.gap.servo import simulate, Windows
+from beetle_omni_ros.identify.gap.signals import Signals
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+DESCRIBED, MOTION = RobotParameters.load(), Motion()
+KEYS = ('module_reaction.module_inertia', 'module_reaction.mass_moment')
+
+
+def test_undescribed_modules_load_joints_as_described_ones_of_that_moment_and_inertia():
+    flight, module = MOTION.flight(), DESCRIBED.multibody.module
+    moment = -module.mass * module.centre_of_mass[2]
+    inertia = module.inertia[0] - moment * module.centre_of_mass[2]
+    expected = module_load(Signals(flight, DESCRIBED, P), {})
+    hanging, turning = undescribed_load(Signals(flight, ROBOT, P), {})
+    found = moment * hanging + inertia * turning
+    assert np.std(found - expected) < 0.05 * np.std(expected)
+    assert np.std(moment * hanging - expected) > np.std(found - expected)
+
+
+def test_what_the_file_describes_is_not_counted_again():
+    flight = MOTION.flight()
+    assert undescribed_load(Signals(flight, DESCRIBED, P), {}) == ()
+    assert not module_load(Signals(flight, ROBOT, P), {}).any()
+
+
+@pytest.mark.parametrize('robot, groups', [(ROBOT, 'BJ'), (DESCRIBED, 'B')],
+                         ids=['undescribed', 'described'])
+def test_the_reaction_shows_in_joints_where_nothing_else_loads_them(robot, groups):
+    keys = all_keys(robot)
+    assert [keys[name].groups for name in KEYS] == [groups, groups]
+
+
+@pytest.mark.parametrize('sets, base, moment', [
+    ({'module_reaction.mass_moment': 2e-3}, 0.0, 2e-3), ({}, 1e-3, 1e-3),
+    ({'module_reaction.mass_moment': -4e-4}, 1e-3, 6e-4)])
+def test_a_servo_sags_under_a_module_that_hangs_beside_its_axis(sets, base, moment):
+    k, gravity = 800, 9.8
+    zero, one = np.zeros((k, 1, 4)), np.ones((k, 1, 4))
+    windows = Windows(zero[0], zero[0], zero, zero, zero, P.servo_step, 0, 8,
+                      (gravity * one, zero))
+    shown = simulate(ROBOT.joints, windows, np.zeros((1, k, 1, 4)), [sets], {
+        'coulomb': 0.0, 'stiction': 0.0, 'deflection': 0.0, 'modules': 0.0, 'momentum': 0.0,
+        'joint_share': 0.0, 'mass_moment': base, 'module_inertia': 0.0})[0, -1, 0]
+    assert shown == pytest.approx(moment * gravity / ROBOT.joints.kp, rel=1e-3)
