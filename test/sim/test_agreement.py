@@ -50,21 +50,12 @@ def module_reaction():
             'mass_moment': module.mass * depth}
 
 
-@pytest.mark.parametrize('name', EFFECTS)
-def test_plant_without_module_inertia_agrees_with_casadi(name):
-    robot = massless_modules(effects=EFFECTS[name])
+@pytest.mark.parametrize('robot', [
+    *(massless_modules(effects=effects) for effects in EFFECTS.values()),
+    replace(ROBOT, multibody=None)], ids=[*EFFECTS, 'not described'])
+def test_plant_without_module_inertia_agrees_with_casadi(robot):
     made, model = plant(robot), body_acceleration(robot)
     for p, q, v, w, tilt, tilt_rate, thrust in random_states(40, seed=1):
-        linear, angular = model(v, q, w, tilt, thrust)
-        found = made.acceleration(p, q, v, w, tilt, tilt_rate, thrust)
-        assert difference(found[:3], np.array(linear).ravel()) < 1e-6
-        assert difference(found[3:6], np.array(angular).ravel()) < 1e-6
-
-
-def test_a_robot_without_described_modules_flies_as_one_rigid_body():
-    robot = replace(ROBOT, multibody=None)
-    made, model = plant(robot), body_acceleration(robot)
-    for p, q, v, w, tilt, tilt_rate, thrust in random_states(20, seed=6):
         linear, angular = model(v, q, w, tilt, thrust)
         found = made.acceleration(p, q, v, w, tilt, tilt_rate, thrust)
         assert difference(found[:3], np.array(linear).ravel()) < 1e-6
