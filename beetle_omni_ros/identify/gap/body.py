@@ -7,14 +7,13 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.identify.gap.keys import Key
+from beetle_omni_ros.identify.gap.keys import Key, MODULES
 from beetle_omni_ros.robot import dynamics, native
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 WIDTHS = {'velocity': 3, 'quaternion': 4, 'rate': 3, 'tilt': 4, 'thrust': 4, 'tilt_rate': 4,
           'tilt_acceleration': 4, 'thrust_rate': 4, 'position': 3, 'voltage': 1, 'modules': 1}
-MODULES = 'module_reaction'
 
 
 class BodyModel:

@@ -18,6 +18,7 @@ from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
+GYROSCOPIC, MODULES = 'propeller_gyroscopic_torque', 'module_reaction'
 SHAPES = ('cosine_share', 'exponential_share', 'spin_up_share', 'joint_share')
 SMALLEST = 0.02         # ratio to the file's own number ...
 # ... but of a limit so far above all that is asked for that a real one is hundreds of times less:
@@ -108,8 +109,7 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
     if 'joint_friction' in effects:
         effects['joint_friction'] = dict(zip(('coulomb', 'stiction'), friction(robot)))
     # described modules load the joints with their share, and this entry is what goes beyond
-    turning = {'propeller_gyroscopic_torque'} | (
-        {'module_reaction'} if robot.multibody is None else set())
+    turning = {GYROSCOPIC} if robot.multibody else {GYROSCOPIC, MODULES}
     for name, effect in CATALOGUE.items():
         for parameter, spec in effect.parameters.items():
             neutral = np.atleast_1d(np.array(spec.neutral, dtype=float))

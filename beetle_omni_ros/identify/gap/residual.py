@@ -16,11 +16,11 @@ import numpy as np
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.filters import low_pass
 from beetle_omni_ros.identify.gap.ingest import Flight
-from beetle_omni_ros.identify.gap.keys import friction, Key
+from beetle_omni_ros.identify.gap.keys import friction, GYROSCOPIC, Key, MODULES
 from beetle_omni_ros.identify.gap.loads import module_load, spin_load, undescribed_load
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import matrices
-from beetle_omni_ros.identify.gap.servo import GYROSCOPIC, MODULES, simulate, Windows
+from beetle_omni_ros.identify.gap.servo import simulate, Windows
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beetle_omni_ros.identify.gap.keys import GYROSCOPIC, MODULES
 from beetle_omni_ros.robot.effects_actuator import SLIDING_RATE
 from beetle_omni_ros.robot.parameters import JointParameters
-
-GYROSCOPIC, MODULES = 'propeller_gyroscopic_torque', 'module_reaction'
 
 
 @dataclass(frozen=True)
