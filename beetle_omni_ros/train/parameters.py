@@ -154,11 +154,11 @@ class EstimateParameters:
 class RewardWeights:
     """Weights of the terms in :mod:`train.rewards`, by the terms' names."""
 
-    position: float = parameter(-2.0, doc='published -1')
+    position: float = parameter(-2.5, doc='published -1')
     pose: float = parameter(2.0, doc='published')
     reach_position: float = parameter(1.0, doc='published')
     reach_pose: float = parameter(0.75, doc='published')
-    linear_velocity: float = parameter(-0.03, doc='published')
+    linear_velocity: float = parameter(-0.015, doc='published -0.03')
     angular_velocity: float = parameter(-0.05, doc='published')
     joint_limit: float = parameter(-0.02, doc='published')
     thrust_limit: float = parameter(-0.01, doc='published')
@@ -256,7 +256,7 @@ class TrainParameters:
     """One training, completely: dumped beside its checkpoints."""
 
     seed: int = parameter(0, doc='of everything random', low=0, high=2**31 - 1)
-    iterations: int = parameter(7200, doc='PPO iterations', low=1, high=10**7)
+    iterations: int = parameter(6800, doc='PPO iterations', low=1, high=10**7)
     memory: bool = parameter(False, doc='whether the policy sees the estimated disturbance')
     log_every: int = parameter(50, doc='iterations between two rows of progress', low=1,
                                high=10**6)
