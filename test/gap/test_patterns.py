@@ -12,7 +12,7 @@ from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.noise import Noise
-from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, Rhythm, rhythm
+from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, Rhythm, rhythm, SWINGING
 from beetle_omni_ros.identify.gap.trial import Found, TOO_SMALL, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder
 from beetle_omni_ros.identify.gap.verdict import decide
@@ -113,7 +113,7 @@ SURE = Pattern('the place', 90.0, 15.0, 1.0, (0.2, 0.0))
     (SURE, 'unknown'), (replace(SURE, error=60.0), 'no_gap'),
     (replace(SURE, error=38.0), 'unknown'), (replace(SURE, error=38.0, positive=0.75), 'no_gap'),
     (replace(SURE, positive=0.5), 'no_gap'), (replace(SURE, gain=20.0, error=1.0), 'no_gap'),
-    (replace(SURE, size=(0.01, 0.01)), 'no_gap')])
+    (replace(SURE, size=(0.9 * P.least_force, 0.9 * P.least_torque)), 'no_gap')])
 def test_a_sure_and_large_pattern_is_unknown(pattern, verdict):
     assert decided(found=[pattern]).verdict == verdict
 
@@ -123,3 +123,11 @@ def test_a_name_does_not_stand_where_a_pattern_explains_as_much_again(gain, verd
     a = decided([wind()], [replace(SURE, gain=gain, error=5.0)])
     assert a.verdict == verdict
     assert [t.candidate.name for t in a.partial] == (['wind'] if verdict == 'unknown' else [])
+
+
+@pytest.mark.parametrize('text, size, verdict', [
+    (SWINGING, 1.1, 'unknown'), (SWINGING, 0.9, 'named'), ('the place', 2.0, 'named')])
+def test_a_mass_that_swings_is_unknown_however_much_its_weight_explains(text, size, verdict):
+    swing = Pattern(text, 2 * P.least_pattern, 5.0, 1.0, (size * P.swinging_force, 0.0))
+    winds = [wind() for _ in range(4)]      # they explain nine times what is left
+    assert decided(winds, [swing]).verdict == verdict

@@ -19,6 +19,7 @@ from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
 from beetle_omni_ros.identify.gap.series import matrices
 
+SWINGING = 'a mass that swings'
 ROTORS = tuple(f'rotor_thrust_coefficient.scale[{k}]' for k in range(4))
 WORLD = tuple(f'wind.force[{k}]' for k in range(3))
 FORCE, PART = 0.5, 0.05     # sizes that are likely: [N], and of a rotor's thrust
@@ -122,7 +123,7 @@ def questions(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarr
         'thrust of the rotors': _times(rotor, x['thrust'] / 8.0 - 1.0),
         'time of flight, through thrust': _times(rotor, np.concatenate(
             [1 - np.exp(-time / WARM), time / time[-1]], axis=1)),
-        'a mass that swings': _swings(model._body(x, theta)[:, :3], THIN * model.p.grid)}
+        SWINGING: _swings(model._body(x, theta)[:, :3], THIN * model.p.grid)}
 
 
 def _times(forces, shares):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.patterns import SWINGING
 from beetle_omni_ros.identify.gap.trial import FOUGHT, NOT_HELD, TOO_SMALL
 from beetle_omni_ros.robot.effects import CATALOGUE
 
@@ -110,8 +111,10 @@ def _strange(a, explained, p):
     for pattern in a.patterns:
         force, torque = pattern.size
         large = force > p.least_force or torque > p.least_torque
-        if pattern.sure and large and pattern.gain > max(p.least_pattern,
-                                                         p.pattern_share * explained):
+        weighs = pattern.gain > max(p.least_pattern, p.pattern_share * explained)
+        swings = pattern.text == SWINGING and force > p.swinging_force \
+            and pattern.gain > p.least_pattern
+        if pattern.sure and (large and weighs or swings):
             return (f'a force that goes with {pattern.text} ({force:.2f} m/s^2, {torque:.2f} '
                     f'rad/s^2); it gains {pattern.gain:.0f} of chi2 on data left out')
     return ''
