@@ -110,11 +110,10 @@ def _strange(a, explained, p):
                 f'{line.size:.2f} m/s^2, which goes with no state')
     for pattern in a.patterns:
         force, torque = pattern.size
-        large = force > p.least_force or torque > p.least_torque
-        weighs = pattern.gain > max(p.least_pattern, p.pattern_share * explained)
-        swings = pattern.text == SWINGING and force > p.swinging_force \
-            and pattern.gain > p.least_pattern
-        if pattern.sure and (large and weighs or swings):
+        swings = pattern.text == SWINGING and force > p.swinging_force
+        large = swings or force > p.least_force or torque > p.least_torque
+        share = 0.0 if swings else p.pattern_share
+        if pattern.sure and large and pattern.gain > max(p.least_pattern, share * explained):
             return (f'a force that goes with {pattern.text} ({force:.2f} m/s^2, {torque:.2f} '
                     f'rad/s^2); it gains {pattern.gain:.0f} of chi2 on data left out')
     return ''
