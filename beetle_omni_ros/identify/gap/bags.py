@@ -31,6 +31,7 @@ class Recording:
             joint positions, tilt and thrust commands, voltage.
         states: (time of recording, supervisor state), where recorded.
         warnings: what was wrong while reading.
+        received: topic -> (N,) times of recording [s]; empty where they are not known.
 
     """
 
@@ -39,6 +40,7 @@ class Recording:
     values: dict[str, np.ndarray]
     states: list[tuple[float, str]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    received: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -74,15 +76,15 @@ def read_recording(path: str | Path) -> Recording:
         try:
             if message.type != TOPICS[name].type:
                 raise ValueError(message.type)
-            rows[name].append(_READERS[name](message.data, layouts))
+            rows[name].append((*_READERS[name](message.data, layouts), message.received))
         except (struct.error, ValueError, IndexError, KeyError):
             bad[name] += 1
     warnings += [f'{name}: {count} messages not readable' for name, count in bad.items()]
-    times, values = {}, {}
+    times, values, received = {}, {}, {}
     for name, width in {**NEEDED, **OPTIONAL}.items():
-        table = np.array(rows[name], dtype=float).reshape(-1, width + 1)
-        times[name], values[name] = table[:, 0], table[:, 1:]
-    return Recording(Path(path).name, times, values, states, warnings)
+        table = np.array(rows[name], dtype=float).reshape(-1, width + 2)
+        times[name], values[name], received[name] = table[:, 0], table[:, 1:-1], table[:, -1]
+    return Recording(Path(path).name, times, values, states, warnings, received)
 
 
 def _head(data):

@@ -2,25 +2,45 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, read_recording, Recording
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.recording.check import damages, repaired
+from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.bag_reader import BagError
 
 SETTLE = 1.0            # [s] after take-off that are not looked at
 LIFTED = 0.8            # of the weight: commanded thrust that flies
-MOST_DUPLICATES = 0.05
-CLOCK_JUMP = 0.5        # [s] that a stamp may go back
 SPREAD = 0.4            # by which measured and commanded specific force may differ
 
 
 class UnusableFlight(ValueError):
-    """A recording cannot be judged; the text says why, in one line."""
+    """
+    A recording cannot be judged; the text says why, in one line.
+
+    Attributes:
+        problems: what is wrong with it, as far as it is known.
+
+    """
+
+    def __init__(self, text: str, problems: list[Damage] | tuple = ()):
+        """See the class."""
+        # Both go to the parent's process, too, which cannot take functions.
+        super().__init__(text, [replace(damage, repair=None) for damage in problems])
+
+    @property
+    def problems(self) -> list[Damage]:
+        """See the class."""
+        return self.args[1]
+
+    def __str__(self) -> str:
+        """Return the text alone."""
+        return self.args[0]
 
 
 @dataclass
@@ -57,9 +77,16 @@ class Flight:
     findings: list[str] = field(default_factory=list)
 
 
-def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters) -> Flight:
+def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
+                fix: bool = False) -> Flight:
     """
     Read and check one recording.
+
+    Args:
+        path: of the bag.
+        robot: as believed.
+        p: parameters.
+        fix: whether corrections that are certain are applied to what was read.
 
     Raises:
         UnusableFlight: naming the recording and what is wrong with it.
@@ -69,10 +96,11 @@ def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters) -> F
         recording = read_recording(path)
     except BagError as error:
         raise UnusableFlight(str(error)) from None
-    return prepare(recording, robot, p)
+    return prepare(recording, robot, p, fix)
 
 
-def prepare(recording: Recording, robot: RobotParameters, p: GapParameters) -> Flight:
+def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
+            fix: bool = False) -> Flight:
     """
     Check a recording and cut the flight out of it; see :func:`load_flight`.
 
@@ -85,8 +113,16 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters) -> F
     if missing:
         counts = ', '.join(f'{topic} ({len(recording.times[topic])} messages)'
                            for topic in missing)
-        raise UnusableFlight(f'{name}: missing or nearly empty: {counts}')
+        raise UnusableFlight(f'{name}: missing or nearly empty: {counts}', [
+            Damage(name, topic, f'{len(recording.times[topic])} messages') for topic in missing])
     findings = list(recording.warnings)
+    if fix:
+        recording, done, wrong = repaired(recording, robot)
+        findings += done
+    else:
+        wrong = damages(recording, robot)
+    if wrong:
+        raise UnusableFlight(wrong[0].text, wrong)
     series = {topic: _in_order(name, topic, recording, findings) for topic in recording.times}
     begin, end = _flown(name, recording, series, robot)
     begin, end = _without_gaps(name, series, begin, end, p, findings)
@@ -107,23 +143,14 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters) -> F
 
 
 def _in_order(name, topic, recording, findings):
-    """Stamps ascending, each once; a clock that jumped is refused."""
+    """Stamps ascending, each once."""
     t, values = recording.times[topic], recording.values[topic]
     fine = np.isfinite(t) & np.isfinite(values).all(axis=1)
     if not fine.all():
         findings.append(f'{name}: {topic}: {int((~fine).sum())} messages hold no numbers')
         t, values = t[fine], values[fine]
-    if len(t) < 2:
-        return t, values
-    steps = np.diff(t)
-    if steps.min() < -CLOCK_JUMP:
-        where = int(np.argmin(steps))
-        raise UnusableFlight(f'{name}: {topic}: the clock jumps back by {-steps.min():.2f} s at '
-                             f'stamp {t[where]:.3f} s')
     t, first = np.unique(t, return_index=True)
     lost = len(values) - len(first)
-    if lost > MOST_DUPLICATES * len(values) and topic in NEEDED:
-        raise UnusableFlight(f'{name}: {topic}: {lost} of {len(values)} stamps occur twice')
     if lost > 2:
         findings.append(f'{name}: {topic}: {lost} stamps occur twice')
     return t, values[first]

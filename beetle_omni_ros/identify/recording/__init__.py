@@ -1,0 +1,1 @@
+"""A recording checked against itself: clocks, values, units and conventions."""

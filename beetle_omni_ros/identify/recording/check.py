@@ -1,0 +1,68 @@
+"""All checks of one recording, and the repairs that they offer."""
+
+from __future__ import annotations
+
+from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
+from beetle_omni_ros.identify.recording.clocks import clock_damages
+from beetle_omni_ros.identify.recording.conventions import convention_damages
+from beetle_omni_ros.identify.recording.damage import Damage
+from beetle_omni_ros.identify.recording.lags import lag_damages
+from beetle_omni_ros.identify.recording.limits import RecordingLimits, shipped
+from beetle_omni_ros.identify.recording.readings import reading_damages
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+MOST_REPAIRS = 6        # one after the other, each of which can uncover the next
+
+
+def damages(recording: Recording, robot: RobotParameters,
+            limits: RecordingLimits | None = None) -> list[Damage]:
+    """
+    Check a recording against itself.
+
+    Args:
+        recording: with every topic of ``NEEDED``.
+        robot: as believed; used for its geometry and joint limits only.
+        limits: of a sound recording; default the package's.
+
+    Returns:
+        what is wrong, the most fundamental kind of fault alone: values that jump and a clock that
+        is off hide units and axes. Empty for a sound recording.
+
+    """
+    limits = limits or shipped()
+    if min(len(recording.times[topic]) for topic in NEEDED) < 2:
+        return []
+    found = clock_damages(recording, limits)
+    clocked = {damage.topic for damage in found}
+    found += [d for d in reading_damages(recording, limits) if d.topic not in clocked]
+    return found or lag_damages(recording, limits) \
+        or convention_damages(recording, robot, limits)
+
+
+def repaired(recording: Recording, robot: RobotParameters,
+             limits: RecordingLimits | None = None) -> tuple[Recording, list[str], list[Damage]]:
+    """
+    Apply every correction that is certain, until none is offered any more.
+
+    Args:
+        recording: as of :func:`damages`.
+        robot: as of :func:`damages`.
+        limits: as of :func:`damages`.
+
+    Returns:
+        the corrected recording, what was corrected in words, and the damages that remain.
+
+    """
+    done: list[str] = []
+    for _ in range(MOST_REPAIRS):
+        found = damages(recording, robot, limits)
+        certain = [damage for damage in found if damage.repair]
+        if not certain:
+            break
+        for damage in certain:
+            recording = damage.repair(recording)
+            done.append(f'{damage.text}; corrected: {damage.fix}')
+            break
+    else:
+        found = damages(recording, robot, limits)
+    return recording, done, found

@@ -1,0 +1,479 @@
+"""
+Units, axes, signs and orders, from motion that two sensors measure.
+
+Gyroscope and MoCap measure the same rate of turn. The accelerometer measures MoCap's second
+derivative less gravity. Encoders follow tilt commands, and thrust commands push the body. For
+each pair, the conventions that people mix up are hypotheses, weighted by their likelihood with
+Gaussian errors of unknown size and by a prior against every deviation from the convention.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+
+from beetle_omni_ros.identify.gap.bags import Recording
+from beetle_omni_ros.identify.recording.clocks import begin_of
+from beetle_omni_ros.identify.recording.damage import CERTAIN, changed, Damage, MOST_CERTAIN
+from beetle_omni_ros.identify.recording.limits import RecordingLimits
+from beetle_omni_ros.identify.recording.motion import MEANINGS, Motion, motion_of
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+PRIOR = 6.0             # logarithm of the odds against each deviation from the convention
+RATE_UNITS = {1.0: '', 180 / np.pi: 'degrees per second', np.pi / 180: 'turned into radians twice'}
+FORCE_UNITS = {1.0: '', 1 / 9.80665: 'in units of g', 1e3 / 9.80665: 'in milli-g',
+               100.0: 'cm/s^2', 1e3: 'mm/s^2'}
+LENGTH_UNITS = {1.0: '', 1e3: 'millimetres', 100.0: 'centimetres', 1e-3: 'kilometres',
+                1 / 0.3048: 'feet', 1 / 0.0254: 'inches'}
+ANGLE_UNITS = {1.0: '', 180 / np.pi: 'degrees', 4096 / (2 * np.pi): 'encoder counts',
+               np.pi / 180: 'turned into radians twice', 1 / (2 * np.pi): 'turns'}
+THRUST_UNITS = {1e3: 'millinewtons', 1e3 / 9.80665: 'grams', 1 / 9.80665: 'kilograms',
+                5.0: 'per cent of the largest thrust', 0.05: 'parts of the largest thrust'}
+AXES = 'xyz'
+ALL_AXES = [np.array([[sign * (place == column) for column in range(3)]
+                      for sign, place in zip(signs, order, strict=True)], dtype=float)
+            for order in permutations(range(3)) for signs in product((1, -1), repeat=3)]
+UPS = [np.eye(3)[k] * sign for k in (2, 1, 0) for sign in (1, -1)]      # (0, 0, 1) first
+FLOOR = 1e-4            # part of a variance that no agreement of two sensors is below
+ONE = np.eye(3)
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """
+    One way in which IMU and MoCap may be meant.
+
+    Attributes:
+        quaternion: key of MEANINGS.
+        rate_axes: (3, 3) signed permutation from MoCap's rate to the gyroscope's.
+        rate_unit: key of RATE_UNITS, or another factor.
+        force_axes: (3, 3) likewise of the accelerometer.
+        force_unit: key of FORCE_UNITS.
+        up: (3,) MoCap's axis that points up.
+        length_unit: key of LENGTH_UNITS.
+        position_axes: (3, 3) signed permutation of MoCap's positions alone.
+
+    """
+
+    quaternion: str = ''
+    rate_axes: np.ndarray = None
+    rate_unit: float = 1.0
+    force_axes: np.ndarray = None
+    force_unit: float = 1.0
+    up: np.ndarray = None
+    length_unit: float = 1.0
+    position_axes: np.ndarray = None
+
+    def rate(self, m: Motion) -> np.ndarray:
+        """(N, 3) what the gyroscope should say."""
+        return self.rate_unit * m.seen_rate[self.quaternion] @ self.rate_axes.T
+
+    def force(self, m: Motion, gravity: float) -> np.ndarray:
+        """(N, 3) what the accelerometer should say."""
+        push = _pushed(m, self.quaternion, self.position_axes) / self.length_unit
+        up = np.einsum('i,nij->nj', self.up, m.seen_up[self.quaternion])
+        return self.force_unit * (push + gravity * up) @ self.force_axes.T
+
+
+USUAL = Meaning('', ONE, 1.0, ONE, 1.0, UPS[0], 1.0, ONE)
+
+
+def _pushed(m, meaning, axes):
+    """MoCap's acceleration (N, 3) in the body's axes, positions' axes exchanged first."""
+    if axes is ONE:
+        return m.seen_push[meaning].sum(axis=1)
+    # Row i of seen_push is acceleration i along world axis i: divide the axis out and exchange.
+    made = np.zeros_like(m.seen_push[meaning][:, 0])
+    for i in range(3):
+        j = int(np.argmax(np.abs(axes[i])))
+        made += axes[i, j] * _along(m, meaning, j, i)
+    return made
+
+
+def _along(m, meaning, source, target):
+    """MoCap's acceleration along world axis ``source``, laid along ``target``, in body axes."""
+    up = m.seen_up[meaning]
+    size = np.einsum('nj,nj->n', m.seen_push[meaning][:, source], up[:, source])
+    return size[:, None] * up[:, target]
+
+
+def convention_damages(recording: Recording, robot: RobotParameters,
+                       limits: RecordingLimits) -> list[Damage]:
+    """Everything that sensors show against each other."""
+    m = motion_of(recording, robot, limits)
+    if m is None:
+        return []
+    with np.errstate(all='ignore'):
+        found = _body(recording, m, robot, limits)
+        if not found:
+            found = _joints(recording, m, robot, limits)
+        if not found:
+            found = _thrusts(recording, m, robot, limits)
+    return found
+
+
+# ---- IMU against MoCap
+
+def _body(recording, m, robot, limits):
+    usual_rate, usual_force = _errors(m, USUAL, robot)
+    lively = np.sqrt((m.rate**2).sum(axis=1).mean()) > limits.least_motion[0]
+    fine = 1 - limits.least_agreement
+    far = limits.unit_factor**2
+    rate_size, seen_size = (np.sqrt((x**2).sum(axis=1).mean())
+                            for x in (m.rate, m.seen_rate['']))
+    lively |= bool(seen_size > limits.least_motion[0])
+    rate_bad = lively and (usual_rate.sum() > fine * (m.rate**2).sum()
+                           or not 1 / far < (rate_size / seen_size)**2 < far)
+    force_bad = usual_force.sum() > 0.25 * fine * (m.force**2).sum()
+    parts = _parts(len(m.t), limits.blocks)
+    parted = lively and any(
+        usual_rate[k].sum() > 2 * fine * (m.rate[k]**2).sum()
+        and (m.rate[k]**2).sum() > limits.least_motion[0]**2 * len(usual_rate[k])
+        or usual_force[k].sum() > fine * (m.force[k]**2).sum() for k in parts)
+    if not (rate_bad or force_bad or parted):
+        return _position_axes(recording, m, robot, limits)
+    whole, sure = _likeliest(m, robot, slice(None), lively)
+    if _explains(m, whole, robot, lively, limits):
+        return _said(recording, m, whole, sure, None, robot, limits)
+    return _position_axes(recording, m, robot, limits) or _on_the_way(
+        recording, m, robot, limits, parts, lively, usual_rate, usual_force)
+
+
+def _errors(m, meaning, robot):
+    """Squared errors (N,) of rates and of forces."""
+    return (((m.rate - meaning.rate(m))**2).sum(axis=1),
+            ((m.force - meaning.force(m, robot.gravity))**2).sum(axis=1))
+
+
+def _parts(count, blocks):
+    edges = np.linspace(0, count, blocks + 1).astype(int)
+    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def _explains(m, meaning, robot, lively, limits, part=slice(None)):
+    rate, force = _errors(m, meaning, robot)
+    good = force[part].sum() < 0.25 * (1 - limits.least_agreement) * (m.force[part]**2).sum()
+    return good and (not lively or rate[part].sum() < (1 - limits.least_agreement)
+                     * (m.rate[part]**2).sum())
+
+
+def _likeliest(m, robot, part, lively):
+    """The likeliest meaning of a part of the flight, and its probability."""
+    count = 0.5 * len(m.t[part])    # independent samples of an axis, at twice the edge
+    tried = []
+    for quaternion in MEANINGS:
+        seen = m.seen_rate[quaternion][part]
+        rates = _matched(m.rate[part], seen, RATE_UNITS, count) if lively else [(0.0, ONE, 1.0)]
+        forces = []
+        for up in UPS:
+            lifted = np.einsum('i,nij->nj', up, m.seen_up[quaternion][part])
+            push = m.seen_push[quaternion][part].sum(axis=1)
+            for length in LENGTH_UNITS:
+                expected = push / length + robot.gravity * lifted
+                price = PRIOR * ((length != 1.0) + (up is not UPS[0]))
+                forces += [(score - price, axes, unit, up, length) for score, axes, unit
+                           in _matched(m.force[part], expected, FORCE_UNITS, count)]
+        forces.sort(key=lambda f: -f[0])
+        for score, axes, unit in rates:
+            for other, force_axes, force_unit, up, length in forces[:40]:
+                price = PRIOR * (bool(quaternion) + (quaternion.startswith('inverse (')))
+                tried.append((score + other - price - _price(axes, force_axes), Meaning(
+                    quaternion, axes, unit, force_axes, force_unit, up, length, ONE)))
+    tried.sort(key=lambda pair: -pair[0])
+    scores = np.array([score for score, _ in tried])
+    weight = np.exp(scores - scores[0])
+    return tried[0][1], float(min(weight[0] / weight.sum(), MOST_CERTAIN))
+
+
+def _matched(measured, seen, units, count):
+    """(log likelihood, axes, unit) of every signed permutation and unit, the ten best."""
+    cross, size, total = measured.T @ seen, (seen**2).sum(), (measured**2).sum()
+    made = []
+    for unit in units:
+        for axes in ALL_AXES:
+            left = total - 2 * unit * (axes * cross).sum() + unit**2 * size
+            part = max(left / max(total, 1e-12), FLOOR)
+            made.append((-1.5 * count * np.log(part) - PRIOR * (unit != 1.0), axes, unit))
+    made.sort(key=lambda one: -one[0])
+    return [(score, ONE if (axes == ONE).all() else axes, unit) for score, axes, unit in made[:10]]
+
+
+def _price(rate_axes, force_axes):
+    """Of one frame that is turned or mirrored, or of two mistakes."""
+    if rate_axes is ONE and force_axes is ONE:
+        return 0.0
+    same = np.allclose(rate_axes, np.linalg.det(force_axes) * force_axes)
+    return PRIOR * (1 if same or rate_axes is ONE or force_axes is ONE else 2)
+
+
+def _on_the_way(recording, m, robot, limits, parts, lively, usual_rate, usual_force):
+    """A meaning that changes in flight, or none at all."""
+    best = None
+    for part in parts:
+        meaning, sure = _likeliest(m, robot, part, lively)
+        if _same(meaning, USUAL) or not _explains(m, meaning, robot, lively, limits, part):
+            continue
+        rate, force = _errors(m, meaning, robot)
+        gain = sum((usual - new) / max(size, 1e-9) for usual, new, size in (
+            (usual_rate, rate, (m.rate**2).sum()), (usual_force, force, (m.force**2).sum())))
+        after = np.cumsum(gain[::-1])[::-1]     # of the meaning from each sample on
+        k = int(np.argmax(after))
+        if best is None or after[k] > best[0]:
+            best = float(after[k]), k, meaning, sure
+    if best:
+        _, k, meaning, sure = best
+        later = slice(k, len(m.t))
+        if _explains(m, meaning, robot, lively, limits, later):
+            return _said(recording, m, meaning, sure, m.t[k], robot, limits, repair=False)
+    rate_part = usual_rate.sum() / max((m.rate**2).sum(), 1e-12)
+    force_part = usual_force.sum() / max((m.force**2).sum(), 1e-12)
+    return [Damage(recording.name, 'mocap/pose', 'contradicts imu/data_raw under every convention '
+                   f"that was tried: {min(rate_part, 9.99):.0%} of the gyroscope's and "
+                   f"{min(force_part, 9.99):.0%} of the accelerometer's signal remain "
+                   'unexplained by the pose', None, 0.9)]
+
+
+def _same(a, b):
+    return a.quaternion == b.quaternion and a.rate_unit == b.rate_unit \
+        and a.force_unit == b.force_unit and a.length_unit == b.length_unit \
+        and all(np.array_equal(x, y) for x, y in (
+            (a.rate_axes, b.rate_axes), (a.force_axes, b.force_axes), (a.up, b.up)))
+
+
+def _said(recording, m, meaning, sure, at, robot, limits, repair=True):
+    """The deviations of a meaning from the usual one, in words."""
+    made = []
+    moment = None if at is None else float(at) - begin_of(recording)
+
+    def say(topic, cause, fix=None, change=None):
+        can = fix and repair and sure >= CERTAIN and at is None
+        made.append(Damage(recording.name, topic, cause, moment, sure, fix if can else None,
+                           change if can else None))
+
+    if meaning.quaternion:
+        order, sign = MEANINGS[meaning.quaternion]
+        say('mocap/pose', 'the quaternion is stored as ' + (
+            meaning.quaternion if meaning.quaternion.startswith('(')
+            else f'the {meaning.quaternion}, world seen from the body') +
+            '; expected (x, y, z, w), the body seen from the world',
+            'reorder the quaternion', _with(3, 7, lambda v: v[:, order] * [sign] * 1.0
+                                            if sign > 0 else v[:, order] * [-1, -1, -1, 1]))
+    if meaning.length_unit != 1.0:
+        unit = meaning.length_unit
+        say('mocap/pose', f'positions accelerate {unit:.4g} times as much as the IMU measures: '
+            f'{LENGTH_UNITS[unit]}?', 'scale the positions', _with(0, 3, lambda v: v / unit))
+    if meaning.up is not UPS[0]:
+        k = int(np.argmax(np.abs(meaning.up)))
+        axis = f'{"-" if meaning.up[k] < 0 else ""}{AXES[k]}'
+        say('mocap/pose', f'the {axis} axis points up, against gravity as the accelerometer '
+            'measures it; expected z up')
+    if meaning.rate_unit != 1.0:
+        unit = meaning.rate_unit
+        say('imu/data_raw', f"angular velocity is {unit:.3g} times the MoCap's: "
+            f'{RATE_UNITS[unit]}?', 'scale the angular velocity',
+            _with(3, 6, lambda v: v / unit, 'imu/data_raw'))
+    if meaning.force_unit != 1.0:
+        unit = meaning.force_unit
+        say('imu/data_raw', f'linear acceleration is {unit:.3g} times what MoCap and gravity '
+            f'make: {FORCE_UNITS[unit]}?', 'scale the linear acceleration',
+            _with(0, 3, lambda v: v / unit, 'imu/data_raw'))
+    _say_axes(say, m, meaning, slice(None) if at is None else m.t >= at)
+    return made or [Damage(recording.name, 'imu/data_raw', 'angular velocity and linear '
+                           'acceleration contradict mocap/pose', moment, sure)]
+
+
+def _with(first, last, change, topic='mocap/pose'):
+    """A repair of some columns."""
+    def repair(recording):
+        values = recording.values[topic].copy()
+        values[:, first:last] = change(values[:, first:last])
+        return changed(recording, topic, values=values)
+    return repair
+
+
+def _say_axes(say, m, meaning, part):
+    """Frames that are turned or mirrored, and signs."""
+    rate, force = meaning.rate_axes, meaning.force_axes
+    if rate is ONE and force is ONE:
+        return
+    # An accelerometer of the wrong sign looks like a frame with all axes reversed.
+    if np.allclose(rate, np.linalg.det(force) * force) and not np.array_equal(force, -ONE):
+        turned = np.linalg.det(force) > 0
+        topic = 'mocap/pose' if _thrust_agrees(m, meaning, part) else 'imu/data_raw'
+        how = f'axes are turned: {_axes_text(force)}' if turned else \
+            f'the frame is left-handed: {_axes_text(force)}'
+        whose = "the IMU's axes in those of the MoCap's body"
+        fix = topic == 'imu/data_raw'
+        say(topic, f'{how} ({whose})', 'turn the axes back' if fix else None, _with(
+            0, 6, lambda v: np.concatenate([v[:, :3] @ force, v[:, 3:] @ rate], axis=1),
+            'imu/data_raw'))
+        return
+    for what, axes, columns in (('angular velocity', rate, (3, 6)),
+                                ('linear acceleration', force, (0, 3))):
+        if axes is ONE:
+            continue
+        if np.array_equal(axes, -ONE):
+            how = 'has the opposite sign' + (
+                ': gravity is meant to be measured upwards at rest, +9.81 m/s^2 (REP-145)'
+                if columns[0] == 0 else '')
+        elif np.linalg.det(axes) < 0:
+            how = 'has axes that are left-handed, swapped or of the wrong sign: ' \
+                + _axes_text(axes)
+        else:
+            how = f'has axes that are turned: {_axes_text(axes)}'
+        say('imu/data_raw', f'{what} {how}', 'exchange the axes', _with(
+            *columns, lambda v, axes=axes: v @ axes, 'imu/data_raw'))
+
+
+def _axes_text(axes):
+    """Such as 'x is y, y is -x, z is z'."""
+    parts = []
+    for k in range(3):
+        j = int(np.argmax(np.abs(axes[k])))
+        parts.append(f'{AXES[k]} is {"-" if axes[k, j] < 0 else ""}{AXES[j]}')
+    return ', '.join(parts)
+
+
+def _thrust_agrees(m, meaning, part):
+    """Whether the accelerometer's axes are those that commanded thrusts push along."""
+    force, pushed = m.force[part] / meaning.force_unit, m.thrust_force[part]
+    usual = (force * pushed).sum()
+    turned = (force * (pushed @ meaning.force_axes.T)).sum()
+    return usual > turned
+
+
+def _position_axes(recording, m, robot, limits):
+    """Axes of positions alone that are exchanged or mirrored."""
+    up = robot.gravity * m.seen_up[''][:, 2]
+    push = m.force - up
+    seen = _pushed(m, '', ONE)
+    size = (seen**2).sum(axis=1).mean()
+    if np.sqrt(size) < limits.least_motion[1]:
+        return []
+    usual = ((push - seen)**2).sum()
+    if usual < (1 - limits.least_agreement) * (push**2).sum():
+        return []
+    count, tried = 0.5 * len(m.t), []
+    for axes in ALL_AXES:
+        left = ((push - _pushed(m, '', ONE if (axes == ONE).all() else axes))**2).sum()
+        tried.append((-1.5 * count * np.log(max(left / max((push**2).sum(), 1e-12), FLOOR))
+                      - PRIOR * (not (axes == ONE).all()), axes, left))
+    tried.sort(key=lambda one: -one[0])
+    score, axes, left = tried[0]
+    if (axes == ONE).all() or left > (1 - limits.least_agreement) * (push**2).sum():
+        return []
+    weight = np.exp(np.array([other for other, _, _ in tried]) - score)
+    sure = float(min(1 / weight.sum(), MOST_CERTAIN))
+    kind = 'left-handed' if np.linalg.det(axes) < 0 else 'exchanged'
+    return [Damage(recording.name, 'mocap/pose', f'the axes of positions are {kind} against those '
+                   f'of the orientation and of the accelerometer: {_axes_text(axes)}', None, sure,
+                   'exchange the axes of positions' if sure >= CERTAIN else None,
+                   _with(0, 3, lambda v: v @ axes.T) if sure >= CERTAIN else None)]
+
+
+# ---- encoders against tilt commands
+
+def _joints(recording, m, robot, limits):
+    asked, read = (x - x.mean(axis=0) for x in (m.tilt_command, m.tilt))
+    count, limit = 0.5 * len(m.t), robot.joints.position_limit
+    moving = np.sqrt((np.gradient(asked, m.t, axis=0)**2).mean(axis=0)) > limits.least_motion[2]
+    moving |= np.ptp(read, axis=0) > 2 * limit
+    units, swaps, signs, unlike = [], [], [], []
+    for i in np.flatnonzero(moving):
+        total = (read[:, i]**2).sum()
+        usual = ((read[:, i] - asked[:, i])**2).sum()
+        if usual < (1 - limits.least_agreement) * max(total, (asked[:, i]**2).sum()):
+            continue
+        tried = []
+        for j, (unit, sign) in product(range(4), product(
+                {*ANGLE_UNITS, *(1 / u for u in ANGLE_UNITS)}, (1, -1))):
+            left = ((read[:, i] - sign * unit * asked[:, j])**2).sum() / max(total, 1e-12)
+            price = PRIOR * ((j != i) + (unit != 1.0) + (sign < 0))
+            tried.append((-0.5 * count * np.log(max(left, FLOOR)) - price, j, unit, sign, left))
+        tried.sort(key=lambda one: -one[0])
+        weight = np.exp(np.array([one[0] for one in tried]) - tried[0][0])
+        sure = float(min(1 / weight.sum(), MOST_CERTAIN))
+        _, j, unit, sign, left = tried[0]
+        if left > 1 - limits.least_agreement:
+            unlike.append((i, sure))
+        elif unit != 1.0:
+            units.append((i, unit, sure))
+        elif j != i:
+            swaps.append((i, j, sure))
+        elif sign < 0:
+            signs.append((i, sure))
+    return _joints_said(recording, m, robot, units, swaps, signs, unlike)
+
+
+def _joints_said(recording, m, robot, units, swaps, signs, unlike):
+    def damage(topic, cause, sure, fix=None, repair=None):
+        can = fix and sure >= CERTAIN
+        return [Damage(recording.name, topic, cause, None, sure, fix if can else None,
+                       repair if can else None)]
+
+    if units:
+        i, unit, sure = units[0]
+        limit = 2 * robot.joints.position_limit
+        odd = 'command' if np.ptp(m.tilt_command[:, i]) > limit else 'joint_states'
+        topic = odd if unit != 1.0 else 'joint_states'
+        ratio = unit if topic == 'joint_states' else 1 / unit
+        words = ANGLE_UNITS.get(min(ANGLE_UNITS, key=lambda u: abs(np.log(u / ratio))), '')
+        what = 'encoders turn' if topic == 'joint_states' else 'tilt commands turn'
+        other = 'tilt commands' if topic == 'joint_states' else 'encoders'
+        return damage(topic, f'{what} {ratio:.4g} times as far as the {other}: {words}?', sure,
+                      'scale the angles', _with(0, 4, lambda v: v / ratio, topic))
+    if swaps:
+        sure = min(s for *_, s in swaps)
+        text = ', '.join(f'gimbal{i + 1} moves as gimbal{j + 1} is commanded'
+                         for i, j, _ in swaps)
+        order = np.arange(4)
+        for i, j, _ in swaps:
+            order[j] = i
+        whole = sorted(order) == [0, 1, 2, 3]
+        return damage('joint_states', f'joints are swapped: {text}', sure,
+                      'exchange the joints' if whole else None,
+                      _with(0, 4, lambda v: v[:, order], 'joint_states'))
+    if signs:
+        sure = min(s for _, s in signs)
+        names = ', '.join(f'gimbal{i + 1}' for i, _ in signs)
+        flip = np.ones(4)
+        flip[[i for i, _ in signs]] = -1
+        return damage('joint_states', f'{names} turns against its command: the sign of the '
+                      'encoder or of the command is reversed', sure, 'reverse the sign',
+                      _with(0, 4, lambda v: v * flip, 'joint_states'))
+    if unlike:
+        names = ', '.join(f'gimbal{i + 1}' for i, _ in unlike)
+        return damage('joint_states', f'{names} does not follow its command: encoder, servo, or '
+                      'the commands of another flight', 0.9)
+    return []
+
+
+# ---- thrust commands against the accelerometer
+
+def _thrusts(recording, m, robot, limits):
+    pushed, felt = (np.linalg.norm(x, axis=1) for x in (m.thrust_force, m.force))
+    scale = float((pushed * felt).sum() / max((felt**2).sum(), 1e-12))
+    unit = min(THRUST_UNITS, key=lambda u: abs(np.log(max(scale, 1e-9) / u)))
+    if not 1 / 3 < scale < 3 and 0.6 < scale / unit < 1.6:
+        return [Damage(recording.name, 'command', f'commanded thrusts are {scale:.3g} times what '
+                       f'the accelerometer feels: {THRUST_UNITS[unit]}?', None, 0.95)]
+    measured = np.concatenate([m.force, 0.1 * m.turning], axis=1)
+    wrench = m.rotor_wrench * np.array([1, 1, 1, 0.1, 0.1, 0.1])[:, None]
+    count, tried = 0.5 * len(m.t), []
+    for order in permutations(range(4)):
+        expected = np.einsum('nci,ni->nc', wrench, m.thrust[:, order])
+        left = ((measured - expected)**2).sum()
+        tried.append((left, order))
+    usual = tried[0][0]
+    tried.sort()
+    left, order = tried[0]
+    if order == (0, 1, 2, 3) or left > limits.permuted * usual \
+            or left > (1 - limits.least_agreement) * (measured**2).sum():
+        return []
+    sure = float(min(1 - np.exp(-count * np.log(usual / max(left, 1e-12))), MOST_CERTAIN))
+    text = ', '.join(f'rotor{i + 1} gives what rotor{j + 1} is commanded'
+                     for i, j in enumerate(order) if i != j)
+    return [Damage(recording.name, 'command', f'the order of the thrusts is another one: {text}',
+                   None, sure)]

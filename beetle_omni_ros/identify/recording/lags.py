@@ -1,0 +1,141 @@
+"""
+Clocks that stamps alone do not betray: one sensor's motion against another's, window by window.
+
+What is compared does not depend on axes, signs or units: the rate of turn and the tilts' speed,
+both as magnitudes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.identify.gap.bags import Recording
+from beetle_omni_ros.identify.gap.filters import low_pass
+from beetle_omni_ros.identify.gap.series import matrices
+from beetle_omni_ros.identify.recording.clocks import begin_of, change_point
+from beetle_omni_ros.identify.recording.damage import Damage
+from beetle_omni_ros.identify.recording.limits import RecordingLimits
+from beetle_omni_ros.identify.recording.motion import (
+    _body_rate,
+    _orientation,
+    common_grid,
+    GRID,
+    held,
+    series_of,
+)
+
+LEAST_WINDOWS = 2       # to each side of a step
+LEAST_NOISE = 0.005     # [s] that windows of any flight scatter by
+SHARP = 0.9             # of the best correlation that a second, distant shift may reach
+
+
+def lag_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
+    """Steps, drifts and offsets between MoCap and IMU, and between encoders and commands."""
+    grid = common_grid(recording)
+    if grid is None:
+        return []
+    kernel = low_pass(2 * limits.edge, 1, GRID)
+    stamps, values = series_of(recording, 'mocap/pose')
+    turned = _body_rate(matrices(_orientation(stamps, values[:, 3:], grid)))
+    rate = held(recording, 'imu/data_raw', grid)[:, 3:]
+    tilt, asked = (kernel(held(recording, topic, grid)[:, :4], 1)
+                   for topic in ('joint_states', 'command'))
+    t = grid[kernel.margin:len(grid) - kernel.margin]
+    pairs = (('mocap/pose', 'imu/data_raw', 'the pose', 'the gyroscope', limits.sensor_lag,
+              np.linalg.norm(kernel(turned), axis=1), np.linalg.norm(kernel(rate), axis=1)),
+             ('joint_states', 'command', 'encoders', 'commands', limits.servo_lag,
+              np.linalg.norm(tilt, axis=1), np.linalg.norm(asked, axis=1)))
+    made = []
+    for topic, other, what, whose, allowed, late, early in pairs:
+        at, lags = window_lags(t, late, early, limits)
+        damage = _judged(recording, topic, other, what, whose, allowed, at, lags, limits)
+        if damage:
+            made.append(damage)
+    return made
+
+
+def window_lags(t, late, early, limits: RecordingLimits) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Shifts by which one series follows another, in windows where both move alike.
+
+    Args:
+        t: (N,) [s].
+        late: (N,) magnitude that follows.
+        early: (N,) magnitude that leads.
+        limits: window, reach and least likeness.
+
+    Returns:
+        middles (W,) of the windows [s], and shifts (W,) [s].
+
+    """
+    length, reach = (round(x / GRID) for x in (limits.lag_window, limits.lag_reach))
+    at, lags = [], []
+    for first in range(0, len(t) - length + 1, length // 3):
+        own = late[first:first + length]
+        begin = max(0, first - reach)
+        wide = early[begin:first + length + reach]
+        shift = _shift(own, wide, first - begin, limits.lag_likeness)
+        if shift is not None:
+            at.append(t[first + length // 2])
+            lags.append(GRID * shift)
+    return np.array(at), np.array(lags)
+
+
+def _shift(own, wide, place, likeness):
+    """Samples by which ``own``, at a place of ``wide``, follows it; None where that is unclear."""
+    n = len(own)
+    own = own - own.mean()
+    size = np.sqrt((own**2).sum())
+    sums = np.concatenate([[0.0], np.cumsum(wide)])
+    squares = np.concatenate([[0.0], np.cumsum(wide**2)])
+    mean = (sums[n:] - sums[:-n]) / n
+    spread = np.sqrt(np.maximum((squares[n:] - squares[:-n]) - n * mean**2, 1e-12))
+    cross = np.correlate(wide, own, 'valid')
+    alike = cross / (spread * max(size, 1e-9))
+    k = int(np.argmax(alike))
+    if alike[k] < likeness or not 0 < k < len(alike) - 1:
+        return None
+    far = np.abs(np.arange(len(alike)) - k) > 60
+    if far.any() and alike[far].max() > SHARP * alike[k]:
+        return None
+    a, b, c = alike[k - 1:k + 2]
+    bend = a - 2 * b + c
+    part = 0.5 * (a - c) / bend if bend < 0 else 0.0
+    return place - (k + part)
+
+
+def _judged(recording, topic, other, what, whose, allowed, at, lags, limits):
+    """A step, or a lag outside its range."""
+    if len(lags) < LEAST_WINDOWS:
+        return None
+
+    def damage(cause, moment=None):
+        return Damage(recording.name, topic, cause,
+                      None if moment is None else float(moment) - begin_of(recording))
+
+    if len(lags) >= 2 * LEAST_WINDOWS + 1:
+        split, before, after, noise = change_point(lags)
+        step = after - before
+        large = max(limits.lag_step, limits.lag_noise * max(noise, LEAST_NOISE))
+        line = np.polyfit(at, lags, 1)
+        drift = abs(line[0]) * (at[-1] - at[0])
+        straight = ((lags - np.polyval(line, at))**2).sum()
+        levels = np.where(np.arange(len(lags)) < split, before, after)
+        stepped = ((lags - levels)**2).sum()
+        if drift > large and straight < 0.7 * stepped:
+            return damage(f'the clock drifts against {other}: {what} fall behind {whose} by '
+                          f'{drift:.2f} s in this recording'.replace('pose fall', 'pose falls'))
+        sides = min(split, len(lags) - split)
+        if abs(step) > large and sides >= LEAST_WINDOWS:
+            moment = 0.5 * (at[split - 1] + at[split])
+            return damage(f'the clock steps against {other}: {what} follow {whose} by '
+                          f'{before:.2f} s before and by {after:.2f} s after'.replace(
+                              'pose follow', 'pose follows'), moment)
+    middle = float(np.median(lags))
+    low, high = allowed
+    if not low <= middle <= high and len(lags) >= 3:
+        word = 'behind' if middle > 0 else 'ahead of'
+        return damage(f'{what} are {abs(middle):.2f} s {word} {whose}, expected {low:g} to '
+                      f'{high:g} s: the clock of {topic} or of {other} is off'.replace(
+                          'pose are', 'pose is'))
+    return None

@@ -1,0 +1,104 @@
+"""Limits within which a sound recording stays; the numbers stand in params/recording.yaml."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import parameter
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingLimits:
+    """See params/recording.yaml, which gives the source of each number."""
+
+    shortest_period: float = parameter(
+        low=0, unit='s', doc='Least time between messages of a sensor.')
+    longest_period: float = parameter(
+        low=0, unit='s', doc='Longest usual time between messages of a sensor.')
+    repeated_stamps: float = parameter(
+        low=0, unit='1', doc='Largest part of a topic whose stamps occur twice.')
+    disordered: float = parameter(
+        low=0, unit='1', doc='Largest part of a topic that is out of order.')
+    clock_offset: float = parameter(
+        low=0, unit='s', doc='Largest difference of ages between topics.')
+    clock_step: float = parameter(
+        low=0, unit='s', doc='Largest change of an age within a recording.')
+    clock_noise: float = parameter(
+        low=0, unit='1', doc='Standard deviations by which such a change must stand out.')
+    clock_bin: float = parameter(low=0, unit='s', doc='Time over which ages are compared.')
+    lag_window: float = parameter(low=0, unit='s', doc='Time over which two motions are compared.')
+    lag_reach: float = parameter(low=0, unit='s', doc='Largest shift that is tried.')
+    lag_likeness: float = parameter(
+        low=0, unit='1', doc='Least correlation of a shift that counts.')
+    sensor_lag: np.ndarray = parameter(shape=(2,), unit='s',
+        doc='Range of the lag of MoCap behind the IMU.')
+    servo_lag: np.ndarray = parameter(shape=(2,), unit='s',
+        doc='Range of the lag of encoders behind commands.')
+    lag_step: float = parameter(low=0, unit='s', doc='Largest change of a lag within a recording.')
+    lag_noise: float = parameter(
+        low=0, unit='1', doc='Standard deviations by which such a change must stand out.')
+    full_scale: np.ndarray = parameter(shape=(2,), unit='',
+        doc='Largest specific force [m/s^2] and rate [rad/s].')
+    contact: float = parameter(low=0, unit='m', doc='Height below which spikes may be impacts.')
+    room: float = parameter(low=0, unit='m', doc='Largest position.')
+    frozen: float = parameter(low=0, unit='s', doc='Longest time of equal readings.')
+    frozen_axis: float = parameter(
+        low=0, unit='s', doc='Longest time of equal readings of one axis.')
+    frozen_joint: float = parameter(
+        low=0, unit='s', doc='Longest time of an encoder at rest while its command moves.')
+    frozen_command: float = parameter(
+        low=0, unit='rad', doc='Motion of the command that an encoder must follow.')
+    stale: float = parameter(
+        low=0, unit='1', doc='Largest part of readings that repeat the one before.')
+    clipped: float = parameter(
+        low=0, unit='1', doc='Largest part of readings at the largest value of an axis.')
+    outlier_window: int = parameter(low=0, unit='1', doc='Readings of the running median.')
+    outlier_noise: float = parameter(
+        low=0, unit='1', doc='Standard deviations from the running median of an outlier.')
+    outlier_position: float = parameter(low=0, unit='m', doc='Least distance of an outlier.')
+    outlier_angle: float = parameter(low=0, unit='rad', doc='Least angle of an outlier.')
+    outlier_force: float = parameter(
+        low=0, unit='m/s^2', doc='Least specific force of an outlier.')
+    outlier_rate: float = parameter(low=0, unit='rad/s', doc='Least rate of an outlier.')
+    outlier_joint: float = parameter(
+        low=0, unit='rad', doc='Least angle of an outlier of an encoder.')
+    alternating: float = parameter(low=0, unit='1', doc='Part of outliers that means two sources.')
+    jump_angle: float = parameter(
+        low=0, unit='rad', doc='Turn between two MoCap readings that the gyroscope must show.')
+    jump_position: float = parameter(
+        low=0, unit='m', doc='Largest distance between two MoCap readings.')
+    unit_length: float = parameter(
+        low=0, unit='1', doc='Largest deviation of a quaternion norm from 1.')
+    edge: float = parameter(
+        low=0, unit='Hz', doc='Low-pass edge of what two sensors are compared by.')
+    least_motion: np.ndarray = parameter(shape=(3,), unit='',
+        doc='RMS of rate, acceleration and tilt rate that shows a convention.')
+    least_agreement: float = parameter(
+        low=0, unit='1', doc='Least part of the variance of one sensor that another explains.')
+    unit_factor: float = parameter(low=0, unit='1', doc='Least factor of a wrong unit.')
+    blocks: int = parameter(low=0, unit='1', doc='Parts of a flight that are judged alone.')
+    permuted: float = parameter(
+        low=0, unit='1', doc='Part of the squared error that another order of thrusts may leave.')
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> RecordingLimits:
+        """
+        Read a file of limits; default the shipped one.
+
+        Raises:
+            ParameterError: naming file and key.
+
+        """
+        return schema.load(cls, path or share_path('params/recording.yaml'))
+
+
+@cache
+def shipped() -> RecordingLimits:
+    """Return the limits of the package."""
+    return RecordingLimits.load()

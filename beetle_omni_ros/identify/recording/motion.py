@@ -1,0 +1,154 @@
+"""The same motion as each sensor tells it, on one grid and below one frequency."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
+from beetle_omni_ros.identify.gap.filters import low_pass
+from beetle_omni_ros.identify.gap.series import matrices
+from beetle_omni_ros.identify.recording.limits import RecordingLimits
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+GRID = 0.01             # [s]
+EVERY = 10              # grid points to each that is kept
+WIDE = 6.0              # [Hz] of a derivative before it is turned into another frame
+LEAST_TIME = 6.0        # [s] that all topics have in common
+# How the four numbers of an orientation may be meant, and which of the stored numbers are then
+# x, y, z and w.
+MEANINGS = {'': ((0, 1, 2, 3), 1.0), '(w, x, y, z)': ((1, 2, 3, 0), 1.0),
+            'inverse': ((0, 1, 2, 3), -1.0), 'inverse (w, x, y, z)': ((1, 2, 3, 0), -1.0)}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """
+    Smoothed series of one recording.
+
+    Attributes:
+        t: (N,) stamps [s].
+        rate: (N, 3) of the gyroscope [rad/s].
+        force: (N, 3) of the accelerometer [m/s^2].
+        seen_rate: meaning of the quaternion -> (N, 3) rate in the body's axes by MoCap [rad/s].
+        seen_up: meaning -> (N, 3, 3) world's axes x, y, z in the body's axes, one a row.
+        seen_push: meaning -> (N, 3, 3) acceleration along each world axis, as vectors in the
+            body's axes, one a row [m/s^2].
+        tilt: (N, 4) encoders [rad].
+        tilt_command: (N, 4) [rad].
+        thrust_force: (N, 3) specific force by commanded thrusts at the measured tilts [m/s^2].
+        rotor_wrench: (N, 6, 4) what 1 N of each rotor gives: specific force, torque over inertia.
+        thrust: (N, 4) commanded, behind the rotors' lag [N].
+        turning: (N, 3) derivative of the gyroscope's rate [rad/s^2].
+
+    """
+
+    t: np.ndarray
+    rate: np.ndarray
+    force: np.ndarray
+    seen_rate: dict[str, np.ndarray]
+    seen_up: dict[str, np.ndarray]
+    seen_push: dict[str, np.ndarray]
+    tilt: np.ndarray
+    tilt_command: np.ndarray
+    thrust_force: np.ndarray
+    rotor_wrench: np.ndarray
+    thrust: np.ndarray
+    turning: np.ndarray
+
+
+def series_of(recording: Recording, topic: str) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (N,) ascending, each once, and finite values (N, width)."""
+    t, values = recording.times[topic], recording.values[topic]
+    fine = np.isfinite(t) & np.isfinite(values).all(axis=1)
+    t, first = np.unique(t[fine], return_index=True)
+    return t, values[fine][first]
+
+
+def common_grid(recording: Recording) -> np.ndarray | None:
+    """(N,) stamps that all topics have in common [s]; None where these are too few."""
+    spans = [series_of(recording, topic)[0] for topic in NEEDED]
+    if min(len(t) for t in spans) < 2:
+        return None
+    begin, end = max(t[0] for t in spans), min(t[-1] for t in spans)
+    if not LEAST_TIME < end - begin < 1e5:
+        return None
+    return begin + GRID * np.arange(int((end - begin) / GRID))
+
+
+def held(recording: Recording, topic: str, t: np.ndarray) -> np.ndarray:
+    """(N, width) values on a grid, straight between messages."""
+    stamps, values = series_of(recording, topic)
+    return np.stack([np.interp(t, stamps, column) for column in values.T], axis=1)
+
+
+def motion_of(recording: Recording, robot: RobotParameters,
+              limits: RecordingLimits) -> Motion | None:
+    """Smooth all topics alike; None where they have too little time in common."""
+    grid = common_grid(recording)
+    if grid is None:
+        return None
+    kernel, wide = low_pass(limits.edge, EVERY, GRID), low_pass(WIDE, 1, GRID)
+    inner = slice(wide.margin, len(grid) - wide.margin)
+    t = grid[inner]
+    if len(t) < 4 * kernel.margin:
+        return None
+    imu, pose = held(recording, 'imu/data_raw', grid), held(recording, 'mocap/pose', grid)
+    position = wide(pose[:, :3], 2)
+    position = position[:len(t)]
+    rates, ups, pushes = {}, {}, {}
+    stamps, values = series_of(recording, 'mocap/pose')
+    for meaning, (order, sign) in MEANINGS.items():
+        q = _orientation(stamps, values[:, 3:][:, order] * [sign, sign, sign, 1.0], grid)
+        rotation = matrices(q)
+        rates[meaning] = kernel(_body_rate(rotation)[inner])
+        turned = rotation[inner]
+        ups[meaning] = kernel(turned)
+        pushes[meaning] = kernel(turned * position[:, :, None])
+    command = held(recording, 'command', grid)[inner]
+    tilt = held(recording, 'joint_states', grid)[inner]
+    wrench, thrust = _wrench(robot, tilt), _lagged(robot, command[:, 4:])
+    rate = wide(imu[:, 3:], 1)[:len(t)]
+    return Motion(t[kernel.centres(len(t))], kernel(imu[inner, 3:]), kernel(imu[inner, :3]),
+                  rates, ups, pushes, kernel(tilt), kernel(command[:, :4]),
+                  kernel(np.einsum('nci,ni->nc', wrench[:, :3], thrust)), kernel(wrench),
+                  kernel(thrust), kernel(rate))
+
+
+def _orientation(stamps, quaternion, grid):
+    """Unit quaternions (N, 4) xyzw on a grid."""
+    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    unit = quaternion / np.where(norm > 1e-9, norm, 1.0)
+    sign = np.sign((unit[1:] * unit[:-1]).sum(axis=1))
+    sign[sign == 0] = 1
+    unit = unit * np.concatenate([[1.0], np.cumprod(sign)])[:, None]
+    q = np.stack([np.interp(grid, stamps, column) for column in unit.T], axis=1)
+    return q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-9)
+
+
+def _body_rate(rotation):
+    """(N, 3) rate of turn in the body's axes [rad/s] of rotations (N, 3, 3)."""
+    change = np.gradient(rotation, GRID, axis=0)
+    skew = np.einsum('nji,njk->nik', rotation, change)
+    return np.stack([skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0],
+                     skew[:, 1, 0] - skew[:, 0, 1]], axis=1) / 2
+
+
+def _wrench(robot, tilt):
+    """(N, 6, 4) specific force and torque over inertia, of 1 N of each rotor at tilts (N, 4)."""
+    made = np.empty((len(tilt), 6, 4))
+    for i, axis in enumerate(robot.tilt_axes):
+        level = np.cross(axis, [0.0, 0.0, 1.0])
+        normal = np.cos(tilt[:, i:i + 1]) * [0.0, 0.0, 1.0] + np.sin(tilt[:, i:i + 1]) * level
+        torque = np.cross(robot.rotors.positions[i], normal) \
+            - robot.rotors.spin[i] * robot.rotors.torque_to_thrust_ratio * normal
+        made[:, :3, i], made[:, 3:, i] = normal / robot.mass, torque / robot.inertia
+    return made
+
+
+def _lagged(robot, thrust):
+    """(N, 4) thrusts behind the rotors' first-order lag [N]."""
+    keep = np.exp(-GRID / robot.rotors.time_constant)
+    return lfilter([1 - keep], [1, -keep], thrust, axis=0, zi=keep * thrust[:1])[0]

@@ -1,0 +1,259 @@
+"""Values that no working sensor gives: frozen, repeated, clipped, spikes, no unit quaternions."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from beetle_omni_ros.identify.gap.bags import Recording
+from beetle_omni_ros.identify.recording.clocks import begin_of, NORMAL
+from beetle_omni_ros.identify.recording.damage import changed, Damage
+from beetle_omni_ros.identify.recording.limits import RecordingLimits
+
+AXES = {'imu/data_raw': [f'linear_acceleration.{a}' for a in 'xyz']
+        + [f'angular_velocity.{a}' for a in 'xyz'],
+        'mocap/pose': [f'position.{a}' for a in 'xyz'] + [f'orientation.{a}' for a in 'xyzw'],
+        'joint_states': [f'position of gimbal{k}' for k in range(1, 5)]}
+LEAST_CLIPPED = 10      # readings
+MOST_REPAIRED = 0.02    # of a topic's readings: more outliers are no few bad readings
+
+
+def reading_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
+    """Everything that single topics' values show to be wrong, at most one fault a topic."""
+    found = {}
+    for topic, checks in (('imu/data_raw', (_beyond, _clipped, _outliers, _stale, _frozen)),
+                          ('mocap/pose', (_beyond, _norms, _alternating, _outliers, _stale,
+                                          _frozen, _jumps)),
+                          ('joint_states', (_beyond, _outliers, _stuck)),
+                          ('command', (_beyond,))):
+        for check in checks:
+            damage = check(_Series(recording, topic), limits)
+            if damage:
+                found[topic] = damage
+                break
+    return list(found.values())
+
+
+class _Series:
+    """One topic in the order of its stamps, without readings that are no numbers."""
+
+    def __init__(self, recording, topic):
+        self.recording, self.topic = recording, topic
+        t, values = recording.times[topic], recording.values[topic]
+        fine = np.isfinite(t) & np.isfinite(values).all(axis=1)
+        order = np.argsort(t, kind='stable')
+        self.index = order[fine[order]]
+        self.t, self.values = t[self.index], values[self.index]
+
+    def damage(self, cause, at=None, bad=None, fix=None):
+        """A fault; ``bad`` (n,) marks readings that a repair drops."""
+        moment = None if at is None else max(0.0, float(at) - begin_of(self.recording))
+        repair = None
+        if bad is not None and fix:
+            keep = np.sort(self.index[~bad])
+            topic = self.topic
+            repair = lambda r: changed(r, topic, keep=keep)     # noqa: E731
+        return Damage(self.recording.name, self.topic, cause, moment,
+                      fix=fix if repair else None, repair=repair)
+
+
+def _beyond(series, limits):
+    """Values beyond any sensor's range."""
+    scale = {'imu/data_raw': [limits.full_scale[0]] * 3 + [limits.full_scale[1]] * 3,
+             'mocap/pose': [limits.room] * 3 + [np.inf] * 4,
+             'joint_states': [np.inf] * 4, 'command': [np.inf] * 8}[series.topic]
+    size = np.abs(series.values)
+    bad = (size > scale).any(axis=1) & ~_at_floor(series, limits) | (size > 1e5).any(axis=1)
+    if not bad.any() or bad.mean() > MOST_REPAIRED:
+        return None         # a unit, if it is all of them
+    k = int(np.argmax(bad))
+    return series.damage(f'{int(bad.sum())} spikes beyond what the sensor can measure, such as '
+                         f'{np.abs(series.values[k]).max():.3g}', series.t[k], bad,
+                         'drop these readings')
+
+
+def _at_floor(series, limits):
+    """(n,) readings of the IMU that an impact may have made."""
+    if series.topic != 'imu/data_raw':
+        return np.zeros(len(series.t), dtype=bool)
+    pose = _Series(series.recording, 'mocap/pose')
+    return np.interp(series.t, pose.t, pose.values[:, 2]) < limits.contact
+
+
+def _norms(series, limits):
+    """Quaternions that are no rotations."""
+    norm = np.linalg.norm(series.values[:, 3:], axis=1)
+    zero = norm < 0.1
+    if zero.any():
+        few = zero.mean() < MOST_REPAIRED
+        return series.damage(f'{int(zero.sum())} of {len(zero)} orientations are zero quaternions:'
+                             ' the body was not tracked', series.t[np.argmax(zero)], zero,
+                             'drop these readings' if few else None)
+    off = np.abs(norm - 1) > limits.unit_length
+    if off.mean() > 0.01:
+        made = series.recording.values[series.topic].copy()
+        made[:, 3:] /= np.linalg.norm(made[:, 3:], axis=1, keepdims=True)
+        at = None if off.mean() > 0.9 else series.t[np.argmax(off)]
+        damage = series.damage(f'the orientation is no unit quaternion: its norm is '
+                               f'{np.median(norm[off]):.3g}, expected 1', at)
+        topic = series.topic
+        return Damage(damage.run, topic, damage.cause, damage.at_s, 0.99, 'normalise',
+                      lambda r: changed(r, topic, values=made))
+    return None
+
+
+def _outliers(series, limits):
+    """Readings far from a running median of their neighbours."""
+    width = limits.outlier_window
+    values = series.values
+    if series.topic == 'mocap/pose':
+        values = values.copy()
+        values[:, 3:] = _aligned(values[:, 3:])
+        floor = [limits.outlier_position] * 3 + [limits.outlier_angle / 2] * 4
+    elif series.topic == 'imu/data_raw':
+        floor = [limits.outlier_force] * 3 + [limits.outlier_rate] * 3
+    else:
+        moved = np.abs(np.diff(values, axis=0))
+        count = moved[moved > 1e-6].min(initial=10.0)       # of the encoder, in its unit
+        floor = [max(limits.outlier_joint, 3 * count)] * 4
+    off = np.abs(values - median_filter(values, size=(width, 1), mode='nearest'))
+    # By the usual step there, too: a reading in another unit is none, whatever its noise.
+    steps = np.abs(np.diff(values, axis=0, prepend=values[:1]))
+    usual = median_filter(steps, size=(2 * width + 1, 1), mode='nearest')
+    noise = NORMAL * np.maximum(np.median(off, axis=0), usual)
+    bad = (off > np.maximum(floor, limits.outlier_noise * noise)).any(axis=1) \
+        & ~_at_floor(series, limits)
+    if bad.mean() > limits.alternating:
+        return series.damage(f'{bad.mean():.0%} of the readings jump to and fro: two sources or '
+                             'two recordings are interleaved', series.t[np.argmax(bad)])
+    if bad.sum() == 0:
+        return None
+    k = int(np.argmax(bad))
+    few = bad.mean() < MOST_REPAIRED
+    what = 'outliers: the markers were mistaken for others, or swapped' \
+        if series.topic == 'mocap/pose' else 'spikes'
+    axis = AXES[series.topic][int(np.argmax((off / np.maximum(floor, 1e-9))[k]))]
+    return series.damage(f'{int(bad.sum())} readings are {what} ({axis} is off by '
+                         f'{off[k].max():.3g})', series.t[k], bad,
+                         'drop these readings' if few else None)
+
+
+def _alternating(series, limits):
+    """Positions that go to and fro from one message to the next, farther than noise."""
+    steps = np.diff(series.values[:, :3], axis=0)
+    size = np.linalg.norm(steps, axis=1)
+    cosine = (steps[1:] * steps[:-1]).sum(axis=1) / np.maximum(size[1:] * size[:-1], 1e-12)
+    back = (cosine < -0.8) & (size[1:] > limits.outlier_position / 3)
+    # Noise turns back in a third of its steps, motion hardly ever.
+    if back.mean() < 0.6:
+        return None
+    return series.damage(f'{back.mean():.0%} of the positions jump to and fro by '
+                         f'{np.median(size[1:][back]):.2f} m: two sources or two recordings are '
+                         'interleaved', series.t[int(np.argmax(back))])
+
+
+def _aligned(quaternion):
+    """Quaternions (N, 4) whose signs follow a running reference."""
+    sign = np.sign((quaternion[1:] * quaternion[:-1]).sum(axis=1))
+    sign[sign == 0] = 1
+    return quaternion * np.concatenate([[1.0], np.cumprod(sign)])[:, None]
+
+
+def _stale(series, limits):
+    """Readings that repeat the one before, here and there."""
+    same = (np.diff(series.values, axis=0) == 0).all(axis=1)
+    runs = _runs(same)
+    short = sum(length for _, length in runs if length < 10)
+    if short < limits.stale * len(same):
+        return None
+    bad = np.concatenate([[False], same])
+    return series.damage(f'{short / len(same):.0%} of the readings repeat the one before: the '
+                         'driver publishes stale readings, faster than the sensor measures',
+                         series.t[np.argmax(bad)] if runs[0][0] > 20 else None, bad,
+                         'drop repeated readings')
+
+
+def _frozen(series, limits):
+    """Equal readings for long, of all axes or of one."""
+    same = np.diff(series.values, axis=0) == 0
+    period = float(np.median(np.diff(series.t)))
+    for what, columns, longest in (
+            ('', same.all(axis=1), limits.frozen),
+            *((AXES[series.topic][k] + ' ', column, limits.frozen_axis)
+              for k, column in enumerate(same.T))):
+        runs = [(k, n) for k, n in _runs(columns) if n * period > longest]
+        if runs:
+            lasting = period * sum(n for _, n in runs)
+            k = max(runs, key=lambda run: run[1])[0]
+            return series.damage(f'{what}frozen: the same reading for {lasting:.1f} s',
+                                 series.t[k])
+    return None
+
+
+def _runs(mask):
+    """(first index, length) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [(int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _clipped(series, limits):
+    """A largest value that occurs again and again."""
+    for k, column in enumerate(series.values.T):
+        for word, extreme in (('largest', column.max()), ('smallest', column.min())):
+            at = column == extreme
+            pairs = (at[1:] & at[:-1]).sum()
+            if pairs >= LEAST_CLIPPED and abs(extreme) > 0.1 and not at.all():
+                return series.damage(
+                    f'{AXES[series.topic][k]} is clipped: {int(at.sum())} readings are exactly '
+                    f'the {word}, {extreme:.4g}: the range of the sensor is too small',
+                    series.t[np.argmax(at)])
+    return None
+
+
+def _jumps(series, limits):
+    """Poses that leap and stay, which the gyroscope does not show."""
+    position = series.values[:, :3]
+    q = series.values[:, 3:] / np.linalg.norm(series.values[:, 3:], axis=1, keepdims=True)
+    angle = 2 * np.arccos(np.clip(np.abs((q[1:] * q[:-1]).sum(axis=1)), 0, 1))
+    leap = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    steps = np.diff(series.t)
+    usual = steps < 3 * np.median(steps)
+    imu = _Series(series.recording, 'imu/data_raw')
+    rate = np.linalg.norm(imu.values[:, 3:], axis=1)
+    between = 0.5 * (series.t[1:] + series.t[:-1])
+    turned = np.interp(between, imu.t, rate) * steps
+    # Gyroscopes in degrees per second show more than there is, and never less.
+    jump = usual & (angle > limits.jump_angle) & (turned < 0.5 * angle)
+    spread = float(np.median(leap[usual])) if usual.any() else 0.0
+    # In millimetres every step is large.
+    far = usual & (leap > max(limits.jump_position, 20 * spread))
+    bad = jump | far
+    if not bad.any() or bad.mean() > limits.alternating:
+        return None
+    k = int(np.argmax(bad))
+    size = f'{angle[k]:.2f} rad' if jump[k] else f'{leap[k]:.2f} m'
+    return series.damage(f'the pose jumps by {size} between two readings, {int(bad.sum())} times, '
+                         'and the gyroscope does not show it: the markers were swapped',
+                         series.t[k])
+
+
+def _stuck(series, limits):
+    """An encoder that rests while its command moves."""
+    command = _Series(series.recording, 'command')
+    if len(command.t) < 2 or np.abs(command.values[:, :4]).max() > 4 * np.pi:
+        return None         # no angles in radians, which is judged later
+    steps = max(1, round(limits.frozen_joint / float(np.median(np.diff(series.t)))))
+    for k in range(4):
+        same = np.diff(series.values[:, k]) == 0
+        for first, length in _runs(same):
+            if length < steps:
+                continue
+            span = (command.t > series.t[first]) & (
+                command.t < series.t[min(first + length, len(series.t) - 1)])
+            if span.sum() > 2 and np.ptp(command.values[span, k]) > limits.frozen_command:
+                return series.damage(
+                    f'gimbal{k + 1} is frozen: the same reading for '
+                    f'{series.t[first + length] - series.t[first]:.1f} s while its command moved '
+                    f'by {np.ptp(command.values[span, k]):.2f} rad: encoder, or a jammed servo',
+                    series.t[first])
+    return None

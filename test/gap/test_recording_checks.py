@@ -1,0 +1,259 @@
+"""Damaged recordings are refused with the topic, the cause in words and the moment."""
+
+import warnings
+
+import numpy as np
+import pytest
+from recordings import columns, kept, late_half, recording, ROBOT, turned_pose
+from scipy.spatial.transform import Rotation
+
+from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.recording.check import damages, repaired
+
+P = GapParameters.load()
+IMU, POSE, JOINTS, COMMAND = 'imu/data_raw', 'mocap/pose', 'joint_states', 'command'
+HALF = 12.2
+
+
+def shifted(made, topic, by, late=False, both=False):
+    part = late_half(made, topic) if late else 1.0
+    made.times[topic] = made.times[topic] + by * part
+    if both:
+        made.received[topic] = made.received[topic] + by * part
+    return made
+
+
+def frozen(made, topic, begin, end, columns_=slice(None)):
+    t = made.times[topic] - made.times[topic][0]
+    inside = (t > begin) & (t < end)
+    made.values[topic] = made.values[topic].copy()
+    made.values[topic][inside, columns_] = made.values[topic][np.argmax(inside), columns_]
+    return made
+
+
+def spiked(made, topic, rows, column, value):
+    made.values[topic] = made.values[topic].copy()
+    made.values[topic][rows, column] = value
+    return made
+
+
+def mirrored(made):
+    """A left-handed world: y reversed, and what a driver makes of that for the quaternion."""
+    made = columns(made, POSE, 0, 3, lambda v: v * [1, -1, 1])
+    return columns(made, POSE, 3, 7, lambda v: v * [-1, 1, -1, 1])
+
+
+def y_up(made):
+    turn = Rotation.from_euler('x', -90, degrees=True)
+    made = columns(made, POSE, 0, 3, turn.apply)
+    return turned_pose(made, world=turn)
+
+
+def interleaved(made):
+    other = columns(recording('published'), POSE, 0, 2, lambda v: -v)
+    other.times[POSE] = other.times[POSE] + 2e-3
+    for topic in (POSE,):
+        order = np.argsort(np.concatenate([made.received[topic], other.received[topic] + 1e-3]))
+        for a, b in ((made.times, other.times), (made.values, other.values),
+                     (made.received, other.received)):
+            a[topic] = np.concatenate([a[topic], b[topic]])[order]
+    return made
+
+
+def stale(made):
+    made.values[IMU] = made.values[IMU][np.arange(len(made.values[IMU])) // 2 * 2]
+    return made
+
+
+def reordered(made):
+    order = np.arange(len(made.times[POSE]))
+    for k in range(10, len(order) - 10, 20):
+        order[k:k + 2] = order[k:k + 2][::-1]
+    made.times[POSE], made.values[POSE] = made.times[POSE][order], made.values[POSE][order]
+    return made
+
+
+def flips(made):
+    made.values[POSE] = made.values[POSE].copy()
+    half = Rotation.from_euler('z', 180, degrees=True)
+    for k in range(300, 2300, 300):
+        made.values[POSE][k, 3:] = (Rotation.from_quat(made.values[POSE][k, 3:]) * half).as_quat()
+    return made
+
+
+def turned_on_the_way(made):
+    late = late_half(made, IMU)
+    turn = Rotation.from_euler('z', 90, degrees=True)
+    made.values[IMU] = made.values[IMU].copy()
+    for part in (slice(0, 3), slice(3, 6)):
+        made.values[IMU][late, part] = turn.apply(made.values[IMU][late, part])
+    return made
+
+
+def flipped_from_half(made):
+    late = late_half(made, POSE)
+    turn = Rotation.from_euler('z', 90, degrees=True)
+    q = Rotation.from_quat(made.values[POSE][late, 3:]) * turn
+    made.values[POSE] = made.values[POSE].copy()
+    made.values[POSE][late, 3:] = q.as_quat()
+    return made
+
+
+def drifting(made):
+    t = made.times[POSE]
+    made.times[POSE] = t + 0.01 * (t - t[0])
+    return made
+
+
+def silent_clock(made):
+    """Times of recording that follow the damaged stamps: only motion shows the fault."""
+    made.received = {}
+    return made
+
+
+# name -> damage, topic, words of which one must be in the cause, moment [s] or None
+KINDS = {
+    'quaternion w first': (lambda m: columns(m, POSE, 3, 7, lambda v: v[:, [3, 0, 1, 2]]),
+                           POSE, ['(w, x, y, z)'], None),
+    'quaternion inverse': (lambda m: columns(m, POSE, 3, 7, lambda v: v * [-1, -1, -1, 1]),
+                           POSE, ['inverse'], None),
+    'quaternion scaled': (lambda m: columns(m, POSE, 3, 7, lambda v: 2 * v), POSE, ['norm'],
+                          None),
+    'zero quaternions': (lambda m: spiked(m, POSE, slice(400, None, 500), slice(3, 7), 0.0),
+                         POSE, ['zero quaternion'], 4.0),
+    'millimetres': (lambda m: columns(m, POSE, 0, 3, lambda v: 1e3 * v), POSE, ['millimetres'],
+                    None),
+    'centimetres': (lambda m: columns(m, POSE, 0, 3, lambda v: 1e2 * v), POSE, ['centimetres'],
+                    None),
+    'y up': (y_up, POSE, ['points up'], None),
+    'left-handed MoCap': (mirrored, POSE, ['left-handed'], None),
+    'positions exchanged': (lambda m: columns(m, POSE, 0, 3, lambda v: v[:, [1, 0, 2]]), POSE,
+                            ['axes of positions'], None),
+    'MoCap body turned': (lambda m: turned_pose(m, body=Rotation.from_euler(
+        'z', 90, degrees=True)), POSE, ['turned'], None),
+    'MoCap body turned on the way': (flipped_from_half, POSE, ['turned', 'jumps'], HALF),
+    'MoCap frozen': (lambda m: frozen(m, POSE, 10, 13.5), POSE, ['frozen'], 10.0),
+    'marker flips': (flips, POSE, ['markers'], 3.0),
+    'MoCap interleaved': (interleaved, POSE, ['sources', 'interleaved'], 0.0),
+    'MoCap clock back': (lambda m: shifted(m, POSE, -0.3, late=True), POSE, ['clock'], HALF),
+    'MoCap clock back, recorded so': (lambda m: silent_clock(shifted(m, POSE, -0.3, late=True)),
+                                      POSE, ['clock'], HALF),
+    'MoCap clock forward': (lambda m: shifted(m, POSE, 0.5, late=True), POSE, ['clock'], HALF),
+    'MoCap clock forward, recorded so': (
+        lambda m: silent_clock(shifted(m, POSE, 0.5, late=True)), POSE, ['clock'], HALF),
+    'MoCap clock drifts': (drifting, POSE, ['drift'], None),
+    'MoCap clock drifts, recorded so': (lambda m: silent_clock(drifting(m)), POSE, ['drift'],
+                                        None),
+    'MoCap clock of another computer': (lambda m: shifted(m, POSE, -3600.0), POSE,
+                                        ['behind'], None),
+    'encoder clock late': (lambda m: shifted(m, JOINTS, 0.15, late=True), JOINTS, ['clock'],
+                           HALF),
+    'encoder clock late, recorded so': (
+        lambda m: silent_clock(shifted(m, JOINTS, 0.15, late=True)), JOINTS, ['clock'], HALF),
+    'commands early': (lambda m: silent_clock(shifted(m, COMMAND, -0.5)), JOINTS, ['clock'],
+                       None),
+    'stamps of zero': (lambda m: _stopped(m), IMU, ['do not advance'], None),
+    'stamps in milliseconds': (lambda m: _thousand(m), IMU, ['apart'], None),
+    'out of order': (reordered, POSE, ['out of order'], 0.1),
+    'recorded twice': (lambda m: _twice(m), IMU, ['twice'], 0.0),
+    'degrees per second': (lambda m: columns(m, IMU, 3, 6, np.rad2deg), IMU,
+                           ['degrees per second'], None),
+    'acceleration in g': (lambda m: columns(m, IMU, 0, 3, lambda v: v / 9.80665), IMU,
+                          ['units of g'], None),
+    'gravity downwards': (lambda m: columns(m, IMU, 0, 3, lambda v: -v), IMU,
+                          ['opposite sign'], None),
+    'one gyroscope axis reversed': (lambda m: columns(m, IMU, 3, 6, lambda v: v * [1, -1, 1]),
+                                    IMU, ['wrong sign'], None),
+    'IMU axes swapped': (lambda m: columns(m, IMU, 0, 6, lambda v: v[:, [0, 2, 1, 3, 5, 4]]),
+                         IMU, ['swapped', 'left-handed'], None),
+    'IMU turned': (lambda m: columns(columns(m, IMU, 0, 3, lambda v: v[:, [1, 0, 2]]
+                                             * [1, -1, 1]), IMU, 3, 6,
+                                     lambda v: v[:, [1, 0, 2]] * [1, -1, 1]),
+                   IMU, ['turned'], None),
+    'IMU upside down': (lambda m: columns(m, IMU, 0, 6, lambda v: v * [1, -1, -1, 1, -1, -1]), IMU,
+                        ['turned'], None),
+    'IMU turned on the way': (turned_on_the_way, IMU, ['turned'], HALF),
+    'IMU spike': (lambda m: spiked(m, IMU, 3000, 1, 1e6), IMU, ['spike'], 15.0),
+    'IMU stale': (stale, IMU, ['repeat'], None),
+    'gyroscope clipped': (lambda m: columns(m, IMU, 3, 6, lambda v: np.clip(v, -0.5, 0.5)), IMU,
+                          ['clipped'], None),
+    'one gyroscope axis frozen': (lambda m: frozen(m, IMU, 12, 20, 4), IMU, ['frozen'], 12.0),
+    'joints swapped': (lambda m: columns(m, JOINTS, 0, 4, lambda v: v[:, [1, 0, 2, 3]]), JOINTS,
+                       ['swapped'], None),
+    'joint reversed': (lambda m: columns(m, JOINTS, 2, 3, lambda v: -v), JOINTS, ['against'],
+                       None),
+    'joints in degrees': (lambda m: columns(m, JOINTS, 0, 4, np.rad2deg), JOINTS, ['degrees'],
+                          None),
+    'joints in counts': (lambda m: columns(m, JOINTS, 0, 4, lambda v: 2048 + v * 4096
+                                           / (2 * np.pi)), JOINTS, ['counts'], None),
+    'one joint frozen': (lambda m: frozen(m, JOINTS, 8.5, 24, 1), JOINTS, ['frozen'], 8.5),
+    'tilts commanded in degrees': (lambda m: columns(m, COMMAND, 0, 4, np.rad2deg), COMMAND,
+                                   ['degrees'], None),
+    'thrusts in millinewtons': (lambda m: columns(m, COMMAND, 4, 8, lambda v: 1e3 * v), COMMAND,
+                                ['millinewtons'], None),
+}
+
+
+def _stopped(made):
+    made.times[IMU] = np.zeros_like(made.times[IMU])
+    return made
+
+
+def _thousand(made):
+    made.times[IMU] = made.times[IMU] * 1000
+    return made
+
+
+def _twice(made):
+    return kept(made, IMU, np.repeat(np.arange(len(made.times[IMU])), 2))
+
+
+@pytest.mark.parametrize('conditions', ['nominal', 'published'])
+@pytest.mark.parametrize('kind', KINDS)
+def test_damage_is_refused_with_topic_cause_and_moment(kind, conditions):
+    change, topic, words, at = KINDS[kind]
+    with warnings.catch_warnings(), pytest.raises(UnusableFlight) as error:
+        warnings.simplefilter('error')
+        prepare(change(recording(conditions)), ROBOT, P)
+    assert '\n' not in str(error.value)
+    problems = error.value.problems
+    right = [d for d in problems if d.topic == topic and any(w in d.cause for w in words)]
+    assert right, [d.text for d in problems]
+    assert 0.5 < right[0].sure <= 1 and right[0].run == 'case'
+    if at is not None:
+        assert right[0].at_s == pytest.approx(at, abs=2.0 if 'recorded so' not in kind else 4.5)
+
+
+@pytest.mark.parametrize('conditions', ['nominal', 'published'])
+def test_a_sound_recording_has_no_damage(conditions):
+    assert damages(recording(conditions), ROBOT) == []
+    assert damages(silent_clock(recording(conditions)), ROBOT) == []
+
+
+@pytest.mark.parametrize('kind', ['quaternion w first', 'millimetres', 'degrees per second',
+                                  'gravity downwards', 'joints swapped', 'joints in degrees',
+                                  'MoCap clock of another computer', 'MoCap clock back',
+                                  'quaternion scaled', 'IMU spike', 'recorded twice', 'IMU stale',
+                                  'IMU upside down', 'out of order', 'marker flips'])
+def test_a_repair_gives_the_sound_recording_back(kind):
+    sound = recording()
+    fixed, done, left = repaired(KINDS[kind][0](recording()), ROBOT)
+    assert done and left == []
+    for topic in (IMU, POSE, JOINTS, COMMAND):
+        t = sound.times[topic]
+        inside = (t > fixed.times[topic].min()) & (t < fixed.times[topic].max())
+        order = np.argsort(fixed.times[topic])
+        for k, column in enumerate(sound.values[topic].T):
+            again = np.interp(t[inside], fixed.times[topic][order],
+                              fixed.values[topic][order, k])
+            error = np.abs(np.abs(again) - np.abs(column[inside]))
+            assert np.median(error) < 1e-3 + 0.03 * np.std(column), (topic, k)
+
+
+def test_without_repair_the_recording_is_left_as_it_was():
+    made = KINDS['degrees per second'][0](recording())
+    before = {topic: v.copy() for topic, v in made.values.items()}
+    repaired(made, ROBOT)
+    for topic, values in before.items():
+        assert np.array_equal(made.values[topic], values)
