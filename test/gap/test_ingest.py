@@ -45,7 +45,7 @@ def test_a_missing_topic_is_named(topic):
 def test_a_clock_that_jumps_back_is_named_with_its_topic():
     made = recording()
     made.times['mocap/pose'] = made.times['mocap/pose'] - 5.0 * (made.times['mocap/pose'] > 8)
-    refused(made, 'mocap/pose', 'clock jumps')
+    refused(made, 'mocap/pose', 'clock goes back by')
 
 
 def test_many_stamps_that_occur_twice_are_refused():
@@ -80,8 +80,14 @@ def test_a_robot_that_stays_on_the_ground_is_no_flight():
 
 def test_another_robots_file_is_noticed():
     made = recording()
-    made.values['imu/data_raw'][:, :3] *= 3
+    made.values['command'][:, 4:] *= 3.2
     refused(made, 'robot file does not fit')
+
+
+def test_an_accelerometer_of_another_range_is_noticed():
+    made = recording()
+    made.values['imu/data_raw'][:, :3] *= 3
+    refused(made, 'imu/data_raw', 'linear acceleration is 3 times')
 
 
 def test_readings_that_are_no_numbers_are_left_out_and_counted():

@@ -227,12 +227,30 @@ def _on_the_way(recording, m, robot, limits, parts, lively, usual_rate, usual_fo
         later = slice(k, len(m.t))
         if _explains(m, meaning, robot, lively, limits, later):
             return _said(recording, m, meaning, sure, m.t[k], robot, limits, repair=False)
+    scaled = _scaled(recording, m, robot, limits, lively)
+    if scaled:
+        return scaled
     rate_part = usual_rate.sum() / max((m.rate**2).sum(), 1e-12)
     force_part = usual_force.sum() / max((m.force**2).sum(), 1e-12)
     return [Damage(recording.name, 'mocap/pose', 'contradicts imu/data_raw under every convention '
                    f"that was tried: {min(rate_part, 9.99):.0%} of the gyroscope's and "
                    f"{min(force_part, 9.99):.0%} of the accelerometer's signal remain "
                    'unexplained by the pose', None, 0.9)]
+
+
+def _scaled(recording, m, robot, limits, lively):
+    """A factor that no unit has: a range setting, or a gain."""
+    made = []
+    expected = (('angular velocity', m.rate, USUAL.rate(m)) if lively else None,
+                ('linear acceleration', m.force, USUAL.force(m, robot.gravity)))
+    for what, measured, seen in filter(None, expected):
+        factor = float((measured * seen).sum() / max((seen**2).sum(), 1e-12))
+        left = ((measured - factor * seen)**2).sum() / max((measured**2).sum(), 1e-12)
+        if left < 1 - limits.least_agreement and not (
+                1 / limits.unit_factor < factor < limits.unit_factor):
+            made.append(Damage(recording.name, 'imu/data_raw', f'{what} is {factor:.3g} times '
+                               'what the pose shows: a wrong range or gain?', None, 0.9))
+    return made
 
 
 def _same(a, b):

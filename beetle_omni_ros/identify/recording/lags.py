@@ -22,9 +22,11 @@ from beetle_omni_ros.identify.recording.motion import (
     GRID,
     held,
     series_of,
+    silent,
 )
 
 LEAST_WINDOWS = 2       # to each side of a step
+MOST_SILENT = 0.15      # of a window
 LEAST_NOISE = 0.005     # [s] that windows of any flight scatter by
 SHARP = 0.9             # of the best correlation that a second, distant shift may reach
 
@@ -45,16 +47,18 @@ def lag_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
               np.linalg.norm(kernel(turned), axis=1), np.linalg.norm(kernel(rate), axis=1)),
              ('joint_states', 'command', 'encoders', 'commands', limits.servo_lag,
               np.linalg.norm(tilt, axis=1), np.linalg.norm(asked, axis=1)))
+    gaps = silent(recording, t, 0.0)
     made = []
     for topic, other, what, whose, allowed, late, early in pairs:
-        at, lags = window_lags(t, late, early, limits)
+        at, lags = window_lags(t, late, early, limits, gaps)
         damage = _judged(recording, topic, other, what, whose, allowed, at, lags, limits)
         if damage:
             made.append(damage)
     return made
 
 
-def window_lags(t, late, early, limits: RecordingLimits) -> tuple[np.ndarray, np.ndarray]:
+def window_lags(t, late, early, limits: RecordingLimits,
+                gaps: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
     Shifts by which one series follows another, in windows where both move alike.
 
@@ -63,6 +67,7 @@ def window_lags(t, late, early, limits: RecordingLimits) -> tuple[np.ndarray, np
         late: (N,) magnitude that follows.
         early: (N,) magnitude that leads.
         limits: window, reach and least likeness.
+        gaps: (N,) times at which a topic was silent, whose windows are left out.
 
     Returns:
         middles (W,) of the windows [s], and shifts (W,) [s].
@@ -71,6 +76,8 @@ def window_lags(t, late, early, limits: RecordingLimits) -> tuple[np.ndarray, np
     length, reach = (round(x / GRID) for x in (limits.lag_window, limits.lag_reach))
     at, lags = [], []
     for first in range(0, len(t) - length + 1, length // 3):
+        if gaps is not None and gaps[first:first + length].mean() > MOST_SILENT:
+            continue
         own = late[first:first + length]
         begin = max(0, first - reach)
         wide = early[begin:first + length + reach]

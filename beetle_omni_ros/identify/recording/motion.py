@@ -17,6 +17,8 @@ GRID = 0.01             # [s]
 EVERY = 10              # grid points to each that is kept
 WIDE = 6.0              # [Hz] of a derivative before it is turned into another frame
 LEAST_TIME = 6.0        # [s] that all topics have in common
+LONGEST_GAP = 0.15      # [s] across which a straight line stands for a motion
+LEAST_SAMPLES = 40      # that remain beside such gaps
 # How the four numbers of an orientation may be meant, and which of the stored numbers are then
 # x, y, z and w.
 MEANINGS = {'': ((0, 1, 2, 3), 1.0), '(w, x, y, z)': ((1, 2, 3, 0), 1.0),
@@ -111,10 +113,34 @@ def motion_of(recording: Recording, robot: RobotParameters,
     tilt = held(recording, 'joint_states', grid)[inner]
     wrench, thrust = _wrench(robot, tilt), _lagged(robot, command[:, 4:])
     rate = wide(imu[:, 3:], 1)[:len(t)]
-    return Motion(t[kernel.centres(len(t))], kernel(imu[inner, 3:]), kernel(imu[inner, :3]),
-                  rates, ups, pushes, kernel(tilt), kernel(command[:, :4]),
-                  kernel(np.einsum('nci,ni->nc', wrench[:, :3], thrust)), kernel(wrench),
-                  kernel(thrust), kernel(rate))
+    at = t[kernel.centres(len(t))]
+    near = ~silent(recording, at, kernel.margin * GRID)
+    if near.sum() < LEAST_SAMPLES:
+        return None
+
+    def part(series):
+        return series[near]
+
+    def smooth(series):
+        return part(kernel(series))
+
+    def parts(by_meaning):
+        return {meaning: part(series) for meaning, series in by_meaning.items()}
+
+    return Motion(part(at), smooth(imu[inner, 3:]), smooth(imu[inner, :3]), parts(rates),
+                  parts(ups), parts(pushes), smooth(tilt), smooth(command[:, :4]),
+                  smooth(np.einsum('nci,ni->nc', wrench[:, :3], thrust)), smooth(wrench),
+                  smooth(thrust), smooth(rate))
+
+
+def silent(recording: Recording, t: np.ndarray, reach: float) -> np.ndarray:
+    """(N,) whether any topic has a gap within ``reach`` [s] of each time."""
+    made = np.zeros(len(t), dtype=bool)
+    for topic in NEEDED:
+        stamps = series_of(recording, topic)[0]
+        for k in np.flatnonzero(np.diff(stamps) > LONGEST_GAP):
+            made |= (t > stamps[k] - reach) & (t < stamps[k + 1] + reach)
+    return made
 
 
 def _orientation(stamps, quaternion, grid):
