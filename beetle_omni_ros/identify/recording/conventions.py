@@ -474,7 +474,8 @@ def _thrusts(recording, m, robot, limits):
     pushed, felt = (np.linalg.norm(x, axis=1) for x in (m.thrust_force, m.force))
     scale = float((pushed * felt).sum() / max((felt**2).sum(), 1e-12))
     unit = min(THRUST_UNITS, key=lambda u: abs(np.log(max(scale, 1e-9) / u)))
-    if not 1 / 3 < scale < 3 and 0.6 < scale / unit < 1.6:
+    # Thrusts and accelerometer agree within some per cent; any other factor is another robot's.
+    if not 1 / 3 < scale < 3 and 0.85 < scale / unit < 1.18:
         return [Damage(recording.name, 'command', f'commanded thrusts are {scale:.3g} times what '
                        f'the accelerometer feels: {THRUST_UNITS[unit]}?', None, 0.95)]
     measured = np.concatenate([m.force, 0.1 * m.turning], axis=1)
