@@ -89,9 +89,9 @@ def judge(kind: Kind, asked: dict, onset: float | None, begin: float,
 
 def statements(answer: dict) -> list[dict]:
     """Everything said: ``text`` without folders, ``topic`` and ``at_s`` where they are told."""
-    said = [{'text': words(entry.get('cause')), 'topic': entry.get('topic'),
-             'at_s': entry.get('at_s')}
-            for entry in answer.get('bad_data') or () if isinstance(entry, dict)]
+    entries = [e for e in answer.get('bad_data') or () if isinstance(e, dict)]
+    said = [{'text': words(f"{e.get('topic') or ''}: {e.get('cause')}"), 'topic': e.get('topic'),
+             'at_s': e.get('at_s')} for e in entries]
     return said + [{'text': words(text), 'topic': None, 'at_s': None}
                    for text in (answer.get('reason'), *(answer.get('findings') or ())) if text]
 

@@ -9,7 +9,8 @@ from gap_damage_kinds.kind import damage, FIRST, HARMLESS, REPAIRABLE
 from gap_damage_kinds.recording import MOCAP
 
 OUTLIERS = 12
-TURNED = r'turn|rotat|mount|misalign|axes|frame'
+TURNED = r'\bturn|rotat|\bmount|misalign|ax[ei]s|frame'
+UNIT = 'unit|scale|factor|instead|in place'
 
 
 @damage('MoCap quaternion in the order w, x, y, z', MOCAP,
@@ -21,13 +22,15 @@ def mocap_wxyz(bag, random, other):
     bag.put(MOCAP, pose)
 
 
-@damage('MoCap position in millimetres', MOCAP, causes=[r'millimet|\bmm\b'])
+@damage('MoCap position in millimetres', MOCAP, causes=[
+    'millimet', (r'\bmm\b', f'{UNIT}|in mm|1000')])
 def mocap_millimetres(bag, random, other):
     """Positions times 1000."""
     bag.put(MOCAP, bag.values(MOCAP) * [1e3, 1e3, 1e3, 1, 1, 1, 1])
 
 
-@damage('MoCap position in centimetres', MOCAP, causes=[r'centimet|\bcm\b'])
+@damage('MoCap position in centimetres', MOCAP, causes=[
+    'centimet', (r'\bcm\b', f'{UNIT}|in cm|100')])
 def mocap_centimetres(bag, random, other):
     """Positions times 100."""
     bag.put(MOCAP, bag.values(MOCAP) * [1e2, 1e2, 1e2, 1, 1, 1, 1])
