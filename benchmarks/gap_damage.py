@@ -9,6 +9,7 @@ never pass as no gap or as an effect, and the cause must be told in words.
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 import hashlib
 import os
 from pathlib import Path
@@ -24,8 +25,7 @@ HERE = Path(__file__).resolve().parent
 PLACES = [str(HERE), str(HERE.parent)]
 sys.path[:0] = [place for place in PLACES if place not in sys.path]
 
-from gap_damage_kinds import report  # noqa: E402
-from gap_damage_kinds.ask import ask  # noqa: E402
+from gap_damage_kinds import ask, report  # noqa: E402
 from gap_damage_kinds.catalogue import KINDS  # noqa: E402
 from gap_damage_kinds.flights import FLIGHTS, make_flight, sets_of, undamaged  # noqa: E402
 from gap_damage_kinds.judge import judge  # noqa: E402
@@ -52,6 +52,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--output', type=Path, help='for damage.json and damage.md (FOLDER)')
     parser.add_argument('--jobs', type=int, default=1, help='at a time; -1: every core')
     parser.add_argument('--timeout', type=float, default=300.0, metavar='S', help='of an answer')
+    parser.add_argument('--fresh', action='store_true', help='ask again where an answer is kept')
     parser.add_argument('--keep', action='store_true', help='keep the damaged bags')
     given = parser.parse_args(arguments)
     names = given.kinds.split(',') if given.kinds else list(KINDS)
@@ -87,32 +88,71 @@ def fly_all(orders: list, jobs: int, console: Console) -> list[Path]:
     return [order.folder / 'bag' for order in orders]
 
 
-def ask_damaged(name: str | None, bags: list[Path], other: Path, seed: int, everywhere: bool,
-                place: Path, timeout: float, keep: bool) -> tuple[dict, float | None, float]:
+@dataclass(frozen=True)
+class Case:
     """
-    Damage a set of flights and ask about it.
+    One question.
 
-    Folders have neutral names, and no bag tells what the simulator or the estimator knew.
+    Attributes:
+        name: of the kind of damage; None: the flights as they are.
+        bags: two that are fitted, one that judges.
+        other: bag of another flight.
+        seed: of what is random in the damage.
+        everywhere: damage all flights, whatever the kind's scope.
+        place: folder for the damaged bags; its name tells nothing.
+        timeout: [s] for the answer.
+        keep: leave the damaged bags there.
+
+    """
+
+    name: str | None
+    bags: tuple[Path, ...]
+    other: Path
+    seed: int
+    everywhere: bool
+    place: Path
+    timeout: float
+    keep: bool
+
+    def key(self, code: str) -> str:
+        """What an answer depends on."""
+        return f'{code} {self.name} {self.bags} {self.other} {self.seed} {self.everywhere}'
+
+
+def answered(case: Case, code: str, fresh: bool) -> dict:
+    """
+    The answer to a case, a kept one where there is one.
 
     Returns:
-        the answer; onset [s] in the first flight or None; first stamp [s] of that flight.
+        as :func:`~gap_damage_kinds.ask.ask`, with ``onset`` [s] in the first flight or None, and
+        ``begin``, the first stamp [s] of that flight.
 
     """
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir(parents=True)
-    stranger, onset, begin, paths = Recording.read(other), None, 0.0, []
-    for n, bag in enumerate(bags):
+    file = case.place.with_suffix('.json')
+    found = None if fresh else ask.kept(file, case.key(code))
+    if found is None:
+        found = ask_damaged(case)
+        ask.keep(file, case.key(code), found)
+    return found
+
+
+def ask_damaged(case: Case) -> dict:
+    """Damage a set of flights, ask, and clear up; see :func:`answered`."""
+    shutil.rmtree(case.place, ignore_errors=True)
+    case.place.mkdir(parents=True)
+    other, onset, begin, paths = Recording.read(case.other), None, 0.0, []
+    for n, bag in enumerate(case.bags):
         recording = Recording.read(bag)
         if n == 0:
             begin = min(recording.on(topic)[0].stamp for topic in MEASURED)
-        if name and (n == 0 or everywhere or KINDS[name].scope != FIRST):
-            recording, moment = KINDS[name].apply(recording, stranger, seed + n)
+        if case.name and (n == 0 or case.everywhere or KINDS[case.name].scope != FIRST):
+            recording, moment = KINDS[case.name].apply(recording, other, case.seed + n)
             onset = moment if n == 0 else onset
-        paths.append(recording.write(place / f'flight_{n}'))
-    answer = ask(paths[:-1], paths[-1], place / 'gap.json', timeout)
-    if not keep:
-        shutil.rmtree(place)
-    return answer, onset, begin
+        paths.append(recording.write(case.place / f'flight_{n}'))
+    found = ask.ask(paths[:-1], paths[-1], case.place / 'gap.json', case.timeout)
+    if not case.keep:
+        shutil.rmtree(case.place)
+    return {**found, 'onset': onset, 'begin': begin}
 
 
 def flight_sets(given: argparse.Namespace, console: Console) -> list[list[Path]]:
@@ -126,17 +166,20 @@ def flight_sets(given: argparse.Namespace, console: Console) -> list[list[Path]]
 
 def run_kinds(given: argparse.Namespace, console: Console) -> int:
     """Every kind on every set; tables and files."""
-    sets = flight_sets(given, console)
-    cases = [(name, k) for name in (None, *given.names) for k in range(len(sets))]
-    calls = [(ask_damaged, name, sets[k], sets[(k + 1) % len(sets)][1], given.seed,
-              given.everywhere, place_of(given.folder, name, k), given.timeout, given.keep)
-             for name, k in cases]
-    found = {cases[n]: result for n, result in on_cores('asked', given.jobs, calls, console)}
-    known = [named(found[None, k][0]) for k in range(len(sets))]
-    for k, names in enumerate(known):
-        verdict = (found[None, k][0]['answer'] or {}).get('verdict', 'no answer')
-        console.print(f'undamaged set {k + 1}: {verdict} {", ".join(names)}', highlight=False)
-    results = {name: [judge(KINDS[name], *found[name, k], known[k]) for k in range(len(sets))]
+    sets, code = flight_sets(given, console), ask.code_key()
+    cases = [Case(name, tuple(sets[k]), sets[(k + 1) % len(sets)][1], given.seed,
+                  given.everywhere, place_of(given.folder, name, k), given.timeout, given.keep)
+             for name in (None, *given.names) for k in range(len(sets))]
+    calls = [(answered, case, code, given.fresh) for case in cases]
+    done = dict(on_cores('asked', given.jobs, calls, console))
+    found = {name: [done[n] for n, case in enumerate(cases) if case.name == name]
+             for name in (None, *given.names)}
+    known = [named(asked) for asked in found[None]]
+    for k, asked in enumerate(found[None]):
+        verdict = (asked['answer'] or {}).get('verdict', 'no answer')
+        console.print(f'undamaged set {k + 1}: {verdict} {", ".join(known[k])}', highlight=False)
+    results = {name: [judge(KINDS[name], asked, names)
+                      for asked, names in zip(found[name], known, strict=True)]
                for name in given.names}
     output = given.output or given.folder
     report.write(results, KINDS, {'command': command_of(given), 'undamaged': known}, output)

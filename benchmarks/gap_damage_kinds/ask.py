@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -25,7 +26,7 @@ def ask(fitted: list[Path], judging: Path, output: Path, timeout: float) -> dict
 
     Returns:
         ``status`` (124 after the timeout), ``answer`` (JSON or None), ``seconds``, ``crash``
-        (a traceback was printed), ``message`` (the end of standard error).
+        (a traceback was printed), ``message`` (the end of standard error), ``folder``.
 
     """
     words = [sys.executable, '-c', CALL, 'gap', *map(str, fitted), '--holdout', str(judging),
@@ -43,7 +44,33 @@ def ask(fitted: list[Path], judging: Path, output: Path, timeout: float) -> dict
     except (OSError, ValueError):
         answer = None
     return {'status': status, 'answer': answer, 'seconds': seconds,
-            'crash': 'Traceback' in text, 'message': text.strip()[-600:]}
+            'folder': str(output.parent), 'crash': 'Traceback' in text,
+            'message': text.strip()[-600:]}
+
+
+def kept(file: Path, key: str) -> dict | None:
+    """An earlier answer to the same question, or None."""
+    try:
+        found = json.loads(file.read_text())
+    except (OSError, ValueError):
+        return None
+    return found['result'] if found.get('key') == key else None
+
+
+def keep(file: Path, key: str, result: dict) -> None:
+    """Keep an answer."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps({'key': key, 'result': result}) + '\n')
+
+
+def code_key() -> str:
+    """Of the package's code and parameters and of this benchmark: others answer otherwise."""
+    digest = hashlib.sha256()
+    for folder in (PACKAGE / 'beetle_omni_ros', PACKAGE / 'params', Path(__file__).parent):
+        for file in sorted(folder.rglob('*')):
+            if file.suffix in ('.py', '.yaml'):
+                digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def _environment():

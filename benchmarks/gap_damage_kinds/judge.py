@@ -49,8 +49,7 @@ class Judged:
         return asdict(self)
 
 
-def judge(kind: Kind, asked: dict, onset: float | None, begin: float,
-          known: tuple[str, ...] = ()) -> Judged:
+def judge(kind: Kind, asked: dict, known: tuple[str, ...] = ()) -> Judged:
     """
     Judge one answer.
 
@@ -60,9 +59,9 @@ def judge(kind: Kind, asked: dict, onset: float | None, begin: float,
 
     Args:
         kind: of damage.
-        asked: see :func:`~gap_damage_kinds.ask.ask`.
-        onset: of the damage [s] by the undamaged stamps.
-        begin: first stamp of the damaged recording [s]; moments may count from there.
+        asked: see :func:`~gap_damage_kinds.ask.ask`; beside that, ``onset`` of the damage [s] by
+            the undamaged stamps, or None, and ``begin``, the first of these stamps [s], from
+            which moments may count.
         known: names that the undamaged flights get.
 
     """
@@ -71,7 +70,7 @@ def judge(kind: Kind, asked: dict, onset: float | None, begin: float,
     names = tuple(dict.fromkeys(
         name for effect in answer.get('effects') or () for name in effect['names'][:1]))
     false = tuple(n for n in names if n not in SENSORS and n not in known)
-    told = [s for s in statements(answer) if kind.told_by(s['text'])]
+    told = [s for s in statements(answer, asked['folder']) if kind.told_by(s['text'])]
     cause = topic = None
     if kind.causes:
         cause = bool(told)
@@ -82,23 +81,28 @@ def judge(kind: Kind, asked: dict, onset: float | None, begin: float,
         used if kind.harm == HARMLESS else
         bool(cause) and (refused or (kind.harm == REPAIRABLE and used)))
     return Judged(verdict, asked['status'], names, false, cause, topic,
-                  None if onset is None else any(near(s, onset, begin) for s in told), right,
+                  told_moment(asked, told), right,
                   (told[0]['text'] if told else answer.get('reason')) or asked['message'],
                   asked['seconds'])
 
 
-def statements(answer: dict) -> list[dict]:
-    """Everything said: ``text`` without folders, ``topic`` and ``at_s`` where they are told."""
+def statements(answer: dict, folder: str) -> list[dict]:
+    """
+    Everything said: ``text``, and ``topic`` and ``at_s`` where they are told.
+
+    Args:
+        answer: the JSON.
+        folder: of the bags; it is left out, for its name is not the finder's words.
+
+    """
+    def words(text):
+        return str(text).replace(folder, '')
+
     entries = [e for e in answer.get('bad_data') or () if isinstance(e, dict)]
     said = [{'text': words(f"{e.get('topic') or ''}: {e.get('cause')}"), 'topic': e.get('topic'),
              'at_s': e.get('at_s')} for e in entries]
     return said + [{'text': words(text), 'topic': None, 'at_s': None}
                    for text in (answer.get('reason'), *(answer.get('findings') or ())) if text]
-
-
-def words(text) -> str:
-    """Leave out paths: their names are not the finder's words."""
-    return re.sub(r'(?<!\w)/(?:[\w.+-]+/)+[\w.+-]*', '', str(text or ''))
 
 
 def on_topic(kind: Kind, statement: dict) -> bool:
@@ -108,6 +112,13 @@ def on_topic(kind: Kind, statement: dict) -> bool:
     if statement['topic']:
         return any(str(statement['topic']).lstrip('/').endswith(t) for t in kind.topics)
     return any(topic in statement['text'] for topic in kind.topics)
+
+
+def told_moment(asked: dict, told: list[dict]) -> bool | None:
+    """Whether a statement of the cause tells its onset; None without one."""
+    if asked['onset'] is None:
+        return None
+    return any(near(s, asked['onset'], asked['begin']) for s in told)
 
 
 def near(statement: dict, onset: float, begin: float) -> bool:
