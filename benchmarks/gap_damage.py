@@ -28,7 +28,7 @@ sys.path[:0] = [place for place in PLACES if place not in sys.path]
 from gap_damage_kinds import ask, report  # noqa: E402
 from gap_damage_kinds.catalogue import KINDS  # noqa: E402
 from gap_damage_kinds.flights import FLIGHTS, make_flight, sets_of, undamaged  # noqa: E402
-from gap_damage_kinds.judge import judge  # noqa: E402
+from gap_damage_kinds.judge import judge, verdict_of  # noqa: E402
 from gap_damage_kinds.kind import FIRST  # noqa: E402
 from gap_damage_kinds.recording import MEASURED, Recording  # noqa: E402
 
@@ -116,7 +116,9 @@ class Case:
 
     def key(self, code: str) -> str:
         """What an answer depends on."""
-        return f'{code} {self.name} {self.bags} {self.other} {self.seed} {self.everywhere}'
+        damage = KINDS[self.name].key() if self.name else ''
+        bags = ' '.join(str(bag) for bag in (*self.bags, self.other))
+        return f'{code} {self.name} {damage} {self.seed} {self.everywhere} {bags}'
 
 
 def answered(case: Case, code: str, fresh: bool) -> dict:
@@ -132,7 +134,8 @@ def answered(case: Case, code: str, fresh: bool) -> dict:
     found = None if fresh else ask.kept(file, case.key(code))
     if found is None:
         found = ask_damaged(case)
-        ask.keep(file, case.key(code), found)
+        if found['status'] != ask.TIMEOUT:     # on a busy computer it says little
+            ask.keep(file, case.key(code), found)
     return found
 
 
@@ -170,14 +173,17 @@ def run_kinds(given: argparse.Namespace, console: Console) -> int:
     cases = [Case(name, tuple(sets[k]), sets[(k + 1) % len(sets)][1], given.seed,
                   given.everywhere, place_of(given.folder, name, k), given.timeout, given.keep)
              for name in (None, *given.names) for k in range(len(sets))]
-    calls = [(answered, case, code, given.fresh) for case in cases]
-    done = dict(on_cores('asked', given.jobs, calls, console))
+    calls, done = [(answered, case, code, given.fresh) for case in cases], {}
+    for n, asked in on_cores('asked', given.jobs, calls, console):
+        done[n] = asked
+        console.print(f'{cases[n].name or "undamaged"}, set {n % len(sets) + 1}: '
+                      f'{verdict_of(asked)}', highlight=False)
     found = {name: [done[n] for n, case in enumerate(cases) if case.name == name]
              for name in (None, *given.names)}
     known = [named(asked) for asked in found[None]]
     for k, asked in enumerate(found[None]):
-        verdict = (asked['answer'] or {}).get('verdict', 'no answer')
-        console.print(f'undamaged set {k + 1}: {verdict} {", ".join(known[k])}', highlight=False)
+        console.print(f'undamaged set {k + 1}: {verdict_of(asked)} {", ".join(known[k])}',
+                      highlight=False)
     results = {name: [judge(KINDS[name], asked, names)
                       for asked, names in zip(found[name], known, strict=True)]
                for name in given.names}

@@ -11,6 +11,7 @@ import sys
 import time
 
 CALL = 'import sys; from beetle_omni_ros.cli import main; sys.exit(main())'
+TIMEOUT = 124       # exit status, as of timeout(1)
 PACKAGE = Path(__file__).resolve().parents[2]
 
 
@@ -37,7 +38,7 @@ def ask(fitted: list[Path], judging: Path, output: Path, timeout: float) -> dict
                               check=False, timeout=timeout, env=_environment())
         status, text = done.returncode, done.stderr
     except subprocess.TimeoutExpired:
-        status, text = 124, f'not finished after {timeout:g} s'
+        status, text = TIMEOUT, f'not finished after {timeout:g} s'
     seconds = time.monotonic() - began
     try:
         answer = json.loads(output.read_text())
@@ -64,9 +65,9 @@ def keep(file: Path, key: str, result: dict) -> None:
 
 
 def code_key() -> str:
-    """Of the package's code and parameters and of this benchmark: others answer otherwise."""
+    """Of the package's code and parameters: others answer otherwise."""
     digest = hashlib.sha256()
-    for folder in (PACKAGE / 'beetle_omni_ros', PACKAGE / 'params', Path(__file__).parent):
+    for folder in (PACKAGE / 'beetle_omni_ros', PACKAGE / 'params'):
         for file in sorted(folder.rglob('*')):
             if file.suffix in ('.py', '.yaml'):
                 digest.update(file.read_bytes())

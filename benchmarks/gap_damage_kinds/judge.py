@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 import re
 
+from gap_damage_kinds.ask import TIMEOUT
 from gap_damage_kinds.kind import HARMLESS, Kind, REPAIRABLE
 
 SENSORS = ('mocap_time_offset', 'imu_filter_lag', 'joint_feedback_delay', 'mocap_misalignment',
@@ -66,7 +67,7 @@ def judge(kind: Kind, asked: dict, known: tuple[str, ...] = ()) -> Judged:
 
     """
     answer = asked['answer'] or {}
-    verdict = answer.get('verdict') or {124: 'timeout'}.get(asked['status'], 'no answer')
+    verdict = verdict_of(asked)
     names = tuple(dict.fromkeys(
         name for effect in answer.get('effects') or () for name in effect['names'][:1]))
     false = tuple(n for n in names if n not in SENSORS and n not in known)
@@ -84,6 +85,12 @@ def judge(kind: Kind, asked: dict, known: tuple[str, ...] = ()) -> Judged:
                   told_moment(asked, told), right,
                   (told[0]['text'] if told else answer.get('reason')) or asked['message'],
                   asked['seconds'])
+
+
+def verdict_of(asked: dict) -> str:
+    """The verdict, or what happened in its place."""
+    answer = asked['answer'] or {}
+    return answer.get('verdict') or ('timeout' if asked['status'] == TIMEOUT else 'no answer')
 
 
 def statements(answer: dict, folder: str) -> list[dict]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 import re
+from types import CodeType
 import zlib
 
 import numpy as np
@@ -61,6 +62,13 @@ class Kind:
         random = np.random.default_rng([seed, zlib.crc32(self.name.encode())])
         onset = self.change(made, random, other)
         return made, onset
+
+    def key(self) -> str:
+        """Changes with what the damage does, not with the words that are looked for."""
+        code = self.change.__code__
+        parts = [code.co_code, *(repr(c).encode() for c in code.co_consts[1:]
+                                 if not isinstance(c, CodeType)), self.scope.encode()]
+        return f'{zlib.crc32(b" ".join(parts)):08x}'
 
     def told_by(self, statement: str) -> bool:
         """Whether a statement holds the words of the cause."""
