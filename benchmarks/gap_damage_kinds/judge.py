@@ -1,0 +1,137 @@
+"""Whether the damage was noticed, and what was said about it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+import re
+
+from gap_damage_kinds.ask import TIMEOUT
+from gap_damage_kinds.kind import HARMLESS, Kind, REPAIRABLE
+
+SENSORS = ('mocap_time_offset', 'imu_filter_lag', 'joint_feedback_delay', 'mocap_misalignment',
+           'imu_accelerometer_bias', 'imu_gyroscope_bias', 'imu_misalignment', 'imu_lever_arm')
+NEAR = 2.0          # [s] from the onset
+BAD_DATA = 3        # exit status
+
+
+@dataclass(frozen=True)
+class Judged:
+    """
+    What came of one kind of damage on one set of flights.
+
+    Attributes:
+        verdict: of the JSON, or what happened in its place.
+        status: exit status.
+        names: every effect that was named.
+        false_names: effects of body, rotors, joints and commands that were named, and are not
+            named on the same flights undamaged.
+        cause: the cause stands in words; None where there is none.
+        topic: the right topic stands beside it; None without a cause.
+        onset: the moment stands beside it; None where the damage has none.
+        right: see :func:`judge`.
+        said: the statement that holds the cause, or the reason.
+        seconds: that the answer took.
+
+    """
+
+    verdict: str
+    status: int
+    names: tuple[str, ...]
+    false_names: tuple[str, ...]
+    cause: bool | None
+    topic: bool | None
+    onset: bool | None
+    right: bool
+    said: str
+    seconds: float
+
+    def plain(self) -> dict:
+        """As data."""
+        return asdict(self)
+
+
+def judge(kind: Kind, asked: dict, known: tuple[str, ...] = ()) -> Judged:
+    """
+    Judge one answer.
+
+    Right is: ``bad_data`` with exit status 3 and the cause in words; for repairable damage also
+    another verdict with status 0, the cause in words and no false name; for a control every
+    verdict but ``bad_data``, with status 0 and no false name.
+
+    Args:
+        kind: of damage.
+        asked: see :func:`~gap_damage_kinds.ask.ask`; beside that, ``onset`` of the damage [s] by
+            the undamaged stamps, or None, and ``begin``, the first of these stamps [s], from
+            which moments may count.
+        known: names that the undamaged flights get.
+
+    """
+    answer = asked['answer'] or {}
+    verdict = verdict_of(asked)
+    names = tuple(dict.fromkeys(
+        name for effect in answer.get('effects') or () for name in effect['names'][:1]))
+    false = tuple(n for n in names if n not in SENSORS and n not in known)
+    told = [s for s in statements(answer, asked['folder']) if kind.told_by(s['text'])]
+    cause = topic = None
+    if kind.causes:
+        cause = bool(told)
+        topic = any(on_topic(kind, s) for s in told)
+    refused = verdict == 'bad_data' and asked['status'] == BAD_DATA
+    used = verdict not in ('bad_data', 'timeout', 'no answer') and asked['status'] == 0
+    right = not false and not asked['crash'] and (
+        used if kind.harm == HARMLESS else
+        bool(cause) and (refused or (kind.harm == REPAIRABLE and used)))
+    return Judged(verdict, asked['status'], names, false, cause, topic,
+                  told_moment(asked, told), right,
+                  (told[0]['text'] if told else answer.get('reason')) or asked['message'],
+                  asked['seconds'])
+
+
+def verdict_of(asked: dict) -> str:
+    """The verdict, or what happened in its place."""
+    answer = asked['answer'] or {}
+    return answer.get('verdict') or ('timeout' if asked['status'] == TIMEOUT else 'no answer')
+
+
+def statements(answer: dict, folder: str) -> list[dict]:
+    """
+    Everything said: ``text``, and ``topic`` and ``at_s`` where they are told.
+
+    Args:
+        answer: the JSON.
+        folder: of the bags; it is left out, for its name is not the finder's words.
+
+    """
+    def words(text):
+        return str(text).replace(folder, '')
+
+    entries = [e for e in answer.get('bad_data') or () if isinstance(e, dict)]
+    said = [{'text': words(f"{e.get('topic') or ''}: {e.get('cause')}"), 'topic': e.get('topic'),
+             'at_s': e.get('at_s')} for e in entries]
+    return said + [{'text': words(text), 'topic': None, 'at_s': None}
+                   for text in (answer.get('reason'), *(answer.get('findings') or ())) if text]
+
+
+def on_topic(kind: Kind, statement: dict) -> bool:
+    """Whether a statement tells one of the right topics."""
+    if not kind.topics:
+        return True
+    if statement['topic']:
+        return any(str(statement['topic']).lstrip('/').endswith(t) for t in kind.topics)
+    return any(topic in statement['text'] for topic in kind.topics)
+
+
+def told_moment(asked: dict, told: list[dict]) -> bool | None:
+    """Whether a statement of the cause tells its onset; None without one."""
+    if asked['onset'] is None:
+        return None
+    return any(near(s, asked['onset'], asked['begin']) for s in told)
+
+
+def near(statement: dict, onset: float, begin: float) -> bool:
+    """Whether a statement tells the moment, by the stamps or since the first of them."""
+    if isinstance(statement['at_s'], (int, float)):
+        times = [statement['at_s']]
+    else:
+        times = [float(t) for t in re.findall(r'(\d+(?:\.\d+)?) s\b', statement['text'])]
+    return any(abs(t - moment) <= NEAR for t in times for moment in (onset, onset - begin))

@@ -1,0 +1,27 @@
+"""Small bags of a robot that turns and climbs, without a simulator."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from beetle_omni_ros.runs.bag import BagWriter
+
+DURATION, GRAVITY = 1.2, 9.80665    # [s], [m/s^2]
+
+
+def small_bag(path, phase=0.0):
+    """Write a bag: 200 Hz IMU, 100 Hz MoCap, joints and commands, all values different."""
+    with BagWriter(path, meta={'task': 'poses'}) as bag:
+        for k in range(int(DURATION * 200)):
+            t = 1.0 + k / 200
+            s = np.sin(t * np.array([1.1, 1.7, 2.3]) + phase)
+            turn = Rotation.from_rotvec(1.5 * s)
+            bag.write_imu(t, turn.inv().apply([0.1 * s[0], 0, GRAVITY]), 2.5 * s[::-1])
+            if k % 2:
+                continue
+            q = 0.3 + 0.2 * np.sin(t * np.array([1.0, 1.3, 1.6, 1.9]) + phase)
+            bag.write_mocap(t, [s[0], 2 * s[1], 1.5 + 0.3 * s[2]], turn.as_quat())
+            bag.write_joints(t, q, q - 0.3)
+            bag.write_command(t, q + 0.01, 7 + q)
+            if k % 40 == 0:
+                bag.write_battery(t, 24.0, -20.0)
+    return path
