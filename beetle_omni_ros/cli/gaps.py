@@ -24,6 +24,9 @@ def gap(runs: Annotated[list[Path], typer.Argument(
             '--report', metavar='FILE', help='Write an HTML page with the plots.')] = None,
         parameters: Annotated[Optional[Path], typer.Option(
             '--gap', metavar='FILE', help='Changes to params/gap.yaml.')] = None,
+        fix: Annotated[bool, typer.Option(
+            '--fix', help='Correct damaged recordings where the correction is certain; the bags '
+                          'stay as they are.')] = False,
         json_path: JsonOption = None):
     """
     Find where model and measurement disagree, name the effect, add it, show the gap shrink.
@@ -32,7 +35,7 @@ def gap(runs: Annotated[list[Path], typer.Argument(
     """
     from beetle_omni_ros.identify.gap.command import run_gap
     raise typer.Exit(run_gap(runs, holdout or [], robot, apply, json_path, page,
-                             parameters=parameters))
+                             parameters=parameters, fix=fix))
 
 
 def spread(arguments: list[str]) -> list[str]:

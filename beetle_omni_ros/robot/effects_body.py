@@ -174,7 +174,7 @@ BODY: dict[str, Effect] = {
         ('joint_offset', 'rotor_acceleration_torque'), 'yaw steps at zero tilt',
         _torque_coefficient),
     'ground_effect': Effect(
-        'body', {'gain_at_0.25m': EffectParameter('1', 0.0, -0.5, 1.0, 0.08, 0.01),
+        'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0, 0.08, 0.01),
                  'exponential_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0)},
         'f_i (1 + g s(h) n_z^2), s = (0.25 m / h)^2 after Cheeseman and Bennett 1955, or '
         'exp((0.25 m - h) / 0.25 m); h: rotor above the floor', 'hover below 0.6 m',
@@ -190,17 +190,17 @@ BODY: dict[str, Effect] = {
         'F = -c |v| v', 'translation above 2 m/s', ('rotor_drag', 'wind'),
         'passes above 4 m/s', _body_drag),
     'axial_inflow': Effect(
-        'body', {'per_rotor': EffectParameter('N s/m', 0.0, -2.0, 5.0, 0.4, 0.04)},
+        'body', {'per_rotor': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.04)},
         'f_i - k sqrt(f_i / f_h) v.n: momentum theory, linear part (Leishman 2006, ch. 2)',
         'climb and descent', ('rotor_lag', 'rotor_drag'),
         'steady climb and descent at 1 m/s beside thrust steps', _axial_inflow),
     'translational_lift': Effect(
-        'body', {'per_rotor': EffectParameter('N s^2/m^2', 0.0, -1.0, 1.0, 0.03, 0.01)},
+        'body', {'per_rotor': EffectParameter('N s^2/m^2', 0.0, 0.0, 1.0, 0.03, 0.01)},
         'f_i + k |v_in_plane|^2: induced velocity falls with the flow through the disc '
         '(Leishman 2006, ch. 2)', 'fast passes', ('thrust_coefficient', 'axial_inflow'),
         'level passes at 1, 2 and 3 m/s', _translational_lift),
     'tilt_thrust_loss': Effect(
-        'body', {'loss_at_60deg': EffectParameter('1', 0.0, -0.5, 0.9, 0.06, 0.01),
+        'body', {'loss_at_60deg': EffectParameter('1', 0.0, 0.0, 0.9, 0.06, 0.01),
                  'cosine_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0)},
         'f_i (1 - L s(q)), s = sin^2 q / 0.75 or 2 (1 - cos q): arm and body in the wake',
         'large tilts', ('thrust_coefficient', 'mass', 'ground_effect'),
@@ -211,7 +211,7 @@ BODY: dict[str, Effect] = {
                                                             'mocap_misalignment'),
         'hover at yaw 0 and 180 deg; fan off', _wind),
     'propeller_gyroscopic_torque': Effect(
-        'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, -1.0, 1.0, 0.066,
+        'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0, 0.066,
                                                               0.008),
                  'spin_up_share': EffectParameter('1', 1.0, 0.0, 1.0, default=1.0),
                  'joint_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0)},
@@ -221,7 +221,7 @@ BODY: dict[str, Effect] = {
         'fast tilting by internal force at rest', _propeller_gyroscopic_torque,
         _gyroscopic_load),
     'rotor_acceleration_torque': Effect(
-        'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, -1.0, 1.0, 0.066,
+        'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0, 0.066,
                                                               0.008)},
         "-h' s n with h ~ sqrt(f): spinning up turns the body", 'thrust steps',
         ('torque_coefficient', 'propeller_gyroscopic_torque', 'rotor_lag'),

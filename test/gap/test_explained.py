@@ -181,6 +181,20 @@ def test_a_reading_is_not_younger_than_its_stamp(name, delay, physical):
     assert at_bound(KEYS, trial) != physical
 
 
+@pytest.mark.parametrize('name', ['command_latency', 'joint_command_latency', 'rotor_dead_time'])
+def test_no_command_acts_before_its_stamp(name):
+    trial = Trial(Candidate(name, (f'{name}.delay',), label=name), 100.0, {f'{name}.delay': -0.01})
+    assert at_bound(KEYS, trial, (-0.002, 0.01)) and not at_bound(KEYS, trial, (0.0, 0.0))
+
+
+@pytest.mark.parametrize('name', [
+    'axial_inflow.per_rotor', 'rotor_drag.coefficient', 'body_drag.coefficient',
+    'ground_effect.gain_at_0.25m', 'translational_lift.per_rotor',
+    'tilt_thrust_loss.loss_at_60deg', 'joint_friction.coulomb', 'joint_backlash.gap'])
+def test_an_effect_of_one_sign_stays_on_its_side(name):
+    assert KEYS[name].low == 0.0 < KEYS[name].high
+
+
 def test_a_reading_may_be_younger_than_the_robot_file_says():
     late = all_keys(replace(ROBOT, effects={'joint_feedback_delay': {'delay': 0.01}}))
     key = 'joint_feedback_delay.delay'

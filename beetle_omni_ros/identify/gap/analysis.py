@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from beetle_omni_ros.identify.gap.absolute import ceilings, Loud, too_loud
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.certainty import deviations, Visibility, visibility
@@ -28,11 +29,14 @@ from beetle_omni_ros.identify.gap.rollouts import (
 from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.gap.trial import Found, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
-from beetle_omni_ros.identify.gap.verdict import decide, withdraw
+from beetle_omni_ros.identify.gap.verdict import decide, disagreement, withdraw
+from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 JUDGED = HORIZONS.index(0.5)
 AT_FLOOR = 1.1          # a gap below so much times the floor cannot be closed
+RUNS_A_BLOCK = 8        # free runs that share gusts: 4 s of flight
+CLEARLY = 2.0           # standard errors by which flights held out are worse
 WORSE = 1.05            # a regime may get worse by this
 # Noise floors that what is named may leave where it closes less than half of the gap. In the blind
 # campaign whatever was named left 3 at most; flights that are out of control leave hundreds.
@@ -63,6 +67,9 @@ class Analysis:
         models: fitted; judging.
         experiment: what to fly next, or None.
         findings: remarks of the checks.
+        partial: effects that explain a part and are not named.
+        damages: what is wrong with the recordings.
+        loud: channels beyond what sensors and gusts may make, with everything that was found.
 
     """
 
@@ -85,6 +92,8 @@ class Analysis:
     experiment: str | None = None
     findings: list[str] = field(default_factory=list)
     partial: list[Trial] = field(default_factory=list)
+    damages: list[Damage] = field(default_factory=list)
+    loud: list[Loud] = field(default_factory=list)
 
     @property
     def accepted(self) -> list[Trial]:
@@ -136,6 +145,7 @@ def _analysed(fitted, judging, robot, p, progress):
     a.patterns = patterns(a.problem, a.found.state, involved)
     a.rhythm = rhythm(a.problem, a.found.theta)
     a.where = _where(a)
+    a.loud = too_loud(models, a.found.theta, p)
     decide(a, p)
     progress('free runs')
     _falsify(a, search.wide)
@@ -206,7 +216,8 @@ def _falsify(a, wide):
                'placebo': _placebo(a)}
     everyone = list(dict.fromkeys([*a.models[0], *judges]))
     noise = dict(zip(everyone, forked(
-        lambda m: a.problem.noise_of(m, found.theta, wide), everyone), strict=True))
+        lambda m: a.problem.noise_of(m, found.theta, wide).bounded(ceilings(m, a.problem.p)),
+        everyone), strict=True))
     if not found.accepted:
         points = {name: points[name] for name in ('before', 'file')}
     flown = iter(forked(lambda pair: free_runs(pair[1], pair[0], noise[pair[1]]),
@@ -217,11 +228,9 @@ def _falsify(a, wide):
         a.runs.setdefault(name, a.runs[same])
     trim = trimmed(forked(lambda m: free_runs(m, found.theta, noise[m]), a.models[0]))
     _measure(a, trim)
-    judged = a.gaps[HORIZONS[JUDGED]]
-    worse = a.held_out and judged['after'] > max(AT_FLOOR, WORSE * judged['before'])
-    far = judged['after'] > max(FAR_OFF, 1 + (1 - LEAST_CLOSED) * (judged['before'] - 1))
-    if found.accepted and (worse or far):
-        withdraw(a, judged)
+    why = _refuted(a, trim) if found.accepted else ''
+    if why:
+        withdraw(a, a.gaps[HORIZONS[JUDGED]], why)
         a.runs |= {'after': a.runs['before'], 'effects_alone': a.runs['file'],
                    'placebo': a.runs['before']}
         _measure(a, trim)
@@ -230,6 +239,53 @@ def _falsify(a, wide):
                          for name in ('before', 'after'))
         a.regimes[str(regime)] = {'before': before, 'after': after,
                                   'worse': bool(after > WORSE * before)}
+    disagreement(a, a.gaps[HORIZONS[JUDGED]]['before'])
+
+
+def _refuted(a, trim):
+    """Why flights that judge speak against what is named, in words; '' where they do not."""
+    judged = a.gaps[HORIZONS[JUDGED]]
+    before, after = judged['before'], judged['after']
+    if not np.isfinite([before, after]).all():
+        return 'leaves free runs that end nowhere'
+    if a.held_out and after > max(AT_FLOOR, WORSE * before):
+        return 'makes the held-out ones worse'
+    if after > max(FAR_OFF, 1 + (1 - LEAST_CLOSED) * (before - 1)):
+        return 'leaves most of what free runs show'
+    if not a.held_out:
+        return ''
+    fall, scatter = _fall(a.runs['before'], a.runs['after'], trim)
+    if after > AT_FLOOR and fall < -CLEARLY * scatter:
+        return 'makes the held-out ones worse'
+    gain, error = _gain_held_out(a)
+    if fall <= scatter and gain <= error:
+        return 'does not improve the held-out ones by more than their scatter'
+    return ''
+
+
+def _fall(before, after, trim):
+    """Mean fall of the squared gap at 0.5 s over blocks of free runs, and its standard error."""
+    falls = []
+    for one, other in zip(before, after, strict=True):
+        floor = one.floor[JUDGED] * trim[JUDGED]
+        each = ((one.error[JUDGED]**2 - other.error[JUDGED]**2) / floor**2).mean(axis=1)
+        count = max(1, len(each) // RUNS_A_BLOCK)
+        falls += [part.mean() for part in np.array_split(each, count)]
+    return float(np.mean(falls)), _error(falls)
+
+
+def _gain_held_out(a):
+    """Gain of chi2 on flights that were not fitted, in the noise of the fit, and its error."""
+    judges = Problem(a.models[1], a.problem.keys, a.problem.beliefs, a.problem.p)
+    judges.use(a.problem.noise)
+    before, after = (judges.residual(theta)**2 for theta in (a.found.base, a.found.theta))
+    gains = [float((before - after)[judges.block == b].sum()) for b in range(judges.blocks)]
+    return sum(gains), len(gains) * _error(gains)
+
+
+def _error(values):
+    """Standard error of a mean."""
+    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
 
 
 def _measure(a, trim):

@@ -14,15 +14,13 @@ from beetle_omni_ros.identify.gap.residual import THIN
 from beetle_omni_ros.identify.gap.series import matrices
 from beetle_omni_ros.robot.effects import CATALOGUE
 
-MODEL_ERROR = 0.005     # of a deviation: no form is exact ...
-# ... and these the least: Stribeck curves or bristles fitted with two constants, a play that is a
-# spring as well, flapping blades, a shadow that is no parabola of the tilt are off by so much in
-# all flights alike (measured in the blind campaign).
-FORM_ERRORS = {'joint_friction': 0.1, 'joint_backlash': 0.1, 'tilt_thrust_loss': 0.1,
-               'rotor_drag': 0.1}
-LAG_ERROR = 0.1         # of a rotor's whole lag, of which a second one in series is delay to a fit
+# No form is exactly the robot's: Stribeck curves, flapping blades or a second lag in series are
+# off by this part of an effect in all flights alike, and by this part of what is worth naming.
+# The one rule for every effect; 0.04 is the median error of forms that differ (docs/gap.md).
+FORM_PART, FORM_SHARE = 0.05, 0.25
 BUS_DELAY = 0.002       # [s] that commands may differ by, when asking what could be seen
 DISAGREE = 1.5          # times what noise alone makes of it: then a scatter between bands counts
+EXCITATIONS = 4         # groups of samples of equal information
 LEAST_BANDS = 4         # that a number comes from, at least; a scatter of fewer says too little
 LEAST_SCALE = 0.3       # of the variance, where a floor made the data look noisier than they are
 
@@ -32,10 +30,10 @@ def deviations(problem: Problem, state: State, names: list[str],
     """
     Half widths of 95 % intervals.
 
-    The largest of three: noise and beliefs through the curvature of the objective, the scatter
-    between blocks of the flights, and that between slow and quick motion, neither of which needs
-    a noise model. The last one sees what is the same in all flights: answers to gusts, and a
-    form that is not quite that of the robot.
+    The largest of four: noise and beliefs through the curvature of the objective, and the scatter
+    between blocks of the flights, between slow and quick motion, and between weak and strong
+    excitation, none of which needs a noise model. The last two see what is the same in all
+    flights: answers to gusts, and a form that is not quite that of the robot.
     """
     columns = [state.index[name] for name in names]
     s = state.slopes[:, columns]
@@ -62,10 +60,29 @@ def deviations(problem: Problem, state: State, names: list[str],
         if (shares**2).sum() > DISAGREE * expected.sum():
             half = max(half, _scattered(shares, max(
                 LEAST_BANDS, expected.sum()**2 / max((expected**2).sum(), 1e-30))))
-        form = FORM_ERRORS.get(problem.keys[name].effect, MODEL_ERROR)
-        widths[name] = half + (LAG_ERROR if problem.keys[name].effect == 'rotor_lag'
-                               else form * abs(state.theta.get(name, 0.0)))
+        if name in free:
+            shares = _by_excitation(s @ a, state.r)
+            if (shares**2).sum() > DISAGREE * level * float(a @ data @ a):
+                half = max(half, _scattered(shares, EXCITATIONS))
+        form = FORM_PART * abs(state.theta.get(name, 0.0)) \
+            + FORM_SHARE * problem.keys[name].smallest
+        widths[name] = half + form
     return widths
+
+
+def _by_excitation(weight, r):
+    """
+    Shares (EXCITATIONS,) of a number that weakly to strongly excited samples want to change it by.
+
+    Args:
+        weight: (n,) by which each sample's residual enters the number.
+        r: (n,) whitened residual.
+
+    """
+    order = np.argsort(np.abs(weight))
+    part = np.cumsum(weight[order]**2)
+    edges = np.searchsorted(part, part[-1] * np.arange(1, EXCITATIONS) / EXCITATIONS)
+    return np.array([some.sum() for some in np.split((weight * r)[order], edges)])
 
 
 def _scattered(shares, count):

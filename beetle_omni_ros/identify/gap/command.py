@@ -21,12 +21,14 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import check_writable, write_json
 from beetle_omni_ros.runs.table import print_grids
 
+BAD_DATA = 3        # exit status
 LEAST_FITTED = 2    # flights, above which the last one judges where nobody named one
 
 
 def run_gap(runs: list[Path], holdout: list[Path] = (), robot: Path | None = None,
             apply: Path | None = None, json_path: Path | None = None, page: Path | None = None,
-            console: Console | None = None, parameters: Path | None = None) -> int:
+            console: Console | None = None, parameters: Path | None = None,
+            fix: bool = False) -> int:
     """
     Find where model and measurement disagree.
 
@@ -39,20 +41,21 @@ def run_gap(runs: list[Path], holdout: list[Path] = (), robot: Path | None = Non
         page: HTML page to write.
         console: where to print.
         parameters: file with changes to params/gap.yaml.
+        fix: whether damage whose correction is certain is corrected in what was read.
 
     Returns:
-        0; a verdict is no error.
+        3 for the verdict `bad_data`; 0 for any other, which is no error.
 
     Raises:
         ParameterError, LogError: unusable robot file, log or output, in one line.
 
     """
-    gap_results(runs, holdout, robot, apply, json_path, page, console, parameters)
-    return 0
+    made = gap_results(runs, holdout, robot, apply, json_path, page, console, parameters, fix)
+    return BAD_DATA if made['verdict'] == 'bad_data' else 0
 
 
 def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=None,
-                console=None, parameters=None) -> dict:
+                console=None, parameters=None, fix=False) -> dict:
     """Do as :func:`run_gap`, and return what it writes to JSON."""
     console = console or Console()
     runs, holdout = [Path(r) for r in runs], [Path(h) for h in holdout]
@@ -66,7 +69,7 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
         with Progress(SpinnerColumn(), TextColumn('{task.description}'), TimeElapsedColumn(),
                       console=console, transient=True) as bars:
             bar = bars.add_task('reading')
-            a = _analysed(runs, holdout, believed, p,
+            a = _analysed(runs, holdout, believed, p, fix,
                           lambda text: bars.update(bar, description=text))
         made = results(a, believed, p, meta)
         html = gap_page(a, made) if page else ''
@@ -84,30 +87,24 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
     return made
 
 
-def _analysed(runs, holdout, robot, p, progress):
-    findings, flights = [], {}
-
+def _analysed(runs, holdout, robot, p, fix, progress):
     def loaded(path):
         try:
-            return load_flight(path, robot, p)
+            return load_flight(path, robot, p, fix)
         except UnusableFlight as error:
             return error
 
-    paths = [*runs, *holdout]
-    for path, flight in zip(paths, forked(loaded, paths), strict=True):
-        if isinstance(flight, UnusableFlight):
-            findings.append(str(flight))
-        else:
-            flights[path] = flight
-            findings += flight.findings
-    fitted = [flights[r] for r in runs if r in flights]
-    judging = [flights[h] for h in holdout if h in flights]
-    if not fitted:
-        return Analysis('bad_data', findings[0] if findings else 'no run', findings=findings)
-    if not holdout and len(fitted) > LEAST_FITTED:
+    flights = forked(loaded, [*runs, *holdout])
+    unusable = [flight for flight in flights if isinstance(flight, UnusableFlight)]
+    if unusable:
+        # A verdict about the other flights would pass for one about all that were given.
+        return Analysis('bad_data', str(unusable[0]), findings=[str(f) for f in unusable[1:]],
+                        damages=[damage for f in unusable for damage in f.problems])
+    fitted, judging = flights[:len(runs)], flights[len(runs):]
+    if not judging and len(fitted) > LEAST_FITTED:
         fitted, judging = fitted[:-1], fitted[-1:]
     a = analyse(fitted, judging, robot, p, progress)
-    a.findings = [*findings, *a.findings]
+    a.findings = [text for flight in flights for text in flight.findings] + a.findings
     return a
 
 

@@ -103,6 +103,11 @@ class Problem:
         self.block, self.where = np.concatenate(blocks), np.concatenate(where)
         self.flight, self.time, self.blocks = np.concatenate(flights), np.concatenate(times), first
 
+    def use(self, noise: Noise) -> None:
+        """Take a noise that was learnt elsewhere."""
+        self.noise = noise
+        self._label()
+
     def residual(self, theta: dict[str, float]) -> np.ndarray:
         """(n,) whitened."""
         return np.concatenate(forked(lambda m: self.noise.whiten(m.residual(theta)), self.models))

@@ -17,6 +17,8 @@ LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
 # from 708).
 LEAST_UNEVEN = 300.0
 AGES = ('imu_filter_lag.delay', 'joint_feedback_delay.delay')   # of readings at their stamps
+COMMANDS = ('command_latency.delay', 'joint_command_latency.delay', 'rotor_dead_time.delay')
+EARLY = 5e-4            # [s] before a stamp, as well as a fit knows a delay
 # Two forms of one response: where one is joined and the other still gains beside it, the response
 # has a shape that neither holds, such as a lag of second order, and which number is wrong is open.
 ONE_RESPONSE = {'rotor_lag', 'rotor_dead_time'}
@@ -53,12 +55,22 @@ def believed(p: GapParameters, gain: float, of_beliefs: float, price: float = 0.
     return min(gain, of_beliefs) >= p.least_believed + price
 
 
-def at_bound(keys: dict[str, Key], trial: Trial) -> bool:
+def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = ()) -> bool:
     """
     Whether a number is as far off as it can be; zero is a bound of a friction, too.
 
-    Readings that would be younger than their stamps are beyond it.
+    Readings that would be younger than their stamps are beyond it, and so are commands that would
+    act before theirs.
+
+    Args:
+        keys: by name.
+        trial: with its numbers.
+        delays: from the stamps of tilt and thrust commands until they act, with them [s].
+
     """
+    if any(name in COMMANDS for name in trial.candidate.keys) \
+            and min(delays, default=0.0) < -EARLY:
+        return True
     for name in trial.candidate.keys:
         x, key = trial.theta.get(name, 0.0), keys[name]
         if x >= key.high or x <= key.low != 0.0 or name in AGES and key.value(x) < 0:

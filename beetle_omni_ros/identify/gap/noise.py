@@ -58,6 +58,19 @@ class Noise:
             seen[group] = np.array(own)
         return cls(taps, sigma, seen)
 
+    def bounded(self, ceilings: dict[str, np.ndarray]) -> Noise:
+        """
+        Return the same noise, no channel louder than it may be.
+
+        Args:
+            ceilings: group -> (channels,) root mean square of a sound residual.
+
+        """
+        shares = {group: np.minimum(1.0, ceilings[group] / np.maximum(size, 1e-12))
+                  for group, size in self.spread.items()}
+        return Noise(self.taps, {g: x * shares[g] for g, x in self.sigma.items()},
+                     {g: x * shares[g] for g, x in self.seen.items()})
+
     def whiten(self, residual: dict[str, np.ndarray]) -> np.ndarray:
         """(n,) or (n, K) whitened samples of one flight's residual or slopes, groups in a row."""
         parts = []

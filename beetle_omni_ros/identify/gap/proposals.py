@@ -12,13 +12,13 @@ from beetle_omni_ros.identify.gap.trial import Trial
 
 REFINED = 5             # candidates of each step that are fitted, not only estimated
 PROMISING = 0.25        # of the best linear gain
+LEAST_LOOKED_AT = 0.5   # of what an effect must gain: a straight line may promise too little
 PROMISING_CURVED = 0.1  # likewise, of those that a straight line cannot judge
 
 
-def proposed(problem: Problem, candidates: list[Candidate], state: State, cost: float,
-             involved: list[str], free: frozenset[str]) -> tuple[list[Trial], dict[str, State]]:
+class Proposals:
     """
-    Try each candidate beside what is fitted, on all cores.
+    Every candidate tried beside what is fitted, on all cores.
 
     Args:
         problem: flights, beliefs, noise.
@@ -28,49 +28,78 @@ def proposed(problem: Problem, candidates: list[Candidate], state: State, cost: 
         involved: keys that are fitted in any case.
         free: of which nothing is believed.
 
-    Returns:
-        trials, most gain first, and by label the point at which each was judged.
+    Attributes:
+        trials: one for each candidate, most gain first.
+        points: label -> the point at which the trial was judged.
 
     """
-    h, g = state.slopes.T @ state.slopes, state.slopes.T @ state.r
-    chi2 = float(state.r @ state.r)
 
-    def names_with(c):
-        return list(dict.fromkeys([*involved, *c.keys])), free | set(c.keys)
+    def __init__(self, problem: Problem, candidates: list[Candidate], state: State, cost: float,
+                 involved: list[str], free: frozenset[str]):
+        """Estimate all of them from slopes."""
+        self.problem, self.state, self.cost = problem, state, cost
+        self.involved, self.free = involved, free
+        h, g = state.slopes.T @ state.slopes, state.slopes.T @ state.r
+        chi2 = float(state.r @ state.r)
 
-    def estimated(c):
-        names, released = names_with(c)
-        if c.starts or c.fixed:
-            trial, point = _elsewhere(problem, state, cost, c, names, released)
-            return trial, point.beside(state)
-        index = [state.index[name] for name in names]
-        theta = handed_over(state.theta, c)
-        step, reached, _ = problem.solve(theta, names, released, h[np.ix_(index, index)],
-                                         g[index], chi2)
-        trial = Trial(c, cost - reached, problem.moved(theta, names, step))
-        return trial, None if theta is state.theta else State(
-            theta, problem.residual(theta), state.slopes, state.names).beside(state)
+        def estimated(c):
+            names, released = self._with(c)
+            if c.starts or c.fixed:
+                trial, point = _elsewhere(problem, state, cost, c, names, released)
+                return trial, point.beside(state)
+            index = [state.index[name] for name in names]
+            theta = handed_over(state.theta, c)
+            step, reached, _ = problem.solve(theta, names, released, h[np.ix_(index, index)],
+                                             g[index], chi2)
+            trial = Trial(c, cost - reached, problem.moved(theta, names, step))
+            return trial, None if theta is state.theta else State(
+                theta, problem.residual(theta), state.slopes, state.names).beside(state)
 
-    trials, points = [], {}
-    for c, (trial, difference) in zip(candidates, forked(estimated, candidates), strict=True):
-        trials.append(trial)
-        points[c.label] = state.with_difference(difference) if difference else state
-    trials.sort(key=lambda t: -t.gain)
-    chosen = _promising(problem, trials)
+        self.trials: list[Trial] = []
+        self.points: dict[str, State] = {}
+        for c, (trial, difference) in zip(candidates, forked(estimated, candidates), strict=True):
+            self.trials.append(trial)
+            self.points[c.label] = state.with_difference(difference) if difference else state
+        self.trials.sort(key=lambda t: -t.gain)
 
-    def refined(k):
-        c = trials[k].candidate
-        new, reached = problem.refine(points[c.label], *names_with(c), 4)
-        return new.beside(state), reached
+    def _with(self, c):
+        return list(dict.fromkeys([*self.involved, *c.keys])), self.free | set(c.keys)
 
-    for k, (difference, reached) in zip(chosen, forked(refined, chosen), strict=True):
-        c = trials[k].candidate
-        points[c.label] = state.with_difference(difference)
-        theta = dict(points[c.label].theta)
-        believed = problem.prior(state.theta, free) - problem.prior(theta, names_with(c)[1])
-        trials[k] = Trial(c, cost - reached, theta, True, believed)
-    trials.sort(key=lambda t: -t.gain)
-    return trials, points
+    def fit_best(self) -> list[Trial]:
+        """Fit the most promising ones; all trials, most gain first."""
+        self._fit(_promising(self.problem, self.trials))
+        return self.trials
+
+    def fit_more(self) -> list[Trial]:
+        """
+        Fit the next that gain, whatever stood before them; these, most gain first.
+
+        What leads may be too small to matter, or hold in one block only: then it must not hide
+        what explains less and is there.
+        """
+        least = LEAST_LOOKED_AT * self.problem.p.least_gain
+        chosen = [k for k, trial in enumerate(self.trials)
+                  if not trial.refined and trial.gain >= least][:REFINED]
+        labels = {self.trials[k].candidate.label for k in chosen}
+        self._fit(chosen)
+        return [trial for trial in self.trials if trial.candidate.label in labels]
+
+    def _fit(self, chosen):
+        problem, state, trials, points = self.problem, self.state, self.trials, self.points
+
+        def refined(k):
+            c = trials[k].candidate
+            new, reached = problem.refine(points[c.label], *self._with(c), 4)
+            return new.beside(state), reached
+
+        for k, (difference, reached) in zip(chosen, forked(refined, chosen), strict=True):
+            c = trials[k].candidate
+            points[c.label] = state.with_difference(difference)
+            theta = dict(points[c.label].theta)
+            believed = problem.prior(state.theta, self.free) - problem.prior(
+                theta, self._with(c)[1])
+            trials[k] = Trial(c, self.cost - reached, theta, True, believed)
+        trials.sort(key=lambda t: -t.gain)
 
 
 def _promising(problem, trials):
@@ -80,7 +109,8 @@ def _promising(problem, trials):
     for k, trial in enumerate(trials):
         curved = any(problem.keys[n].parameter in CURVED for n in trial.candidate.keys)
         if trial.gain < (PROMISING_CURVED if curved else PROMISING) * best \
-                or trial.gain < 0.5 * problem.p.least_gain or len(chosen) >= REFINED + 3:
+                or trial.gain < LEAST_LOOKED_AT * problem.p.least_gain \
+                or len(chosen) >= REFINED + 3:
             continue
         if len(chosen) < REFINED or curved:
             chosen.append(k)

@@ -37,6 +37,8 @@ def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -
         'next_experiment': a.experiment,
         'horizons': {f'{h:g} s': values for h, values in a.gaps.items()},
         'regimes': a.regimes, 'held_out': a.held_out, 'findings': a.findings,
+        'bad_data': [{'run': d.run, 'topic': d.topic, 'cause': d.cause, 'at_s': d.at_s,
+                      'sure': d.sure, 'fix': d.fix} for d in a.damages],
         'modules_of_the_file': bool(a.models[0] and a.models[0][0].modules),
         'meta': {**meta, 'version': __version__}}
     if a.problem is not None:

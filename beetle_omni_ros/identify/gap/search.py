@@ -12,6 +12,7 @@ from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
 from beetle_omni_ros.identify.gap.gates import (
     at_bound,
     believed,
+    COMMANDS,
     cross_validate,
     enough,
     fought,
@@ -19,7 +20,7 @@ from beetle_omni_ros.identify.gap.gates import (
     neither_holds,
 )
 from beetle_omni_ros.identify.gap.keys import SHAPES
-from beetle_omni_ros.identify.gap.proposals import proposed
+from beetle_omni_ros.identify.gap.proposals import Proposals
 from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, NOT_HELD, TOO_SMALL
 
 MOST_TURNS = 4          # of fresh slopes, while a fit runs away from them
@@ -50,6 +51,8 @@ class Search:
         self.wide = {name: WIDE * problem.keys[name].typical for name in self.names}
         self.always = [name for name in problem.beliefs if name in problem.keys]
 
+    _proposals: Proposals | None = None     # of the present step
+
     def run(self) -> Found:
         """Search; see the module."""
         found, problem, everyone = Found(), self.problem, self.candidates
@@ -66,6 +69,9 @@ class Search:
             for trial in trials:
                 found.trials[trial.candidate.label] = trial
             best = self._judge(trials, cost, floor, [t.candidate for t in found.accepted])
+            while best is None and self._proposals and (more := self._proposals.fit_more()):
+                best = self._judge(more, cost, floor, [t.candidate for t in found.accepted])
+                found.trials |= {trial.candidate.label: trial for trial in more}
             if best is None or len(found.accepted) >= self.p.most_effects:
                 break
             found.accepted.append(best)
@@ -157,10 +163,10 @@ class Search:
         taken, free = {c.label for c in accepted}, self._free(accepted)
         asked = [c for c in self.candidates
                  if c.label not in taken and not any(key in free for key in c.keys)]
-        trials, self._points = proposed(self.problem, asked, state, cost,
-                                        self._involved(accepted), free)
+        self._proposals = Proposals(self.problem, asked, state, cost, self._involved(accepted),
+                                    free)
         self._without = state
-        return trials
+        return self._proposals.fit_best()
 
     def _judge(self, trials, cost, floor, accepted):
         """The first trial that passes every gate; the others get their reason."""
@@ -181,7 +187,7 @@ class Search:
                 trial.reason = TOO_SMALL
             elif (c.name, c.member) in names_taken:
                 trial.reason = 'named already'
-            elif at_bound(self.problem.keys, trial):
+            elif self._impossible(trial):
                 trial.reason = 'beyond what is physical'
             elif chosen is not None:
                 trial.reason = 'others explain more'
@@ -199,13 +205,18 @@ class Search:
                     chosen = trial
         return chosen
 
+    def _impossible(self, trial):
+        commanded = any(name in COMMANDS for name in trial.candidate.keys)
+        return at_bound(self.problem.keys, trial, self.problem.models[0].signals.delays(
+            trial.theta) if commanded else ())
+
     def _fought(self, trial, accepted):
-        return fought(self.problem, trial, self._points[trial.candidate.label],
+        return fought(self.problem, trial, self._proposals.points[trial.candidate.label],
                       self._involved(accepted), self._free(accepted))
 
     def _cross_validate(self, trial, accepted):
-        cross_validate(self.problem, trial, self._points[trial.candidate.label], self._without,
-                       self._involved(accepted), self._free(accepted))
+        cross_validate(self.problem, trial, self._proposals.points[trial.candidate.label],
+                       self._without, self._involved(accepted), self._free(accepted))
 
     def _prune(self, found, state, cost):
         """Drop what later steps, or the noise learnt after the last one, made superfluous."""
@@ -253,7 +264,7 @@ class Search:
                 near_enough = other.gain > gain - margin \
                     or neither_holds(found, own.name, other.candidate.name, self.p.rival_gain)
                 if not (other.refined and near_enough) \
-                        or at_bound(self.problem.keys, other) \
+                        or self._impossible(other) \
                         or not other.candidate.large_enough(self.problem.keys, other.theta):
                     continue
                 self._cross_validate(other, others)

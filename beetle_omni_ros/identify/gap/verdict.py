@@ -49,11 +49,11 @@ def decide(a: Analysis, p: GapParameters) -> None:
     elif found.accepted:
         part = a.rest.gain / max(before - after, 1e-9)
         if left > p.least_left and explained < p.enough or strange \
-                or repeats and part > p.remainder_share:
+                or repeats and part > p.remainder_share or a.loud:
             a.verdict, a.partial = 'unknown', list(found.accepted)
+            rest = strange or (a.loud[0].text if a.loud else a.rest.text)
             a.reason = (f'{found.accepted[0].candidate.name} and its like explain '
-                        f'{explained:.0%} of what known effects could; the rest is '
-                        f'{strange or a.rest.text}')
+                        f'{explained:.0%} of what known effects could; the rest: {rest}')
             found.accepted.clear()
         elif max(names) >= p.crowd or (share > p.most_hidden and max(names) > 1):
             a.verdict = 'not_decidable'
@@ -61,6 +61,8 @@ def decide(a: Analysis, p: GapParameters) -> None:
         else:
             a.verdict = 'named_set' if max(names) > 1 else 'named'
             a.reason = f'explains {explained:.1%} of what known effects could explain'
+    elif a.loud:
+        a.verdict, a.reason = 'unknown', f'{a.loud[0].text}, and no known effect explains it'
     elif repeats or strange or left > 0.05 * count:
         a.verdict, a.reason = 'unknown', strange or a.rest.text
     elif share > p.most_hidden:
@@ -72,22 +74,39 @@ def decide(a: Analysis, p: GapParameters) -> None:
     a.experiment = _experiment(a, sets if found.accepted or pushed else [], out_of_sight)
 
 
-def withdraw(a: Analysis, gap: dict[str, float]) -> None:
+def disagreement(a: Analysis, gap: float) -> None:
     """
-    Take back what makes flights that were not fitted worse, or leaves most of a large gap.
+    Take "no gap" back where free runs or a channel are farther off than noise may be.
+
+    Args:
+        a: decided, with its free runs.
+        gap: of the flights that judge, in noise floors.
+
+    """
+    if a.verdict != 'no_gap':
+        return
+    if not gap <= a.problem.p.agreement:
+        a.verdict = 'unknown'
+        a.reason = (f'free runs are {gap:.2f} noise floors off, and no known effect explains it; '
+                    f'flights without a gap have at most {a.problem.p.agreement:g}')
+        a.experiment = _experiment(a, [], [])
+
+
+def withdraw(a: Analysis, gap: dict[str, float], why: str) -> None:
+    """
+    Take back what flights that judge speak against.
 
     Such a model is not to be flown with, and such an effect is not what differs.
 
     Args:
         a: decided, with something named.
         gap: 'before' and 'after' of the flights that judge, in noise floors.
+        why: what the effects do to those flights.
 
     """
     names = ' and '.join(t.candidate.name for t in a.accepted)
     a.verdict, a.partial = 'unknown', list(a.found.accepted)
-    worse = 'makes the held-out ones worse' if gap['after'] > gap['before'] else \
-        'leaves most of what free runs show'
-    a.reason = (f'{names} would explain the fitted flights and {worse}: '
+    a.reason = (f'{names} would explain the fitted flights and {why}: '
                 f'{gap["before"]:.2f} to {gap["after"]:.2f} noise floors in free runs')
     a.found.accepted.clear()
     a.experiment = _experiment(a, [], [])
