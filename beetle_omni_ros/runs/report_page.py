@@ -26,6 +26,12 @@ img { width: 100%; height: auto; display: block; }
 .card .warning { color: #a3470b; display: block; }
 figure { margin: 0 0 22px; } figure:last-child { margin-bottom: 0; }
 figcaption { font-weight: 600; margin: 0 0 6px; }
+.note { color: var(--faint); margin: 0 0 8px; font-size: 13px; }
+.verdict { border-left: 10px solid; }
+.verdict h2 { font-size: 26px; margin: 0 0 6px; }
+.verdict p.said { color: var(--ink); font-size: 17px; margin: 0 0 12px; overflow-wrap: anywhere; }
+@media (max-width: 600px) { main { padding: 20px 10px 40px; } section { padding: 14px 12px; }
+  .verdict h2 { font-size: 21px; } li { overflow-wrap: anywhere; } }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: 13.5px;
   font-variant-numeric: tabular-nums; }

@@ -48,6 +48,7 @@ class Grid:
         rows: their cells.
         faint: indices of rows that are not ours but published.
         faint_columns: indices of such columns.
+        note: what the columns mean, below the title.
 
     """
 
@@ -56,6 +57,7 @@ class Grid:
     rows: list[list[str]]
     faint: frozenset[int] = frozenset()
     faint_columns: frozenset[int] = frozenset()
+    note: str = ''
 
 
 def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
@@ -240,6 +242,8 @@ def print_grids(shown: list[Grid], console: Console) -> None:
     """Print tables to the terminal."""
     for grid in shown:
         console.print(_rich(grid))
+        if grid.note:
+            console.print(grid.note, style='dim', highlight=False, markup=False)
 
 
 def _rich(grid):
@@ -279,6 +283,7 @@ def html(grid: Grid) -> str:
     body = ''.join(
         '<tr>' + ''.join(cell('td', text, row, k) for k, text in enumerate(cells)) + '</tr>\n'
         for row, cells in enumerate(grid.rows))
-    return (f'<figure class="table"><figcaption>{escape(grid.title)}</figcaption>'
+    note = f'<p class="note">{escape(grid.note)}</p>' if grid.note else ''
+    return (f'<figure class="table"><figcaption>{escape(grid.title)}</figcaption>{note}'
             f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'
             f'<tbody>{body}</tbody></table></div></figure>\n')

@@ -4,16 +4,20 @@ from dataclasses import replace
 from io import StringIO
 import json
 import os
+import shutil
 import sys
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from beetle_omni_ros import cli
 from beetle_omni_ros.evaluation.command import fly
 from beetle_omni_ros.identify.gap.command import gap_results, run_gap
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.bag import BagWriter
+from beetle_omni_ros.runs.bag_reader import read_messages
 from beetle_omni_ros.runs.tasks import make_task
 
 TRUE = np.array([1.2, -0.8, 0.0])
@@ -116,12 +120,75 @@ def test_page_and_terminal_say_what_was_found(made):
     assert page.count('<img') >= 3 and 'src="http' not in page
 
 
-def test_a_missing_bag_is_bad_data_not_a_traceback(tmp_path):
-    code = run_gap([tmp_path / 'none'], json_path=tmp_path / 'gap.json', console=quiet(),
-                   page=tmp_path / 'gap.html')
+def _bag_of_something_else(folder):
+    with BagWriter(folder / 'other', topics=('battery_state',)):
+        pass
+    return folder / 'other'
+
+
+@pytest.mark.parametrize(('made', 'words'), [
+    (lambda folder: folder / 'none', 'no such bag'),
+    (lambda folder: folder, 'no .mcap file'),
+    (lambda folder: folder / 'photo.jpg', 'expected a rosbag2 folder'),
+    (_bag_of_something_else, 'no recording of this robot')])
+def test_what_is_no_recording_of_this_robot_is_one_line_and_status_2(made, words, tmp_path,
+                                                                     capsys):
+    (tmp_path / 'photo.jpg').write_bytes(b'no bag')
+    run = made(tmp_path)
+    for arguments in ([run], ['x', '--holdout', run]):
+        (tmp_path / 'x').mkdir(exist_ok=True)
+        assert cli.main(['gap', *map(str, arguments)]) == 2
+        error = capsys.readouterr().err.strip()
+        assert len(error.splitlines()) == 1
+    assert cli.main(['gap', str(run)]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_the_same_recording_twice_is_refused_under_any_name(made, tmp_path, capsys):
+    flight = made[0] / 'flight0'
+    (tmp_path / 'link').symlink_to(flight)
+    shutil.copytree(flight, tmp_path / 'copy')
+    for other in (flight, tmp_path / 'link', tmp_path / 'copy'):
+        assert cli.main(['gap', str(flight), '--holdout', str(other)]) == 2
+        error = capsys.readouterr().err
+        assert 'the same recording twice' in error and str(other) in error
+
+
+def test_a_damaged_hold_out_is_bad_data_and_not_left_out(made, tmp_path):
+    damaged = tmp_path / 'damaged'
+    with BagWriter(damaged) as bag:
+        for message in read_messages(made[0] / 'flight1'):
+            if not message.topic.endswith('imu/data_raw'):
+                bag.write_raw(message.topic, message.type, message.data, message.received)
+    console = quiet()
+    status = run_gap([made[0] / 'flight0'], [damaged], json_path=tmp_path / 'gap.json',
+                     page=tmp_path / 'gap.html', console=console)
     results = json.loads((tmp_path / 'gap.json').read_text())
-    assert code == 0 and results['verdict'] == 'bad_data' and 'no such bag' in results['reason']
+    assert status == 3 and results['verdict'] == 'bad_data'
     assert results['effects'] == [] and results['closure'] is None
+    row, = results['bad_data']
+    assert (row['run'], row['topic']) == ('damaged', 'imu/data_raw')
+    assert 'damaged' in results['summary']
+    assert console.file.getvalue().count(results['summary']) == 1
+    assert 'bad data' in (tmp_path / 'gap.html').read_text()
+
+
+def test_the_page_begins_with_verdict_sentence_and_picture(made):
+    page = (made[0] / 'gap.html').read_text()
+    begin = page.index('class="verdict"')
+    assert begin < page.index('class="said"') < page.index('<img') < page.index('<table')
+    assert made[1]['summary'][:40] in page
+
+
+def test_the_sentence_says_size_and_closure(made):
+    assert made[1]['summary'].startswith('Wind of 1.2') and '+-' in made[1]['summary']
+    assert f'{made[1]["closure"]:.0%}' in made[1]['summary']
+
+
+def test_tables_explain_their_columns(made):
+    for words in ('sign reversed', 'closure: part of the gap', 'standard deviations'):
+        assert words in made[2]
+    assert 'placebo' not in made[2]
 
 
 def test_the_believed_file_is_not_overwritten(tmp_path):

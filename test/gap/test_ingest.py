@@ -8,6 +8,7 @@ import pytest
 
 from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.ingest import load_flight, prepare, UnusableFlight
+from beetle_omni_ros.runs.bag_reader import BagError
 
 
 def recording(duration=16.0):
@@ -100,5 +101,5 @@ def test_readings_that_are_no_numbers_are_left_out_and_counted():
 
 
 def test_no_bag_at_all_is_one_line(tmp_path):
-    with pytest.raises(UnusableFlight, match='no such bag'):
+    with pytest.raises(BagError, match='no such bag'):
         load_flight(tmp_path / 'nothing', ROBOT, P)

@@ -32,7 +32,9 @@ def rivals(monkeypatch, accepted, other, beside, instead):
     state = State({}, np.zeros(4), np.zeros((4, 1)), [accepted[1]])
     search = Search.__new__(Search)
     search.p = P
-    search.problem = SimpleNamespace(keys=KEYS, residual=lambda theta: np.zeros(4))
+    signals = SimpleNamespace(delays=lambda theta: (0.01, 0.01))
+    search.problem = SimpleNamespace(keys=KEYS, residual=lambda theta: np.zeros(4),
+                                     models=[SimpleNamespace(signals=signals)])
     monkeypatch.setattr(Search, '_refit', lambda self, start, others, n: (start, 1220.0))
     monkeypatch.setattr(Search, '_step', lambda *rest: [trial(other, instead)])
 

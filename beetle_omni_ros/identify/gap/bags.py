@@ -48,7 +48,7 @@ def read_recording(path: str | Path) -> Recording:
     Read the topics that the gap finder needs.
 
     Raises:
-        BagError: no such bag, not readable, or several robots in it.
+        BagError: no such bag, not readable, several robots in it, or none of this kind.
 
     """
     rows: dict[str, list] = {name: [] for name in (*NEEDED, *OPTIONAL)}
@@ -79,6 +79,10 @@ def read_recording(path: str | Path) -> Recording:
             rows[name].append((*_READERS[name](message.data, layouts), message.received))
         except (struct.error, ValueError, IndexError, KeyError):
             bad[name] += 1
+    if not any(rows[name] for name in NEEDED):
+        found = ', '.join(sorted(known)) or 'no message'
+        raise BagError(f'{path}: no recording of this robot: expected {", ".join(NEEDED)} with '
+                       f'its joints and rotors, found {found}')
     warnings += [f'{name}: {count} messages not readable' for name, count in bad.items()]
     times, values, received = {}, {}, {}
     for name, width in {**NEEDED, **OPTIONAL}.items():

@@ -10,11 +10,12 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from beetle_omni_ros.identify.gap.analysis import analyse, Analysis
 from beetle_omni_ros.identify.gap.apply import write_corrected
 from beetle_omni_ros.identify.gap.forks import forked
+from beetle_omni_ros.identify.gap.given import check_apart
 from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
 from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log
 from beetle_omni_ros.identify.gap.page import gap_page
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.results import grids, results, WORDS
+from beetle_omni_ros.identify.gap.results import grids, headline, results
 from beetle_omni_ros.identify.robot_file import check_not_base, write_text
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -47,7 +48,8 @@ def run_gap(runs: list[Path], holdout: list[Path] = (), robot: Path | None = Non
         3 for the verdict `bad_data`; 0 for any other, which is no error.
 
     Raises:
-        ParameterError, LogError: unusable robot file, log or output, in one line.
+        BagError: a run that does not exist or is no recording of this robot, in one line.
+        ParameterError, LogError: unusable robot file, log or output, or the same run twice.
 
     """
     made = gap_results(runs, holdout, robot, apply, json_path, page, console, parameters, fix)
@@ -60,6 +62,7 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
     console = console or Console()
     runs, holdout = [Path(r) for r in runs], [Path(h) for h in holdout]
     _check_outputs(apply, robot, json_path, page)
+    check_apart([*runs, *holdout])
     believed, p = RobotParameters.load(robot), GapParameters.load(parameters)
     if any(run.suffix.lower() == '.csv' for run in runs):
         made, html = analyse_joint_log(runs, holdout, believed, robot)
@@ -117,11 +120,9 @@ def _check_outputs(apply, robot, json_path, page):
 
 
 def _print(console, made):
-    names = ', '.join(' or '.join(effect['names']) for effect in made['effects'])
-    console.print(f"{WORDS[made['verdict']]}{': ' + names if names else ''}", style='bold',
-                  highlight=False, markup=False)
-    console.print(made['reason'], highlight=False, markup=False)
-    for finding in made['findings']:
+    console.print(headline(made), style='bold', highlight=False, markup=False)
+    console.print(made['summary'], highlight=False, markup=False)
+    for finding in dict.fromkeys(made['findings']):
         console.print(finding, style='dim', highlight=False, markup=False)
     print_grids(grids(made), console)
     if made['next_experiment']:

@@ -12,7 +12,6 @@ from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.bag_reader import BagError
 
 SETTLE = 1.0            # [s] after take-off that are not looked at
 LIFTED = 0.8            # of the weight: commanded thrust that flies
@@ -89,14 +88,11 @@ def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
         fix: whether corrections that are certain are applied to what was read.
 
     Raises:
+        BagError: no such bag, or no recording of this robot.
         UnusableFlight: naming the recording and what is wrong with it.
 
     """
-    try:
-        recording = read_recording(path)
-    except BagError as error:
-        raise UnusableFlight(str(error)) from None
-    return prepare(recording, robot, p, fix)
+    return prepare(read_recording(path), robot, p, fix)
 
 
 def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,

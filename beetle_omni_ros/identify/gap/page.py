@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from html import escape
-
 import matplotlib
 from matplotlib.figure import Figure
 import numpy as np
 
 from beetle_omni_ros.identify.gap.analysis import Analysis, JUDGED
 from beetle_omni_ros.identify.gap.residual import CHANNELS, UNITS
-from beetle_omni_ros.identify.gap.results import _evidence, grids, WORDS
+from beetle_omni_ros.identify.gap.results import _evidence, grids, headline
 from beetle_omni_ros.identify.gap.rollouts import STATES
 from beetle_omni_ros.identify.gap.rollouts import UNITS as STATE_UNITS
-from beetle_omni_ros.identify.page import page
+from beetle_omni_ros.identify.page import page, verdict_head
 from beetle_omni_ros.runs.figures import COLOURS, FAINT, legend, line, panels, STYLE, svg
 from beetle_omni_ros.runs.report_page import section
 from beetle_omni_ros.runs.table import Grid, html
 
 BARS = 16
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
+# Of verdicts: settled, found, open, unusable.
+VERDICT_COLOURS = {'no_gap': '#2b7a3d', 'named': '#1f5fa8', 'named_set': '#1f5fa8',
+                   'unknown': '#b06a00', 'not_decidable': '#b06a00', 'bad_data': '#b3261e'}
+SHOWN = ('position', 'orientation')     # states of the first picture
 
 
 def gap_page(a: Analysis, made: dict) -> str:
@@ -31,7 +33,7 @@ def gap_page(a: Analysis, made: dict) -> str:
         made: its results.
 
     """
-    notes = [made['reason'], *([f'Next: {made["next_experiment"]}']
+    notes = [f'Reason: {made["reason"]}', *([f'Next: {made["next_experiment"]}']
                                if made['next_experiment'] else []), *made['findings']]
     sections = []
     if a.problem is not None:
@@ -50,10 +52,41 @@ def gap_page(a: Analysis, made: dict) -> str:
                         'is most like. Below 5 it could not be told.', html(_visible(made))),
                 section('Tolerances', 'What this robot differs by within what any robot does; '
                         'carried along, not named and not written.', html(_tolerances(made)))]
-    word = WORDS[made['verdict']]
-    named = ', '.join(' or '.join(e['names']) for e in made['effects'])
-    return page('Gap', f'{word}{": " + named if named else ""}; '
-                f'{escape(", ".join(made["meta"]["runs"]))}', grids(made)[:3], notes, sections)
+    return page('Gap', ', '.join(made['meta']['runs']), grids(made)[:3], notes, sections,
+                head(made, _picture(a)))
+
+
+def head(made: dict, picture: str = '') -> str:
+    """Verdict, sentence and picture of any results of `gap`, as HTML."""
+    return verdict_head(headline(made), VERDICT_COLOURS[made['verdict']], made['summary'],
+                        picture)
+
+
+def _picture(a):
+    """Free runs before and after, or nothing where there are none."""
+    if not a.runs:
+        return ''
+    with matplotlib.rc_context(STYLE):
+        figure, axes = panels(len(SHOWN), 1, height=1.6, sharex=True)
+        lines = [('before', BEFORE, 'robot file, tolerances fitted')]
+        if a.found.accepted:
+            lines.append(('after', AFTER, 'with what is named'))
+        for axis, state in zip(axes[:, 0], SHOWN, strict=True):
+            _errors(a, axis, state, lines)
+        axes[-1, 0].set_xlabel('start of the free run, every 0.5 s of flight')
+        legend(figure, axes[0, 0])
+        return svg(figure, 'error of the model alone after half a second')
+
+
+def _errors(a, axis, state, lines):
+    k = STATES.index(state)
+    for name, colour, label in lines:
+        error = np.concatenate([run.error[JUDGED][:, k] for run in a.runs[name]])
+        axis.plot(error, color=colour, lw=1.0, label=label)
+    axis.axhline(a.runs['before'][0].floor[JUDGED][k], color=FAINT, ls='--', lw=0.9,
+                 label='noise alone')
+    axis.set_ylabel(f'{state} [{STATE_UNITS[state]}]')
+    axis.set_ylim(bottom=0)
 
 
 def _residuals(a) -> Figure:
@@ -76,14 +109,9 @@ def _residuals(a) -> Figure:
 
 def _runs(a) -> Figure:
     figure, axes = panels(len(STATES), 1, height=1.4, sharex=True)
-    for k, (axis, state) in enumerate(zip(axes[:, 0], STATES, strict=True)):
-        for name, colour, label in (('before', BEFORE, 'file as it was'),
-                                    ('after', AFTER, 'with the effects')):
-            error = np.concatenate([run.error[JUDGED][:, k] for run in a.runs[name]])
-            axis.plot(error, color=colour, lw=1.0, label=label)
-        axis.axhline(a.runs['before'][0].floor[JUDGED][k], color=FAINT, ls='--', lw=0.9)
-        axis.set_ylabel(f'{state} [{STATE_UNITS[state]}]')
-        axis.set_ylim(bottom=0)
+    lines = (('before', BEFORE, 'file as it was'), ('after', AFTER, 'with the effects'))
+    for axis, state in zip(axes[:, 0], STATES, strict=True):
+        _errors(a, axis, state, lines)
     axes[-1, 0].set_xlabel('start of the run, every 0.5 s')
     legend(figure, axes[0, 0])
     return figure

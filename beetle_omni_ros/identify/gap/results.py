@@ -11,6 +11,7 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.gap.analysis import Analysis, JUDGED
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.rollouts import HORIZONS
+from beetle_omni_ros.identify.gap.sentence import summary
 from beetle_omni_ros.identify.gap.trial import Trial
 from beetle_omni_ros.identify.gap.verdict import hidden
 from beetle_omni_ros.robot.effects import CATALOGUE
@@ -20,7 +21,7 @@ from beetle_omni_ros.runs.table import ABSENT, Grid
 MOST_ROWS = 12
 WORDS = {'no_gap': 'no gap', 'named': 'named', 'named_set': 'one of a set',
          'unknown': 'unknown: none of the known effects', 'not_decidable': 'not decidable',
-         'bad_data': 'bad data'}
+         'bad_data': 'bad data: the recording contradicts itself'}
 
 
 def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -> dict:
@@ -53,7 +54,14 @@ def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -
                                'terms': dict(a.rest.terms)},
                  'patterns': [asdict(pattern) for pattern in a.patterns],
                  'rhythm': asdict(a.rhythm)}
+    made['summary'] = summary(made)
     return made
+
+
+def headline(made: dict) -> str:
+    """Return the verdict and the names, if any."""
+    names = ', '.join(' or '.join(effect['names']) for effect in made['effects'])
+    return f"{WORDS[made['verdict']]}{': ' + names if names else ''}"
 
 
 def _effect(a, trial, robot):
@@ -142,6 +150,8 @@ def _tolerances(a):
 def grids(made: dict) -> list[Grid]:
     """Tables: what was found, before and after, where, and the strongest candidates."""
     tables = []
+    if made.get('bad_data'):
+        tables.append(_damages(made['bad_data']))
     if made['effects'] or made['partial']:
         rows = []
         for effect in made['effects'] or made['partial']:
@@ -152,20 +162,29 @@ def grids(made: dict) -> list[Grid]:
                              _numbers(entry['value']), _spans(entry.get('interval')),
                              f"{effect['evidence']['delta_bic']:.0f}" if k == 0 else ''])
         title = 'Effects' if made['effects'] else 'Explains a part only, not accepted'
-        tables.append(Grid(title, ['effect', 'parameter', 'value', '95 %', 'delta BIC'], rows))
+        tables.append(Grid(
+            title, ['effect', 'parameter', 'value', '95 %', 'delta BIC'], rows,
+            note='95 %: interval that holds the true number in 95 of 100 cases. delta BIC: '
+                 'evidence after the price of the numbers; 10 is strong.'))
     if made['horizons']:
         flights = 'held-out flights' if made['held_out'] else 'the fitted flights'
         rows = [[h, *(_cell(v[k]) for k in ('before', 'after', 'effects_alone', 'placebo',
                                             'closure'))]
                 for h, v in made['horizons'].items()]
-        tables.append(Grid(f'Free runs on {flights}: error over noise floor (1: nothing but '
-                           'noise)', ['horizon', 'before', 'after', 'effects alone', 'placebo',
-                                      'closure'], rows))
+        tables.append(Grid(
+            f'Free runs on {flights}: error over noise floor',
+            ['horizon', 'before', 'after', 'file + effects', 'sign reversed', 'closure'], rows,
+            note='The model runs alone from measured states; 1 is nothing but noise. before, '
+                 'after: without and with what is named, tolerances of this robot as fitted. '
+                 'file + effects: the robot file with the effects and no fitted tolerance. sign '
+                 'reversed: a control that must not help. closure: part of the gap that is gone.'))
     if made['where']:
         rows = [[w['channel'], w['regime'], _cell(w['excess']), _cell(w['excess_after'])]
                 for w in made['where'][:6]]
-        tables.append(Grid('Where model and measurement disagree most (1: as noise)',
-                           ['channel', 'regime', 'before', 'after'], rows))
+        tables.append(Grid('Where model and measurement disagree most',
+                           ['channel', 'regime', 'before', 'after'], rows,
+                           note='RMS of measured minus expected, in standard deviations of the '
+                                'noise: 1 is noise.'))
     if made['candidates']:
         tables.append(_evidence(made['candidates'], 8))
     return tables
@@ -176,8 +195,20 @@ def _evidence(rows, most):
                            if r.get('rotor') or r.get('joint') else ''),
               f"{r['evidence']['delta_chi2']:.0f}", _cell(r['sigma_of_realistic_size']),
               'accepted' if r['accepted'] else r['reason']] for r in rows[:most]]
-    return Grid('Candidates, after the last step', ['entry', 'chi2', 'visible [sigma]',
-                                                    'why not'], shown)
+    return Grid('Candidates, after the last step',
+                ['entry', 'gain of chi2', 'detectability [sigma]', 'decision'], shown,
+                note='gain of chi2: squared residual over noise that the entry takes away. '
+                     'detectability: standard deviations by which a realistic size would show.')
+
+
+def _damages(rows):
+    shown = [[row['run'], row['topic'], row['cause'],
+              ABSENT if row['at_s'] is None else f"{row['at_s']:.1f}", f"{row['sure']:.1%}",
+              row['fix'] or 'no'] for row in rows]
+    return Grid('What is wrong with the recordings',
+                ['recording', 'topic', 'likely cause', 'from [s]', 'sure', '--fix'], shown,
+                note='from: seconds after the first IMU message. sure: probability among the '
+                     'causes that were compared. --fix: correction that the option applies.')
 
 
 def _cell(value):
@@ -196,4 +227,4 @@ def _spans(interval):
     return f'{interval[0]:.4g}..{interval[1]:.4g}'
 
 
-__all__ = ['evidence', 'grids', 'MOST_ROWS', 'parameters', 'results', 'WORDS']
+__all__ = ['evidence', 'grids', 'headline', 'MOST_ROWS', 'parameters', 'results', 'WORDS']

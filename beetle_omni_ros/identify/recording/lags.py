@@ -25,7 +25,7 @@ from beetle_omni_ros.identify.recording.motion import (
     silent,
 )
 
-LEAST_WINDOWS = 2       # to each side of a step
+LEAST_WINDOWS = 3       # to each side of a step
 MOST_SILENT = 0.15      # of a window
 LEAST_NOISE = 0.005     # [s] that windows of any flight scatter by
 SHARP = 0.9             # of the best correlation that a second, distant shift may reach
@@ -120,7 +120,7 @@ def _judged(recording, topic, other, what, whose, allowed, at, lags, limits):
         return Damage(recording.name, topic, cause,
                       None if moment is None else float(moment) - begin_of(recording))
 
-    if len(lags) >= 2 * LEAST_WINDOWS + 1:
+    if len(lags) >= 2 * LEAST_WINDOWS:
         split, before, after, noise = change_point(lags)
         step = after - before
         large = max(limits.lag_step, limits.lag_noise * max(noise, LEAST_NOISE))
