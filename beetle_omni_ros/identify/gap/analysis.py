@@ -10,7 +10,12 @@ import numpy as np
 from beetle_omni_ros.identify.gap.absolute import ceilings, Loud, too_loud
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import candidates
-from beetle_omni_ros.identify.gap.certainty import deviations, Visibility, visibility
+from beetle_omni_ros.identify.gap.certainty import (
+    deviations,
+    limits_out_of_sight,
+    Visibility,
+    visibility,
+)
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.forks import forked, team
 from beetle_omni_ros.identify.gap.ingest import Flight
@@ -69,6 +74,7 @@ class Analysis:
         findings: remarks of the checks.
         partial: effects that explain a part and are not named.
         damages: what is wrong with the recordings.
+        unseen: limits, friction and play that these flights would not show, where no gap is found.
         loud: channels beyond what sensors and gusts may make, with everything that was found.
 
     """
@@ -94,6 +100,7 @@ class Analysis:
     partial: list[Trial] = field(default_factory=list)
     damages: list[Damage] = field(default_factory=list)
     loud: list[Loud] = field(default_factory=list)
+    unseen: list[str] = field(default_factory=list)
 
     @property
     def accepted(self) -> list[Trial]:
@@ -147,6 +154,8 @@ def _analysed(fitted, judging, robot, p, progress):
     a.where = _where(a)
     a.loud = too_loud(models, a.found.theta, p)
     decide(a, p)
+    if a.verdict == 'no_gap':
+        a.unseen = limits_out_of_sight(a.problem, a.found.state)
     progress('free runs')
     _falsify(a, search.wide)
     return a

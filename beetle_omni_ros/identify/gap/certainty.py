@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from beetle_omni_ros.identify.gap.bands import by_band
-from beetle_omni_ros.identify.gap.candidates import Candidate
+from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import THIN
 from beetle_omni_ros.identify.gap.series import matrices
@@ -164,6 +164,24 @@ def visibility(problem: Problem, state: State, always: list[str],
                 rivals[o.label] = left(c.keys, o.keys)
         made[c.label] = Visibility(left(c.keys, ()), rivals)
     return made
+
+
+def limits_out_of_sight(problem: Problem, state: State) -> list[str]:
+    """
+    Names of limits, friction and play that these flights would not show at a realistic size.
+
+    They have no slope where they do not act, so the residual itself says what they would change.
+    """
+    unseen = []
+    for name in LIMITS:
+        own = [key for key in problem.keys.values() if key.effect == name]
+        # Realistic is a limit that is lower by this part, or a friction of this size.
+        theta = {key.name: float(np.log(max(1 - key.typical, 0.05))) if key.relative
+                 else key.typical for key in own}
+        change = problem.residual({**state.theta, **theta}) - state.r
+        if np.sqrt(change @ change) < problem.p.decidable:
+            unseen.append(name)
+    return unseen
 
 
 def _rivals_of(candidate):

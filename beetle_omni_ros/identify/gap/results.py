@@ -48,7 +48,7 @@ def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -
         made |= {'explained': a.found.explained if a.found.accepted else None,
                  'excess': {'samples': count, 'before': before, 'after': after,
                             'everything': floor},
-                 'hidden': hidden(a, p), 'tolerances': _tolerances(a),
+                 'hidden': [*hidden(a, p), *a.unseen], 'tolerances': _tolerances(a),
                  'remainder': {'gain': a.rest.gain, 'positive': a.rest.positive,
                                'frame': a.rest.frame, 'channels': dict(a.rest.channels),
                                'terms': dict(a.rest.terms)},
