@@ -11,6 +11,7 @@ from beetle_omni_ros.identify.gap.analysis import analyse, Analysis
 from beetle_omni_ros.identify.gap.apply import write_corrected
 from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
+from beetle_omni_ros.identify.gap.joint_changes import change_grids
 from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log
 from beetle_omni_ros.identify.gap.page import gap_page
 from beetle_omni_ros.identify.gap.parameters import GapParameters
@@ -126,7 +127,7 @@ def _print(console, made):
     console.print(made['reason'], highlight=False, markup=False)
     for finding in made['findings']:
         console.print(finding, style='dim', highlight=False, markup=False)
-    print_grids(grids(made), console)
+    print_grids([*grids(made), *change_grids(made.get('changes', []))], console)
     if made['next_experiment']:
         console.print(f"Next: {made['next_experiment']}", highlight=False, markup=False)
 

@@ -19,14 +19,20 @@ from beetle_omni_ros.identify.joint_servos import Servos
 from beetle_omni_ros.identify.selection import block_masks
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
 from beetle_omni_ros.identify.uncertainty import DIFFERENT, gradient_scatter
-from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.table import Grid
 
 FITTED = ('natural_frequency', 'damping_ratio', 'delay', 'coulomb_friction', 'offset')
-ROWS = (('joint_offset', 'offset'), ('joint_bandwidth', 'kp'), ('joint_bandwidth', 'kd'),
-        ('joint_friction', 'coulomb'), ('joint_command_latency', 'delay'))
+# Catalogue entry, parameter, unit. A log without a torque determines friction over stiffness (the
+# dead band) better than either, and the lag behind a ramp better than its parts.
+ROWS = (('joint_offset', 'offset', 'rad'), ('joint_bandwidth', 'kp', 'N m/rad'),
+        ('joint_bandwidth', 'kd', 'N m s/rad'), ('joint_friction', 'coulomb', 'N m'),
+        ('joint_friction', 'dead_band', 'rad'), ('joint_command_latency', 'delay', 's'),
+        ('joint_command_latency', 'ramp_lag', 's'))
 WRONG = 0.05            # probability that any row of two logs is called significant by chance
-DECADE = 1.6            # rad/s and 1, factors about which the file's gains are right, as a prior
+# One standard deviation of frequency and damping about the median joint: a factor, which keeps a
+# fit in place and says nothing beside a log.
+FACTOR = 1.6
 MILLI = {'rad': ('mrad', 1e3), 's': ('ms', 1e3), 'N m': ('mN m', 1e3)}
 
 
@@ -40,8 +46,8 @@ def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[d
         robot: the servos as believed, from which both fits start.
 
     Returns:
-        for each joint of both logs and each of zero, stiffness, damping, friction and delay
-        ``joint``, ``name`` of the catalogue entry, ``parameter``, ``unit``, ``before``,
+        for each joint of both logs and each of ``ROWS`` the second ``log``, ``joint``, ``name``
+        of the catalogue entry, ``parameter``, ``unit``, ``before``,
         ``after``, their ``difference``, its 95 % ``interval`` and ``significant``: whether
         chance makes so large a difference anywhere between two logs in 5 % of the cases at most.
 
@@ -52,13 +58,12 @@ def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[d
     for number in joints:
         pair = [(values[log.joints.index(number)], errors[log.joints.index(number)])
                 for log, (values, errors) in zip((before, after), fits, strict=True)]
-        for k, (name, parameter) in enumerate(ROWS):
+        for k, (name, parameter, unit) in enumerate(ROWS):
             (old, spread), (new, other) = ((v[k], e[k]) for v, e in pair)
             error, difference = float(np.hypot(spread, other)), float(new - old)
             reach = float(norm.isf(0.025)) * error
             rows.append({'log': after.name, 'joint': number, 'name': name,
-                         'parameter': parameter,
-                         'unit': CATALOGUE[name].parameters[parameter].unit,
+                         'parameter': parameter, 'unit': unit,
                          'before': float(old), 'after': float(new), 'difference': difference,
                          'interval': [difference - reach, difference + reach],
                          'significant': bool(abs(difference) > norm.isf(WRONG / 2 / count)
@@ -71,7 +76,7 @@ def estimate(log: JointLog, robot: RobotParameters) -> tuple[np.ndarray, np.ndar
     Zero, gains, friction and delay of each joint of a log.
 
     Returns:
-        (J, 5) values in the order of ``ROWS``, and (J, 5) their standard errors.
+        (J, 7) values in the order of ``ROWS``, and (J, 7) their standard errors.
 
     """
     servos = Servos(robot, log.joints)
@@ -97,7 +102,7 @@ def _prior(start):
     """Frequency and damping within a factor of the median joint's, which keeps a fit in place."""
     precision = np.zeros(len(NAMES))
     for name in ('natural_frequency', 'damping_ratio'):
-        precision[INDEX[name]] = (TERMS[name].scale / np.log(DECADE))**2
+        precision[INDEX[name]] = (TERMS[name].scale / np.log(FACTOR))**2
     return Prior(np.median(encode(start), axis=0), precision)
 
 
@@ -133,8 +138,9 @@ def _physical(points, covariance, sets, free, servos):
                           strict=True))
         frequency, damping = (np.exp(chosen[n]) for n in ('natural_frequency', 'damping_ratio'))
         kp = servos.robot.joints.inertia * frequency**2
-        return np.array([-chosen['offset'], kp, 2 * damping * kp / frequency,
-                         kp * chosen['coulomb_friction'], chosen['delay'] - servos.delays])
+        band, delay = chosen['coulomb_friction'], chosen['delay'] - servos.delays
+        return np.array([-chosen['offset'], kp, 2 * damping * kp / frequency, kp * band, band,
+                         delay, delay + 2 * damping / frequency])
 
     made = np.array([values(point) for point in points])
     for j in range(count):
@@ -151,6 +157,23 @@ def sentences(rows: list[dict], log: str) -> list[str]:
     if not changed:
         return [f'{log}: no significant change of zero, gains, friction or delay']
     return [f'{log}: {line(row)}' for row in changed]
+
+
+def change_grids(rows: list[dict]) -> list[Grid]:
+    """One table for each further log: before, after and their difference."""
+    made = []
+    for log in dict.fromkeys(row['log'] for row in rows):
+        cells = []
+        for row in (r for r in rows if r['log'] == log):
+            unit, factor = MILLI.get(row['unit'], (row['unit'], 1.0))
+            old, new, difference, low, high = (factor * x for x in (
+                row['before'], row['after'], row['difference'], *row['interval']))
+            cells.append([str(row['joint']), f"{row['parameter']} [{unit}]", f'{old:.3g}',
+                          f'{new:.3g}', f'{difference:+.3g}', f'{low:.3g}..{high:.3g}',
+                          'yes' if row['significant'] else ''])
+        made.append(Grid(f'Changes to {log}', ['joint', 'parameter', 'before', 'after',
+                                               'difference', '95 %', 'significant'], cells))
+    return made
 
 
 def line(row: dict) -> str:

@@ -53,6 +53,7 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
     made['changes'] = [row for other in others for row in changes(log, other, robot)]
     made['findings'] = [text for other in others for text in sentences(
         [row for row in made['changes'] if row['log'] == other.name], other.name)]
+    identified['text'] = [*identified['text'], *made['findings']]
     sets = any(len(effect['names']) > 1 for effect in made['effects'])
     made |= {'next_experiment': _experiment(joints) if sets else None, 'joints': joints,
              'meta': {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],

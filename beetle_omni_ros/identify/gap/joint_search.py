@@ -33,6 +33,9 @@ FIRST_NOISE = 0.002     # [rad] white, until the residuals tell
 CHANCE = 0.001
 BLOCKS = 5
 MOST_EFFECTS = 8
+QUICK = 5               # iterations that show what an entry gains; the accepted are fitted again
+NEARLY = 0.8            # of the noise: below, what was found lets see more than before
+MOST_PASSES = 3
 BEYOND = 1.15           # a limit counts only if the command asks for so much more than it
 # Smallest changes that are named, where the catalogue's are not those of a response log. A zero:
 # three counts of a 12-bit encoder, 0.26 deg. Friction: gears and seals of one type differ by a
@@ -145,7 +148,7 @@ class Search:
     """
 
     def __init__(self, log: JointLog, robot: RobotParameters):
-        """Fit all numbers once, for the noise; see the class."""
+        """Fit the usual numbers once, for the noise; see the class."""
         self.whole, self.log = log, log.first(FITTED_PART)
         self.servos = Servos(robot, log.joints)
         self.weight = (self.log.t >= self.log.t[0] + SETTLING).astype(float)
@@ -165,7 +168,7 @@ class Search:
     def _estimate_noise(self):
         """Noise around the best servos that a robot file can hold, from two starts."""
         usual = [e for e in self.entries if e.name == 'joint_offset' or (
-            e.name in ('joint_friction', *PAIR) and e.joint is None)]
+            e.name in ('joint_friction', 'joint_velocity_limit', *PAIR) and e.joint is None)]
         white = Noise.white(len(self.log.joints), FIRST_NOISE)
         starts = [self._started(self.servos.believed, usual, k) for k in range(2)]
         for noise in (white, None):
@@ -173,7 +176,8 @@ class Search:
             solved = self._solve(starts, [usual] * len(starts), 12)
             self.full = solved.points[solved.chi2.argmin()]
             starts = [self.full]
-        self.fitter = StackFitter(self.log, self._noise(self.full), self.servos)
+        self.noise = self._noise(self.full)
+        self.fitter = StackFitter(self.log, self.noise, self.servos)
         self.scatter = self._scatter(self.full, usual)
 
     def _noise(self, point):
@@ -237,9 +241,21 @@ class Search:
 
     def run(self) -> Found:
         """Select, drop what became superfluous, find what does as well."""
-        accepted, point = [], self.servos.believed.copy()
+        kept, point = [], self.servos.believed.copy()
+        for _ in range(MOST_PASSES):
+            accepted, point, trials = self._grown(kept, point)
+            kept, point = self._pruned(accepted, point)
+            noise = self._noise(point)
+            if (noise.sigma > NEARLY * self.noise.sigma).all():
+                break
+            self.noise, self.full = noise, point
+            self.fitter = StackFitter(self.log, noise, self.servos)
+        return self._found(kept, point, trials if kept == accepted else self._beside(kept, point))
+
+    def _grown(self, accepted, point):
+        """Add entries while any is worth it: accepted, their model, and the trials of the rest."""
+        trials = self._beside(accepted, point)
         while len(accepted) < MOST_EFFECTS:
-            trials = self._beside(accepted, point)
             fit = [t for t in trials if t.unlikely and self._matters(t)]
             if not fit:
                 break
@@ -247,8 +263,8 @@ class Search:
             best = max(fit, key=lambda t: t.gain - t.needed)
             inside = [e for e in accepted if not self._within(e, best.entry)]
             accepted, point = [*inside, best.entry], best.point
-        accepted, point = self._pruned(accepted, point)
-        return self._found(accepted, point)
+            trials = self._beside(accepted, point)
+        return accepted, point, trials
 
     def _beside(self, accepted, point):
         """A trial of each other entry beside the accepted ones."""
@@ -257,7 +273,7 @@ class Search:
                  for k in range(self._starts(e))]
         points = [point, *(self._started(point, [e], k) for e, k in asked)]
         models = [accepted, *([*accepted, e] for e, _ in asked)]
-        solved = self._solve(points, models)
+        solved = self._solve(points, models, QUICK)
         best: dict = {}
         for (entry, _), p, chi2 in zip(asked, solved.points[1:], solved.chi2[1:], strict=True):
             gain = (solved.chi2[0] - chi2) / self.scatter
@@ -351,14 +367,14 @@ class Search:
         cost = (self.fitter.residuals(fitted, left)**2).sum(axis=(1, 2))
         return cost.reshape(len(models), BLOCKS)
 
-    def _found(self, accepted, point):
+    def _found(self, accepted, point, others):
         trials = self._dropped(accepted, point) if accepted else []
         if trials:
             point = trials[0].point
         widths = self._widths(accepted, point)
         sets = self._sets(accepted, point, trials, widths)
         members = {t.entry for group in sets.values() for t in group}
-        rejected = [t for t in self._beside(accepted, point) if t.entry not in members]
+        rejected = [t for t in others if t.entry not in members]
         for trial in rejected:
             trial.reason = self._reason(trial)
         strongest = sorted(trials, key=lambda t: -t.gain)
