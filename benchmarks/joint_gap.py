@@ -147,9 +147,9 @@ def run(log: JointLog, cases: int, seed: int, console: Console) -> dict:
                'named': [[e['names'], e.get('joint')] for e in made['effects']],
                'seconds': time.process_time() - begin}
         rows.append(row)
-        if not row['found'] or row['wrong']:
-            console.print(f"case {k}, {kind} {words}: {row['verdict']} {row['named']}",
-                          highlight=False, markup=False)
+        mark = '' if row['found'] and not row['wrong'] else '  <-'
+        console.print(f"{k} {kind} {words}: {row['verdict']} {row['named']}{mark}",
+                      highlight=False, markup=False, soft_wrap=True)
     return {'seed': seed, 'real': {
         'verdict': first['verdict'], 'names': [e['names'] for e in first['effects']],
         'reason': first['reason'], 'verdict_corrected': second['verdict'],
