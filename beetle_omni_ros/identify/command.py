@@ -11,6 +11,7 @@ from beetle_omni_ros.identify import rotor_results as of_rotor
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import read_joint_log
 from beetle_omni_ros.identify.joint_page import grids, joint_page
+from beetle_omni_ros.identify.joint_servos import file_servos
 from beetle_omni_ros.identify.robot_file import check_not_base, write_text
 from beetle_omni_ros.identify.rotor import identify_rotor
 from beetle_omni_ros.identify.rotor_log import read_rotor_log
@@ -43,19 +44,21 @@ def run_identify_joint(path: Path, *, validate: list[Path] = (), robot: Path | N
     """
     console = console or Console()
     _check_outputs(json_path, report, params, robot)
-    published = RobotParameters.load(robot).joints
+    believed = RobotParameters.load(robot)
+    published = believed.joints
     log = read_joint_log(path)
+    servos = file_servos(believed, log.joints)
     validations = [read_joint_log(other) for other in validate]
     with console.status(f'identifying {len(log.joints)} joints'):
         models = identify_joints(log, published)
-    results = of_joints.joint_results(log, validations, models, published)
+    results = of_joints.joint_results(log, validations, models, published, servos)
     if robot:
         results['meta']['robot'] = str(robot)
     _print(console, grids(results, brief=True), results['text'])
     if json_path:
         write_json(json_path, results)
     if report:
-        write_text(report, joint_page(log, validations, models, published, results),
+        write_text(report, joint_page(log, validations, models, servos, results),
                              'report')
     if params:
         of_joints.write_joint_file(params, results, robot)

@@ -8,9 +8,9 @@ import numpy as np
 
 from beetle_omni_ros.identify.joint import FITTED_PART, JointModel
 from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.joint_servos import FileServos
 from beetle_omni_ros.identify.page import page
-from beetle_omni_ros.identify.servo_model import published_set, simulate
-from beetle_omni_ros.robot.parameters import JointParameters
+from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.runs.figures import COLOURS, FAINT, INK, legend, line, panels, STYLE, svg
 from beetle_omni_ros.runs.report_page import section
 from beetle_omni_ros.runs.table import Grid
@@ -60,7 +60,7 @@ def _value(term):
 
 
 def joint_page(log: JointLog, validations: list[JointLog], models: list[JointModel],
-               published: JointParameters, results: dict) -> str:
+               published: FileServos, results: dict) -> str:
     """HTML page with the tables, what cannot be told, and figures of every log."""
     with matplotlib.rc_context(STYLE):
         sections = []
@@ -80,22 +80,21 @@ def joint_page(log: JointLog, validations: list[JointLog], models: list[JointMod
 
 
 def _pairs(log, models):
-    """(index in the log, model) of the joints that both have."""
-    return [(log.joints.index(model.joint), model) for model in models
+    """(index in the log, index of the model, model) of the joints that both have."""
+    return [(log.joints.index(model.joint), k, model) for k, model in enumerate(models)
             if model.joint in log.joints]
 
 
 def _responses(log, models, published, end) -> Figure:
     pairs = _pairs(log, models)
     figure, axes = panels(len(pairs), height=1.9, sharex=True)
-    start = published_set(published)[None]
-    for axis, (k, model) in zip(axes[:, 0], pairs, strict=True):
+    for axis, (k, own, model) in zip(axes[:, 0], pairs, strict=True):
         t = log.t - log.t[0]
         _shade(axis, t, end)
         line(axis, t, log.command[k], color=FAINT, lw=1.0, label='command')
         line(axis, t, log.measured[k], color=INK, lw=1.4, label='measured')
-        line(axis, t, simulate(log, k, start, held=False)[0], color=COLOURS[1], lw=0.9,
-             label='published model')
+        line(axis, t, simulate(log, k, published.sets[own], published.held)[0], color=COLOURS[1],
+             lw=0.9, label='published model')
         line(axis, t, simulate(log, k, model.values[None])[0], color=COLOURS[0], lw=0.9,
              label='identified model')
         axis.set_ylabel(f'joint {model.joint} [rad]')
@@ -107,12 +106,11 @@ def _responses(log, models, published, end) -> Figure:
 def _errors(log, models, published, end) -> Figure:
     pairs = _pairs(log, models)
     figure, axes = panels(len(pairs), 2, height=1.5, sharex=True)
-    start = published_set(published)[None]
-    for row, (k, model) in zip(axes, pairs, strict=True):
+    for row, (k, own, model) in zip(axes, pairs, strict=True):
         t = log.t - log.t[0]
         for axis, values, held, colour, name in (
-                (row[0], start, False, COLOURS[1], 'published'),
-                (row[1], model.values[None], True, COLOURS[0], 'identified')):
+                (row[0], published.sets[own], published.held, COLOURS[1], 'published'),
+                (row[1], model.values, True, COLOURS[0], 'identified')):
             _shade(axis, t, end)
             error = MILLI * (simulate(log, k, values, held)[0] - log.measured[k])
             line(axis, t, error, color=colour, lw=0.8)
@@ -126,7 +124,7 @@ def _errors(log, models, published, end) -> Figure:
 def _loops(log, models) -> Figure:
     pairs = _pairs(log, models)
     figure, axes = panels(1, len(pairs), height=2.8, sharey=True)
-    for axis, (k, model) in zip(axes[0], pairs, strict=True):
+    for axis, (k, own, model) in zip(axes[0], pairs, strict=True):
         speed = np.gradient(log.command[k], log.t)
         axis.plot(speed, MILLI * (log.measured[k] - log.command[k]), color=INK, lw=0.8,
                   label='measured')

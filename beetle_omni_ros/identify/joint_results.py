@@ -10,6 +10,7 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.candidates import CANDIDATES, LINEAR
 from beetle_omni_ros.identify.joint import error_rms, FITTED_PART, JointModel
 from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.joint_servos import FileServos
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, published_set, TERMS
 from beetle_omni_ros.robot.parameters import JointParameters
@@ -22,7 +23,7 @@ WORDS = {'natural_frequency': 'bandwidth', 'damping_ratio': 'damping', 'delay': 
 
 
 def joint_results(log: JointLog, validations: list[JointLog], models: list[JointModel],
-                  published: JointParameters) -> dict:
+                  published: JointParameters, believed: FileServos | None = None) -> dict:
     """
     All numbers of an identification.
 
@@ -30,10 +31,14 @@ def joint_results(log: JointLog, validations: list[JointLog], models: list[Joint
         log: that was identified from.
         validations: other logs of the same servos.
         models: of the log's joints, in its order.
-        published: the servo as the robot file has it.
+        published: gains and limits of the robot file's servo.
+        believed: the file's servos with its effects; default: without any.
 
     """
-    joints = [_joint(log, k, validations, model, published) for k, model in enumerate(models)]
+    if believed is None:
+        believed = FileServos(np.tile(published_set(published), (len(models), 1)), held=False)
+    joints = [_joint(log, k, validations, model, published, believed)
+              for k, model in enumerate(models)]
     return {'meta': {'log': log.name, 'validate': [other.name for other in validations],
                      'fitted_part': FITTED_PART, 'version': __version__},
             'joints': joints, 'text': _merged(joints)}
@@ -49,24 +54,24 @@ def _merged(joints):
             for text, numbers in about.items()]
 
 
-def _joint(log, index, validations, model, published):
+def _joint(log, index, validations, model, published, believed):
     end = log.end_of(FITTED_PART)
     first, last = slice(0, end), slice(end, None)
-    start, inertia = published_set(published), published.inertia
+    start, held, inertia = believed.sets[index], believed.held, published.inertia
     wn, zeta = (model.values[INDEX[name]] for name in LINEAR)
     kp = inertia * wn**2
     known = [(other, other.joints.index(model.joint) if model.joint in other.joints else None)
              for other in validations]
     return {
         'joint': model.joint,
-        'published_rms_rad': error_rms(log, index, start, held=False),
+        'published_rms_rad': error_rms(log, index, start, held),
         'fit_rms_rad': error_rms(log, index, model.values, part=first),
         'heldout_rms_rad': error_rms(log, index, model.values, part=last),
         'validation_rms_rad': [None if k is None else error_rms(other, k, model.values)
                                for other, k in known],
-        'published_heldout_rms_rad': error_rms(log, index, start, held=False, part=last),
+        'published_heldout_rms_rad': error_rms(log, index, start, held, part=last),
         'published_validation_rms_rad': [
-            None if k is None else error_rms(other, k, start, held=False) for other, k in known],
+            None if k is None else error_rms(other, k, start, held) for other, k in known],
         'terms': {name: _term(model, name) for name in NAMES},
         'traded': model.traded,
         'text': sentences(model),

@@ -81,7 +81,7 @@ def uncertainties(log: JointLog, noise: Noise, problems: Problems,
     for k, free in enumerate(problems.free):
         information = slopes[k] @ slopes[k].T
         covariance = _inverse(information, free)
-        scatter = _scatter(slopes[k], base[k], free, covariance, block_masks(
+        scatter = gradient_scatter(slopes[k], base[k], free, covariance, block_masks(
             problems.weight[k], DIFFERENT))
         covariance *= scatter
         size = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
@@ -102,8 +102,19 @@ def _inverse(information, free):
     return covariance
 
 
-def _scatter(slopes, residual, free, covariance, blocks):
-    """Mean variance of the gradient over blocks, relative to what white residuals give."""
+def gradient_scatter(slopes: np.ndarray, residual: np.ndarray, free: np.ndarray,
+                     covariance: np.ndarray, blocks: np.ndarray) -> float:
+    """
+    Mean variance of the gradient over blocks, relative to what white residuals give.
+
+    Args:
+        slopes: (n, N) derivatives of the whitened residuals.
+        residual: (N,) whitened.
+        free: (n,) which numbers count.
+        covariance: (n, n) of the numbers, as white residuals would have it.
+        blocks: (blocks, N) 1 within each.
+
+    """
     scores = np.array([(slopes[free] * block) @ residual for block in blocks])
     found = scores.T @ scores
     ratio = np.trace(covariance[np.ix_(free, free)] @ found) / free.sum()
@@ -278,5 +289,5 @@ def _plans(sets, free, noise, scatter):
     return [plans[k:k + count] for k in range(0, len(plans), count)]
 
 
-__all__ = ['Experiment', 'NAMES', 'separating_experiments', 'traded', 'uncertainties',
-           'Uncertainty']
+__all__ = ['Experiment', 'gradient_scatter', 'NAMES', 'separating_experiments', 'traded',
+           'uncertainties', 'Uncertainty']

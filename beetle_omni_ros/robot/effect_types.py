@@ -23,6 +23,7 @@ class EffectParameter:
         typical: realistic deviation from neutral; a fraction where neutral is NaN.
         smallest: deviation below which nobody would act on it; likewise.
         default: value where a file leaves it out; None: it must be there.
+        of_each: whether a file may have a list of four in place of the number, one for each joint.
 
     """
 
@@ -33,6 +34,7 @@ class EffectParameter:
     typical: float = float('nan')
     smallest: float = float('nan')
     default: float | None = None
+    of_each: bool = False
 
 
 @dataclass

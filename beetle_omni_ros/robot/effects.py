@@ -29,6 +29,8 @@ from beetle_omni_ros.robot.schema import ParameterError
 CATALOGUE: dict[str, Effect] = {'joint_offset': ACTUATOR['joint_offset'], **BODY, **ACTUATOR,
                                 **SENSOR}
 
+MEMBERS = 4         # joints of this kind of robot
+
 __all__ = ['CATALOGUE', 'command_delays', 'Effect', 'EffectParameter', 'ServoTerms', 'settings',
            'Terms', 'validated']
 
@@ -79,8 +81,11 @@ def _value(at, spec, value):
     except (TypeError, ValueError):
         raise ParameterError(f'{at}: expected numbers [{spec.unit}], found {value!r}') from None
     shape = np.shape(spec.neutral)
+    if spec.of_each and array.shape == (MEMBERS,):
+        shape = array.shape
     if array.shape != shape:
-        raise ParameterError(f'{at}: expected shape {shape}, found {array.shape}')
+        each = f' or {(MEMBERS,)}' if spec.of_each else ''
+        raise ParameterError(f'{at}: expected shape {shape}{each}, found {array.shape}')
     if not np.all((array >= spec.low) & (array <= spec.high)):
         raise ParameterError(f'{at}: {value} is outside {spec.low:g} to {spec.high:g} {spec.unit}')
     return tuple(map(float, array)) if shape else float(array)

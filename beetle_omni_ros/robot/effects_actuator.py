@@ -30,7 +30,13 @@ def _joint_deflection(servo, joint, deflection_per_newton):
         else servo.target + deflection_per_newton * servo.thrust
 
 
+def per_joint(value, joint: int):
+    """Value of the joint with this index, of one number for all or of four."""
+    return value[joint] if isinstance(value, tuple) else value
+
+
 def _joint_friction(servo, joint, coulomb, stiction):
+    coulomb, stiction = per_joint(coulomb, joint), per_joint(stiction, joint)
     speed = servo.tilt_rate / SLIDING_RATE
     sliding = speed / ca.sqrt(1 + speed * speed)
     servo.torque = servo.torque - sliding * (
@@ -86,8 +92,8 @@ ACTUATOR: dict[str, Effect] = {
         ('joint_velocity_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
         settings={'effort_limit': 'joints.effort_limit'}),
     'joint_friction': Effect(
-        'joint', {'coulomb': EffectParameter('N m', 0.0, 0.0, 1.0, 0.01, 0.002),
-                  'stiction': EffectParameter('N m', 0.0, 0.0, 1.0, 0.01, 0.002)},
+        'joint', {'coulomb': EffectParameter('N m', 0.0, 0.0, 1.0, 0.01, 0.002, of_each=True),
+                  'stiction': EffectParameter('N m', 0.0, 0.0, 1.0, 0.01, 0.002, of_each=True)},
         "-coulomb sgn(q') while sliding, up to stiction at rest (Armstrong-Helouvry 1994); "
         'smooth over 0.05 rad/s in the model', 'slow reversals of the tilts',
         ('joint_backlash', 'joint_bandwidth'), 'triangle of 2 deg at 0.1 Hz',

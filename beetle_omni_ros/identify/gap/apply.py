@@ -42,17 +42,36 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
                 all_four = list(values.get(parameter, spec.neutral))
                 all_four[member - 1] = value
                 value = all_four
+            elif spec.of_each:
+                value = _of_each(values.get(parameter, spec.neutral), found)
             low, high = spec.low, spec.high
             values[parameter] = [rounded(min(max(v, low), high)) for v in value] \
                 if isinstance(value, (list, tuple)) else rounded(min(max(value, low), high))
     return effects
 
 
+def _of_each(own, found):
+    """
+    One number where all joints share it, else a list of four.
+
+    A log gives each joint's (``each``). A flight gives one for all: differences between joints
+    that the file already has stay.
+    """
+    each = found.get('each')
+    if each is None:
+        if not isinstance(own, (list, tuple)):
+            return found['value']
+        mean = sum(own) / MEMBERS
+        return [value + found['value'] - mean for value in own]
+    before = list(own) if isinstance(own, (list, tuple)) else [own] * MEMBERS
+    return [each.get(str(k + 1), before[k]) for k in range(MEMBERS)]
+
+
 def is_read(name: str) -> bool:
     """Whether anything reads the effect from a robot file; sensors' own are for their drivers."""
     entry = CATALOGUE[name]
     return bool(entry.apply or entry.servo or entry.settings) or name in (
-        'command_latency', 'joint_command_latency', 'rotor_dead_time')
+        'command_latency', 'joint_command_latency', 'rotor_dead_time', 'joint_backlash')
 
 
 def write_corrected(path: Path, results: dict, robot: RobotParameters,

@@ -12,6 +12,7 @@ from beetle_omni_ros.identify.gap.apply import write_corrected
 from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.given import check_apart
 from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
+from beetle_omni_ros.identify.gap.joint_changes import change_grids
 from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log
 from beetle_omni_ros.identify.gap.page import gap_page
 from beetle_omni_ros.identify.gap.parameters import GapParameters
@@ -124,7 +125,7 @@ def _print(console, made):
     console.print(made['summary'], highlight=False, markup=False)
     for finding in dict.fromkeys(made['findings']):
         console.print(finding, style='dim', highlight=False, markup=False)
-    print_grids(grids(made), console)
+    print_grids([*grids(made), *change_grids(made.get('changes', []))], console)
     if made['next_experiment']:
         console.print(f"Next: {made['next_experiment']}", highlight=False, markup=False)
 

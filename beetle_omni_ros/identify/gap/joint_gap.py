@@ -7,30 +7,28 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros import __version__
+from beetle_omni_ros.identify.gap.joint_changes import changes, sentences
+from beetle_omni_ros.identify.gap.joint_search import Entry, Found, Search, Trial
 from beetle_omni_ros.identify.joint import identify_joints
-from beetle_omni_ros.identify.joint_log import read_joint_log
+from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
 from beetle_omni_ros.identify.joint_page import joint_page
 from beetle_omni_ros.identify.joint_results import joint_results
+from beetle_omni_ros.identify.joint_servos import file_servos
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-# Terms of the servo model -> catalogue entry, its parameter, and how to get there from radians.
-ENTRIES = {'coulomb_friction': ('joint_friction', 'coulomb', 'stiffness'),
-           'backlash': ('joint_backlash', 'gap', 'both sides'),
-           'delay': ('joint_command_latency', 'delay', ''),
-           'velocity_limit': ('joint_velocity_limit', 'velocity_limit', ''),
-           'torque_limit': ('joint_torque_limit', 'effort_limit', 'stiffness')}
-CHANGED = 0.15          # of frequency or damping: another bandwidth than published
-LEAST_GAIN = 5.0        # of error before over after, below which nothing is named
+# Error over that of the freest fit, up to which the file predicts what it did not see as well: a
+# log's last part differs from its first by as much where nothing has changed.
+AS_WELL = 1.5
 
 
 def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParameters,
                       base: Path | None) -> tuple[dict, str]:
     """
-    Judge a response log.
+    Judge a response log, and compare it with others.
 
     Args:
-        runs: the log; further ones only judge, as do those of ``holdout``.
+        runs: the log; further ones are compared with it, as are those of ``holdout``.
         holdout: further logs.
         robot: as believed.
         base: its file, for the record.
@@ -44,42 +42,73 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
     """
     log = read_joint_log(runs[0])
     others = [read_joint_log(path) for path in [*runs[1:], *holdout]]
+    found = Search(log, robot).run()
     models = identify_joints(log, robot.joints)
-    found = joint_results(log, others, models, robot.joints)
-    joints = found['joints']
-    before = _rms(j['published_heldout_rms_rad'] for j in joints)
-    after = _rms(j['heldout_rms_rad'] for j in joints)
-    floor = min(log.quantum / np.sqrt(12), after)
-    effects = [*_effects(joints, models), *_timing(joints, models, robot)]
-    if before < 1.5 * floor or before / after < LEAST_GAIN ** (len(effects) == 0):
-        effects = effects if before > 1.5 * after else []
-    sets = any(len(effect['names']) > 1 for effect in effects)
-    verdict = ('no_gap' if before < 2 * floor else 'unknown') if not effects else \
-        'named_set' if sets else 'named'
-    scale = max(floor, 1e-9)
-    made = {
-        'verdict': verdict,
+    identified = joint_results(log, others, models, robot.joints, file_servos(robot, log.joints))
+    made = gap_of(found, log)
+    joints = identified['joints']
+    for k, joint in enumerate(joints):
+        joint['file_heldout_rms_rad'] = float(found.errors['believed'][k])
+        joint['corrected_heldout_rms_rad'] = float(found.errors['corrected'][k])
+    made['changes'] = [row for other in others for row in changes(log, other, robot)]
+    made['findings'] = [text for other in others for text in sentences(
+        [row for row in made['changes'] if row['log'] == other.name], other.name)]
+    identified['text'] = [*identified['text'], *made['findings']]
+    sets = any(len(effect['names']) > 1 for effect in made['effects'])
+    made |= {'next_experiment': _experiment(joints) if sets else None, 'joints': joints,
+             'meta': {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
+                      'robot': str(base) if base else 'params/robot.yaml',
+                      'version': __version__}}
+    return made, joint_page(log, others, models, file_servos(robot, log.joints), identified)
+
+
+def gap_of(found: Found, log: JointLog) -> dict:
+    """
+    Verdict, effects and errors of a search, as INTERFACES lays them out.
+
+    Args:
+        found: by the search.
+        log: that was searched.
+
+    """
+    effects = _effects(found)
+    best = np.minimum(found.errors['free'], found.errors['corrected'])
+    before, after, floor = (_rms(e) for e in (found.errors['believed'],
+                                              found.errors['corrected'], best))
+    closure = _closure(before, after, floor)
+    return {
+        'verdict': _verdict(found, effects, best),
         'reason': f'error on the held-out part {1e3 * before:.1f} mrad before, '
                   f'{1e3 * after:.1f} mrad after',
-        'closure': _closure(before, after, floor), 'gap_before': before / scale,
-        'gap_after': after / scale, 'noise_floor': floor / scale, 'effects': effects,
-        'partial': [], 'candidates': _candidates(models, joints),
-        'where': sorted(({'channel': f'joint_{j["joint"]}', 'regime': 'log',
-                          'excess': j['published_heldout_rms_rad'] / scale,
-                          'excess_after': j['heldout_rms_rad'] / scale} for j in joints),
+        'closure': closure, 'gap_before': before / floor, 'gap_after': after / floor,
+        'noise_floor': 1.0, 'effects': effects, 'partial': [],
+        'candidates': _candidates(found),
+        'where': sorted(({'channel': f'joint_{number}', 'regime': 'log',
+                          'excess': float(found.errors['believed'][k] / best[k]),
+                          'excess_after': float(found.errors['corrected'][k] / best[k])}
+                         for k, number in enumerate(log.joints)),
                         key=lambda row: -row['excess']),
-        'next_experiment': _experiment(joints) if sets else None,
         'horizons': {'held-out part': {
-            'before': before / scale, 'after': after / scale, 'effects_alone': after / scale,
-            'placebo': None, 'closure': _closure(before, after, floor)}},
-        'regimes': {}, 'held_out': True, 'findings': [], 'joints': joints,
-        'meta': {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
-                 'robot': str(base) if base else 'params/robot.yaml', 'version': __version__}}
-    return made, joint_page(log, others, models, robot.joints, found)
+            'before': before / floor, 'after': after / floor, 'effects_alone': after / floor,
+            'placebo': None, 'closure': closure}},
+        'regimes': {}, 'held_out': True, 'findings': []}
+
+
+def _verdict(found, effects, best):
+    """
+    What the search means.
+
+    Without an effect there is no gap where the file predicts the held-out part as well as the
+    freest fit, up to what manufacturing tolerances make.
+    """
+    if effects:
+        return 'named_set' if any(len(e['names']) > 1 for e in effects) else 'named'
+    allowed = np.hypot(AS_WELL * best, found.tolerated)
+    return 'no_gap' if (found.errors['believed'] <= allowed).all() else 'unknown'
 
 
 def _rms(values):
-    return float(np.sqrt(np.mean(np.square(list(values)))))
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _closure(before, after, floor):
@@ -88,106 +117,119 @@ def _closure(before, after, floor):
     return float(1 - max(after**2 - floor**2, 0.0) / (before**2 - floor**2))
 
 
-def _kept(joints, term):
-    return [j for j in joints if j['terms'][term]['kept']]
+def _evidence(trial: Trial):
+    """Evidence of one entry beside the others; ``cv_gain``: on blocks that were not fitted."""
+    total = float(trial.blocks.sum())
+    error = float(trial.blocks.std(ddof=1) * np.sqrt(len(trial.blocks)))
+    return {'delta_bic': trial.gain - trial.numbers * float(np.log(trial.samples)),
+            'delta_chi2': trial.gain, 'cv_gain': total,
+            'cv_gain_se': total / error if error > 0 else 0.0,
+            'blocks_positive': int((trial.blocks > 0).sum())}
 
 
-def _value(joint, term, how):
-    stiffness = {'stiffness': joint['derived']['kp_N_m_per_rad'], 'both sides': 2.0}.get(how, 1.0)
-    entry = joint['terms'][term]
-    return [stiffness * x if x is not None else None
-            for x in (entry['value'], *entry['interval'])]
-
-
-def _entry(joints, term, name, parameter, how):
-    """Median over the joints, and the widest interval that a median can have."""
-    values = [_value(j, term, how) for j in joints]
-    middle = float(np.median([v[0] for v in values]))
-    low, high = (float(np.median([v[k] if v[k] is not None else v[0] for v in values]))
-                 for k in (1, 2))
-    return {'value': middle, 'unit': CATALOGUE[name].parameters[parameter].unit,
-            'interval': [low, high],
-            'each': {str(j['joint']): v[0] for j, v in zip(joints, values, strict=True)}}
-
-
-def _evidence(models, term, joints):
-    gains = [m.gain.get(term, 0.0) for m in models if any(j['joint'] == m.joint for j in joints)]
-    return {'delta_bic': float(np.sum(gains)), 'delta_chi2': float(np.sum(gains)),
-            'cv_gain': float(np.sum(gains)), 'cv_gain_se': float(len(gains)),
-            'joints': len(gains)}
-
-
-def _effects(joints, models):
-    made = []
-    for term, (name, parameter, how) in ENTRIES.items():
-        having = _kept(joints, term)
-        if term == 'delay' or 2 * len(having) < len(joints) or not having:
+def _effects(found: Found):
+    """Accepted entries, the strongest first; friction of several joints is one."""
+    made, friction = [], [t for t in found.accepted if t.entry.name == 'joint_friction'
+                          and t.entry in found.sets]
+    for trial in found.accepted:
+        if trial.entry not in found.sets or trial in friction[1:]:
             continue
-        entries = {parameter: _entry(having, term, name, parameter, how)}
-        if name == 'joint_friction':
-            entries['stiction'] = _with_stiction(having, entries['coulomb'])
-        made.append({'names': [name], 'layer': 'joint', 'parameters': entries,
-                     'joints': [j['joint'] for j in having],
-                     'evidence': _evidence(models, term, having)})
+        members = found.sets[trial.entry]
+        effect = {'names': [t.entry.name for t in members], 'layer': 'joint',
+                  'parameters': _parameters(found, members[0].entry),
+                  'evidence': _evidence(max(friction, key=lambda t: t.gain)
+                                        if trial in friction else members[0])}
+        number = trial.entry.joint
+        if trial in friction:
+            effect['joints'] = _joints(found, friction)
+        elif number is not None:
+            effect['joint'] = found.servos.joints[number]
+        if len(members) > 1:
+            effect['rivals'] = [{'name': t.entry.name, 'gain': t.gain, 'evidence': _evidence(t),
+                                 'parameters': _parameters(found, t.entry, t.point)}
+                                for t in members[1:]]
+            effect['separated_by'] = CATALOGUE[members[0].entry.name].separated_by
+        also = _also(found, members)
+        if also:
+            effect['also'] = also
+        made.append(effect)
     return made
 
 
-def _with_stiction(joints, coulomb):
-    """Breakaway torque: sliding friction and what sticking adds, where it was found."""
-    extra = [_value(j, 'stiction', 'stiffness')[0] if j['terms']['stiction']['kept'] else 0.0
-             for j in joints]
-    more = float(np.median(extra))
-    return {**coulomb, 'value': coulomb['value'] + more,
-            'interval': [v + more for v in coulomb['interval']]}
+def _joints(found, trials):
+    if any(t.entry.joint is None for t in trials):
+        return list(found.servos.joints)
+    return sorted(found.servos.joints[t.entry.joint] for t in trials)
 
 
-def _timing(joints, models, robot):
-    """Delay, bandwidth, or the set of the two where the log trades them."""
-    delayed = _kept(joints, 'delay')
-    frequency = np.median([j['terms']['natural_frequency']['value'] for j in joints])
-    damping = np.median([j['terms']['damping_ratio']['value'] for j in joints])
-    changed = abs(frequency / robot.joints.natural_frequency - 1) > CHANGED or abs(
-        damping / robot.joints.damping_ratio - 1) > CHANGED
-    traded = any({'delay', 'natural_frequency'} <= set(pair) for j in joints
-                 for pair in j['traded'])
-    names = [name for name, there in (('joint_command_latency', bool(delayed)),
-                                      ('joint_bandwidth', changed)) if there]
-    if not names:
-        return []
-    bandwidth = {'kp': _derived(joints, 'kp_N_m_per_rad', 'N m/rad'),
-                 'kd': _derived(joints, 'kd_N_m_s_per_rad', 'N m s/rad')}
-    delay = {'delay': _entry(delayed, 'delay', 'joint_command_latency', 'delay', '')} \
-        if delayed else {}
-    parts = {'joint_command_latency': delay, 'joint_bandwidth': bandwidth}
-    evidence = _evidence(models, 'delay', delayed or joints)
-    if traded and delayed:
-        return [{'names': list(dict.fromkeys([*names, 'joint_bandwidth'])), 'layer': 'joint',
-                 'parameters': delay, 'also': {'joint_bandwidth': bandwidth},
-                 'evidence': evidence,
-                 'separated_by': CATALOGUE['joint_command_latency'].separated_by}]
-    return [{'names': [name], 'layer': 'joint', 'parameters': parts[name], 'evidence': evidence}
-            for name in names]
+def _also(found, members):
+    """What was fitted with an effect and must be written with it, though it is not named."""
+    also = {t.entry.name: _parameters(found, t.entry) for t in members[1:]
+            if any(t.entry == a.entry for a in found.accepted)}
+    servos, fitted = found.servos, [t.entry.name for t in found.accepted]
+    held = found.point[servos.index('dead_band_held')] > 0.5
+    if members[0].entry.name == 'joint_bandwidth' and held and 'joint_friction' not in fitted \
+            and servos.friction(found.believed).any():
+        also['joint_friction'] = _parameters(found, Entry('joint_friction'))
+    return also
 
 
-def _derived(joints, key, unit):
-    values = [j['derived'][key] for j in joints]
-    middle, spread = float(np.median(values)), float(np.ptp(values)) / 2
-    return {'value': middle, 'unit': unit, 'interval': [middle - spread, middle + spread]}
+def _parameters(found: Found, entry: Entry, point=None):
+    """Parameter -> value, unit, 95 % interval of one entry; ``point``: a model of its own."""
+    servos, other = found.servos, point is not None
+    point = found.point if point is None else point
+    if entry.name == 'joint_friction':
+        return _friction(found, point)
+    made, values = {}, servos.values(point)
+    for k in np.flatnonzero(servos.mask(entry.name, entry.joint)):
+        number, width = servos.numbers[k], 0.0 if other else found.widths[k] * servos.scale[k]
+        ends = [values[k] * np.exp(s * width) if number.logarithmic else values[k] + s * width
+                for s in (-1, 1)]
+        less = servos.delays if number.name == 'delay' else 0.0
+        made[number.name] = {'value': float(values[k] - less),
+                             'unit': CATALOGUE[entry.name].parameters[number.name].unit}
+        if not other:
+            made[number.name]['interval'] = [float(end - less) for end in ends]
+    return made
 
 
-def _candidates(models, joints):
-    rows = []
-    for term, (name, _, _) in ENTRIES.items():
-        having = _kept(joints, term)
-        evidence = _evidence(models, term, joints)
-        rows.append({'name': name, 'accepted': 2 * len(having) >= len(joints) and bool(having),
-                     'evidence': evidence, 'sigma_of_realistic_size': None,
-                     'sigma_beside_rivals': {},
-                     'reason': '' if having else 'does not help on data left out'})
-    return sorted(rows, key=lambda row: -row['evidence']['delta_chi2'])
+def _friction(found, point):
+    """Coulomb friction and stiction [N m]: the median of the joints, and each joint's own."""
+    servos, mask = found.servos, found.servos.mask('joint_friction')
+    force, count = servos.friction(point), len(servos.joints)
+    torque = servos.friction(np.where(mask, 1.0, point))    # [N m] for each scale of a dead band
+    width = found.widths[mask] * torque
+    at = servos.index('stiction')
+    extra = servos.values(point)[at] / servos.scale[mask] * torque
+    unit = CATALOGUE['joint_friction'].parameters['coulomb'].unit
+    made = {}
+    for name, value in (('coulomb', force), ('stiction', force + extra)):
+        made[name] = {'value': float(np.median(value)), 'unit': unit,
+                      'interval': [max(float(np.median(value + s * width)), 0.0)
+                                   for s in (-1, 1)],
+                      'each': {str(servos.joints[j]): float(value[j]) for j in range(count)}}
+    return made
+
+
+def _candidates(found: Found):
+    """One row for each entry, with its own evidence; the strongest first."""
+    members = {t.entry: t for group in found.sets.values() for t in group}
+    rows = [(t, True) for t in members.values()] + [(t, False) for t in found.rejected]
+    made = []
+    for trial, accepted in sorted(rows, key=lambda row: (-row[1], -row[0].gain)):
+        row = {'name': trial.entry.name, 'accepted': accepted, 'evidence': _evidence(trial),
+               'sigma_of_realistic_size': None, 'sigma_beside_rivals': {},
+               'reason': '' if accepted else trial.reason}
+        if trial.entry.joint is not None:
+            row['joint'] = found.servos.joints[trial.entry.joint]
+        made.append(row)
+    return made
 
 
 def _experiment(joints):
     plan = joints[0]['experiment']
     return (f'sine of {plan["frequency_Hz"]:g} Hz and {plan["amplitude_rad"]:.2f} rad for '
             f'{plan["duration_s"]:g} s on the joints (separates latency from bandwidth)')
+
+
+__all__ = ['analyse_joint_log', 'gap_of']

@@ -96,10 +96,11 @@ def _own(robot: RobotParameters) -> dict[str, float | np.ndarray]:
             'effort_limit': joints.effort_limit}
 
 
-def friction(robot: RobotParameters) -> tuple[float, float]:
-    """Coulomb friction and stiction [N m] of the file, whose stiction is at least the former."""
+def friction(robot: RobotParameters) -> tuple[np.ndarray, np.ndarray]:
+    """Coulomb friction and stiction of the file [N m], the latter at least the former; (4,)."""
     own = robot.effects.get('joint_friction', {'coulomb': 0.0, 'stiction': 0.0})
-    return own['coulomb'], max(own['stiction'], own['coulomb'])
+    coulomb, stiction = (np.broadcast_to(own[name], 4) for name in ('coulomb', 'stiction'))
+    return coulomb, np.maximum(stiction, coulomb)
 
 
 def all_keys(robot: RobotParameters) -> dict[str, Key]:
@@ -107,7 +108,9 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
     own, keys = _own(robot), {}
     effects = dict(robot.effects)
     if 'joint_friction' in effects:
-        effects['joint_friction'] = dict(zip(('coulomb', 'stiction'), friction(robot)))
+        # a flight judges what all joints share; differences between them stay as the file has them
+        effects['joint_friction'] = dict(zip(('coulomb', 'stiction'), (
+            float(np.mean(value)) for value in friction(robot))))
     # described modules load the joints with their share, and this entry is what goes beyond
     turning = {GYROSCOPIC} if robot.multibody else {GYROSCOPIC, MODULES}
     for name, effect in CATALOGUE.items():

@@ -1,0 +1,185 @@
+"""
+What changed in the servos between two response logs.
+
+Both logs are fitted with the same numbers, joint by joint. As in `identify joint`, servos of one
+type on one bus are expected to differ from their mean by 10 % and 3 ms: where a slow log trades
+delay against stiffness, the other joints help.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import norm
+
+from beetle_omni_ros.identify.fitting import encode, Fitter, Noise, Prior, Problems
+from beetle_omni_ros.identify.gap.joint_search import FIRST_NOISE, SETTLING
+from beetle_omni_ros.identify.joint import COMMON_DEVIATION
+from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.joint_servos import Servos
+from beetle_omni_ros.identify.selection import block_masks
+from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
+from beetle_omni_ros.identify.uncertainty import DIFFERENT, gradient_scatter
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.table import Grid
+
+FITTED = ('natural_frequency', 'damping_ratio', 'delay', 'coulomb_friction', 'offset')
+# Catalogue entry, parameter, unit. A log without a torque determines friction over stiffness (the
+# dead band) better than either, and the lag behind a ramp better than its parts.
+ROWS = (('joint_offset', 'offset', 'rad'), ('joint_bandwidth', 'kp', 'N m/rad'),
+        ('joint_bandwidth', 'kd', 'N m s/rad'), ('joint_friction', 'coulomb', 'N m'),
+        ('joint_friction', 'dead_band', 'rad'), ('joint_command_latency', 'delay', 's'),
+        ('joint_command_latency', 'ramp_lag', 's'))
+WRONG = 0.05            # probability that any row of two logs is called significant by chance
+# One standard deviation of frequency and damping about the median joint: a factor, which keeps a
+# fit in place and says nothing beside a log.
+FACTOR = 1.6
+MILLI = {'rad': ('mrad', 1e3), 's': ('ms', 1e3), 'N m': ('mN m', 1e3)}
+
+
+def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[dict]:
+    """
+    Compare the servos of two logs.
+
+    Args:
+        before: the first log.
+        after: the second.
+        robot: the servos as believed, from which both fits start.
+
+    Returns:
+        for each joint of both logs and each of ``ROWS`` the second ``log``, ``joint``, ``name``
+        of the catalogue entry, ``parameter``, ``unit``, ``before``,
+        ``after``, their ``difference``, its 95 % ``interval`` and ``significant``: whether
+        chance makes so large a difference anywhere between two logs in 5 % of the cases at most.
+
+    """
+    fits = [estimate(log, robot) for log in (before, after)]
+    joints = [j for j in before.joints if j in after.joints]
+    rows, count = [], len(joints) * len(ROWS)
+    for number in joints:
+        pair = [(values[log.joints.index(number)], errors[log.joints.index(number)])
+                for log, (values, errors) in zip((before, after), fits, strict=True)]
+        for k, (name, parameter, unit) in enumerate(ROWS):
+            (old, spread), (new, other) = ((v[k], e[k]) for v, e in pair)
+            error, difference = float(np.hypot(spread, other)), float(new - old)
+            reach = float(norm.isf(0.025)) * error
+            rows.append({'log': after.name, 'joint': number, 'name': name,
+                         'parameter': parameter, 'unit': unit,
+                         'before': float(old), 'after': float(new), 'difference': difference,
+                         'interval': [difference - reach, difference + reach],
+                         'significant': bool(abs(difference) > norm.isf(WRONG / 2 / count)
+                                             * error)})
+    return rows
+
+
+def estimate(log: JointLog, robot: RobotParameters) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Zero, gains, friction and delay of each joint of a log.
+
+    Returns:
+        (J, 7) values in the order of ``ROWS``, and (J, 7) their standard errors.
+
+    """
+    servos = Servos(robot, log.joints)
+    start = servos.sets(servos.believed[None])[0]
+    count, free = len(log.joints), np.array([name in FITTED for name in NAMES])
+    weight = np.tile((log.t >= log.t[0] + SETTLING).astype(float), (count, 1))
+    start[:, INDEX['coulomb_friction']] = np.maximum(start[:, INDEX['coulomb_friction']], 0.005)
+    start[:, INDEX['delay']] = np.maximum(start[:, INDEX['delay']], 0.008)
+    noise, joints = Noise.white(count, FIRST_NOISE), np.arange(count)
+    for _ in range(2):
+        fitter = Fitter(log, noise, _prior(start))
+        solved = fitter.solve(Problems(joints, start, np.tile(free, (count, 1)), weight), 15)
+        start = solved.sets
+        error = simulate(log, joints, start) - log.measured
+        noise = Noise.of(error[:, weight[0] > 0], max(log.quantum, 1e-4) / np.sqrt(12),
+                         log.period)
+    problems = Problems(joints, start, np.tile(free, (count, 1)), weight)
+    points, covariance = _pooled(Fitter(log, noise, Prior.none()), problems, free)
+    return _physical(points, covariance, start, free, servos)
+
+
+def _prior(start):
+    """Frequency and damping within a factor of the median joint's, which keeps a fit in place."""
+    precision = np.zeros(len(NAMES))
+    for name in ('natural_frequency', 'damping_ratio'):
+        precision[INDEX[name]] = (TERMS[name].scale / np.log(FACTOR))**2
+    return Prior(np.median(encode(start), axis=0), precision)
+
+
+def _pooled(fitter, problems, free):
+    """(J, n) encoded numbers drawn to the mean of all joints, and (J n, J n) their covariance."""
+    points = encode(problems.sets)
+    base = fitter.residuals(points, problems.joint, problems.weight)
+    slopes = fitter.jacobian(points, problems, base)[:, free]
+    count, size = slopes.shape[:2]
+    blocks, every = block_masks(problems.weight[0], DIFFERENT), np.ones(size, dtype=bool)
+    precision = np.zeros((count * size, count * size))
+    for j in range(count):
+        information = slopes[j] @ slopes[j].T + 1e-7 * np.eye(size)
+        scatter = gradient_scatter(slopes[j], base[j], every, np.linalg.inv(information), blocks)
+        precision[j * size:(j + 1) * size, j * size:(j + 1) * size] = information / scatter
+    own = points[:, free].ravel()
+    apart = np.eye(count) - 1 / count
+    names = [name for name, chosen in zip(NAMES, free, strict=True) if chosen]
+    common = np.diag([(TERMS[n].scale / COMMON_DEVIATION[n])**2 if n in COMMON_DEVIATION else 0.0
+                      for n in names])
+    covariance = np.linalg.inv(precision + np.kron(apart, common))
+    return (covariance @ precision @ own).reshape(count, size), covariance
+
+
+def _physical(points, covariance, sets, free, servos):
+    """Values and standard errors in the units of the catalogue, by finite differences."""
+    count, size = points.shape
+    scale = np.array([term.scale for term in TERMS.values()])[free]
+    errors = np.zeros((count, len(ROWS)))
+
+    def values(point):
+        chosen = dict(zip([n for n, c in zip(NAMES, free, strict=True) if c], point * scale,
+                          strict=True))
+        frequency, damping = (np.exp(chosen[n]) for n in ('natural_frequency', 'damping_ratio'))
+        kp = servos.robot.joints.inertia * frequency**2
+        band, delay = chosen['coulomb_friction'], chosen['delay'] - servos.delays
+        return np.array([-chosen['offset'], kp, 2 * damping * kp / frequency, kp * band, band,
+                         delay, delay + 2 * damping / frequency])
+
+    made = np.array([values(point) for point in points])
+    for j in range(count):
+        slope = np.array([(values(points[j] + step) - values(points[j] - step)) / 0.02
+                          for step in 0.01 * np.eye(size)])
+        own = covariance[j * size:(j + 1) * size, j * size:(j + 1) * size]
+        errors[j] = np.sqrt(np.diag(slope.T @ own @ slope))
+    return made, errors
+
+
+def sentences(rows: list[dict], log: str) -> list[str]:
+    """One line for each significant change, or that there is none."""
+    changed = [row for row in rows if row['significant']]
+    if not changed:
+        return [f'{log}: no significant change of zero, gains, friction or delay']
+    return [f'{log}: {line(row)}' for row in changed]
+
+
+def change_grids(rows: list[dict]) -> list[Grid]:
+    """One table for each further log: before, after and their difference."""
+    made = []
+    for log in dict.fromkeys(row['log'] for row in rows):
+        cells = []
+        for row in (r for r in rows if r['log'] == log):
+            unit, factor = MILLI.get(row['unit'], (row['unit'], 1.0))
+            old, new, difference, low, high = (factor * x for x in (
+                row['before'], row['after'], row['difference'], *row['interval']))
+            cells.append([str(row['joint']), f"{row['parameter']} [{unit}]", f'{old:.3g}',
+                          f'{new:.3g}', f'{difference:+.3g}', f'{low:.3g}..{high:.3g}',
+                          'yes' if row['significant'] else ''])
+        made.append(Grid(f'Changes to {log}', ['joint', 'parameter', 'before', 'after',
+                                               'difference', '95 %', 'significant'], cells))
+    return made
+
+
+def line(row: dict) -> str:
+    """A row in words, e.g. 'joint 2: joint_offset offset 0.4 to 18.2 mrad, change 17.8 ...'."""
+    unit, factor = MILLI.get(row['unit'], (row['unit'], 1.0))
+    old, new, difference, low, high = (factor * x for x in (
+        row['before'], row['after'], row['difference'], *row['interval']))
+    return (f"joint {row['joint']}: {row['name']} {row['parameter']} {old:.3g} to {new:.3g} "
+            f'{unit}, change {difference:+.3g} ({low:.3g}..{high:.3g})')

@@ -1,0 +1,478 @@
+"""
+Which catalogue entries a response log needs beside the servos of the robot file.
+
+Entries join one by one, from the file's servos on: the one that explains most for its numbers.
+What is fitted is what a robot file can hold, so the corrected file is the fitted model itself,
+and the same log judged against that file shows no gap. An entry counts if chance would hardly
+gain as much, if blocks of the log that it was not fitted to agree, and if it is larger than what
+servos of one type differ by anyway.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2 as chi_square
+
+from beetle_omni_ros.identify.fitting import Noise
+from beetle_omni_ros.identify.gap.joint_fit import StackFitter
+from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.joint_servos import GROUPS, Servos
+from beetle_omni_ros.identify.selection import block_masks
+from beetle_omni_ros.identify.servo_model import simulate
+from beetle_omni_ros.identify.uncertainty import DIFFERENT, gradient_scatter
+from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+SETTLING = 0.25         # [s] of a log that are not fitted: its first velocity is only a guess
+FITTED_PART = 0.6       # of the log; the rest judges
+FIRST_NOISE = 0.002     # [rad] white, until the residuals tell
+# Probability that chance gains as much, for each entry tried: about a dozen are, so that one log
+# in a hundred without a change gets a name.
+CHANCE = 0.001
+BLOCKS = 5
+MOST_EFFECTS = 8
+QUICK = 5               # iterations that show what an entry gains; the accepted are fitted again
+NEARLY = 0.8            # of the noise: below, what was found lets see more than before
+MOST_PASSES = 3
+BEYOND = 1.15           # a limit counts only if the command asks for so much more than it
+# Smallest changes that are named, where the catalogue's are not those of a response log. A zero:
+# three counts of a 12-bit encoder, 0.26 deg. Friction: gears and seals of one type differ by a
+# fifth, and change as much with wear and temperature.
+LEAST_OFFSET = 3 * 2 * np.pi / 4096     # [rad]
+LEAST_FRICTION = 0.2                    # of the believed
+LEAST_DEAD_BAND = 2 * np.pi / 4096      # [rad] one count
+# Delay and stiffness of a pair are told apart where both are known better than the smallest
+# change of each that matters; else they are one set.
+PAIR = ('joint_command_latency', 'joint_bandwidth')
+RIVALS = {'joint_command_latency': 'joint_bandwidth', 'joint_bandwidth': 'joint_command_latency',
+          'joint_friction': 'joint_backlash', 'joint_backlash': 'joint_friction',
+          'joint_velocity_limit': 'joint_torque_limit',
+          'joint_torque_limit': 'joint_velocity_limit'}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """
+    A catalogue entry as a candidate.
+
+    Attributes:
+        name: of the catalogue.
+        joint: index in the log of the one joint that it is about, or None.
+
+    """
+
+    name: str
+    joint: int | None = None
+
+
+@dataclass
+class Trial:
+    """
+    What an entry gains.
+
+    Attributes:
+        entry: which.
+        gain: fall of chi2 beside the accepted others, over the residuals' scatter.
+        numbers: how many it has.
+        samples: that were fitted.
+        blocks: (BLOCKS,) gain on each block of the log that was left out.
+        point: the fitted model with it.
+        reason: why it is not accepted, or ''.
+
+    """
+
+    entry: Entry
+    gain: float
+    numbers: int
+    samples: int
+    blocks: np.ndarray
+    point: np.ndarray
+    reason: str = ''
+
+    @property
+    def needed(self) -> float:
+        """Gain that chance hardly reaches, and that is worth its numbers (BIC)."""
+        return max(chi_square.isf(CHANCE, self.numbers), self.numbers * np.log(self.samples))
+
+    @property
+    def unlikely(self) -> bool:
+        """Whether chance would hardly gain as much."""
+        return self.gain > self.needed
+
+    @property
+    def agreed(self) -> bool:
+        """Whether blocks that were left out gain, most of them and all together."""
+        return bool(self.blocks.sum() > 0 and 2 * (self.blocks > 0).sum() > len(self.blocks))
+
+
+@dataclass
+class Found:
+    """
+    The outcome of a search.
+
+    Attributes:
+        servos: layout of the points.
+        believed: (P,) the file's servos.
+        point: (P,) corrected servos.
+        accepted: trials of the accepted entries, the strongest first.
+        sets: accepted name -> trials that do as well in its place, itself among them.
+        rejected: trials of all other entries, beside the accepted ones.
+        widths: (P,) half widths of 95 % intervals, 0 where a number was not fitted.
+        errors: 'believed', 'corrected', 'free' -> (J,) RMS on the held-out part [rad]; free: with
+            gains, delay, friction and zeros fitted, whether they are worth it or not.
+        tolerated: (J,) RMS that tolerances of manufacturing make on that part [rad].
+
+    """
+
+    servos: Servos
+    believed: np.ndarray
+    point: np.ndarray
+    accepted: list[Trial]
+    sets: dict[Entry, list[Trial]]
+    rejected: list[Trial]
+    widths: np.ndarray
+    errors: dict[str, np.ndarray]
+    tolerated: np.ndarray
+
+
+class Search:
+    """
+    Forward selection from the servos of the file.
+
+    Args:
+        log: the whole log; only its first part is fitted.
+        robot: as believed.
+
+    """
+
+    def __init__(self, log: JointLog, robot: RobotParameters):
+        """Fit the usual numbers once, for the noise; see the class."""
+        self.whole, self.log = log, log.first(FITTED_PART)
+        self.servos = Servos(robot, log.joints)
+        self.weight = (self.log.t >= self.log.t[0] + SETTLING).astype(float)
+        self.blocks = block_masks(self.weight, BLOCKS)
+        self.samples = int(self.weight.sum()) * len(log.joints)
+        self.entries = self._entries()
+        self._estimate_noise()
+
+    def _entries(self):
+        made = [Entry(name, j) for name in ('joint_offset', 'joint_friction')
+                for j in range(len(self.log.joints))]
+        made += [Entry(name) for name in GROUPS if name != 'joint_offset']
+        # A speed limit that the command never asks for cannot show.
+        slow = (self.log.asked_speed() < BEYOND * 0.95 * self.log.speed()).all()
+        return [e for e in made if not (e.name == 'joint_velocity_limit' and slow)]
+
+    def _estimate_noise(self):
+        """Noise around the best servos that a robot file can hold, from two starts."""
+        usual = [e for e in self.entries if e.name == 'joint_offset' or (
+            e.name in ('joint_friction', 'joint_velocity_limit', *PAIR) and e.joint is None)]
+        white = Noise.white(len(self.log.joints), FIRST_NOISE)
+        starts = [self._started(self.servos.believed, usual, k) for k in range(2)]
+        for noise in (white, None):
+            self.fitter = StackFitter(self.log, noise or self._noise(self.full), self.servos)
+            solved = self._solve(starts, [usual] * len(starts), 12)
+            self.full = solved.points[solved.chi2.argmin()]
+            starts = [self.full]
+        self.noise = self._noise(self.full)
+        self.fitter = StackFitter(self.log, self.noise, self.servos)
+        self.scatter = self._scatter(self.full, usual)
+
+    def _noise(self, point):
+        sets = self.servos.sets(point[None])[0]
+        error = simulate(self.log, np.arange(len(sets)), sets) - self.log.measured
+        return Noise.of(error[:, self.weight > 0], max(self.log.quantum, 1e-4) / np.sqrt(12),
+                        self.log.period)
+
+    def _scatter(self, point, entries):
+        information, slopes, base = self.fitter.information(point, self._free(entries),
+                                                            self.weight)
+        free, count = self._free(entries), len(base)
+        covariance = _inverse(information, free)
+        blocks = np.tile(block_masks(self.weight, DIFFERENT), (1, count))
+        return gradient_scatter(slopes.reshape(len(free), -1), base.ravel(), free, covariance,
+                                blocks)
+
+    def _free(self, entries):
+        return np.any([self.servos.mask(e.name, e.joint) for e in entries], axis=0) \
+            if entries else np.zeros(len(self.servos.numbers), dtype=bool)
+
+    def _solve(self, points, models, iterations=8, weights=None):
+        free = np.array([self._free(entries) for entries in models])
+        if weights is None:
+            weights = np.tile(self.weight, (len(free), 1))
+        return self.fitter.solve(np.array(points), free, weights, iterations)
+
+    def _starts(self, entry):
+        """How many starts an entry has: a stiffness with and without friction's torque."""
+        return 1 if entry.name in ('joint_offset', 'joint_friction') else 2
+
+    def _started(self, point, entries, k):
+        """A point moved to where the entries have a slope and do not contradict the log."""
+        point = point.copy()
+        for entry in entries:
+            if entry.name == 'joint_friction':
+                mask = self.servos.mask(entry.name, entry.joint)
+                point[mask] = np.maximum(point[mask], 2.0)
+            elif entry.name == 'joint_command_latency':
+                at = self.servos.index('delay')
+                point[at] = max(point[at] + (4.0, -2.0)[k], 0.5)
+            elif entry.name == 'joint_bandwidth':
+                point[self.servos.index('dead_band_held')] = float(k)
+                if len(entries) > 1:    # from scratch: as soft as slow servos are, or as believed
+                    point[self.servos.index('kp')] += (0.0, -8.0)[k]
+                    point[self.servos.index('kd')] += (0.0, -8.0)[k]
+            elif entry.name == 'joint_backlash':
+                at = self.servos.index('gap')
+                point[at] = max(point[at], (3.0, 10.0)[k])
+            elif entry.name == 'joint_velocity_limit':
+                self._set(point, 'velocity_limit', (0.97, 0.8)[k] * self.log.speed().max())
+            elif entry.name == 'joint_torque_limit':
+                largest = np.abs(self.log.command - self.log.measured).max()
+                kp = self.servos.values(point)[self.servos.index('kp')]
+                self._set(point, 'effort_limit', (0.9, 0.6)[k] * kp * largest)
+        return point
+
+    def _set(self, point, name, value):
+        at = self.servos.index(name)
+        point[at] = np.log(value) / self.servos.scale[at]
+
+    def run(self) -> Found:
+        """Select, drop what became superfluous, find what does as well."""
+        kept, point = [], self.servos.believed.copy()
+        for _ in range(MOST_PASSES):
+            accepted, point, trials = self._grown(kept, point)
+            kept, point = self._pruned(accepted, point)
+            noise = self._noise(point)
+            if (noise.sigma > NEARLY * self.noise.sigma).all():
+                break
+            self.noise, self.full = noise, point
+            self.fitter = StackFitter(self.log, noise, self.servos)
+        return self._found(kept, point, trials if kept == accepted else self._beside(kept, point))
+
+    def _grown(self, accepted, point):
+        """Add entries while any is worth it: accepted, their model, and the trials of the rest."""
+        trials = self._beside(accepted, point)
+        while len(accepted) < MOST_EFFECTS:
+            fit = [t for t in trials if t.unlikely and self._matters(t)]
+            if not fit:
+                break
+            # The most for its numbers: one zero outdoes a friction of four.
+            best = max(fit, key=lambda t: t.gain - t.needed)
+            inside = [e for e in accepted if not self._within(e, best.entry)]
+            accepted, point = [*inside, best.entry], best.point
+            trials = self._beside(accepted, point)
+        return accepted, point, trials
+
+    def _beside(self, accepted, point):
+        """A trial of each other entry beside the accepted ones."""
+        free = self._free(accepted)
+        asked = [(e, k) for e in self.entries if (self._free([e]) & ~free).any()
+                 for k in range(self._starts(e))]
+        points = [point, *(self._started(point, [e], k) for e, k in asked)]
+        models = [accepted, *([*accepted, e] for e, _ in asked)]
+        solved = self._solve(points, models, QUICK)
+        best: dict = {}
+        for (entry, _), p, chi2 in zip(asked, solved.points[1:], solved.chi2[1:], strict=True):
+            gain = (solved.chi2[0] - chi2) / self.scatter
+            if entry not in best or gain > best[entry].gain:
+                best[entry] = Trial(entry, float(gain), self._count(entry), self.samples,
+                                    np.zeros(BLOCKS), p)
+        return list(best.values())
+
+    def _within(self, entry, other):
+        """Whether the other entry frees all numbers of this one."""
+        return not (self._free([entry]) & ~self._free([other])).any()
+
+    def _count(self, entry):
+        return int(self._free([entry]).sum())
+
+    def _matters(self, trial):
+        """Whether an entry changes more than what servos of one type differ by."""
+        return self.is_large(trial.entry, self.servos.believed, trial.point)
+
+    def is_large(self, entry: Entry, before: np.ndarray, after: np.ndarray) -> bool:
+        """Whether the entry's change from one point to another is worth a name."""
+        old, new = self.servos.values(before), self.servos.values(after)
+        if entry.name == 'joint_friction':
+            force = [self.servos.friction(p) for p in (before, after)]
+            bands = [f / self.servos.values(p)[self.servos.index('kp')]
+                     for f, p in zip(force, (before, after), strict=True)]
+            return bool(np.any((np.abs(force[1] - force[0]) > LEAST_FRICTION * force[0])
+                               & (np.abs(bands[1] - bands[0]) > LEAST_DEAD_BAND)))
+        if entry.name == 'joint_torque_limit':
+            errors = np.abs(self.log.command - self.log.measured)
+            limit = new[self.servos.index('effort_limit')] / new[self.servos.index('kp')]
+            if BEYOND * limit > np.quantile(errors[:, self.weight > 0], 0.99):
+                return False
+        mask = self.servos.mask(entry.name, entry.joint)
+        for k in np.flatnonzero(mask):
+            number = self.servos.numbers[k]
+            least = LEAST_OFFSET if number.name == 'offset' else \
+                CATALOGUE[entry.name].parameters[number.name].smallest
+            change = abs(np.log(new[k] / old[k])) if number.logarithmic else abs(new[k] - old[k])
+            if change > least:
+                return True
+        return False
+
+    def _pruned(self, accepted, point):
+        """Drop, the weakest first, what others explain or what unseen blocks do not confirm."""
+        while accepted:
+            trials = self._dropped(accepted, point)
+            weak = [t for t in trials if not (t.unlikely and t.agreed and self._matters(t))]
+            if not weak:
+                break
+            worst = min(weak, key=lambda t: t.gain).entry
+            accepted = [e for e in accepted if e != worst]
+            point = self._refitted(accepted, point)
+        return accepted, point
+
+    def _refitted(self, accepted, point):
+        """The model with these entries alone, all else as the file has it."""
+        start = self._kept(accepted, point)
+        return self._solve([start], [accepted]).points[0] if accepted else start
+
+    def _kept(self, accepted, point):
+        free = self._free(accepted)
+        free[self.servos.index('dead_band_held')] = Entry('joint_bandwidth') in accepted
+        return np.where(free, point, self.servos.believed)
+
+    def _dropped(self, accepted, point, each=None):
+        """
+        A trial of each accepted entry: what the model loses without it, fitted and unseen.
+
+        Args:
+            accepted: entries of the model.
+            point: its fitted numbers.
+            each: entries to judge, default all of them.
+
+        """
+        each = accepted if each is None else each
+        models = [accepted, *([o for o in accepted if o != e] for e in each)]
+        points = [point, *(self._kept(m, point) for m in models[1:])]
+        solved = self._solve(points, models)
+        unseen = self._unseen(solved.points, models)
+        return [Trial(e, float((chi2 - solved.chi2[0]) / self.scatter), self._count(e),
+                      self.samples, (cost - unseen[0]) / self.scatter, solved.points[0])
+                for e, chi2, cost in zip(each, solved.chi2[1:], unseen[1:], strict=True)]
+
+    def _unseen(self, points, models):
+        """(M, BLOCKS) chi2 of each block, predicted by models fitted without it."""
+        every = self.blocks.sum(axis=0)
+        rows = np.repeat(np.arange(len(models)), BLOCKS)
+        left = np.tile(self.blocks, (len(models), 1))
+        fitted = self._solve(points[rows], [models[r] for r in rows], 4, every - left).points
+        cost = (self.fitter.residuals(fitted, left)**2).sum(axis=(1, 2))
+        return cost.reshape(len(models), BLOCKS)
+
+    def _found(self, accepted, point, others):
+        trials = self._dropped(accepted, point) if accepted else []
+        if trials:
+            point = trials[0].point
+        widths = self._widths(accepted, point)
+        sets = self._sets(accepted, point, trials, widths)
+        members = {t.entry for group in sets.values() for t in group}
+        rejected = [t for t in others if t.entry not in members]
+        for trial in rejected:
+            trial.reason = self._reason(trial)
+        strongest = sorted(trials, key=lambda t: -t.gain)
+        return Found(self.servos, self.servos.believed, point, strongest, sets, rejected, widths,
+                     self._errors(point), self._tolerated())
+
+    def _reason(self, trial):
+        if not trial.unlikely:
+            return 'gains no more than chance'
+        if not self._matters(trial):
+            return 'smaller than servos of one type differ by'
+        return 'does not help on data left out'
+
+    def _widths(self, accepted, point):
+        free = self._free(accepted)
+        if not free.any():
+            return np.zeros(len(free))
+        information = self.fitter.information(point, free, self.weight)[0]
+        covariance = _inverse(information, free) * self.scatter
+        return np.where(free, 1.96 * np.sqrt(np.maximum(np.diag(covariance), 0.0)), 0.0)
+
+    def _sets(self, accepted, point, trials, widths):
+        """Accepted entry -> what may stand in its place; a pair that is not told apart is one."""
+        sets: dict[Entry, list[Trial]] = {t.entry: [t] for t in trials}
+        pair = [Entry(name) for name in PAIR]
+        if all(e in accepted for e in pair) and not self._told_apart(widths):
+            alone = self._alone(accepted, point, pair)
+            first, second = sorted(alone, key=lambda t: -t.gain)
+            if second.gain > 0:
+                sets[first.entry] = [first, second]
+                del sets[second.entry]
+            return sets
+        for entry in accepted:
+            rival = Entry(RIVALS.get(entry.name, ''))
+            if rival in self.entries and rival not in accepted:
+                own, other = self._alone(accepted, point, [entry, rival])
+                near = own.gain - other.gain < chi_square.isf(CHANCE, 1)
+                if near and other.unlikely and other.agreed and self._matters(other):
+                    sets[entry] = [own, other]
+        return sets
+
+    def _told_apart(self, widths):
+        """Whether delay, stiffness and damping are known better than what matters of each."""
+        least = {name: CATALOGUE[group].parameters[name].smallest
+                 for group in PAIR for name in GROUPS[group]}
+        return all(widths[self.servos.index(name)] * self.servos.scale[self.servos.index(name)]
+                   < size for name, size in least.items())
+
+    def _alone(self, accepted, point, members):
+        """What each member gains beside the others of the model, without the other members."""
+        others = [e for e in accepted if e not in members]
+        found = []
+        for member in members:
+            best = None
+            for k in range(self._starts(member)):
+                start = self._kept([*others, member], point) if member in accepted and not k \
+                    else self._started(self._kept(others, point), [member], k)
+                solved = self._solve([start], [[*others, member]])
+                if best is None or solved.chi2[0] < best.chi2[0]:
+                    best = solved
+            found.append(self._dropped([*others, member], best.points[0], [member])[0])
+        return found
+
+    def _errors(self, point):
+        """(J,) RMS on the held-out part of the file's, the corrected and the freest servos."""
+        return {name: held_out_rms(self.whole, self.servos, p) for name, p in (
+            ('believed', self.servos.believed), ('corrected', point), ('free', self.full))}
+
+    def _tolerated(self):
+        """(J,) RMS on the held-out part of changes just too small to be named, together."""
+        changes = {'kp': 0.05, 'kd': 0.05, 'delay': 0.001}
+        total = np.zeros(len(self.log.joints))
+        for name, size in changes.items():
+            point, at = self.servos.believed.copy(), self.servos.index(name)
+            point[at] += size / self.servos.scale[at]
+            total += self._moved(point)**2
+        point = self.servos.believed.copy()
+        for j in range(len(self.log.joints)):
+            point[self.servos.index('coulomb', j)] *= 1 + LEAST_FRICTION
+            point[self.servos.index('offset', j)] += 0.5
+        return np.sqrt(total + self._moved(point)**2)
+
+    def _moved(self, point):
+        joints = np.arange(len(self.log.joints))
+        a, b = (simulate(self.whole, joints, self.servos.sets(p[None])[0])
+                for p in (point, self.servos.believed))
+        return np.sqrt(np.mean((a - b)[:, self.whole.end_of(FITTED_PART):]**2, axis=1))
+
+
+def held_out_rms(log: JointLog, servos: Servos, point: np.ndarray) -> np.ndarray:
+    """(J,) RMS [rad] of free runs minus the log, over its part that is not fitted."""
+    sets = servos.sets(point[None])[0]
+    error = simulate(log, np.arange(len(sets)), sets) - log.measured
+    return np.sqrt(np.mean(error[:, log.end_of(FITTED_PART):]**2, axis=1))
+
+
+def _inverse(information, free):
+    covariance = np.zeros_like(information)
+    chosen = np.ix_(free, free)
+    covariance[chosen] = np.linalg.inv(information[chosen] + 1e-7 * np.eye(free.sum()))
+    return covariance

@@ -1,0 +1,184 @@
+"""
+The four tilt servos of a robot file as one point: numbers that they share and numbers of each.
+
+A robot file has one stiffness, damping, delay and limit for all joints, and friction and zero of
+each joint. A fit of these numbers is therefore a fit of what can be written to the file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.identify.servo_model import INDEX, OFF, TERMS
+from beetle_omni_ros.robot.effects_actuator import per_joint, SLIDING_RATE
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+GROUPS = {'joint_friction': ('coulomb',), 'joint_command_latency': ('delay',),
+          'joint_bandwidth': ('kp', 'kd'), 'joint_offset': ('offset',),
+          'joint_backlash': ('gap',), 'joint_velocity_limit': ('velocity_limit',),
+          'joint_torque_limit': ('effort_limit',)}
+
+
+@dataclass(frozen=True)
+class Number:
+    """
+    One coordinate of a point.
+
+    Attributes:
+        name: parameter of the catalogue, or 'stiction' and 'dead_band_held'.
+        joint: index in the log, None where all joints share it.
+        scale: a change that matters; of the logarithm where ``logarithmic``.
+        low: smallest value.
+        high: largest value.
+        logarithmic: whether the point holds its logarithm.
+
+    """
+
+    name: str
+    joint: int | None
+    scale: float
+    low: float
+    high: float
+    logarithmic: bool = False
+
+
+def _numbers(count):
+    made = [Number('kp', None, 0.05, 1e-3, 1e2, True), Number('kd', None, 0.05, 1e-5, 1e1, True),
+            Number('delay', None, 0.002, 0.0, 0.12),
+            Number('velocity_limit', None, 0.05, 0.2, 1e3, True),
+            Number('effort_limit', None, 0.05, 1e-3, 1e3, True),
+            Number('gap', None, 0.002, 0.0, 0.3), Number('stiction', None, 0.002, 0.0, 0.4),
+            Number('dead_band_held', None, 1.0, 0.0, 1.0)]
+    made += [Number('coulomb', j, 0.002, 0.0, 0.4) for j in range(count)]
+    return made + [Number('offset', j, 0.002, -0.5, 0.5) for j in range(count)]
+
+
+class Servos:
+    """
+    A robot file's servos and their deviations.
+
+    Friction and stiction of a point are dead bands [rad] at the stiffness of the file: without a
+    torque in the log only ratios to the stiffness show. ``dead_band_held`` says what stays where
+    the stiffness changes and friction is not fitted: the torque (0) or the dead band (1).
+
+    Args:
+        robot: as the file has it, effects included.
+        joints: numbers of the log's joints, 1 to 4.
+
+    """
+
+    def __init__(self, robot: RobotParameters, joints: tuple[int, ...]):
+        """Lay out the numbers; see the class."""
+        self.robot, self.joints = robot, joints
+        self.numbers = _numbers(len(joints))
+        self.scale = np.array([n.scale for n in self.numbers])
+        self._log = np.array([n.logarithmic for n in self.numbers])
+        self.low, self.high = (self._encode(np.array([getattr(n, side) for n in self.numbers]))
+                               for side in ('low', 'high'))
+        self.believed = self._encode(self._believed())
+
+    def _encode(self, values):
+        return np.where(self._log, np.log(np.where(self._log, values, 1.0)), values) / self.scale
+
+    def values(self, points: np.ndarray) -> np.ndarray:
+        """(..., P) numbers of points in their units."""
+        values = points * self.scale
+        return np.where(self._log, np.exp(np.where(self._log, values, 0.0)), values)
+
+    def _believed(self):
+        servo, effects = self.robot.joints, self.robot.effects
+        friction = effects.get('joint_friction', {'coulomb': 0.0, 'stiction': 0.0})
+        coulomb = np.array([per_joint(friction['coulomb'], j - 1) for j in self.joints])
+        extra = np.array([per_joint(friction['stiction'], j - 1) for j in self.joints]) - coulomb
+        offset = effects.get('joint_offset', {}).get('offset', (0.0,) * 4)
+        values = {'kp': servo.kp, 'kd': max(servo.kd, 1e-5), 'delay': self.own_delay + self.delays,
+                  'velocity_limit': servo.velocity_limit, 'effort_limit': servo.effort_limit,
+                  'gap': effects.get('joint_backlash', {}).get('gap', 0.0),
+                  'stiction': max(float(np.median(extra)), 0.0) / servo.kp,
+                  'dead_band_held': 0.0, 'coulomb': coulomb / servo.kp,
+                  'offset': np.array([offset[j - 1] for j in self.joints])}
+        return np.array([values[n.name] if n.joint is None else values[n.name][n.joint]
+                         for n in self.numbers])
+
+    @property
+    def own_delay(self) -> float:
+        """The file's ``joint_command_latency`` [s]."""
+        return self.robot.effects.get('joint_command_latency', {}).get('delay', 0.0)
+
+    @property
+    def delays(self) -> float:
+        """Delays of all commands and of the encoders [s]: a log cannot tell them from it."""
+        effects = self.robot.effects
+        return sum(effects.get(name, {}).get('delay', 0.0)
+                   for name in ('command_latency', 'joint_feedback_delay'))
+
+    def index(self, name: str, joint: int | None = None) -> int:
+        """Where a number stands in a point."""
+        return next(k for k, n in enumerate(self.numbers) if (n.name, n.joint) == (name, joint))
+
+    def mask(self, group: str, joint: int | None = None) -> np.ndarray:
+        """(P,) numbers of a catalogue entry, of one joint where given."""
+        return np.array([n.name in GROUPS[group] and joint in (None, n.joint)
+                         for n in self.numbers])
+
+    def sets(self, points: np.ndarray) -> np.ndarray:
+        """(M, J, len(NAMES)) parameter sets of the servo model for points (M, P)."""
+        values = self.values(points)
+        count, joint = len(self.joints), self.robot.joints
+        shared = {n.name: values[:, k, None] for k, n in enumerate(self.numbers)
+                  if n.joint is None}
+        coulomb, offset = values[:, -2 * count:-count], values[:, -count:]
+        softer = (joint.kp / shared['kp'])**(1 - shared['dead_band_held'])
+        made = {'natural_frequency': np.sqrt(shared['kp'] / joint.inertia),
+                'damping_ratio': shared['kd'] / (2 * np.sqrt(shared['kp'] * joint.inertia)),
+                'delay': shared['delay'], 'offset': -offset, 'coulomb_friction': coulomb * softer,
+                'stiction': shared['stiction'] * softer,
+                'stribeck_velocity': np.full((1, 1), SLIDING_RATE),
+                'backlash': shared['gap'] / 2, 'velocity_limit': shared['velocity_limit'],
+                'torque_limit': shared['effort_limit'] / shared['kp']}
+        sets = np.tile(OFF, (len(points), count, 1))
+        for name, value in made.items():
+            sets[:, :, INDEX[name]] = np.clip(value, TERMS[name].low, TERMS[name].high)
+        return sets
+
+    def friction(self, point: np.ndarray) -> np.ndarray:
+        """(J,) Coulomb friction of a point [N m]."""
+        coulomb = self.sets(point[None])[0, :, INDEX['coulomb_friction']]
+        return coulomb * self.values(point)[self.index('kp')]
+
+
+def believed_sets(robot: RobotParameters, joints: tuple[int, ...]) -> np.ndarray:
+    """
+    Parameter sets (J, len(NAMES)) of the complete servos of a robot file, effects included.
+
+    The zero's sign is the catalogue's: the true tilt is the encoder's plus ``joint_offset``, and
+    a servo at rest stands where it is told to, so that its encoder reads the target minus it.
+    Deflection needs a thrust, which a response log does not have.
+    """
+    servos = Servos(robot, joints)
+    return servos.sets(servos.believed[None])[0]
+
+
+@dataclass(frozen=True)
+class FileServos:
+    """
+    What a robot file says of a log's joints.
+
+    Attributes:
+        sets: (J, len(NAMES)) parameter sets.
+        held: whether each command is held until the next. The shipped gains come from logs with
+            interpolated commands; delays that `gap` and `identify` find count from held ones.
+
+    """
+
+    sets: np.ndarray
+    held: bool
+
+
+def file_servos(robot: RobotParameters, joints: tuple[int, ...]) -> FileServos:
+    """Servos of a robot file for the joints of a log, as they are replayed."""
+    return FileServos(believed_sets(robot, joints),
+                      any(name in robot.effects for name in (*GROUPS, 'command_latency',
+                                                             'joint_feedback_delay')))
