@@ -60,7 +60,7 @@ def _value(term):
 
 
 def joint_page(log: JointLog, validations: list[JointLog], models: list[JointModel],
-               published: FileServos, results: dict) -> str:
+               published: FileServos, results: dict, head: str = '') -> str:
     """HTML page with the tables, what cannot be told, and figures of every log."""
     with matplotlib.rc_context(STYLE):
         sections = []
@@ -76,7 +76,7 @@ def joint_page(log: JointLog, validations: list[JointLog], models: list[JointMod
                                 'straight line is lag, the gap between the branches a dead band.',
                                 svg(_loops(log, models), 'position error over speed')))
     return page('Tilt servos', f'identified from {log.name}', grids(results), results['text'],
-                sections)
+                sections, head)
 
 
 def _pairs(log, models):

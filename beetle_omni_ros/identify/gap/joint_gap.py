@@ -9,6 +9,8 @@ import numpy as np
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.gap.joint_changes import changes, sentences
 from beetle_omni_ros.identify.gap.joint_search import Entry, Found, Search, Trial
+from beetle_omni_ros.identify.gap.page import head
+from beetle_omni_ros.identify.gap.sentence import summary
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
 from beetle_omni_ros.identify.joint_page import joint_page
@@ -59,7 +61,9 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
              'meta': {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                       'robot': str(base) if base else 'params/robot.yaml',
                       'version': __version__}}
-    return made, joint_page(log, others, models, file_servos(robot, log.joints), identified)
+    made['summary'] = summary(made)
+    return made, joint_page(log, others, models, file_servos(robot, log.joints), identified,
+                            head(made))
 
 
 def gap_of(found: Found, log: JointLog) -> dict:

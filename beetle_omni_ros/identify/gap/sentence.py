@@ -25,9 +25,11 @@ def _bad_data(made):
 def _no_gap(made):
     unseen = made.get('hidden') or []
     text = 'Model and measurement agree to within noise and manufacturing tolerance.'
+    if 'joints' in made:
+        return text
     if not unseen:
         return f'{text} Every known effect of realistic size would have shown.'
-    return f'{text} A realistic {listed(unseen, "or")} would not have shown in these flights.'
+    return f'{text} A realistic {listed(unseen, "or")} would not have shown in these data.'
 
 
 def _named(made):
@@ -42,7 +44,7 @@ def _unknown(made):
 
 
 def _not_decidable(made):
-    return f'These flights cannot decide: {made["reason"]}.'
+    return f'These data cannot decide: {made["reason"]}.'
 
 
 _SENTENCES = {'bad_data': _bad_data, 'no_gap': _no_gap, 'named': _named, 'named_set': _named,
@@ -82,7 +84,8 @@ def _size(value, span):
 def _closing(made):
     if made.get('closure') is None:
         return 'The gap in free runs is at its noise floor before and after.'
-    flights = 'the held-out flight' if made.get('held_out') else 'the fitted flights'
+    flights = 'the held-out part of the log' if 'joints' in made else \
+        'the held-out flight' if made.get('held_out') else 'the fitted flights'
     return f'Adding it closes {made["closure"]:.0%} of the gap on {flights}.'
 
 
