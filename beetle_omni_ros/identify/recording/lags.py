@@ -134,7 +134,8 @@ def _judged(recording, topic, other, what, whose, allowed, at, lags, limits):
                           f'{drift:.2f} s in this recording'.replace('pose fall', 'pose falls'))
         sides = min(split, len(lags) - split)
         if abs(step) > large and sides >= LEAST_WINDOWS:
-            moment = 0.5 * (at[split - 1] + at[split])
+            moment = _onset(recording, topic, 0.5 * (at[split - 1] + at[split]), step,
+                            limits.lag_window)
             return damage(f'the clock steps against {other}: {what} follow {whose} by '
                           f'{before:.2f} s before and by {after:.2f} s after'.replace(
                               'pose follow', 'pose follows'), moment)
@@ -146,3 +147,11 @@ def _judged(recording, topic, other, what, whose, allowed, at, lags, limits):
                       f'{high:g} s: the clock of {topic} or of {other} is off'.replace(
                           'pose are', 'pose is'))
     return None
+
+
+def _onset(recording, topic, near, step, reach):
+    """A silence as long as the step, near the middle between two windows, else that middle [s]."""
+    stamps = series_of(recording, topic)[0]
+    silences = np.diff(stamps)
+    fits = (np.abs(stamps[:-1] - near) < reach) & (np.abs(silences - abs(step)) < 0.3 * abs(step))
+    return float(stamps[:-1][fits][np.argmax(silences[fits])]) if fits.any() else near
