@@ -207,12 +207,13 @@ def named(asked: dict) -> tuple[str, ...]:
 
 def check(bag: Path) -> str:
     """Load a flight as the gap finder does; why it is refused, or ''."""
+    from beetle_omni_ros.identify.gap.bags import BagError
     from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
     from beetle_omni_ros.identify.gap.parameters import GapParameters
     from beetle_omni_ros.robot.parameters import RobotParameters
     try:
         load_flight(bag, RobotParameters.load(), GapParameters.load())
-    except UnusableFlight as error:
+    except (BagError, UnusableFlight) as error:
         return str(error)
     return ''
 

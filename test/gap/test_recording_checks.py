@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 from recordings import columns, kept, late_half, recording, ROBOT, turned_pose
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from beetle_omni_ros.identify.gap import bags
 from beetle_omni_ros.identify.gap.bags import read_recording
@@ -110,6 +110,24 @@ def drifting(made):
     return made
 
 
+def later_and_later(made, topic, most):
+    """Stamped on arrival, at the end of a queue that fills."""
+    t = made.times[topic]
+    by = most * (t - t[0]) / (t[-1] - t[0])
+    made.times[topic] = t + by
+    made.received[topic] = made.received[topic] + by
+    return made
+
+
+def without_gravity(made):
+    t, pose = made.times[POSE], made.values[POSE]
+    attitude = Slerp(t, Rotation.from_quat(pose[:, 3:]))
+    at = np.clip(made.times[IMU], t[0], t[-1])
+    made.values[IMU] = made.values[IMU].copy()
+    made.values[IMU][:, :3] -= attitude(at).inv().apply([0, 0, ROBOT.gravity])
+    return made
+
+
 def silent_clock(made):
     """Times of recording that follow the damaged stamps: only motion shows the fault."""
     made.received = {}
@@ -161,10 +179,13 @@ KINDS = {
     'stamps in milliseconds': (lambda m: _thousand(m), IMU, ['apart'], None),
     'out of order': (reordered, POSE, ['out of order'], 0.1),
     'recorded twice': (lambda m: _twice(m), IMU, ['twice'], 0.0),
+    'encoders recorded twice': (lambda m: _twice(m, JOINTS), JOINTS, ['twice'], 0.0),
+    'MoCap later and later': (lambda m: later_and_later(m, POSE, 0.5), POSE, ['drifts'], None),
     'degrees per second': (lambda m: columns(m, IMU, 3, 6, np.rad2deg), IMU,
                            ['degrees per second'], None),
     'acceleration in g': (lambda m: columns(m, IMU, 0, 3, lambda v: v / 9.80665), IMU,
                           ['units of g'], None),
+    'gravity taken off': (lambda m: without_gravity(m), IMU, ['without gravity'], None),
     'gravity downwards': (lambda m: columns(m, IMU, 0, 3, lambda v: -v), IMU,
                           ['opposite sign'], None),
     'one gyroscope axis reversed': (lambda m: columns(m, IMU, 3, 6, lambda v: v * [1, -1, 1]),
@@ -209,8 +230,8 @@ def _thousand(made):
     return made
 
 
-def _twice(made):
-    return kept(made, IMU, np.repeat(np.arange(len(made.times[IMU])), 2))
+def _twice(made, topic=IMU):
+    return kept(made, topic, np.repeat(np.arange(len(made.times[topic])), 2))
 
 
 @pytest.mark.parametrize('conditions', ['nominal', 'published'])

@@ -33,8 +33,7 @@ def damages(recording: Recording, robot: RobotParameters,
     if min(len(recording.times[topic]) for topic in NEEDED) < 2:
         return []
     found = clock_damages(recording, limits)
-    clocked = {damage.topic for damage in found}
-    found += [d for d in reading_damages(recording, limits) if d.topic not in clocked]
+    found += reading_damages(recording, limits, {damage.topic for damage in found})
     return found or lag_damages(recording, limits) \
         or convention_damages(recording, robot, limits)
 

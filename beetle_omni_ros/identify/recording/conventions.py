@@ -22,15 +22,19 @@ from beetle_omni_ros.identify.recording.motion import MEANINGS, Motion, motion_o
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 PRIOR = 6.0             # logarithm of the odds against each deviation from the convention
-RATE_UNITS = {1.0: '', 180 / np.pi: 'degrees per second', np.pi / 180: 'turned into radians twice'}
+RATE_UNITS = {1.0: '', 180 / np.pi: 'in degrees per second, not rad/s',
+              np.pi / 180: 'turned into radians twice'}
 FORCE_UNITS = {1.0: '', 1 / 9.80665: 'in units of g', 1e3 / 9.80665: 'in milli-g',
-               100.0: 'cm/s^2', 1e3: 'mm/s^2'}
-LENGTH_UNITS = {1.0: '', 1e3: 'millimetres', 100.0: 'centimetres', 1e-3: 'kilometres',
-                1 / 0.3048: 'feet', 1 / 0.0254: 'inches'}
-ANGLE_UNITS = {1.0: '', 180 / np.pi: 'degrees', 4096 / (2 * np.pi): 'encoder counts',
-               np.pi / 180: 'turned into radians twice', 1 / (2 * np.pi): 'turns'}
-THRUST_UNITS = {1e3: 'millinewtons', 1e3 / 9.80665: 'grams', 1 / 9.80665: 'kilograms',
-                5.0: 'per cent of the largest thrust', 0.05: 'parts of the largest thrust'}
+               100.0: 'in cm/s^2', 1e3: 'in mm/s^2'}
+LENGTH_UNITS = {1.0: '', 1e3: 'in millimetres, not metres', 100.0: 'in centimetres, not metres',
+                1e-3: 'in kilometres, not metres', 1 / 0.3048: 'in feet, not metres',
+                1 / 0.0254: 'in inches, not metres'}
+ANGLE_UNITS = {1.0: '', 180 / np.pi: 'in degrees, not radians',
+               4096 / (2 * np.pi): 'in encoder counts, not radians',
+               np.pi / 180: 'turned into radians twice', 1 / (2 * np.pi): 'in turns, not radians'}
+THRUST_UNITS = {1e3: 'in millinewtons, not N', 1e3 / 9.80665: 'in grams, not N',
+                1 / 9.80665: 'in kilograms, not N', 5.0: 'in percent of the largest thrust, not N',
+                0.05: 'in parts of the largest thrust, not N'}
 AXES = 'xyz'
 ALL_AXES = [np.array([[sign * (place == column) for column in range(3)]
                       for sign, place in zip(signs, order, strict=True)], dtype=float)
@@ -227,7 +231,7 @@ def _on_the_way(recording, m, robot, limits, parts, lively, usual_rate, usual_fo
         later = slice(k, len(m.t))
         if _explains(m, meaning, robot, lively, limits, later):
             return _said(recording, m, meaning, sure, m.t[k], robot, limits, repair=False)
-    scaled = _scaled(recording, m, robot, limits, lively)
+    scaled = _weightless(recording, m, robot) or _scaled(recording, m, robot, limits, lively)
     if scaled:
         return scaled
     rate_part = usual_rate.sum() / max((m.rate**2).sum(), 1e-12)
@@ -236,6 +240,20 @@ def _on_the_way(recording, m, robot, limits, parts, lively, usual_rate, usual_fo
                    f"that was tried: {min(rate_part, 9.99):.0%} of the gyroscope's and "
                    f"{min(force_part, 9.99):.0%} of the accelerometer's signal remain "
                    'unexplained by the pose', None, 0.9)]
+
+
+def _weightless(recording, m, robot):
+    """An accelerometer from whose readings gravity was taken off."""
+    without = ((m.force - _pushed(m, '', ONE))**2).sum()
+    usual = _errors(m, USUAL, robot)[1].sum()
+    share = robot.gravity**2 * len(m.t)     # of the squares, by gravity
+    # Vibration and the noise of a second derivative stay; nine tenths of gravity go.
+    if without > 0.1 * share or not 0.5 * share < usual < 2 * share:
+        return []
+    felt = float(np.median(np.linalg.norm(m.force, axis=1)))
+    return [Damage(recording.name, 'imu/data_raw', f'linear acceleration is without gravity: '
+                   f'{felt:.2g} m/s^2 in the median, near {robot.gravity:.2f} m/s^2 expected; '
+                   'the driver takes gravity off', None, 0.9)]
 
 
 def _scaled(recording, m, robot, limits, lively):

@@ -125,13 +125,17 @@ def _judged(recording, topic, other, what, whose, allowed, at, lags, limits):
         step = after - before
         large = max(limits.lag_step, limits.lag_noise * max(noise, LEAST_NOISE))
         line = np.polyfit(at, lags, 1)
-        drift = abs(line[0]) * (at[-1] - at[0])
-        straight = ((lags - np.polyval(line, at))**2).sum()
+        from_line = lags - np.polyval(line, at)
         levels = np.where(np.arange(len(lags)) < split, before, after)
-        stepped = ((lags - levels)**2).sum()
-        if drift > large and straight < 0.7 * stepped:
-            return damage(f'the clock drifts against {other}: {what} fall behind {whose} by '
-                          f'{drift:.2f} s in this recording'.replace('pose fall', 'pose falls'))
+        straight, stepped = (from_line**2).sum(), ((lags - levels)**2).sum()
+        drift = line[0] * (at[-1] - at[0])
+        least = max(limits.lag_step, limits.lag_noise * max(from_line.std(), LEAST_NOISE))
+        if abs(drift) > least and straight < 0.7 * stepped:
+            first, last = np.polyval(line, at[[0, -1]])
+            return damage(f'the clock drifts against {other}: {what} lag behind {whose} by '
+                          f'{first:.2f} s at first and by {last:.2f} s at the end: a clock that '
+                          'runs at another rate, or a delay that grows'.replace(
+                              'pose lag', 'pose lags'))
         sides = min(split, len(lags) - split)
         if abs(step) > large and sides >= LEAST_WINDOWS:
             moment = _onset(recording, topic, 0.5 * (at[split - 1] + at[split]), step,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 import numpy as np
 from scipy.ndimage import median_filter
 
@@ -18,16 +20,28 @@ LEAST_CLIPPED = 10      # readings
 MOST_REPAIRED = 0.02    # of a topic's readings: more outliers are no few bad readings
 
 
-def reading_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
-    """Everything that single topics' values show to be wrong, at most one fault a topic."""
+def reading_damages(recording: Recording, limits: RecordingLimits,
+                    unclocked: Container[str] = ()) -> list[Damage]:
+    """
+    Everything that single topics' values show to be wrong, at most one fault a topic.
+
+    Args:
+        recording: with every topic of ``NEEDED``.
+        limits: of a sound recording.
+        unclocked: topics whose stamps are wrong, which are left out.
+
+    """
     found = {}
     for topic, checks in (('imu/data_raw', (_beyond, _clipped, _outliers, _stale, _frozen)),
                           ('mocap/pose', (_beyond, _norms, _alternating, _outliers, _stale,
                                           _frozen, _jumps)),
                           ('joint_states', (_beyond, _outliers, _stuck)),
                           ('command', (_beyond,))):
+        if topic in unclocked:
+            continue
+        series = _Series(recording, topic)
         for check in checks:
-            damage = check(_Series(recording, topic), limits)
+            damage = check(series, limits)
             if damage:
                 found[topic] = damage
                 break
@@ -44,6 +58,12 @@ class _Series:
         order = np.argsort(t, kind='stable')
         self.index = order[fine[order]]
         self.t, self.values = t[self.index], values[self.index]
+
+    @property
+    def period(self):
+        """Median time between readings with different stamps [s]."""
+        steps = np.diff(self.t)
+        return float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
 
     def damage(self, cause, at=None, bad=None, fix=None):
         """A fault; ``bad`` (n,) marks readings that a repair drops."""
@@ -176,7 +196,7 @@ def _stale(series, limits):
 def _frozen(series, limits):
     """Equal readings for long, of all axes or of one."""
     same = np.diff(series.values, axis=0) == 0
-    period = float(np.median(np.diff(series.t)))
+    period = series.period
     for what, columns, longest in (
             ('', same.all(axis=1), limits.frozen),
             *((AXES[series.topic][k] + ' ', column, limits.frozen_axis)
@@ -242,7 +262,7 @@ def _stuck(series, limits):
     command = _Series(series.recording, 'command')
     if len(command.t) < 2 or np.abs(command.values[:, :4]).max() > 4 * np.pi:
         return None         # no angles in radians, which is judged later
-    steps = max(1, round(limits.frozen_joint / float(np.median(np.diff(series.t)))))
+    steps = max(1, round(limits.frozen_joint / series.period))
     for k in range(4):
         same = np.diff(series.values[:, k]) == 0
         for first, length in _runs(same):
