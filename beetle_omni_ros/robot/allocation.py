@@ -54,6 +54,7 @@ class Allocator:
         inverse: (8, 6) its pseudo-inverse.
         mass: the mass that the hover wrench carries [kg].
         weight: (3,) force in world that holds it against gravity and steady wind [N].
+        axes: (4, 3) unit tilt axes in base_link.
         tilt_limit: travel of the joints to each side [rad].
 
     """
@@ -74,6 +75,7 @@ class Allocator:
                 torque = np.cross(rotors.positions[i], direction) \
                     - rotors.spin[i] * ratio * direction
                 self.matrix[:, column] = scale[i] * np.concatenate([direction, torque])
+        self.axes = robot.tilt_axes
         self.inverse = np.linalg.pinv(self.matrix, rcond=SINGULAR)
         self._negligible = NEGLIGIBLE * robot.hover_thrust
         self._thrust_min, self._thrust_max = rotors.thrust_min, rotors.thrust_max
@@ -144,6 +146,21 @@ class Allocator:
         force = self.weight if extra_force_world is None else self.weight + extra_force_world
         torque = np.zeros(3) if extra_torque_body is None else extra_torque_body
         return self.allocate(force @ rotations.matrix(quaternion), torque, present_tilt)
+
+    def upright(self, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Tilts and thrusts of hovering at many attitudes, travel and range left aside.
+
+        Args:
+            up: (P, 3) world's z in base_link.
+
+        Returns:
+            tilts (P, 4) within +-pi [rad] and thrusts (P, 4) [N].
+
+        """
+        components = (np.linalg.norm(self.weight) * up) @ self.inverse[:, :3].T
+        along, across = components[:, 0::2], components[:, 1::2]
+        return np.arctan2(across, along), np.hypot(along, across)
 
     def _nearest_turn(self, angle, present):
         """Angle + 2 pi k nearest ``present`` inside the travel; (angle, whether cut off)."""

@@ -8,9 +8,11 @@ from math import inf
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, Controller, Reference
+from beetle_omni_ros.control.levelling import plan
+from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.safety.events import ERROR, EventLog
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.ramp import inclination, levelled, Ramp
+from beetle_omni_ros.safety.ramp import inclination, Ramp
 from beetle_omni_ros.safety.support import SupportGauge
 from beetle_omni_ros.safety.vehicle import Vehicle
 
@@ -22,6 +24,7 @@ class Landing:
     Args:
         parameters: rates and thresholds.
         hover: the controller that flies it.
+        allocator: of the robot.
         gauge: what the rotors carry.
         vehicle: estimate, joints and raw sensors.
         events: where to say what is gone.
@@ -32,9 +35,10 @@ class Landing:
 
     """
 
-    def __init__(self, parameters: SupervisorParameters, hover: Controller, gauge: SupportGauge,
-                 vehicle: Vehicle, events: EventLog):
+    def __init__(self, parameters: SupervisorParameters, hover: Controller, allocator: Allocator,
+                 gauge: SupportGauge, vehicle: Vehicle, events: EventLog):
         self._parameters, self._blind_limit = parameters.landing, parameters.state.blind_limit
+        self._allocator = allocator
         self._hover, self._gauge, self._vehicle, self._events = hover, gauge, vehicle, events
         self.grounded, self.given_up = False, ''
         self._standing_for, self._blind_for = 0.0, 0.0
@@ -78,10 +82,10 @@ class Landing:
         """Level out and sink from the present pose."""
         vehicle = self._vehicle
         state = vehicle.backup_state(now) if vehicle.backup.running else vehicle.seen(in_force)
-        p, angle = self._parameters, inclination(state.quaternion)
-        self._ramp = Ramp(state.stamp, state.position, state.quaternion,
-                          levelled(state.quaternion), p.level_rate,
-                          angle / p.level_rate if angle > p.level_first else 0.0,
+        p = self._parameters
+        way = plan(state.quaternion, state.tilt, self._allocator, p.level)
+        first = inclination(state.quaternion) > p.level_first
+        self._ramp = Ramp(state.stamp, state.position, way, way.duration if first else 0.0,
                           -inf, p.speed, p.acceleration)
         self._due = now + self._ramp.wait + max(0.0, state.position[2]) / p.speed
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from beetle_omni_ros.control.levelling import LevellingParameters
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
@@ -97,8 +98,7 @@ class LandingParameters:
 
     speed: float = parameter(0.3, doc='descent speed', unit='m/s', low=0.05, high=3)
     acceleration: float = parameter(0.5, doc='of the descent', unit='m/s^2', low=0.05, high=10)
-    level_rate: float = parameter(0.8, doc='angular rate of the levelling', unit='rad/s', low=0.05,
-                                  high=5)
+    level: LevellingParameters = group(LevellingParameters)
     level_first: float = parameter(0.3, doc='more inclination is levelled before the descent',
                                    unit='rad', low=0, high=3.15)
     overdue_acceleration: float = parameter(

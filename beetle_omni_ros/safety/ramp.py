@@ -8,6 +8,7 @@ from math import sqrt
 import numpy as np
 
 from beetle_omni_ros.control.base import Reference
+from beetle_omni_ros.control.levelling import Way
 from beetle_omni_ros.robot import rotations
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -18,30 +19,17 @@ def inclination(quaternion: np.ndarray) -> float:
     return float(np.arccos(np.clip(rotations.matrix(quaternion)[2, 2], -1.0, 1.0)))
 
 
-def levelled(quaternion: np.ndarray) -> np.ndarray:
-    """The level attitude that is the shortest turn away; from upside down, a half roll."""
-    rotation = rotations.matrix(quaternion)
-    axis = np.cross(rotation[:, 2], UP)
-    length = float(np.linalg.norm(axis))
-    if length < 1e-6:
-        axis, length = rotation[:, 0], 1.0
-    turn = rotations.exp(axis / length * inclination(quaternion))
-    return rotations.normalized(rotations.multiply(turn, quaternion))
-
-
 @dataclass(frozen=True)
 class Ramp:
     """
-    Moves vertically from a pose, after turning at a steady rate towards another attitude.
+    Moves vertically from a pose, and turns towards another attitude meanwhile.
 
     It has the ``at`` of a target, so a controller follows it like any other.
 
     Attributes:
         stamp: when it starts [s].
         position: (3,) start in world [m].
-        quaternion: (4,) start.
-        goal: (4,) attitude at the end of the turn.
-        rate: of the turn [rad/s].
+        way: of the attitude.
         wait: time before the vertical motion [s].
         climb: vertical way, negative downwards, may be infinite [m].
         speed: of the vertical motion [m/s].
@@ -51,36 +39,24 @@ class Ramp:
 
     stamp: float
     position: np.ndarray
-    quaternion: np.ndarray
-    goal: np.ndarray
-    rate: float
+    way: Way
     wait: float
     climb: float
     speed: float
     acceleration: float
 
     @property
-    def turn_time(self) -> float:
-        """Duration of the turn [s]."""
-        return rotations.geodesic_angle(self.goal, self.quaternion) / self.rate
-
-    @property
     def duration(self) -> float:
         """Until nothing moves any more [s]."""
-        return max(self.turn_time, self.wait + self._profile(0.0)[2])
+        return max(self.way.duration, self.wait + self._profile(0.0)[2])
 
     def at(self, time: float) -> Reference:
         """The reference at ``time``."""
         elapsed = max(0.0, time - self.stamp)
         way, speed, _ = self._profile(elapsed - self.wait)
-        turn = rotations.log(rotations.multiply(rotations.conjugate(self.quaternion), self.goal))
-        total = self.turn_time
-        share = 1.0 if total <= 0 else min(1.0, elapsed / total)
+        quaternion, rate = self.way.at(elapsed)
         sign = np.sign(self.climb)
-        return Reference(
-            self.position + sign * way * UP,
-            rotations.multiply(self.quaternion, rotations.exp(share * turn)),
-            sign * speed * UP, turn / total if share < 1.0 else np.zeros(3))
+        return Reference(self.position + sign * way * UP, quaternion, sign * speed * UP, rate)
 
     def _profile(self, elapsed):
         """Way, speed and total time of a trapezoid of speed."""

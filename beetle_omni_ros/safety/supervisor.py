@@ -257,8 +257,8 @@ class Supervisor(Inputs):
         if self._on_ground:
             return self._motors_off(DISARMED, now, severity, f'{text}; still on the ground: '
                                                              'motors off')
-        self._landing = Landing(self._parameters, self._hover, self._gauge, self.vehicle,
-                                self.events)
+        self._landing = Landing(self._parameters, self._hover, self._allocator, self._gauge,
+                                self.vehicle, self.events)
         answer = self._enter(LANDING, now, severity, text)
         self._landing.start(now, self._in_force)
         return answer

@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, Controller, State
+from beetle_omni_ros.control.levelling import Way
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.safety.parameters import TakeoffParameters
 from beetle_omni_ros.safety.ramp import Ramp
 
+LEVEL_RATE = 0.5  # [rad/s] of what the ground was not level
 AIRBORNE = 0.05   # [m] of rise; below it a fault just stops the motors
 
 
@@ -73,9 +75,9 @@ class Takeoff:
         error = np.abs(state.tilt - self._goal_tilt)
         if error.max() < p.align_tolerance and np.array_equal(self._tilt, self._goal_tilt):
             level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(state.quaternion)[2])
-            self._ramp = Ramp(state.stamp, self._start.position, state.quaternion, level, 0.5,
-                              0.0, self.target[2] - self._start.position[2], p.speed,
-                              p.acceleration)
+            way = Way.straight(state.quaternion, level, LEVEL_RATE)
+            self._ramp = Ramp(state.stamp, self._start.position, way, 0.0,
+                              self.target[2] - self._start.position[2], p.speed, p.acceleration)
         elif self._aligned_for > p.align_patience:
             k = int(error.argmax())
             self.failure = f'gimbal{k + 1} is {error[k]:.2f} rad from its place after ' \

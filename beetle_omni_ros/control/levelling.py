@@ -1,0 +1,181 @@
+"""
+The way back to level that the joints can follow.
+
+In a slow turn each tilt is the angle of world's up about the rotor's arm, so the tilts follow
+from the path of the up direction through the body alone. The joints have stops, and a joint near
+half a turn can reach level only along paths on its own side. Where an arm stands upright its
+thrust carries nothing and its tilt may have any value: there a joint that is wound the wrong way
+turns over at no cost. The planner compares paths of the up direction: the direct one, those
+through the horizontal plane of the body, and those through upright arms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.allocation import Allocator, ROTORS
+from beetle_omni_ros.robot.schema import parameter
+
+UP = np.array([0.0, 0.0, 1.0])
+STEP = 0.1              # [rad] between points of a path
+VIA = 16                # points of the body's horizontal plane that are tried
+TURNED_OVER = 1.0       # [rad] in one step: the joint points elsewhere meanwhile
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevellingParameters:
+    """How fast a robot levels out."""
+
+    rate: float = parameter(0.8, doc='angular rate of the body', unit='rad/s', low=0.05, high=5)
+    joint_rate: float = parameter(
+        5.0, doc='joint rate that the way allows for', unit='rad/s', low=0.5, high=50)
+    margin: float = parameter(0.1, doc='distance that tilts keep from their stops', unit='rad',
+                              low=0, high=1)
+    missing_thrust: float = parameter(
+        20.0, doc='time that a second without one hover thrust of lift is worth', unit='s',
+        low=0, high=1000)
+
+
+class Way:
+    """
+    An attitude that turns along a path, piece by piece at steady rates.
+
+    Args:
+        times: (P,) increasing, from 0 [s].
+        quaternions: (P, 4) base_link to world, xyzw.
+
+    """
+
+    def __init__(self, times: np.ndarray, quaternions: np.ndarray):
+        """See the class."""
+        self._times, self._quaternions = times, quaternions
+        self._turns = [rotations.log(rotations.multiply(rotations.conjugate(a), b))
+                       for a, b in zip(quaternions[:-1], quaternions[1:])]
+
+    @classmethod
+    def straight(cls, start: np.ndarray, goal: np.ndarray, rate: float) -> Way:
+        """The shortest turn between two attitudes (4,) at ``rate`` [rad/s]."""
+        angle = rotations.geodesic_angle(goal, start)
+        if angle < 1e-9:
+            return cls(np.zeros(1), np.array([goal]))
+        return cls(np.array([0.0, angle / rate]), np.array([start, goal]))
+
+    @property
+    def duration(self) -> float:
+        """Until it stands still [s]."""
+        return float(self._times[-1])
+
+    @property
+    def goal(self) -> np.ndarray:
+        """(4,) attitude at the end."""
+        return self._quaternions[-1]
+
+    def at(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
+        """Attitude (4,) and body rate (3,) [rad/s], ``elapsed`` [s] after the start."""
+        times = self._times
+        if elapsed >= times[-1]:
+            return self._quaternions[-1], np.zeros(3)
+        if elapsed <= 0:
+            return self._quaternions[0], np.zeros(3)
+        k = int(np.searchsorted(times, elapsed, side='right')) - 1
+        length = times[k + 1] - times[k]
+        part = (elapsed - times[k]) / length
+        return rotations.multiply(self._quaternions[k], rotations.exp(part * self._turns[k])), \
+            self._turns[k] / length
+
+
+def plan(quaternion: np.ndarray, tilt: np.ndarray, allocator: Allocator,
+         p: LevellingParameters) -> Way:
+    """
+    Plan the turn to level that the joints follow best.
+
+    Args:
+        quaternion: (4,) present attitude, base_link to world, xyzw.
+        tilt: (4,) present tilt angles [rad].
+        allocator: of the robot.
+        p: rates.
+
+    Returns:
+        the way, from the present attitude to a level one.
+
+    """
+    start = rotations.matrix(quaternion)[2]     # world's up in base_link
+    paths = [_path(corners) for corners in _corners(start, allocator)]
+    longest = max(map(len, paths))
+    # One array: a path that ends earlier stays level.
+    up = np.array([np.concatenate([path, np.tile(UP, (longest - len(path), 1))])
+                   for path in paths])
+    waits, lost = _follow(tilt, up, allocator, p)
+    times = np.maximum(_angles_between(up) / p.rate, waits)
+    best = int(np.argmin(times.sum(axis=1) + p.missing_thrust * lost))
+    length = len(paths[best])
+    return _way(quaternion, paths[best], times[best, :length])
+
+
+def _corners(start, allocator):
+    """Corner points of the paths of the up direction that are tried."""
+    heading = np.linspace(0, 2 * np.pi, VIA, endpoint=False)
+    ring = np.stack([np.cos(heading), np.sin(heading), np.zeros(VIA)], axis=1)
+    arms = allocator.axes
+    ways = [] if start[2] < -1 + 1e-9 else [(start, UP)]
+    ways += [(start, side, UP) for side in ring if start @ side > -1 + 1e-9]
+    ways += [(start, arm, UP) for arm in arms if start @ arm > -1 + 1e-9]
+    return ways + [(start, one, other, UP) for one in arms for other in arms
+                   if abs(one @ other) < 0.9 and start @ one > -1 + 1e-9]
+
+
+def _path(corners):
+    """Points (P, 3) along great circles between corners."""
+    points = [corners[0][None]]
+    for a, b in zip(corners[:-1], corners[1:]):
+        angle = np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)
+        parts = np.linspace(0, 1, max(1, int(np.ceil(angle / STEP))) + 1)[1:, None]
+        if angle > 1e-6:
+            points.append((np.sin((1 - parts) * angle) * a + np.sin(parts * angle) * b)
+                          / np.sin(angle))
+    return np.concatenate(points)
+
+
+def _angles_between(up):
+    """Angles (N, P) from the point before [rad], the first 0."""
+    cosine = np.clip((up[:, 1:] * up[:, :-1]).sum(axis=2), -1, 1)
+    return np.concatenate([np.zeros((len(up), 1)), np.arccos(cosine)], axis=1)
+
+
+def _follow(tilt, up, allocator, p):
+    """
+    Times (N, P) [s] that the joints need for each step of N paths, and lift lost (N,) [s].
+
+    A joint takes the turn nearest its angle within its stops, as the allocation does. Lift is
+    counted in hover thrusts of one rotor times the time for which its joint points elsewhere.
+    """
+    shape = up.shape[:2] + (ROTORS,)
+    angles, thrusts = (x.reshape(shape) for x in allocator.upright(up.reshape(-1, 3)))
+    limit, hover = allocator.tilt_limit - p.margin, np.linalg.norm(allocator.weight) / ROTORS
+    present = np.tile(np.asarray(tilt, dtype=float), (len(up), 1))
+    waits, lost = np.zeros(shape[:2]), np.zeros(len(up))
+    for k in range(shape[1]):
+        angle = angles[:, k]
+        wished = angle + 2 * np.pi * np.round((present - angle) / (2 * np.pi))
+        wished = np.where(np.abs(wished) > limit, angle, wished)
+        moves = np.abs(wished - present)
+        time = moves / p.joint_rate
+        waits[:, k] = time.max(axis=1)
+        lost += (thrusts[:, k] * np.where(moves > TURNED_OVER, time, 0.0)).sum(axis=1) / hover
+        present = wished
+    return waits, lost
+
+
+def _way(quaternion, path, times):
+    """Attitudes along a path: the smallest turns that carry one up direction to the next."""
+    attitudes = [rotations.normalized(quaternion)]
+    for a, b in zip(path[:-1], path[1:]):
+        axis = np.cross(b, a)
+        sine = np.linalg.norm(axis)
+        turn = axis / sine * np.arctan2(sine, a @ b) if sine > 1e-12 else np.zeros(3)
+        attitudes.append(rotations.normalized(rotations.multiply(attitudes[-1],
+                                                                 rotations.exp(turn))))
+    return Way(np.cumsum(times), np.array(attitudes))
