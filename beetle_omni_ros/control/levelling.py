@@ -63,6 +63,10 @@ class Way:
             return cls(np.zeros(1), np.array([goal]))
         return cls(np.array([0.0, angle / rate]), np.array([start, goal]))
 
+    def ended(self) -> Way:
+        """Its end, held."""
+        return Way(np.zeros(1), self._quaternions[-1:])
+
     @property
     def duration(self) -> float:
         """Until it stands still [s]."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import inf
+from math import inf, isfinite
 
 import numpy as np
 
@@ -28,6 +28,7 @@ class Landing:
         gauge: what the rotors carry.
         vehicle: estimate, joints and raw sensors.
         events: where to say what is gone.
+        floor: height of base_link where it stood before the flight [m].
 
     Attributes:
         grounded: whether it stands.
@@ -36,18 +37,20 @@ class Landing:
     """
 
     def __init__(self, parameters: SupervisorParameters, hover: Controller, allocator: Allocator,
-                 gauge: SupportGauge, vehicle: Vehicle, events: EventLog):
+                 gauge: SupportGauge, vehicle: Vehicle, events: EventLog, floor: float = 0.0):
         self._parameters, self._blind_limit = parameters.landing, parameters.state.blind_limit
-        self._allocator = allocator
+        self._allocator, self._floor = allocator, floor
         self._hover, self._gauge, self._vehicle, self._events = hover, gauge, vehicle, events
         self.grounded, self.given_up = False, ''
         self._standing_for, self._blind_for = 0.0, 0.0
+        self._blind = False
 
     def start(self, now: float, in_force: Command | None) -> None:
         """Begin where the robot is, on the estimator or on the backup."""
         self._hover.reset()
         if self._vehicle.estimate.silent:
             self._vehicle.backup.start(self._vehicle.state)
+        self._blind = self._without_mocap
         self.set_out(now, in_force)
 
     def step(self, now: float, dt: float, in_force: Command | None) -> Command:
@@ -58,8 +61,12 @@ class Landing:
                                          'raw sensors')
             backup.start(vehicle.state)
             self.set_out(now, in_force)
+        if self._without_mocap and not self._blind:
+            self._blind = True      # what is known of the velocity fades: less time in the air
+            self.set_out(now, in_force)
         if not backup.running:
-            return self._follow(vehicle.seen(in_force), dt, None)
+            return self._follow(vehicle.seen(in_force), dt, vehicle.specific_force_up
+                                if vehicle.mocap_lost else None)
         dead_reckoning = self._lean_on_what_is_left(now, dt)
         state = vehicle.seen(in_force, vehicle.backup_state(now))
         return self._follow(state, dt, backup.specific_force_up if dead_reckoning else None)
@@ -82,12 +89,22 @@ class Landing:
         """Level out and sink from the present pose."""
         vehicle = self._vehicle
         state = vehicle.backup_state(now) if vehicle.backup.running else vehicle.seen(in_force)
-        p = self._parameters
-        way = plan(state.quaternion, state.tilt, self._allocator, p.level)
-        first = inclination(state.quaternion) > p.level_first
-        self._ramp = Ramp(state.stamp, state.position, way, way.duration if first else 0.0,
-                          -inf, p.speed, p.acceleration)
-        self._due = now + self._ramp.wait + max(0.0, state.position[2]) / p.speed
+        p, blind = self._parameters, self._without_mocap
+        level = replace(p.level, rate=p.blind_level_rate) if blind else p.level
+        way = plan(state.quaternion, state.tilt, self._allocator, level)
+        wait = way.duration if inclination(state.quaternion) > p.level_first else 0.0
+        height = max(0.0, state.position[2] - self._floor)
+        fast = max(0.0, height - p.flare_height) if blind else 0.0
+        self._ramp = Ramp(state.stamp, state.position, way, wait, *(
+            (-fast, p.blind_speed, p.blind_acceleration) if fast
+            else (-inf, p.speed, p.acceleration)))
+        self._due = now + wait + (height - fast) / p.speed + (
+            self._ramp.duration - wait if fast else 0.0)
+
+    @property
+    def _without_mocap(self):
+        vehicle = self._vehicle
+        return vehicle.mocap.silent if vehicle.backup.running else vehicle.mocap_lost
 
     def _follow(self, state, dt, specific_force_up):
         """
@@ -96,6 +113,8 @@ class Landing:
         ``specific_force_up`` [m/s^2] is given only where motion is not measured: elsewhere an
         upward wind would be taken for the ground.
         """
+        if isfinite(self._ramp.climb) and state.stamp > self._ramp.stamp + self._ramp.duration:
+            self._flare(state.stamp)
         reference = self._ramp.at(state.stamp)
         sink, velocity = 0.0, reference.velocity
         if specific_force_up is not None:
@@ -112,6 +131,12 @@ class Landing:
             [*reference.position[:2], height]))
         self._feel_ground(state, dt, specific_force_up, reference)
         return self._hover.step(state, _Now(reference))
+
+    def _flare(self, stamp):
+        """Go on slowly from the end of the fast descent."""
+        p, end = self._parameters, self._ramp.at(stamp)
+        self._ramp = Ramp(stamp, end.position, self._ramp.way.ended(), 0.0, -inf, p.speed,
+                          p.acceleration)
 
     def _feel_ground(self, state, dt, specific_force_up, reference):
         """The rotors carry clearly less than the weight, yet it does not fall."""

@@ -56,6 +56,8 @@ class StateLimits:
     imu_timeout: float = parameter(0.05, doc='silence of the raw IMU', unit='s', low=0.01, high=1)
     mocap_timeout: float = parameter(0.2, doc='silence of the raw MoCap', unit='s', low=0.02,
                                      high=5)
+    mocap_patience: float = parameter(1.0, doc='silence of the raw MoCap: landing', unit='s',
+                                      low=0.1, high=60)
     blind_limit: float = parameter(0.3, doc='time without any sensor before motors off', unit='s',
                                    low=0.02, high=5)
 
@@ -101,6 +103,13 @@ class LandingParameters:
     level: LevellingParameters = group(LevellingParameters)
     level_first: float = parameter(0.3, doc='more inclination is levelled before the descent',
                                    unit='rad', low=0, high=3.15)
+    blind_level_rate: float = parameter(1.2, doc='angular rate of the levelling without MoCap',
+                                        unit='rad/s', low=0.05, high=5)
+    blind_speed: float = parameter(0.6, doc='descent speed without MoCap, until the flare',
+                                   unit='m/s', low=0.05, high=3)
+    blind_acceleration: float = parameter(1.5, doc='the same', unit='m/s^2', low=0.05, high=10)
+    flare_height: float = parameter(0.5, doc='above the floor, where it slows down to speed',
+                                    unit='m', low=0, high=10)
     overdue_acceleration: float = parameter(
         0.6, doc='without MoCap, growth of the descent speed once the ground is overdue',
         unit='m/s^2', low=0, high=2)

@@ -56,6 +56,7 @@ class Supervisor(Inputs):
         self._landing: Landing | None = None
         self._target: PoseTarget | None = None
         self._stop_left = 0.0
+        self._floor = 0.0       # height of base_link where it stood [m]
 
     # Requests ---------------------------------------------------------------------------------
 
@@ -69,6 +70,7 @@ class Supervisor(Inputs):
         self._takeoff = Takeoff(self._parameters.takeoff, self._allocator, self._hover,
                                 self.vehicle.seen(None))
         self._in_force = None
+        self._floor = float(self.vehicle.state.position[2])
         return self._enter(TAKEOFF, now, INFO, 'armed: takeoff')
 
     def disarm(self, now: float) -> Answer:
@@ -161,6 +163,8 @@ class Supervisor(Inputs):
             why = f' (last refused: {vehicle.last_refusal})' if vehicle.last_refusal else ''
             self._land(now, ERROR, f'ekf_node {vehicle.estimate.text}{why}: controlled descent '
                                    'on raw sensors')
+        elif vehicle.mocap_lost and vehicle.mocap.elapsed > self._parameters.state.mocap_patience:
+            self._land(now, ERROR, f'MoCap {vehicle.mocap.text}: landing by dead reckoning')
         elif no_joints:
             self._land(now, ERROR, f'{no_joints}: landing with the joints as they are')
         elif vehicle.joints.silent:
@@ -258,7 +262,7 @@ class Supervisor(Inputs):
             return self._motors_off(DISARMED, now, severity, f'{text}; still on the ground: '
                                                              'motors off')
         self._landing = Landing(self._parameters, self._hover, self._allocator, self._gauge,
-                                self.vehicle, self.events)
+                                self.vehicle, self.events, self._floor)
         answer = self._enter(LANDING, now, severity, text)
         self._landing.start(now, self._in_force)
         return answer

@@ -129,6 +129,11 @@ class Vehicle:
             return None
         return float(rotations.matrix(self.state.quaternion)[2] @ force)
 
+    @property
+    def mocap_lost(self) -> bool:
+        """Whether MoCap was there and is silent."""
+        return self.mocap.silent and isfinite(self.mocap.elapsed)
+
     def why_not_arm(self) -> str:
         """'' when the motors may start, else what is missing."""
         limits, battery = self._parameters.arming, self._parameters.battery

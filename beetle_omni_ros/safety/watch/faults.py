@@ -1,0 +1,156 @@
+"""All detectors of one vehicle: faults by name, and which actuators work."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.allocation import Allocator, ROTORS
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.watch.joints import JointWatch
+from beetle_omni_ros.safety.watch.parameters import Detection
+from beetle_omni_ros.safety.watch.speeds import SpeedWatch
+from beetle_omni_ros.safety.watch.wrench import ContactWatch, WrenchWatch
+
+CRASH = 'crash'
+
+
+class FaultWatch:
+    """
+    Feeds the detectors and keeps what they have named.
+
+    A fault that was named stays until :meth:`reset`: an actuator that has failed once is not
+    trusted again in the same flight.
+
+    Args:
+        parameters: thresholds.
+        robot: as believed.
+        allocator: of the robot.
+
+    Attributes:
+        faults: name -> when it was named [s].
+        health: which actuators work.
+        offset: (4,) [rad] by which encoders are known to have jumped.
+
+    """
+
+    def __init__(self, parameters: Detection, robot: RobotParameters, allocator: Allocator):
+        """See the class."""
+        self._p, self._limit = parameters, robot.joints.position_limit
+        self._wrench = WrenchWatch(parameters.rotor, parameters.contact, robot, allocator)
+        self._contact = ContactWatch(parameters.contact, robot.gravity)
+        self._joints = JointWatch(parameters.servo, robot)
+        self._speeds = SpeedWatch(parameters.rotor, robot)
+        self.reset()
+
+    def reset(self) -> None:
+        """A new flight: everything is well."""
+        self.faults: dict[str, float] = {}
+        self.health: ActuatorHealth = ALL_WELL
+        self.offset = np.zeros(ROTORS)
+        self._new: list[str] = []
+        self._stamp = -np.inf
+        for watch in (self._wrench, self._contact, self._joints, self._speeds):
+            watch.reset()
+
+    @property
+    def contact(self) -> str:
+        """'' or why the robot counts as on the ground."""
+        return self._contact.reason
+
+    def news(self) -> list[str]:
+        """Texts of faults that were named since the last call."""
+        news, self._new = self._new, []
+        return news
+
+    def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray,
+               command: Command | None, height: float | None) -> None:
+        """
+        Take an IMU sample of a robot in the air.
+
+        Args:
+            stamp: [s].
+            force: (3,) specific force in base_link [m/s^2].
+            rate: (3,) in base_link [rad/s].
+            tilt: (4,) measured [rad].
+            command: in force, None: rotors off.
+            height: of base_link above where it stood [m], None: unknown.
+
+        """
+        dt, self._stamp = stamp - self._stamp, stamp
+        thrust = np.zeros(ROTORS) if command is None else command.thrust
+        self._wrench.on_imu(stamp, force, rate, tilt, thrust, self.health)
+        self._contact.update(min(max(dt, 0.0), 0.05), height, self._wrench)
+        if height is not None and height < self._p.contact.near_ground:
+            return      # the floor pushes, too
+        if self._wrench.lost is not None:
+            self._lose_rotor(self._wrench.lost, stamp, 'the wrench')
+        if self._wrench.slipped is not None:
+            joint, angle = self._wrench.slipped
+            name = f'joint{joint + 1}_slipped'
+            if self._name(name, stamp, f'the thrust of rotor {joint + 1} points {angle:+.2f} rad '
+                                       f'from where gimbal{joint + 1} says'):
+                self.offset[joint] += angle
+
+    def on_command(self, command: Command) -> None:
+        """Take what goes out."""
+        self._joints.on_command(command.stamp, command.tilt)
+
+    def on_joints(self, stamp: float, tilt: np.ndarray, trusted: bool) -> None:
+        """Take a complete reading (4,) [rad]; ``trusted``: joints are driven and in the air."""
+        watch = self._joints
+        watch.on_joints(stamp, tilt)
+        for joint in np.flatnonzero(watch.jump):
+            if self._name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
+                          f'gimbal{joint + 1} jumped by {watch.jump[joint]:+.2f} rad at once'):
+                self.offset[joint] -= watch.jump[joint]
+        if not trusted:
+            return
+        for joint in np.flatnonzero(watch.jammed | watch.astray):
+            jumped = f'joint{joint + 1}_encoder_jump' in self.faults
+            if jumped or self.health.stuck[joint] is not None:
+                continue
+            kind = 'jammed' if watch.jammed[joint] else 'astray'
+            if self._name(f'joint{joint + 1}_{kind}', stamp, f'gimbal{joint + 1} '
+                          + ('stands still beside' if kind == 'jammed' else 'does not follow')
+                          + f' its command, at {tilt[joint]:.2f} rad'):
+                self._stick(joint, float(tilt[joint]))
+        self._follow(tilt)
+
+    def on_speeds(self, stamp: float, speed: np.ndarray, command: Command | None) -> None:
+        """Take ESC speeds (4,) [rad/s], nan where unknown."""
+        thrust = np.zeros(ROTORS) if command is None else command.thrust
+        self._speeds.on_speeds(stamp, speed, thrust)
+        if self._speeds.lost is not None:
+            self._lose_rotor(self._speeds.lost, stamp, 'its ESC')
+
+    def name(self, name: str, now: float, text: str) -> bool:
+        """Enter a fault that others found; False where it is known."""
+        return self._name(name, now, text)
+
+    def _lose_rotor(self, rotor, stamp, by):
+        rotors = self.health.rotors
+        if self._name(f'rotor{rotor + 1}_lost', stamp, f'rotor {rotor + 1} gives less thrust than '
+                      f'asked, by {by}'):
+            self.health = replace(self.health, rotors=tuple(
+                works and k != rotor for k, works in enumerate(rotors)))
+
+    def _stick(self, joint, angle):
+        self.health = replace(self.health, stuck=tuple(
+            angle if k == joint else old for k, old in enumerate(self.health.stuck)))
+
+    def _follow(self, tilt):
+        """Where joints that do not obey are now."""
+        for joint, angle in enumerate(self.health.stuck):
+            if angle is not None and abs(angle - tilt[joint]) > 0.02:
+                self._stick(joint, float(np.clip(tilt[joint], -self._limit, self._limit)))
+
+    def _name(self, name, stamp, text):
+        if name in self.faults:
+            return False
+        self.faults[name] = float(stamp)
+        self._new.append(text)
+        return True

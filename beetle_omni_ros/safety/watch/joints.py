@@ -1,0 +1,90 @@
+"""Joints that do not follow their commands, and encoders that jump."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from beetle_omni_ros.robot.allocation import ROTORS
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.watch.parameters import ServoLimits
+
+KEPT = 64               # commands, 0.3 s at 200 Hz
+LONGEST = 0.1           # [s] between two readings; after a longer gap the model starts anew
+AT_REST = 0.05          # [rad] by which a jammed joint may move while it is judged
+
+
+class JointWatch:
+    """
+    Compares encoders with a first-order servo that follows the commands at its limited rate.
+
+    Args:
+        limits: thresholds.
+        robot: as believed.
+
+    Attributes:
+        jammed: joints (4,) bool that stand still beside their command.
+        astray: joints (4,) bool that move otherwise than commanded.
+        jump: (4,) [rad] by which the last reading jumped farther than a joint can turn, else 0.
+
+    """
+
+    def __init__(self, limits: ServoLimits, robot: RobotParameters):
+        """See the class."""
+        joints = robot.joints
+        self._p, self._rate_limit = limits, joints.velocity_limit
+        self._lag = joints.kd / joints.kp
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew at the next reading."""
+        self._commands: deque = deque(maxlen=KEPT)
+        self._stamp = -np.inf
+        self._for = np.zeros(ROTORS)
+        self._low = self._high = np.zeros(ROTORS)
+        self.jammed = np.zeros(ROTORS, dtype=bool)
+        self.astray = np.zeros(ROTORS, dtype=bool)
+        self.jump = np.zeros(ROTORS)
+
+    def on_command(self, stamp: float, tilt: np.ndarray) -> None:
+        """Take what the joints were asked at ``stamp`` [s], (4,) [rad]."""
+        self._commands.append((stamp, tilt))
+
+    def on_joints(self, stamp: float, tilt: np.ndarray) -> None:
+        """Take a complete reading (4,) [rad] of the time ``stamp`` [s]."""
+        dt = stamp - self._stamp
+        if dt <= 0:
+            return
+        before, self._stamp = getattr(self, '_tilt', tilt), stamp
+        self._tilt = tilt
+        asked = self._asked(stamp - self._p.delay)
+        if dt > LONGEST or asked is None:
+            self._model, self._for = tilt.copy(), np.zeros(ROTORS)
+            self.jump = np.zeros(ROTORS)
+            return
+        change = tilt - before
+        most = self._rate_limit * dt + self._p.jump
+        self.jump = np.where(np.abs(change) > most, change, 0.0)
+        reach = self._rate_limit * dt
+        step = np.clip((asked - self._model) * -np.expm1(-dt / self._lag), -reach, reach)
+        self._model = self._model + step
+        self._judge(tilt, dt, np.abs(step) / dt)
+
+    def _judge(self, tilt, dt, rate):
+        p = self._p
+        off = np.abs(tilt - self._model) > p.error + p.spread * rate
+        began = off & (self._for == 0)
+        self._low = np.where(began, tilt, np.minimum(self._low, tilt))
+        self._high = np.where(began, tilt, np.maximum(self._high, tilt))
+        self._for = np.where(off, self._for + dt, 0.0)
+        named = self._for >= p.time
+        still = self._high - self._low < AT_REST
+        self.jammed, self.astray = named & still, named & ~still
+
+    def _asked(self, time):
+        """The newest command given at ``time`` or before, or None."""
+        for stamp, tilt in reversed(self._commands):
+            if stamp <= time:
+                return tilt
+        return None

@@ -1,0 +1,82 @@
+"""Thresholds of all detectors; params/supervisor.yaml says why each has its value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from beetle_omni_ros.robot.schema import group, parameter
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactLimits:
+    """When something other than the rotors pushes the robot."""
+
+    near_ground: float = parameter(
+        0.3, doc='base_link at most this far above where it stood: the floor is in reach',
+        unit='m', low=0.05, high=5)
+    impact: float = parameter(
+        1.3, doc='specific force beyond this times what the rotors can give is an impact', low=1,
+        high=20)
+    support: float = parameter(
+        0.35, doc='force that the rotors do not explain, in weights: something carries it',
+        low=0.05, high=2)
+    time: float = parameter(0.15, doc='for this long', unit='s', low=0.01, high=2)
+    filter: float = parameter(0.03, doc='time constant of forces', unit='s', low=0.005, high=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotorLimits:
+    """When a rotor gives less than asked."""
+
+    share: float = parameter(0.5, doc='part of its thrust that is missing', low=0.1, high=1)
+    least_thrust: float = parameter(1.5, doc='a rotor asked for less is not judged', unit='N',
+                                    low=0.1, high=20)
+    explained: float = parameter(
+        0.6, doc='part of the squared residual wrench that the loss explains', low=0.1, high=1)
+    force_noise: float = parameter(1.0, doc='of the residual, healthy', unit='m/s^2', low=0.01,
+                                   high=20)
+    torque_noise: float = parameter(6.0, doc='of the residual, healthy', unit='rad/s^2', low=0.1,
+                                    high=100)
+    least_evidence: float = parameter(
+        12.0, doc='residual in standard deviations from which it is judged', low=3, high=1000)
+    time: float = parameter(0.05, doc='for this long', unit='s', low=0.005, high=1)
+    slip: float = parameter(0.4, doc="angle between the true thrust and the encoder's",
+                            unit='rad', low=0.05, high=3)
+    slip_time: float = parameter(0.1, doc='for this long', unit='s', low=0.005, high=1)
+    speed_time: float = parameter(0.06, doc='for this long, by the ESC speed', unit='s', low=0.005,
+                                  high=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServoLimits:
+    """When a joint does not follow its command as its model does."""
+
+    error: float = parameter(0.25, doc='distance from the model', unit='rad', low=0.02, high=3)
+    time: float = parameter(0.12, doc='for this long', unit='s', low=0.01, high=2)
+    delay: float = parameter(0.025, doc='of commands and feedback together', unit='s', low=0,
+                             high=0.2)
+    spread: float = parameter(0.03, doc='by which that delay may differ', unit='s', low=0,
+                              high=0.2)
+    jump: float = parameter(
+        0.5, doc='change between two readings beyond what the joint can turn', unit='rad',
+        low=0.05, high=6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MocapLimits:
+    """When MoCap contradicts the gyroscope."""
+
+    attitude: float = parameter(0.35, doc='jump of the attitude against the gyroscope',
+                                unit='rad', low=0.05, high=3)
+    frozen: int = parameter(5, doc='poses equal to the last digit while the IMU moves', low=2,
+                            high=1000)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detection:
+    """All detectors."""
+
+    contact: ContactLimits = group(ContactLimits)
+    rotor: RotorLimits = group(RotorLimits)
+    servo: ServoLimits = group(ServoLimits)
+    mocap: MocapLimits = group(MocapLimits)

@@ -1,0 +1,182 @@
+"""Forces and torques that the rotors do not explain: a lost rotor, or contact."""
+
+from __future__ import annotations
+
+from math import exp
+
+import numpy as np
+
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.allocation import Allocator, ROTORS
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.watch.parameters import ContactLimits, RotorLimits
+
+LONGEST = 0.05          # [s] between two IMU samples; a longer gap starts the filters anew
+
+
+class WrenchWatch:
+    """
+    Compares accelerometer and gyroscope with the wrench of the commanded thrusts.
+
+    The thrusts follow their commands with the rotors' lag and point along the measured tilts.
+    Model and measurement pass the same first-order filter. The residual, weighted by that of
+    healthy flights, is fitted by another thrust vector of each rotor, one rotor at a time. A
+    vector near zero is a lost rotor, one of about the same length a tilt that differs from its
+    encoder.
+
+    Args:
+        rotor: thresholds of a lost rotor.
+        contact: thresholds of contact.
+        robot: as believed.
+        allocator: of the robot.
+
+    Attributes:
+        lost: the rotor (0 to 3) that is missing, or None.
+        slipped: (joint 0 to 3, true tilt less encoder [rad]) of a tilt that differs, or None.
+        impact: largest specific force of the last sample beyond the rotors' reach [m/s^2], or 0.
+        unexplained: (3,) filtered force that neither the rotors nor another vector of one of them
+            explain, in base_link [m/s^2].
+
+    """
+
+    def __init__(self, rotor: RotorLimits, contact: ContactLimits, robot: RobotParameters,
+                 allocator: Allocator):
+        """See the class."""
+        self._p, self._contact, self._robot, self._allocator = rotor, contact, robot, allocator
+        rotors = robot.rotors
+        self._reach = ROTORS * rotors.thrust_max / allocator.mass
+        self._units = np.concatenate([np.full(3, allocator.mass), robot.inertia])
+        self._weights = 1 / np.repeat([rotor.force_noise, rotor.torque_noise], 3)
+        weighted = allocator.matrix / self._units[:, None] * self._weights[:, None]
+        self._bases = [weighted[:, 2 * i:2 * i + 2] for i in range(ROTORS)]
+        self._fits = [np.linalg.pinv(basis) for basis in self._bases]
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew, with rotors that stand still."""
+        self._thrust = np.zeros(ROTORS)
+        self._stamp = None
+        self._lost_for, self._slipped_for = np.zeros(ROTORS), np.zeros(ROTORS)
+        self._filtered, self._vectors = np.zeros(6), np.zeros((ROTORS, 2))
+        self.lost: int | None = None
+        self.slipped: tuple[int, float] | None = None
+        self.impact = 0.0
+        self.unexplained = np.zeros(3)
+
+    def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray,
+               thrust: np.ndarray, health: ActuatorHealth) -> None:
+        """
+        Take one IMU sample.
+
+        Args:
+            stamp: [s].
+            force: (3,) specific force in base_link [m/s^2].
+            rate: (3,) angular rate in base_link [rad/s].
+            tilt: (4,) measured [rad].
+            thrust: (4,) commanded [N].
+            health: of the actuators, as known.
+
+        """
+        dt = LONGEST + 1 if self._stamp is None else stamp - self._stamp
+        if dt <= 0:
+            return
+        self._stamp = stamp
+        size = float(np.sqrt(force @ force))
+        self.impact = size if size > self._contact.impact * self._reach else 0.0
+        commanded = np.where(health.rotors, thrust, 0.0)
+        if dt > LONGEST:
+            self.reset()
+            self._thrust, self._stamp, self._rate = commanded.copy(), stamp, rate
+            return
+        self._thrust += -np.expm1(-dt / self._robot.rotors.time_constant) \
+            * (commanded - self._thrust)
+        inertia = self._robot.inertia
+        measured = np.concatenate([force, (rate - self._rate) / dt
+                                   + np.cross(rate, inertia * rate) / inertia])
+        self._rate = rate
+        vectors = np.stack([np.cos(tilt), np.sin(tilt)], axis=1) * self._thrust[:, None]
+        modelled = self._allocator.matrix @ vectors.ravel() / self._units
+        gain = 1 - exp(-dt / self._contact.filter)
+        self._filtered += gain * (measured - modelled - self._filtered)
+        self._vectors += gain * (vectors - self._vectors)
+        self._judge(dt)
+
+    def _judge(self, dt):
+        """Which rotor's vector explains the residual, and what it then is."""
+        p = self._p
+        residual = self._filtered * self._weights
+        size = float(residual @ residual)
+        self.unexplained = self._filtered[:3]
+        lost, slipped = np.zeros(ROTORS, dtype=bool), np.zeros(ROTORS, dtype=bool)
+        angle = 0.0
+        if size > p.least_evidence**2:
+            left = [residual - basis @ (fit @ residual)
+                    for basis, fit in zip(self._bases, self._fits)]
+            i = int(np.argmin([rest @ rest for rest in left]))
+            modelled = self._vectors[i]
+            length = float(np.hypot(*modelled))
+            if left[i] @ left[i] < (1 - p.explained) * size and length > p.least_thrust:
+                true = modelled + self._fits[i] @ residual
+                share = float(np.hypot(*true)) / length
+                angle = float(np.arctan2(modelled[0] * true[1] - modelled[1] * true[0],
+                                         modelled @ true))
+                lost[i] = share < 1 - p.share
+                slipped[i] = abs(share - 1) < p.share and abs(angle) > p.slip
+                self.unexplained = left[i][:3] / self._weights[:3]
+        self._lost_for = self._counted(self._lost_for, lost, dt)
+        self._slipped_for = self._counted(self._slipped_for, slipped, dt)
+        self.lost = self._first(self._lost_for >= p.time)
+        joint = self._first(self._slipped_for >= p.slip_time)
+        self.slipped = None if joint is None or not slipped[joint] else (joint, angle)
+
+    @staticmethod
+    def _counted(times, suspect, dt):
+        return np.where(suspect, times + dt, np.maximum(0.0, times - dt))
+
+    @staticmethod
+    def _first(named):
+        return int(np.argmax(named)) if named.any() else None
+
+
+class ContactWatch:
+    """
+    Ground contact and crash, near the ground.
+
+    Args:
+        limits: thresholds.
+        gravity: [m/s^2].
+
+    Attributes:
+        reason: '' or why the robot counts as on the ground.
+
+    """
+
+    def __init__(self, limits: ContactLimits, gravity: float):
+        """See the class."""
+        self._limits, self._gravity = limits, gravity
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew."""
+        self._for, self.reason = 0.0, ''
+
+    def update(self, dt: float, height: float | None, wrench: WrenchWatch) -> None:
+        """
+        Take one IMU sample's verdict.
+
+        Args:
+            dt: since the one before [s].
+            height: of base_link above where it stood [m], None where that is unknown.
+            wrench: of the same sample.
+
+        """
+        if height is not None and height > self._limits.near_ground:
+            self._for = 0.0
+            return
+        if wrench.impact:
+            self.reason = f'impact of {wrench.impact:.0f} m/s^2'
+        push = float(np.linalg.norm(wrench.unexplained)) / self._gravity
+        carried = height is not None and push > self._limits.support
+        self._for = self._for + dt if carried else 0.0
+        if self._for >= self._limits.time and not self.reason:
+            self.reason = f'{push:.1f} of the weight are carried by something else'
