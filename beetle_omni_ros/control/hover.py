@@ -1,16 +1,20 @@
 """
-Hover: PD (and a slow, bounded integral) on the pose, then allocation.
+Hover: PD on the pose with a disturbance observer, then allocation.
 
 The null controller to compare with, and the fallback that the supervisor flies when nothing
 better answers. It needs the robot's parameters, no compiler and no solver, and it is stable
 from any attitude because translation and rotation do not couple on this robot.
 
-    acceleration = Kp e_p + Kd e_v + Ki int e_p           (world)
-    angular acceleration = Kp e_R + Kd e_w + Ki int e_R   (base_link)
+    acceleration = Kp e_p + Kd e_v - d           (world)
+    angular acceleration = Kp e_R + Kd e_w - d   (base_link)
 
-with e_R the geodesic attitude error. The rotors' slow thrust response is sped up by a lead on a
-thrust model, the tilt targets move at a limited rate from the command in force, and a rotor
-whose joint is still on its way pushes only as far as its present direction helps.
+with e_R the geodesic attitude error and d the acceleration that the commands do not explain: a
+wrong mass, an offset of the centre of gravity, wind. It is the low-passed difference between the
+measured motion and that of the thrusts in force, so it needs no error to grow, knows nothing of
+the target, and is there when this controller takes over from another. The rotors' slow thrust
+response is sped up by a lead on a thrust model, the tilt targets move at a limited rate from the
+command in force, and a rotor whose joint is still on its way pushes only as far as its present
+direction helps.
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
 
+LONGEST_STEP = 0.1   # [s] between two states that tell an acceleration
 DAMPING = 1e-2   # [(1/kg)^2] keeps the thrusts near the plain projection where directions agree
 
 
@@ -39,14 +44,12 @@ class AxisGains:
                           high=100)
     kd: float = parameter(4.5, doc='acceleration for each unit of rate error', unit='1/s', low=0,
                           high=50)
-    ki: float = parameter(2.0, doc='acceleration for each unit of integrated error',
-                          unit='1/s^3', low=0, high=50)
     error_limit: float = parameter(0.6, doc='longer errors are shortened to this', unit='m or rad',
                                    low=0.01, high=10)
     rate_limit: float = parameter(3.0, doc='longer rate errors are shortened to this',
                                   unit='m/s or rad/s', low=0.1, high=50)
-    integral_limit: float = parameter(2.0, doc='largest acceleration of the integral',
-                                      unit='m/s^2 or rad/s^2', low=0, high=50)
+    disturbance_limit: float = parameter(4.0, doc='largest acceleration that is compensated',
+                                         unit='m/s^2 or rad/s^2', low=0, high=100)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +59,8 @@ class HoverParameters:
     period: float = parameter(0.01, doc='time between commands', unit='s', low=0.001, high=0.1)
     position: AxisGains = group(AxisGains, 'position and velocity in world')
     attitude: AxisGains = group(AxisGains, 'attitude and rate in base_link')
+    disturbance_time: float = parameter(
+        0.3, doc='time constant of the disturbance observer', unit='s', low=0.02, high=100)
     thrust_response: float = parameter(
         0.04, doc='time constant that the lead gives the thrust', unit='s', low=0.005, high=1)
     thrust_rate: float = parameter(300.0, doc='fastest change of a thrust target', unit='N/s',
@@ -94,13 +99,12 @@ class HoverController:
         self.reset()
 
     def reset(self) -> None:
-        """Forget integrals and the thrust model; the next step starts from state.command."""
+        """Forget disturbances and the thrust model; the next step starts from state.command."""
+        self._before: State | None = None
+        self._disturbance = np.zeros(6)     # acceleration in world, angular in base_link
         self._stamp = None
         self._command = None
         self._thrust = None          # (4,) modelled thrust [N]
-        self._force_integral = np.zeros(3)
-        self._torque_integral = np.zeros(3)
-        self._saturated = False
         self._errors = (0.0, 0.0)
         self._saturations = 0
 
@@ -116,26 +120,56 @@ class HoverController:
         gap = state.stamp - self._stamp if self._stamp is not None else self.period
         dt = min(gap, 5 * self.period)   # after a pause, not one long blind leap
         in_force = state.command
-        # Integrate only while this controller flies.
-        own = in_force is not None and _same(in_force, self._command)
-        self._follow_thrust(in_force, dt)
-        force, torque = self._wrench(state, target, dt if own and not self._saturated else 0.0)
+        self.observe(state)
+        force, torque = self._wrench(state, target)
         present = in_force.tilt if in_force is not None else state.tilt
         wished = self._allocator.hover(state.quaternion, present, force, torque)
-        self._saturated = bool(wished.saturated.any())
-        self._saturations += self._saturated
+        self._saturations += bool(wished.saturated.any())
         self._command = Command(state.stamp, *self._targets(state, wished, present, dt))
         self._stamp = state.stamp
         return self._command
 
+    def observe(self, state: State, free: bool = True) -> None:
+        """
+        Learn the disturbance from one state; :meth:`step` does so itself.
+
+        Args:
+            state: with the command in force, whoever gave it.
+            free: False while something else carries the robot, which is not learnt.
+
+        """
+        before = self._before
+        if before is not None and state.stamp <= before.stamp:
+            return
+        self._before = state
+        if before is None or state.stamp - before.stamp > LONGEST_STEP:
+            self._follow_thrust(state.command, self.period)
+            return
+        dt = state.stamp - before.stamp
+        self._follow_thrust(state.command, dt)
+        if not free or state.command is None:
+            return
+        force, torque = self._allocator.wrench(state.tilt, self._thrust)
+        rate, inertia = state.angular_velocity, self._robot.inertia
+        model = np.concatenate([
+            (rotations.matrix(state.quaternion) @ force - self._allocator.weight)
+            / self._allocator.mass, (torque - np.cross(rate, inertia * rate)) / inertia])
+        measured = np.concatenate([state.velocity - before.velocity,
+                                   rate - before.angular_velocity]) / dt
+        self._disturbance += -np.expm1(-dt / self.parameters.disturbance_time) \
+            * (measured - model - self._disturbance)
+        p = self.parameters
+        self._disturbance[:3] = _shortened(self._disturbance[:3], p.position.disturbance_limit)
+        self._disturbance[3:] = _shortened(self._disturbance[3:], p.attitude.disturbance_limit)
+
     def diagnostics(self) -> dict[str, float | int | str]:
-        """Errors of the last step, integrals and saturated steps since reset."""
+        """Errors of the last step, disturbances and saturated steps since reset."""
         return {'position_error_m': self._errors[0], 'attitude_error_rad': self._errors[1],
-                'force_integral_m_s2': float(np.linalg.norm(self._force_integral)),
-                'torque_integral_rad_s2': float(np.linalg.norm(self._torque_integral)),
+                'force_disturbance_m_s2': float(np.linalg.norm(self._disturbance[:3])),
+                'torque_disturbance_rad_s2': float(np.linalg.norm(self._disturbance[3:])),
                 'saturated_steps': int(self._saturations)}
 
-    def _wrench(self, state, target, integrate_for):
+    def _wrench(self, state, target):
         """Force beside the weight's support (world) and torque (base_link)."""
         reference = target.at(state.stamp)
         to_body = rotations.conjugate(state.quaternion)
@@ -144,13 +178,11 @@ class HoverController:
         position_error = reference.position - state.position
         self._errors = (float(np.linalg.norm(position_error)),
                         float(np.linalg.norm(attitude_error)))
-        acceleration, self._force_integral = _pid(
-            self.parameters.position, position_error, reference.velocity - state.velocity,
-            self._force_integral, integrate_for)
-        angular, self._torque_integral = _pid(
-            self.parameters.attitude, attitude_error,
-            relative @ reference.angular_velocity - state.angular_velocity,
-            self._torque_integral, integrate_for)
+        acceleration = _pd(self.parameters.position, position_error,
+                           reference.velocity - state.velocity) - self._disturbance[:3]
+        angular = _pd(self.parameters.attitude, attitude_error,
+                      relative @ reference.angular_velocity - state.angular_velocity) \
+            - self._disturbance[3:]
         inertia, rate = self._robot.inertia, state.angular_velocity
         gyroscopic = np.cross(rate, inertia * rate)
         return self._allocator.mass * acceleration, inertia * angular + gyroscopic
@@ -209,17 +241,10 @@ class HoverController:
         return thrust
 
 
-def _same(a, b):
-    return a is b if a is None or b is None else (
-        np.array_equal(a.tilt, b.tilt) and np.array_equal(a.thrust, b.thrust))
-
-
-def _pid(gains, error, rate_error, integral, integrate_for):
-    """Acceleration (3,) and the new integral; integrates only small errors, for dt seconds."""
-    if integrate_for > 0.0 and np.linalg.norm(error) < gains.error_limit:
-        integral = _shortened(integral + gains.ki * integrate_for * error, gains.integral_limit)
-    return (gains.kp * _shortened(error, gains.error_limit)
-            + gains.kd * _shortened(rate_error, gains.rate_limit) + integral), integral
+def _pd(gains, error, rate_error):
+    """Acceleration (3,) of proportional and derivative gain, both on shortened errors."""
+    return gains.kp * _shortened(error, gains.error_limit) \
+        + gains.kd * _shortened(rate_error, gains.rate_limit)
 
 
 def _shortened(vector, limit):

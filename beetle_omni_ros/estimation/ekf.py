@@ -19,10 +19,13 @@ from beetle_omni_ros.estimation.mounting import Mounting
 from beetle_omni_ros.estimation.noise import NoiseMonitor
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.propagation import TIME_OFFSET
-from beetle_omni_ros.estimation.samples import Estimate, ImuSample, PoseSample
+from beetle_omni_ros.estimation.samples import ATTITUDE, Estimate, ImuSample, PoseSample
 from beetle_omni_ros.estimation.track import interpolate, SAME_INSTANT, Track
+from beetle_omni_ros.robot.rotations import geodesic_angle
 
 __all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuSample', 'PoseSample']
+
+SURE = 5.0      # standard deviations of the attitude
 
 
 class ErrorStateEkf:
@@ -170,12 +173,22 @@ class ErrorStateEkf:
                 limits = self._parameters.status
                 needed = limits.jump_poses if believed else limits.start_poses
                 if self._candidate.fixes >= needed:
+                    if believed and self._turned_at_once():
+                        self.rejected['attitude_jump'] += 1
+                        return True
                     self._track, self._candidate = self._candidate, None
                 return True
         # What was known of the biases helps once; if it contradicts the poses, start without.
         known = self._track.newest if agrees and self._track is not None else None
         self._candidate = self._started(stamp, position, quaternion, known)
         return agrees
+
+    def _turned_at_once(self) -> bool:
+        """Whether the candidate's attitude is one that the gyroscope rules out."""
+        track, candidate = self._track.newest, self._candidate.newest
+        deviation = sqrt(np.trace(track.covariance[ATTITUDE, ATTITUDE]))
+        return geodesic_angle(track.quaternion, candidate.quaternion) \
+            > self._parameters.status.jump_attitude + SURE * deviation
 
     def _started(self, stamp, position, quaternion, known) -> Track:
         """Start a track at a pose, with the biases of ``known``, and bring it up to now."""

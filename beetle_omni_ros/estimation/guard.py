@@ -28,6 +28,8 @@ class InputGuard:
         self._out_of_range = False
         self._last_reading: float | None = None
         self._last_pose = -inf
+        self._same_pose, self._pose_values = 0, None
+        self._reading_values, self._moved = None, False
         self._refused: list[float] = []  # stamps refused in a row, each shortly after the last
 
     def reading(self, sample) -> tuple[float, np.ndarray, np.ndarray] | None:
@@ -57,6 +59,9 @@ class InputGuard:
                 self.clock_jumped = True
                 self._last_pose = -inf
         self._last_reading = stamp
+        values = (*force.tolist(), *rate.tolist())
+        self._moved |= self._reading_values is not None and values != self._reading_values
+        self._reading_values = values
         self._refused.clear()
         self.shaken, self._out_of_range = self._out_of_range, False
         return stamp, force, rate
@@ -100,7 +105,16 @@ class InputGuard:
         if stamp > self._last_reading + self._imu.gap_limit:
             return self._refuse('future')
         self._last_pose = stamp
+        if self._frozen((*position.tolist(), *quaternion.tolist())):
+            return self._refuse('frozen')
         return stamp, position, quaternion / norm
+
+    def _frozen(self, values) -> bool:
+        """Whether the pose has long stayed the same to the last digit, while the IMU moved."""
+        same, self._pose_values = values == self._pose_values, values
+        self._same_pose = self._same_pose + 1 if same and self._moved else 0
+        self._moved = False
+        return self._same_pose >= self._mocap.frozen_poses
 
     def _refuse(self, reason) -> None:
         self.rejected[reason] += 1

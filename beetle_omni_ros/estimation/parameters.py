@@ -78,6 +78,9 @@ class MocapParameters:
         0.01, doc='largest deviation of the norm of a quaternion from 1', low=1e-6, high=0.5)
     position_limit: float = parameter(
         100.0, doc='larger coordinates are refused', unit='m', low=0.1, high=1e5)
+    frozen_poses: int = parameter(
+        5, doc='poses that repeat the one before to the last digit while the IMU moves, from which '
+        'they are refused', low=1, high=1000)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,15 +122,18 @@ class StatusParameters:
     dead_reckoning_after: float = parameter(
         0.1, doc='time without an accepted pose', unit='s', low=0.01, high=10)
     lost_after: float = parameter(
-        2.0, doc='time without an accepted pose', unit='s', low=0.02, high=600)
+        20.0, doc='time without an accepted pose', unit='s', low=0.02, high=600)
     lost_position_std: float = parameter(
-        0.25, doc='standard deviation of the position, each axis', unit='m', low=0.001, high=100)
+        5.0, doc='standard deviation of the position, each axis', unit='m', low=0.001, high=100)
     start_poses: int = parameter(
         20, doc='consecutive poses that must agree with the IMU before the first fix and when '
         'lost', low=2, high=10000)
     jump_poses: int = parameter(
         100, doc='consecutive poses that must agree with the IMU and with each other before a '
         'persistent jump is believed', low=2, high=10000)
+    jump_attitude: float = parameter(
+        0.35, doc='a jump of the attitude beyond is not believed, for the gyroscope rules it out',
+        unit='rad', low=0.01, high=4)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -47,7 +47,6 @@ class Landing:
 
     def start(self, now: float, in_force: Command | None) -> None:
         """Begin where the robot is, on the estimator or on the backup."""
-        self._hover.reset()
         if self._vehicle.estimate.silent:
             self._vehicle.backup.start(self._vehicle.state)
         self._blind = self._without_mocap

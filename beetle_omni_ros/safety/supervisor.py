@@ -226,6 +226,7 @@ class Supervisor(Inputs):
                                         'fallback to hover')
             return self._hold(now, dt)
         self.source = self.active
+        self._hover.observe(self.vehicle.seen(self._in_force))
         return self._handover.limit(stream.accepted, self._in_force)
 
     def _hold(self, now, dt):
@@ -253,8 +254,6 @@ class Supervisor(Inputs):
         state = self.vehicle.state
         self._target = PoseTarget(state.position if position is None else position,
                                   state.quaternion, now)
-        if position is None:
-            self._hover.reset()
         self._enter(FALLBACK, now, severity, text)
 
     def _land(self, now, severity, text):

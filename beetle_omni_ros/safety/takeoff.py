@@ -53,6 +53,7 @@ class Takeoff:
             return self._align(state, dt)
         self._climbed_for += dt
         self._judge(state)
+        self._hover.observe(state, free=self.airborne)
         return self._hover.step(state, self._ramp)
 
     @property

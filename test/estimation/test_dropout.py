@@ -10,9 +10,10 @@ from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
 from beetle_omni_ros.robot import rotations
 
 
-def new_ekf():
-    """With the shipped parameters."""
-    return ErrorStateEkf(EkfParameters.load(), GRAVITY)
+def new_ekf(**status):
+    """With the shipped parameters, but for those of the status that are given."""
+    shipped = EkfParameters.load()
+    return ErrorStateEkf(replace(shipped, status=replace(shipped.status, **status)), GRAVITY)
 
 
 def history(ekf, flight, drop=lambda time: False):
@@ -40,13 +41,14 @@ def test_half_a_second_without_mocap_costs_less_than_5_cm_and_1_deg(seed):
 
 
 def test_status_and_covariance_tell_a_dropout():
-    ekf, limits = new_ekf(), EkfParameters.load().status
+    limits = EkfParameters.load().status
+    ekf = new_ekf(lost_after=2.0)
     rows = history(ekf, fly(1, 6.0), drop=lambda time: 2.0 < time < 4.8)
     by_time = {round(time, 3): (status, variance) for time, status, variance in rows}
     assert by_time[0.1][0] == 'uninitialised'
     assert by_time[1.9][0] == 'tracking'
     assert by_time[2.0 + limits.dead_reckoning_after + 0.02][0] == 'dead_reckoning'
-    assert by_time[2.0 + limits.lost_after + 0.02][0] == 'lost'
+    assert by_time[2.0 + 2.0 + 0.02][0] == 'lost'
     assert by_time[5.9][0] == 'tracking'
     growing = [variance for time, _, variance in rows if 2.02 < time < 4.8]
     assert np.all(np.diff(growing) > 0)
@@ -54,7 +56,7 @@ def test_status_and_covariance_tell_a_dropout():
 
 
 def test_a_lost_filter_comes_back_where_the_robot_is():
-    ekf, flight = new_ekf(), fly(2, 9.0)
+    ekf, flight = new_ekf(lost_after=2.0), fly(2, 9.0)
     run(ekf, flight, drop=lambda time: 2.0 < time < 7.0)
     error = error_state(ekf.estimate, flight)
     assert ekf.status == 'tracking'
@@ -94,7 +96,8 @@ def test_a_persistent_jump_is_believed_after_a_while_and_not_at_once():
     flight, shift = fly(5, 5.0), np.array([0.5, -0.3, 0.2])
     flight.poses = [replace(pose, position=pose.position + shift) if pose.stamp > 2.0 else pose
                     for pose in flight.poses]
-    ekf, limits = new_ekf(), EkfParameters.load().status
+    limits = EkfParameters.load().status
+    ekf = new_ekf(lost_after=2.0)
     rows = history(ekf, flight)
     back = 2.0 + 0.01 * (limits.jump_poses + 5)
     assert {s for time, s, _ in rows if 2.2 < time < back - 0.1} == {'dead_reckoning'}
@@ -175,3 +178,28 @@ def test_a_blow_that_the_imu_measures_badly_does_not_lose_the_track(seen):
     velocity = truth['velocity'][0] + [0.0, 0.5, 1.2]
     np.testing.assert_allclose(ekf.estimate.velocity, velocity, atol=0.03)
     assert ekf.rejected.get('out_of_range', 0) == (2 if seen == 3.0 else 0)
+
+
+def test_a_frozen_pose_is_refused_and_the_filter_dead_reckons():
+    ekf, flight, kept = new_ekf(), fly(3, 6.0), {}
+    for time, sample in flight.arrivals():
+        if 4.0 < time and not isinstance(sample, ImuSample):
+            kept.setdefault('position', sample.position)
+            kept.setdefault('quaternion', sample.quaternion)
+            sample = replace(sample, **kept)
+        feed(ekf, sample)
+    assert ekf.status == 'dead_reckoning'
+    assert ekf.rejected['frozen'] > 100
+    assert np.linalg.norm(error_state(ekf.estimate, flight)[:3]) < 0.3
+
+
+def test_an_attitude_that_the_gyroscope_rules_out_is_never_believed():
+    """Markers confused from 4 s on: turned by 90 deg about the body's z axis, for good."""
+    ekf, flight = new_ekf(), fly(3, 9.0)
+    turn = rotations.exp(np.array([0.0, 0.0, np.pi / 2]))
+    for time, sample in flight.arrivals():
+        if 4.0 < time and not isinstance(sample, ImuSample):
+            sample = replace(sample, quaternion=rotations.multiply(sample.quaternion, turn))
+        feed(ekf, sample)
+    assert ekf.status == 'dead_reckoning'
+    assert np.linalg.norm(error_state(ekf.estimate, flight)[6:9]) < np.deg2rad(2)

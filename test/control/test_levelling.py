@@ -1,0 +1,86 @@
+"""The way to level: the joints follow it without passing their stops, from any winding."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.levelling import LevellingParameters, plan, Way
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.ramp import inclination
+
+ALLOCATOR = Allocator(RobotParameters.load())
+P = LevellingParameters()
+RANDOM = np.random.default_rng(5)
+ATTITUDES = [rotations.normalized(q) for q in RANDOM.normal(size=(20, 4))]
+UPSIDE_DOWN = [rotations.from_rpy(np.pi, 0.0, yaw) for yaw in (0.0, 0.4, 1.6, 3.0)]
+
+
+def held(attitude):
+    """Tilts of hovering; upside down, those of having come from one side."""
+    beside = rotations.multiply(attitude, rotations.exp(np.array([2e-4, 5e-4, 0.0])))
+    return ALLOCATOR.upright(rotations.matrix(beside)[2][None])[0][0]
+
+
+def followed(way, tilt):
+    """Tilts (P, 4) that the allocation takes along a way, and the largest loss of thrust."""
+    present, tilts, jumps = np.array(tilt), [], []
+    for elapsed in np.linspace(0, way.duration, 200):
+        wished = ALLOCATOR.hover(way.at(elapsed)[0], present)
+        moved = np.abs(wished.tilt - present) > 1.0
+        jumps.append(float((wished.thrust * moved).sum()))
+        present = wished.tilt
+        tilts.append(present)
+    return np.array(tilts), np.array(jumps)
+
+
+@pytest.mark.parametrize('attitude', ATTITUDES + UPSIDE_DOWN)
+def test_ends_level_and_no_loaded_joint_turns_over(attitude):
+    way = plan(attitude, held(attitude), ALLOCATOR, P)
+    assert inclination(way.goal) < 1e-6
+    np.testing.assert_allclose(np.abs(way.at(0.0)[0] @ attitude), 1, atol=1e-9)
+    tilts, jumps = followed(way, held(attitude))
+    np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
+    assert jumps.max() < 1.0
+
+
+@pytest.mark.parametrize('signs', [(1, 1, -1, -1), (1, -1, -1, 1), (-1, -1, 1, 1), (-1, 1, 1, -1)])
+def test_from_upside_down_the_side_is_chosen_by_the_windings(signs):
+    tilt = np.pi * np.array(signs)
+    way = plan(UPSIDE_DOWN[0], tilt, ALLOCATOR, P)
+    tilts, jumps = followed(way, tilt)
+    np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
+    assert jumps.max() < 1.0
+
+
+@pytest.mark.parametrize('attitude', UPSIDE_DOWN)
+@pytest.mark.parametrize('joint', range(4))
+def test_a_joint_wound_the_wrong_way_turns_over_where_its_arm_stands_upright(attitude, joint):
+    tilt = held(attitude)
+    tilt[joint] -= 2 * np.pi * np.sign(tilt[joint])
+    way = plan(attitude, tilt, ALLOCATOR, P)
+    tilts, jumps = followed(way, tilt)
+    np.testing.assert_allclose(tilts[-1], 0, atol=1e-3)
+    assert jumps.max() < 1.5        # of 7.5 N
+
+
+def test_is_no_faster_than_body_and_joints_may_turn():
+    for attitude in ATTITUDES:
+        way = plan(attitude, held(attitude), ALLOCATOR, P)
+        times = np.linspace(0, way.duration, 100)[:-1]
+        assert max(np.linalg.norm(way.at(t)[1]) for t in times) < P.rate + 1e-6
+
+
+def test_the_rate_is_the_derivative_of_the_attitude():
+    way, h = plan(ATTITUDES[0], held(ATTITUDES[0]), ALLOCATOR, P), 1e-6
+    for t in np.linspace(0.01, way.duration - 0.01, 37):
+        turn = rotations.log(rotations.multiply(rotations.conjugate(way.at(t - h)[0]),
+                                                way.at(t + h)[0]))
+        np.testing.assert_allclose(turn / (2 * h), way.at(t)[1], atol=2e-2)
+
+
+def test_a_straight_way_is_the_shortest_turn():
+    goal = rotations.from_rpy(0, 0, 0.3)
+    way = Way.straight(ATTITUDES[1], goal, 0.5)
+    assert way.duration == pytest.approx(rotations.geodesic_angle(goal, ATTITUDES[1]) / 0.5)
+    assert Way.straight(goal, goal, 0.5).duration == 0.0
