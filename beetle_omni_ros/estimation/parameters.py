@@ -79,8 +79,8 @@ class MocapParameters:
     position_limit: float = parameter(
         100.0, doc='larger coordinates are refused', unit='m', low=0.1, high=1e5)
     frozen_poses: int = parameter(
-        5, doc='poses that repeat the one before to the last digit while the IMU moves, from which '
-        'they are refused', low=1, high=1000)
+        5, doc='poses that repeat the one before to the last digit while the IMU moves, from '
+        'which they are refused', low=1, high=1000)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -74,12 +74,17 @@ class BackupEstimator:
             self._use(stamp, force, rate)
         return True
 
+    def is_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
+        """Whether it is a pose at all, and newer than the last."""
+        position, quaternion = _vector(position, 3), _vector(quaternion, 4)
+        return position is not None and quaternion is not None and bool(np.isfinite(stamp)) \
+            and stamp > self._mocap_stamp and abs(quaternion @ quaternion - 1) <= 0.02
+
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
         """Take one pose, captured at ``stamp``; False when it is not usable."""
-        position, quaternion = _vector(position, 3), _vector(quaternion, 4)
-        if position is None or quaternion is None or not np.isfinite(stamp) \
-                or stamp <= self._mocap_stamp or abs(quaternion @ quaternion - 1) > 0.02:
+        if not self.is_pose(stamp, position, quaternion):
             return False
+        position, quaternion = _vector(position, 3), _vector(quaternion, 4)
         dt = min(stamp - self._mocap_stamp, LONGEST_STEP)
         self._mocap_stamp = stamp
         if self.running and self._past:

@@ -7,12 +7,17 @@ from math import isfinite
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
+from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.actuators import Actuators
 from beetle_omni_ros.safety.events import EventLog, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.selection import Selection
 from beetle_omni_ros.safety.vehicle import Vehicle
+from beetle_omni_ros.safety.watch.faults import FaultWatch
+
+
+LATEST = 0.1    # [s] between a MoCap pose and the estimate that it is compared with
 
 
 class Inputs:
@@ -23,6 +28,7 @@ class Inputs:
         events: what happened, oldest first.
         vehicle: the latest of estimate, joints, sensors and battery.
         actuators: what the bridges to servos and motor board say.
+        watch: the detectors, with the faults that they have named.
 
     """
 
@@ -32,6 +38,10 @@ class Inputs:
         self._selection = Selection(controllers, parameters.controller, parameters.commands, robot)
         self.vehicle = Vehicle(parameters, robot)
         self.actuators = Actuators()
+        self._allocator = Allocator(robot)
+        self.watch = FaultWatch(parameters.detection, robot, self._allocator)
+        self._in_force: Command | None = None
+        self._floor = 0.0       # height of base_link where it stood [m]
         self.events = EventLog(parameters.quiet_time)
         self._now: float | None = None
 
@@ -46,7 +56,9 @@ class Inputs:
         reason = self.vehicle.on_state(state, status, self._now)
         if reason:
             self._say(self._now, WARNING, f'ekf_node: estimate refused: {reason}', reason)
-        elif status != before and status != 'tracking':
+        else:
+            self.watch.on_joints(state.tilt_stamp, state.tilt, self.airborne)
+        if not reason and status != before and status != 'tracking':
             self._say(self._now, WARNING, f"ekf_node reports '{status}'")
         return not reason
 
@@ -60,7 +72,10 @@ class Inputs:
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
         """Take raw joint feedback (4,), nan where unknown, beside what comes with the state."""
-        return not self._ahead(stamp) and self.vehicle.on_joints(stamp, position, velocity)
+        good = not self._ahead(stamp) and self.vehicle.on_joints(stamp, position, velocity)
+        if good and np.isfinite(position).all():
+            self.watch.on_joints(stamp, np.asarray(position, dtype=float), self.airborne)
+        return good
 
     def on_imu(self, stamp: float, specific_force: np.ndarray,
                angular_velocity: np.ndarray) -> bool:
@@ -69,14 +84,59 @@ class Inputs:
                                                                      angular_velocity)
         if good:
             self.vehicle.imu.heard()
+            if self.airborne:
+                self.watch.on_imu(stamp, np.asarray(specific_force, dtype=float),
+                                  np.asarray(angular_velocity, dtype=float), self.vehicle.tilt,
+                                  self._in_force, self._height)
         return good
+
+    def on_rotors(self, stamp: float, speed: np.ndarray) -> bool:
+        """Take the rotors' speeds (4,) as their ESCs report them [rad/s], nan where unknown."""
+        speed = np.asarray(speed, dtype=float)
+        if self._ahead(stamp) or not isfinite(stamp) or speed.shape != (4,):
+            return False
+        if self.airborne:
+            self.watch.on_speeds(stamp, speed, self._in_force)
+        return True
+
+    @property
+    def airborne(self) -> bool:
+        """Whether the robot flies, as far as is known."""
+        return False
+
+    @property
+    def _height(self):
+        """Of base_link above where it stood [m]; None where it is unknown."""
+        vehicle = self.vehicle
+        blind = vehicle.mocap.silent if vehicle.backup.running else vehicle.mocap_lost
+        if blind or self._now is None:
+            return None
+        state = vehicle.backup_state(self._now) if vehicle.backup.running else vehicle.state
+        return None if state is None else float(state.position[2]) - self._floor
 
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
         """Take a raw MoCap pose (3,), (4,) of base_link, for the descent without estimator."""
-        good = not self._ahead(stamp) and self.vehicle.backup.on_mocap(stamp, position, quaternion)
+        vehicle = self.vehicle
+        if self._ahead(stamp) or not vehicle.backup.is_pose(stamp, position, quaternion):
+            return False
+        if self.airborne and not self._agrees(stamp, position, quaternion):
+            return False
+        good = vehicle.backup.on_mocap(stamp, position, quaternion)
         if good:
-            self.vehicle.mocap.heard()
+            vehicle.mocap.heard()
         return good
+
+    def _agrees(self, stamp, position, quaternion):
+        """Whether a MoCap pose fits what is known of the flight."""
+        vehicle = self.vehicle
+        state = vehicle.state if not vehicle.backup.running else vehicle.backup_state(self._now)
+        attitude = rate = None
+        if state is not None and abs(state.stamp - stamp) < LATEST:
+            attitude, rate = state.quaternion, state.angular_velocity
+        good = self.watch.on_mocap(stamp, position, quaternion, attitude, rate)
+        if good or 'estimator_wrong' in self.watch.faults:
+            return True
+        return False
 
     def on_battery(self, voltage: float) -> bool:
         """Take the pack voltage under load [V]; not finite or negative is refused."""

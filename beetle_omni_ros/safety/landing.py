@@ -45,9 +45,17 @@ class Landing:
         self._standing_for, self._blind_for = 0.0, 0.0
         self._blind = False
 
-    def start(self, now: float, in_force: Command | None) -> None:
-        """Begin where the robot is, on the estimator or on the backup."""
-        if self._vehicle.estimate.silent:
+    def start(self, now: float, in_force: Command | None, distrusted: bool = False) -> None:
+        """
+        Begin where the robot is, on the estimator or on the backup.
+
+        Args:
+            now: [s].
+            in_force: the command in force.
+            distrusted: whether the estimator is there and wrong.
+
+        """
+        if self._vehicle.estimate.silent or distrusted:
             self._vehicle.backup.start(self._vehicle.state)
         self._blind = self._without_mocap
         self.set_out(now, in_force)
@@ -112,9 +120,9 @@ class Landing:
         ``specific_force_up`` [m/s^2] is given only where motion is not measured: elsewhere an
         upward wind would be taken for the ground.
         """
-        if isfinite(self._ramp.climb) and state.stamp > self._ramp.stamp + self._ramp.duration:
-            self._flare(state.stamp)
         reference = self._ramp.at(state.stamp)
+        if isfinite(self._ramp.climb) and self._slow_enough(state.stamp, reference):
+            self._flare(state.stamp, reference)
         sink, velocity = 0.0, reference.velocity
         if specific_force_up is not None:
             # Dead reckoning may believe in a descent that is none: what is overdue sinks faster.
@@ -131,11 +139,17 @@ class Landing:
         self._feel_ground(state, dt, specific_force_up, reference)
         return self._hover.step(state, _Now(reference))
 
-    def _flare(self, stamp):
-        """Go on slowly from the end of the fast descent."""
-        p, end = self._parameters, self._ramp.at(stamp)
-        self._ramp = Ramp(stamp, end.position, self._ramp.way.ended(), 0.0, -inf, p.speed,
-                          p.acceleration)
+    def _slow_enough(self, stamp, reference):
+        """Whether the fast descent ends: it brakes, down to the speed of the touchdown."""
+        ramp = self._ramp
+        half = ramp.stamp + ramp.wait + 0.5 * (ramp.duration - ramp.wait)
+        return stamp > half and -reference.velocity[2] <= self._parameters.speed
+
+    def _flare(self, stamp, reference):
+        """Go on slowly."""
+        p = self._parameters
+        self._ramp = Ramp(stamp, reference.position, self._ramp.way.ended(), 0.0, -inf, p.speed,
+                          p.acceleration, moving=True)
 
     def _feel_ground(self, state, dt, specific_force_up, reference):
         """The rotors carry clearly less than the weight, yet it does not fall."""

@@ -9,6 +9,7 @@ from beetle_omni_ros.control.levelling import LevellingParameters
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
+from beetle_omni_ros.safety.watch.parameters import Detection
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,6 +111,8 @@ class LandingParameters:
     blind_acceleration: float = parameter(1.5, doc='the same', unit='m/s^2', low=0.05, high=10)
     flare_height: float = parameter(0.5, doc='above the floor, where it slows down to speed',
                                     unit='m', low=0, high=10)
+    time_limit: float = parameter(60.0, doc='longest landing, then motors off', unit='s', low=1,
+                                  high=600)
     overdue_acceleration: float = parameter(
         0.6, doc='without MoCap, growth of the descent speed once the ground is overdue',
         unit='m/s^2', low=0, high=2)
@@ -162,6 +165,10 @@ class Envelope:
     height: float = parameter(20.0, doc='z in world', unit='m', low=0.5, high=1000)
     fence_reaction: str = parameter('landing', doc='on leaving it',
                                     choices=('none', 'landing', 'emergency_stop'))
+    fence_margin: float = parameter(2.0, doc='outside the fence by so much while landing: motors '
+                                    'off', unit='m', low=0, high=100)
+    fallback_time: float = parameter(30.0, doc='longest fallback, then landing', unit='s', low=1,
+                                     high=3600)
     rate: float = parameter(15.0, doc='tumbling above this angular rate', unit='rad/s', low=1,
                             high=100)
     fall_speed: float = parameter(6.0, doc='falling above this speed downwards', unit='m/s',
@@ -186,6 +193,7 @@ class SupervisorParameters:
     backup: BackupParameters = group(BackupParameters)
     battery: BatteryLimits = group(BatteryLimits)
     envelope: Envelope = group(Envelope)
+    detection: Detection = group(Detection)
     tick_limit: float = parameter(0.02, doc='longer pauses of the supervisor itself count as this',
                                   unit='s', low=0.005, high=0.5)
     stop_time: float = parameter(0.3, doc='zero thrust is commanded this long, then nothing',

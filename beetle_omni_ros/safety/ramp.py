@@ -34,6 +34,7 @@ class Ramp:
         climb: vertical way, negative downwards, may be infinite [m].
         speed: of the vertical motion [m/s].
         acceleration: of the vertical motion [m/s^2].
+        moving: whether it already has its speed at the start.
 
     """
 
@@ -44,6 +45,7 @@ class Ramp:
     climb: float
     speed: float
     acceleration: float
+    moving: bool = False
 
     @property
     def duration(self) -> float:
@@ -60,6 +62,8 @@ class Ramp:
 
     def _profile(self, elapsed):
         """Way, speed and total time of a trapezoid of speed."""
+        if self.moving:
+            return max(0.0, elapsed) * self.speed, self.speed, abs(self.climb) / self.speed
         length, a = abs(self.climb), self.acceleration
         speed = min(self.speed, sqrt(length * a))
         rise = speed / a

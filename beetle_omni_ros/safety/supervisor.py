@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, Controller, PoseTarget
-from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
 from beetle_omni_ros.safety.handover import Handover
@@ -18,8 +17,10 @@ from beetle_omni_ros.safety.inputs import Inputs
 from beetle_omni_ros.safety.landing import Landing
 from beetle_omni_ros.safety.limits import within_limits
 from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.ramp import inclination
 from beetle_omni_ros.safety.support import SupportGauge
 from beetle_omni_ros.safety.takeoff import Takeoff
+from beetle_omni_ros.safety.watch.faults import CRASH
 
 DISARMED, TAKEOFF, FLYING = 'disarmed', 'takeoff', 'flying'
 FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
@@ -47,16 +48,15 @@ class Supervisor(Inputs):
                  fallback: Controller, controllers: tuple[str, ...] = ('nmpc', 'rl')):
         super().__init__(parameters, robot, controllers)
         self._hover = fallback
-        self._allocator = Allocator(robot)
         self._gauge = SupportGauge(self._allocator, robot.gravity, robot.rotors.time_constant)
         self._handover = Handover(parameters.handover)
         self.state, self.source = DISARMED, 'none'
-        self._in_force: Command | None = None
         self._takeoff: Takeoff | None = None
         self._landing: Landing | None = None
         self._target: PoseTarget | None = None
         self._stop_left = 0.0
-        self._floor = 0.0       # height of base_link where it stood [m]
+        self._landing_for = self._fallback_for = 0.0
+        self._before = None     # time of the update before [s]
 
     # Requests ---------------------------------------------------------------------------------
 
@@ -71,6 +71,8 @@ class Supervisor(Inputs):
                                 self.vehicle.seen(None))
         self._in_force = None
         self._floor = float(self.vehicle.state.position[2])
+        self.watch.reset()
+        self._landing_for = self._fallback_for = 0.0
         return self._enter(TAKEOFF, now, INFO, 'armed: takeoff')
 
     def disarm(self, now: float) -> Answer:
@@ -122,11 +124,14 @@ class Supervisor(Inputs):
         now = self._now
         if now is None:
             return None
+        self._look_for_faults(now, dt)
         if self.state in IN_FLIGHT:
             self._watch(now)
         command = {TAKEOFF: self._take_off, FLYING: self._fly, FALLBACK: self._hold,
                    LANDING: self._descend}.get(self.state, self._stand)(now, dt)
         command = self._guarded(command, now)
+        if command is not None:
+            self.watch.on_command(command)
         if self.state in IN_FLIGHT:
             self._gauge.update(command, self.vehicle.attitude(now), dt,
                                self.vehicle.specific_force_up,
@@ -138,6 +143,7 @@ class Supervisor(Inputs):
         told = {'state': self.state, 'controller': self.active, 'source': self.source,
                 'estimator': self.vehicle.status or 'never heard',
                 'on_backup_estimator': int(self.vehicle.backup.running)}
+        told.update({f'fault.{name}': at for name, at in self.faults.items()})
         told.update(self.actuators.diagnostics())
         told.update(self._selection.diagnostics())
         for reason, count in self.vehicle.refused.items():
@@ -145,6 +151,50 @@ class Supervisor(Inputs):
         if self.vehicle.voltage is not None:
             told['battery_V'] = self.vehicle.voltage
         return told
+
+    @property
+    def airborne(self) -> bool:
+        """Whether the robot flies, as far as is known."""
+        return self.state in IN_FLIGHT and not self._on_ground
+
+    @property
+    def faults(self) -> dict[str, float]:
+        """Faults of this flight: name -> when it was named [s]."""
+        return self.watch.faults
+
+    def _look_for_faults(self, now, dt):
+        """Act on what the detectors say."""
+        paused, self._before = now - (now if self._before is None else self._before), now
+        for text in self.watch.news():
+            self._say(now, ERROR, text)
+        if not self.airborne:
+            return
+        self._landing_for = self._landing_for + dt if self.state == LANDING else 0.0
+        self._fallback_for = self._fallback_for + dt if self.state == FALLBACK else 0.0
+        if paused > self._parameters.commands.age_limit:
+            self._resume(now, paused)
+        if self.watch.contact:
+            self._crash(now, self.watch.contact)
+
+    def _resume(self, now, paused):
+        """After a pause of this process, in which the actuators have stopped."""
+        self.watch.name('supervisor_paused', now, '')
+        self._say(now, ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: '
+                              'the actuators had stopped')
+        height = self._height
+        if height is not None and height < self._parameters.detection.contact.near_ground:
+            self._crash(now, 'on the floor after the pause')
+        elif self.state == FLYING:
+            self._fall_back(now, ERROR, 'fallback to hover after the pause')
+
+    def _crash(self, now, why):
+        """Motors off on the ground; a landing that ends upright and softly is none."""
+        upright = inclination(self.vehicle.attitude(now)) < self._parameters.arming.tilt
+        if self.state == LANDING and upright:
+            self._motors_off(DISARMED, now, INFO, f'on the ground, {why}: motors off, disarmed')
+            return
+        self.watch.name(CRASH, now, '')
+        self.emergency_stop(now, f'crash: {why}')
 
     def _watch(self, now):
         """Faults that end or change a flight, whoever flies it."""
@@ -154,12 +204,15 @@ class Supervisor(Inputs):
         no_rotors, no_joints = map(self.actuators.fault, ('rotor', 'joint'))
         if no_rotors and not self.actuators.rotors_may_turn:
             return self._lose_rotors(now, no_rotors)
-        if self.state == LANDING:
+        if self._beyond_limits(now) or self.state == LANDING:
             return
         if no_rotors:
             self._land(now, ERROR, f'{no_rotors}: landing while it may follow')
             return
-        if vehicle.estimate.silent:
+        if 'estimator_wrong' in self.faults and not vehicle.backup.running:
+            self._land(now, ERROR, 'the estimate contradicts MoCap: controlled descent on raw '
+                                   'sensors')
+        elif vehicle.estimate.silent:
             why = f' (last refused: {vehicle.last_refusal})' if vehicle.last_refusal else ''
             self._land(now, ERROR, f'ekf_node {vehicle.estimate.text}{why}: controlled descent '
                                    'on raw sensors')
@@ -176,6 +229,26 @@ class Supervisor(Inputs):
             self._react(envelope.fence_reaction, now, 'left the fence')
         elif vehicle.lost and envelope.lost_reaction != 'none':
             self._react(envelope.lost_reaction, now, 'tumbling or falling')
+
+    def _beyond_limits(self, now):
+        """Limits that hold while landing and in fallback, too; whether one was passed."""
+        vehicle, envelope = self.vehicle, self._parameters.envelope
+        limits = self._parameters.landing
+        if self.state == LANDING:
+            if vehicle.far_outside_fence:
+                self.emergency_stop(now, 'left the fence while landing')
+            elif vehicle.lost:
+                self.emergency_stop(now, 'tumbling or falling while landing')
+            elif self._landing_for > limits.time_limit:
+                self.emergency_stop(now, f'no ground within {limits.time_limit:g} s of landing')
+            else:
+                return False
+            return True
+        if self.state == FALLBACK and self._fallback_for > envelope.fallback_time:
+            self._land(now, ERROR, f'{self.active}_node not good for '
+                                   f'{envelope.fallback_time:g} s: landing')
+            return True
+        return False
 
     def _lose_rotors(self, now, why):
         if self._on_ground:
@@ -263,7 +336,7 @@ class Supervisor(Inputs):
         self._landing = Landing(self._parameters, self._hover, self._allocator, self._gauge,
                                 self.vehicle, self.events, self._floor)
         answer = self._enter(LANDING, now, severity, text)
-        self._landing.start(now, self._in_force)
+        self._landing.start(now, self._in_force, 'estimator_wrong' in self.faults)
         return answer
 
     def _motors_off(self, state, now, severity, text):

@@ -176,9 +176,17 @@ class Vehicle:
     @property
     def outside_fence(self) -> bool:
         """Whether the estimate lies outside the fence."""
+        return self._outside(0.0)
+
+    @property
+    def far_outside_fence(self) -> bool:
+        """Whether it lies beyond the margin around the fence."""
+        return self._outside(self._parameters.envelope.fence_margin)
+
+    def _outside(self, margin):
         fence = self._parameters.envelope
         x, y, z = np.abs(self.state.position)
-        return bool(max(x, y) > fence.half_width or z > fence.height)
+        return bool(max(x, y) > fence.half_width + margin or z > fence.height + margin)
 
     def _below(self, threshold):
         return self.voltage is not None and self.voltage < threshold * self._cells

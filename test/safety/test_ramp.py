@@ -36,3 +36,10 @@ def test_starts_at_its_start_and_ends_level_at_the_height():
     np.testing.assert_allclose(last.position, way.position + [0, 0, 0.8])
     assert inclination(last.quaternion) < 1e-6
     assert np.abs(way.at(10.4).position - way.position).max() == 0   # it waits
+
+
+def test_a_moving_ramp_has_its_speed_from_the_start():
+    way = Ramp(1.0, np.zeros(3), Way.straight(*[np.array([0, 0, 0, 1.0])] * 2, 1.0), 0.0, -np.inf,
+               0.3, 0.5, moving=True)
+    assert way.at(1.0).velocity[2] == way.at(3.0).velocity[2] == -0.3
+    assert way.at(3.0).position[2] == pytest.approx(-0.6)

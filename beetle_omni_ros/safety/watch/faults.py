@@ -11,6 +11,7 @@ from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.watch.joints import JointWatch
+from beetle_omni_ros.safety.watch.mocap import MocapWatch
 from beetle_omni_ros.safety.watch.parameters import Detection
 from beetle_omni_ros.safety.watch.speeds import SpeedWatch
 from beetle_omni_ros.safety.watch.wrench import ContactWatch, WrenchWatch
@@ -44,6 +45,7 @@ class FaultWatch:
         self._contact = ContactWatch(parameters.contact, robot.gravity)
         self._joints = JointWatch(parameters.servo, robot)
         self._speeds = SpeedWatch(parameters.rotor, robot)
+        self._mocap = MocapWatch(parameters.mocap)
         self.reset()
 
     def reset(self) -> None:
@@ -53,7 +55,7 @@ class FaultWatch:
         self.offset = np.zeros(ROTORS)
         self._new: list[str] = []
         self._stamp = -np.inf
-        for watch in (self._wrench, self._contact, self._joints, self._speeds):
+        for watch in (self._wrench, self._contact, self._joints, self._speeds, self._mocap):
             watch.reset()
 
     @property
@@ -91,7 +93,8 @@ class FaultWatch:
         if self._wrench.slipped is not None:
             joint, angle = self._wrench.slipped
             name = f'joint{joint + 1}_slipped'
-            if self._name(name, stamp, f'the thrust of rotor {joint + 1} points {angle:+.2f} rad '
+            known = {f'joint{joint + 1}_encoder_jump', f'joint{joint + 1}_astray'}
+            if not known & self.faults.keys() and self._name(name, stamp, f'the thrust of rotor {joint + 1} points {angle:+.2f} rad '
                                        f'from where gimbal{joint + 1} says'):
                 self.offset[joint] += angle
 
@@ -119,6 +122,27 @@ class FaultWatch:
                           + f' its command, at {tilt[joint]:.2f} rad'):
                 self._stick(joint, float(tilt[joint]))
         self._follow(tilt)
+
+    def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
+                 attitude: np.ndarray | None, rate: np.ndarray | None) -> bool:
+        """
+        Take a MoCap pose, see :meth:`MocapWatch.on_pose`.
+
+        Returns:
+            whether it may be used.
+
+        """
+        watch = self._mocap
+        watch.on_pose(stamp, position, quaternion, attitude, rate)
+        if watch.frozen:
+            self._name('mocap_frozen', stamp, 'MoCap repeats the same pose')
+        if watch.contradicts and watch.jumped:
+            self._name('mocap_flipped', stamp, 'the attitude of MoCap jumped, and the gyroscope '
+                       'does not show it')
+        elif watch.contradicts:
+            self._name('estimator_wrong', stamp, 'the estimate contradicts MoCap, which did not '
+                       'jump')
+        return watch.good
 
     def on_speeds(self, stamp: float, speed: np.ndarray, command: Command | None) -> None:
         """Take ESC speeds (4,) [rad/s], nan where unknown."""

@@ -38,7 +38,7 @@ class RotorLimits:
     torque_noise: float = parameter(6.0, doc='of the residual, healthy', unit='rad/s^2', low=0.1,
                                     high=100)
     least_evidence: float = parameter(
-        12.0, doc='residual in standard deviations from which it is judged', low=3, high=1000)
+        3.0, doc='residual in standard deviations from which it is judged', low=1, high=1000)
     time: float = parameter(0.05, doc='for this long', unit='s', low=0.005, high=1)
     slip: float = parameter(0.4, doc="angle between the true thrust and the encoder's",
                             unit='rad', low=0.05, high=3)
@@ -68,6 +68,8 @@ class MocapLimits:
 
     attitude: float = parameter(0.35, doc='jump of the attitude against the gyroscope',
                                 unit='rad', low=0.05, high=3)
+    lasting: int = parameter(10, doc='poses in a row that contradict the estimate', low=1,
+                             high=1000)
     frozen: int = parameter(5, doc='poses equal to the last digit while the IMU moves', low=2,
                             high=1000)
 

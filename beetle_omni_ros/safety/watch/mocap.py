@@ -1,0 +1,72 @@
+"""MoCap that contradicts the estimate, and which of the two is to blame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.safety.watch.parameters import MocapLimits
+
+AGE = 0.05              # [s] by which pose and estimate may be apart
+LONGEST = 0.1           # [s] between two poses across which a jump is seen
+
+
+class MocapWatch:
+    """
+    Looks for jumps that no body makes, for repeated values, and for lasting contradiction.
+
+    Args:
+        limits: thresholds.
+
+    Attributes:
+        good: whether the last pose may be used.
+        jumped: whether MoCap itself jumped, since when it contradicts the estimate.
+        contradicts: whether pose and estimate have contradicted each other for long enough.
+
+    """
+
+    def __init__(self, limits: MocapLimits):
+        """See the class."""
+        self._p = limits
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew."""
+        self._stamp, self._quaternion, self._values = -np.inf, None, None
+        self._same, self._off = 0, 0
+        self.good, self.jumped, self.contradicts = True, False, False
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the pose repeats itself."""
+        return self._same >= self._p.frozen
+
+    def on_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
+                attitude: np.ndarray | None, rate: np.ndarray | None) -> None:
+        """
+        Take a pose.
+
+        Args:
+            stamp: of its capture [s].
+            position: (3,) in world [m].
+            quaternion: (4,) xyzw.
+            attitude: (4,) of the estimate of about that time, None: there is none.
+            rate: (3,) measured body rate [rad/s], None: there is none.
+
+        """
+        values = (*np.asarray(position, dtype=float).tolist(),
+                  *np.asarray(quaternion, dtype=float).tolist())
+        self._same = self._same + 1 if values == self._values else 0
+        self._values = values
+        dt, before = stamp - self._stamp, self._quaternion
+        self._stamp, self._quaternion = stamp, rotations.normalized(quaternion)
+        turning = 0.0 if rate is None else float(np.linalg.norm(rate))
+        if before is not None and 0 < dt < LONGEST and rotations.geodesic_angle(
+                before, self._quaternion) > self._p.attitude + turning * dt:
+            self.jumped = True
+        off = attitude is not None and rotations.geodesic_angle(
+            attitude, self._quaternion) > self._p.attitude + turning * AGE
+        self._off = self._off + 1 if off else 0
+        self.jumped &= off
+        self.contradicts = self._off >= self._p.lasting
+        self.good = not off and not self.frozen
