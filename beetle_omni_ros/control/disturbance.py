@@ -19,10 +19,12 @@ from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.control.call import FunctionCall
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
 SHORT = 0.002           # [s] nearer to an end of a span a command changes there
+UNNOTICED = 0.3     # [s] what was learnt since so long before a fault was named was the fault itself
 HISTORY = 64        # states and commands kept, far more than any latency needs
 
 
@@ -51,6 +53,8 @@ class DisturbanceEstimator:
         self._force_gain = p.force_bandwidth * robot.mass
         self._torque_gain = p.torque_bandwidth * robot.inertia
         self._tilt_bandwidth, self._tilt_correction = p.tilt_bandwidth, p.tilt_correction
+        self._health = ALL_WELL
+        self._movable = np.ones(4)
         self.reset()
 
     def reset(self):
@@ -60,6 +64,29 @@ class DisturbanceEstimator:
         self._stamp = -np.inf
         self._commands: deque[Command] = deque(maxlen=HISTORY)
         self._tilts: deque[tuple[float, np.ndarray]] = deque(maxlen=HISTORY)
+        self._learnt: deque[tuple[float, np.ndarray]] = deque(maxlen=HISTORY)
+
+    def set_health(self, health: ActuatorHealth) -> None:
+        """
+        Predict with what is left from now on.
+
+        What was taken for a disturbance while a fault was not yet named is forgotten.
+        """
+        self._health = health
+        self._movable = np.array([float(angle is None) for angle in health.stuck])
+        before = [d for stamp, d in self._learnt if stamp <= self._stamp - UNNOTICED]
+        self.disturbance = before[-1].copy() if before else np.zeros(model.DISTURBANCE_SIZE)
+        self.disturbance[model.TILT_OFFSET] *= self._movable
+        if self._state is not None:
+            self._state = self._state.copy()
+            self._state[model.TILT], self._state[model.THRUST] = health.possible(
+                self._state[model.TILT], self._state[model.THRUST])
+
+    def _acting(self, command):
+        """What the actuators that are left make of a command (8,)."""
+        if self._health.healthy:
+            return command
+        return np.concatenate(self._health.possible(command[:4], command[4:]))
 
     def update(self, state: State) -> np.ndarray:
         """
@@ -90,6 +117,7 @@ class DisturbanceEstimator:
             self._correct_tilt(state, present, step)
         self._state, self._stamp = present, state.stamp
         self._tilts.append((state.stamp, present[model.TILT].copy()))
+        self._learnt.append((state.stamp, self.disturbance))
         return present
 
     def _restart(self, state):
@@ -110,8 +138,8 @@ class DisturbanceEstimator:
         changes = [at for command in self._commands
                    if start + SHORT < (at := command.stamp + self._delay) < end - SHORT]
         for until in (*changes, end):
-            state = self._advance(state, self._input(start, until - start), self.disturbance,
-                                  until - start)
+            state = self._advance(state, self._acting(self._input(start, until - start)),
+                                  self.disturbance, until - start)
             start = until
         return state
 
@@ -139,7 +167,7 @@ class DisturbanceEstimator:
         if modelled is None:
             return
         limit = self._limit[model.TILT_OFFSET]
-        error = _clipped(state.tilt - modelled, limit)
+        error = self._movable * _clipped(state.tilt - modelled, limit)
         present[model.TILT] += self._tilt_correction * error
         offset = self.disturbance[model.TILT_OFFSET] + self._tilt_bandwidth * step * error
         self.disturbance[model.TILT_OFFSET] = _clipped(offset, limit)

@@ -27,7 +27,8 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, State, Target
 from beetle_omni_ros.robot import rotations, schema
-from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.degraded_allocation import allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
@@ -93,10 +94,15 @@ class HoverController:
         self.parameters = parameters or HoverParameters.load()
         self.period = self.parameters.period
         self._robot = robot
-        self._allocator = Allocator(robot)
-        self._scaled = self._allocator.matrix / np.concatenate(
-            [np.full(3, self._allocator.mass), robot.inertia])[:, None]
+        self.set_health(ALL_WELL)
         self.reset()
+
+    def set_health(self, health: ActuatorHealth) -> None:
+        """Fly with what is left, from the next step on; callable in flight."""
+        self._health = health
+        self._allocator = allocator(self._robot, health)
+        self._scaled = self._allocator.matrix / np.concatenate(
+            [np.full(3, self._allocator.mass), self._robot.inertia])[:, None]
 
     def reset(self) -> None:
         """Forget disturbances and the thrust model; the next step starts from state.command."""
@@ -196,6 +202,8 @@ class HoverController:
         else:
             keep = exp(-dt / self._robot.rotors.time_constant)
             self._thrust = in_force.thrust + keep * (self._thrust - in_force.thrust)
+        if not self._health.healthy:
+            self._thrust = self._health.possible(self._thrust, self._thrust)[1]
 
     def _targets(self, state, wished, present, dt):
         """Tilt and thrust targets after rate limits, projection and lead."""
@@ -211,7 +219,8 @@ class HoverController:
         if state.command is not None:
             reach = p.thrust_rate * dt
             thrust = np.clip(thrust, state.command.thrust - reach, state.command.thrust + reach)
-        return tilt, np.clip(thrust, rotors.thrust_min, rotors.thrust_max)
+        thrust = np.clip(thrust, rotors.thrust_min, rotors.thrust_max)
+        return (tilt, thrust) if self._health.healthy else self._health.possible(tilt, thrust)
 
     def _thrust_on_the_way(self, wished, tilt):
         """

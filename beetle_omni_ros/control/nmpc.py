@@ -15,11 +15,13 @@ from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.references import ReferencePlanner
 from beetle_omni_ros.control.rti import CompiledRti, InterpretedRti
 from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.native import CompilerError
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 log = logging.getLogger(__name__)
 FIRST_ITERATIONS = 5     # from a cold start, before the first command
+NARROW = 1e-3            # [rad or N] between bounds of what cannot move; the QP needs an inside
 FAILURES_TO_RESTART = 5  # unsolved cycles in a row after which the horizon starts anew
 
 
@@ -63,13 +65,34 @@ class NmpcController:
         self._weights = p.weights.vector()
         thrust_max = p.limits.thrust_max
         tilt = min(p.limits.tilt, robot.joints.position_limit)
-        self._bounds = np.r_[np.full(4, -tilt), np.full(4, robot.rotors.thrust_min),
+        self._all_bounds = np.r_[np.full(4, -tilt), np.full(4, robot.rotors.thrust_min),
                              np.full(4, tilt), np.full(4, thrust_max),
                              p.limits.velocity, p.limits.rate,
                              # how far a held target may lead for the lag to keep the rate
                              p.limits.tilt_rate * intervals / -np.expm1(
                                  -intervals / p.model.servo_lag)]
+        self._health, self._bounds = ALL_WELL, self._all_bounds
         self.reset()
+
+    def set_health(self, health: ActuatorHealth) -> None:
+        """
+        Fly with what is left, from the next step on; callable in flight.
+
+        Lost rotors are bounded to no thrust and stuck joints to their angle, in prediction,
+        reference and plan.
+        """
+        if health == self._health:
+            return
+        self._health, self._bounds = health, self._all_bounds.copy()
+        self._estimator.set_health(health)
+        self._planner.set_health(health)
+        lower, upper = self._bounds[:8], self._bounds[8:16]
+        for i, (turns, angle) in enumerate(zip(health.rotors, health.stuck)):
+            if angle is not None:
+                lower[i], upper[i] = angle - NARROW, angle + NARROW
+            if not turns:
+                lower[4 + i], upper[4 + i] = 0.0, NARROW
+        self._iterate = FIRST_ITERATIONS
 
     @staticmethod
     def _make_solver(options, advance, compile_allowed):
@@ -83,7 +106,7 @@ class NmpcController:
     def reset(self) -> None:
         """Forget estimates and horizon."""
         self._estimator.reset()
-        self._started, self._failures = False, 0
+        self._started, self._failures, self._iterate = False, 0, 0
         self._statuses: dict[int, int] = {}
         self._iterations = self._rejected = 0
 
@@ -110,10 +133,12 @@ class NmpcController:
         references = self._planner.plan(target, start, full[model.TILT], disturbance)
         if not self._started:
             self._rti.fill(x0, np.clip(references[0, 13:21], self._bounds[:8], self._bounds[8:16]))
-            for _ in range(FIRST_ITERATIONS):
-                self._rti.step(x0, references, disturbance, self._weights, self._bounds)
+            self._iterate = FIRST_ITERATIONS
         else:
             self._rti.shift(self.period)
+        for _ in range(self._iterate):
+            self._rti.step(x0, references, disturbance, self._weights, self._bounds)
+        self._iterate = 0
         status, self._iterations = self._rti.step(x0, references, disturbance, self._weights,
                                                   self._bounds)
         self._statuses[status] = self._statuses.get(status, 0) + 1
@@ -123,9 +148,11 @@ class NmpcController:
 
     def _command(self, stamp):
         command = np.clip(self._rti.inputs[0], self._bounds[:8], self._bounds[8:16])
-        rotors = self._robot.rotors
-        return Command(stamp, command[:4],
-                       np.clip(command[4:], rotors.thrust_min, rotors.thrust_max))
+        rotors, health = self._robot.rotors, self._health
+        tilt = command[:4]
+        thrust = np.clip(command[4:], rotors.thrust_min, rotors.thrust_max)
+        return Command(stamp, *((tilt, thrust) if health.healthy else
+                                health.possible(tilt, thrust)))
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Solver health and estimated disturbances."""

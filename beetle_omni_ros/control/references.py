@@ -9,7 +9,9 @@ from beetle_omni_ros.control.effect_wrench import EffectWrench
 from beetle_omni_ros.control.ocp import REFERENCE_SIZE
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.degraded_allocation import allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 FIRST_ROUNDS = 3        # of allocation under effects for a new target; afterwards each plan is one
@@ -40,8 +42,9 @@ class ReferencePlanner:
     def __init__(self, robot: RobotParameters, times: np.ndarray, unwind: float,
                  servo_lag: float):
         """See the class."""
-        self._times, self._unwind = times, unwind
+        self._times, self._unwind, self._robot = times, unwind, robot
         self._allocator = Allocator(robot)
+        self._movable = np.ones(4, dtype=bool)
         self._effects = EffectWrench(robot, self._allocator, len(times))
         self._beside = np.zeros((2, len(times), 3))     # force and torque of the effects, per node
         self._target: Target | None = None
@@ -49,6 +52,11 @@ class ReferencePlanner:
         length = np.diff(times)[:, None]
         self._tilt_lead = 1 / -np.expm1(-length / servo_lag)
         self._thrust_lead = 1 / -np.expm1(-length / robot.rotors.time_constant)
+
+    def set_health(self, health: ActuatorHealth) -> None:
+        """Allocate with what is left from now on; a stuck joint takes no other turn."""
+        self._allocator = allocator(self._robot, health)
+        self._movable = np.array([angle is None for angle in health.stuck])
 
     def plan(self, target: Target, start: float, tilt: np.ndarray,
              disturbance: np.ndarray) -> np.ndarray:
@@ -90,7 +98,8 @@ class ReferencePlanner:
         """Take the turn within +-pi unless that costs the joint too much more travel."""
         other = tilt - 2 * np.pi * np.sign(tilt)
         detour = np.abs(other - present) - np.abs(tilt - present)
-        return np.where((np.abs(tilt) > np.pi) & (detour < self._unwind), other, tilt)
+        better = (np.abs(tilt) > np.pi) & (detour < self._unwind) & self._movable
+        return np.where(better, other, tilt)
 
     def _follow(self, target: TrajectoryTarget, times, present, disturbance, references):
         now, ahead = target.sample(times), target.sample(times + DIFFERENCE_STEP)

@@ -1,0 +1,131 @@
+"""
+Allocation with the actuators that are left.
+
+A rotor that gives no thrust has no column in the wrench map, one whose joint is stuck has one,
+along its present direction and with a thrust that cannot be negative; every other rotor keeps
+its two force components. The minimum-norm solution under the sign constraints has the stuck
+rotors either pushing or off, so it is the best of at most 2^stuck pseudo-inverses. A rotor
+that asks for more than its limit is held there, in its direction, and the others solve for the
+rest: a short active-set iteration.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.allocation import Allocation, Allocator, ROTORS, SINGULAR
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+RESIDUAL = 1e-3  # [m/s^2, rad/s^2] two solutions meet a wrench equally well
+
+
+class DegradedAllocator(Allocator):
+    """
+    As :class:`Allocator` for a robot of which some actuators fail.
+
+    Where the wrench cannot be met, thrusts are the least-squares solution in linear and angular
+    acceleration. Lost rotors get no thrust and keep their tilt, stuck joints their angle.
+
+    Args:
+        robot: the robot.
+        health: what is left of it.
+
+    Attributes:
+        matrix: (6, 8) as the healthy one, with zero columns for lost rotors.
+        choices: list of (columns (6, 8), inverse (8, 6)): the map with some of the stuck rotors
+            off, most first, and its pseudo-inverse; a stuck rotor's thrust stands in its first
+            component.
+
+    """
+
+    def __init__(self, robot: RobotParameters, health: ActuatorHealth):
+        super().__init__(robot)
+        self._health = health
+        lost = np.repeat(~np.array(health.rotors), 2)
+        self.matrix[:, lost] = 0.0
+        self._scale = 1 / np.r_[np.full(3, self.mass), robot.inertia]
+        self.stuck = [i for i, angle in enumerate(health.stuck)
+                      if angle is not None and health.rotors[i]]
+        columns = self.matrix.copy()
+        for i in self.stuck:
+            columns[:, 2 * i] = self._along(i, health.stuck[i])
+            columns[:, 2 * i + 1] = 0.0
+        self.choices = []
+        for count in range(len(self.stuck) + 1):
+            for off in combinations(self.stuck, count):
+                chosen = columns.copy()
+                chosen[:, [2 * i for i in off]] = 0.0
+                self.choices.append((chosen, self._pseudo_inverse(chosen)))
+
+    def _along(self, rotor, angle):
+        """(6,) wrench of one newton of a rotor at a tilt [rad]."""
+        return self.matrix[:, 2 * rotor] * np.cos(angle) \
+            + self.matrix[:, 2 * rotor + 1] * np.sin(angle)
+
+    def _pseudo_inverse(self, columns):
+        """Minimum norm, and least squares in accelerations where the rank is not full."""
+        return np.linalg.pinv(self._scale[:, None] * columns, rcond=SINGULAR) * self._scale
+
+    def allocate(self, force: np.ndarray, torque: np.ndarray,
+                 present_tilt: np.ndarray) -> Allocation:
+        """As :meth:`Allocator.allocate`, with what is left."""
+        wrench = np.concatenate([force, torque])
+        components, met = self._within_limits(*self._solved(wrench), wrench)
+        tilt, thrust = np.array(present_tilt, dtype=float), np.zeros(ROTORS)
+        cut = np.zeros(ROTORS, dtype=bool)
+        for i in range(ROTORS):
+            angle, pair = self._health.stuck[i], components[2 * i:2 * i + 2]
+            if angle is not None:
+                tilt[i], thrust[i] = angle, pair[0]
+                continue
+            length = float(np.hypot(*pair))
+            if length > self._negligible:
+                tilt[i], cut[i] = self._nearest_turn(float(np.arctan2(pair[1], pair[0])), tilt[i])
+                thrust[i] = length
+            else:
+                tilt[i], cut[i] = self._inside(float(tilt[i]))
+        held = np.clip(thrust, 0.0, self._thrust_max)
+        return Allocation(tilt, held, cut | (not met))
+
+    def _solved(self, wrench):
+        """Best choice of stuck rotors: its columns and the (8,) components."""
+        best = None
+        for columns, inverse in self.choices:
+            components = inverse @ wrench
+            if any(components[2 * i] < -self._negligible for i in self.stuck):
+                continue
+            rest = self._rest(columns, components, wrench)
+            cost = (rest if rest > RESIDUAL else 0.0, float(components @ components))
+            if best is None or cost < best[0]:
+                best = cost, columns, components
+        return best[1:]
+
+    def _rest(self, columns, components, wrench):
+        return float(np.linalg.norm(self._scale * (columns @ components - wrench)))
+
+    def _within_limits(self, columns, components, wrench):
+        """Components with no rotor beyond its limit, and whether they meet the wrench."""
+        limit, free = self._thrust_max, columns.copy()
+        for _ in range(ROTORS):
+            lengths = np.hypot(components[0::2], components[1::2])
+            over = lengths > limit * (1 + 1e-9)
+            if not over.any():
+                break
+            worst = int(np.argmax(lengths))
+            pair = slice(2 * worst, 2 * worst + 2)
+            free[:, pair] = 0.0
+            held = np.where(np.repeat(free.any(axis=0).reshape(ROTORS, 2).any(axis=1), 2),
+                            0.0, components)
+            held[pair] *= limit / lengths[worst]
+            components = held + self._pseudo_inverse(free) @ (wrench - columns @ held)
+            for i in self.stuck:
+                components[2 * i] = max(components[2 * i], 0.0)
+        return components, self._rest(columns, components, wrench) < RESIDUAL
+
+
+def allocator(robot: RobotParameters, health: ActuatorHealth = ALL_WELL) -> Allocator:
+    """Allocator of a robot with what is left of it."""
+    return Allocator(robot) if health.healthy else DegradedAllocator(robot, health)

@@ -1,0 +1,191 @@
+"""
+Which attitudes can be held with the actuators that are left, and how firmly.
+
+Holding an attitude depends on the direction of up in the body alone, not on heading. For each of
+a grid of directions the allocation of the weight gives tilts and thrusts. About these the
+accelerations [m/s^2, rad/s^2] are linear in small changes of tilt and thrust,
+
+    (a, alpha) = J (thrust change / thrust reach, tilt change / tilt reach),
+
+where a thrust may go down to zero or up to its limit and a tilt as far as its servo turns within
+the reach time. The margin is the radius of the largest ball of accelerations for which no
+actuator exceeds its reach with the minimum-norm change: 1 / max_i |row i of J^+|. It is zero
+where the weight cannot be held, or where a direction of the six cannot be pushed: at level with
+a rotor lost the opposite one carries nothing, its tilt moves no force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.robot import rotations, schema
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.degraded_allocation import DegradedAllocator, RESIDUAL
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import parameter
+
+BISECTIONS = 5          # towards a wished attitude: 6 deg / 2^5
+GOLDEN = np.pi * (1 + np.sqrt(5))
+
+
+@dataclass(frozen=True, kw_only=True)
+class HoldingParameters:
+    """Tuning of the choice of attitudes; params/degraded.yaml says why."""
+
+    reach_time: float = parameter(0.1, doc='within which actuators shall act', unit='s',
+                                  low=0.01, high=1)
+    tilt_rate: float = parameter(7.0, doc='of the servos', unit='rad/s', low=0.1, high=100)
+    directions: int = parameter(1000, doc='of gravity in the body that are compared', low=50,
+                                high=10000)
+    flying_margin: float = parameter(2.0, doc='of the attitude to fly in',
+                                     unit='m/s^2, rad/s^2', low=0, high=20)
+    holding_margin: float = parameter(1.0, doc='with which a wished attitude is held as it is',
+                                      unit='m/s^2, rad/s^2', low=0, high=20)
+
+    @classmethod
+    def load(cls, path=None) -> HoldingParameters:
+        """Read a file; without a path, the shipped params/degraded.yaml."""
+        return schema.load(cls, path if path else share_path('params/degraded.yaml'))
+
+
+class Holding:
+    """
+    The attitudes that a robot can hold.
+
+    Args:
+        robot: the robot.
+        health: what is left of it.
+        parameters: by default params/degraded.yaml.
+
+    Attributes:
+        directions: (N, 3) unit vectors, up in base_link.
+        margins: (N,) margin of each [m/s^2, rad/s^2], 0 where it cannot be held.
+
+    """
+
+    def __init__(self, robot: RobotParameters, health: ActuatorHealth,
+                 parameters: HoldingParameters | None = None):
+        """Compute the table, about 10 ms."""
+        self.parameters = parameters or HoldingParameters.load()
+        self._robot, self._health = robot, health
+        self._allocator = DegradedAllocator(robot, health)
+        self._scale = 1 / np.r_[np.full(3, self._allocator.mass), robot.inertia]
+        self.directions = sphere(self.parameters.directions)
+        self.margins = self._margins(self.directions)
+
+    def margin(self, quaternion: np.ndarray) -> float:
+        """Margin of one attitude (4,) [m/s^2, rad/s^2], 0 where it cannot be held."""
+        return float(self._margins(up(quaternion)[None])[0])
+
+    def nearest(self, quaternion: np.ndarray, margin: float) -> np.ndarray:
+        """
+        Nearest attitude with a margin; the one with the largest margin where none has it.
+
+        Args:
+            quaternion: (4,) wished.
+            margin: [m/s^2, rad/s^2].
+
+        Returns:
+            (4,) quaternion: the wished one turned about a horizontal axis.
+
+        """
+        if self.margin(quaternion) >= margin:
+            return rotations.normalized(quaternion)
+        wished = up(quaternion)
+        firm = np.flatnonzero(self.margins >= margin)
+        best = firm[np.argmax(self.directions[firm] @ wished)] if firm.size else \
+            np.argmax(self.margins)
+        turn = leaned(quaternion, self.directions[best])
+        if not firm.size:
+            return turn
+        whole = rotations.log(rotations.multiply(rotations.conjugate(quaternion), turn))
+        low, high = 0.0, 1.0
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            way = rotations.multiply(quaternion, rotations.exp(middle * whole))
+            low, high = (low, middle) if self.margin(way) >= margin else (middle, high)
+        return rotations.normalized(rotations.multiply(quaternion, rotations.exp(high * whole)))
+
+    def _margins(self, directions):
+        tilt, thrust, met = self._held(directions)
+        limit = self._robot.rotors.thrust_max
+        jacobian = self._jacobian(tilt, thrust)
+        squared = jacobian @ jacobian.transpose(0, 2, 1) + 1e-9 * np.eye(6)
+        needed = jacobian.transpose(0, 2, 1) @ np.linalg.inv(squared)
+        margins = 1 / np.maximum(np.linalg.norm(needed, axis=2).max(axis=1), 1e-6)
+        return np.where(met & (thrust.max(axis=1) <= limit), margins, 0.0)
+
+    def _held(self, directions):
+        """Tilts (N, 4), thrusts (N, 4) that carry the weight, and whether they do."""
+        weight = np.linalg.norm(self._allocator.weight)
+        wrenches = np.pad(weight * directions, ((0, 0), (0, 3)))
+        pairs, cost = np.zeros((len(directions), 8)), np.full(len(directions), np.inf)
+        rest = cost.copy()
+        for columns, inverse in self._allocator.choices:
+            tried = wrenches @ inverse.T
+            error = np.linalg.norm((tried @ columns.T - wrenches) * self._scale, axis=1)
+            pushing = np.all([tried[:, 2 * i] > -RESIDUAL for i in self._allocator.stuck]
+                             or [np.full(len(directions), True)], axis=0)
+            norm = np.linalg.norm(tried, axis=1) + 1e6 * (error > RESIDUAL)
+            better = pushing & (norm < cost)
+            pairs[better], cost[better], rest[better] = tried[better], norm[better], error[better]
+        tilt = np.arctan2(pairs[:, 1::2], pairs[:, 0::2])
+        thrust = np.hypot(pairs[:, 0::2], pairs[:, 1::2])
+        for i, angle in enumerate(self._health.stuck):
+            if angle is not None:
+                tilt[:, i] = angle
+        return tilt, thrust, rest <= RESIDUAL
+
+    def _jacobian(self, tilt, thrust):
+        """(N, 6, 8) accelerations for each actuator going to the end of its reach."""
+        matrix, p = self._scale[:, None] * self._allocator.matrix, self.parameters
+        up_part, side_part = matrix[:, 0::2], matrix[:, 1::2]
+        cos, sin = np.cos(tilt)[:, None], np.sin(tilt)[:, None]
+        room = np.minimum(thrust, self._robot.rotors.thrust_max - thrust).clip(0)
+        swing = thrust * min(p.tilt_rate * p.reach_time, 1.0) \
+            * [float(angle is None) for angle in self._health.stuck]
+        return np.concatenate([(up_part * cos + side_part * sin) * room[:, None],
+                               (side_part * cos - up_part * sin) * swing[:, None]], axis=2)
+
+
+def sphere(count: int) -> np.ndarray:
+    """(count, 3) unit vectors spread evenly: a Fibonacci lattice (Gonzalez 2010)."""
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(GOLDEN * k), radius * np.sin(GOLDEN * k), z], axis=1)
+
+
+def up(quaternion: np.ndarray) -> np.ndarray:
+    """(3,) world's z in the body."""
+    return rotations.matrix(rotations.normalized(quaternion))[2]
+
+
+def leaned(quaternion: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Attitude (4,) by the shortest turn from ``quaternion`` in which up is ``direction`` (3,)."""
+    present = up(quaternion)
+    axis = np.cross(direction, present)
+    length = float(np.linalg.norm(axis))
+    angle = float(np.arctan2(length, present @ direction))
+    if length < 1e-9:
+        axis, length = np.cross(present, np.eye(3)[np.argmin(np.abs(present))]), 1.0
+    axis = axis / np.linalg.norm(axis)
+    return rotations.normalized(rotations.multiply(quaternion, rotations.exp(angle * axis)))
+
+
+def best_attitude(robot: RobotParameters, health: ActuatorHealth,
+                  near_quaternion: np.ndarray) -> np.ndarray:
+    """
+    Attitude (4,) to fly in with what is left: the nearest with the margin for flying.
+
+    Args:
+        robot: the robot.
+        health: what is left of it.
+        near_quaternion: (4,) wished or present attitude.
+
+    """
+    holding = Holding(robot, health)
+    return holding.nearest(near_quaternion, holding.parameters.flying_margin)
