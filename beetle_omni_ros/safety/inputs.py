@@ -16,7 +16,6 @@ from beetle_omni_ros.safety.selection import Selection
 from beetle_omni_ros.safety.vehicle import Vehicle
 from beetle_omni_ros.safety.watch.faults import FaultWatch
 
-
 LATEST = 0.1    # [s] between a MoCap pose and the estimate that it is compared with
 
 

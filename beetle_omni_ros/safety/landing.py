@@ -137,6 +137,8 @@ class Landing:
         reference = replace(reference, velocity=velocity, position=np.array(
             [*reference.position[:2], height]))
         self._feel_ground(state, dt, specific_force_up, reference)
+        # Differences of rates that come from MoCap alone are late and noisy: nothing to learn from.
+        self._hover.observe(state, free=self._vehicle.backup.imu_alive)
         return self._hover.step(state, _Now(reference))
 
     def _slow_enough(self, stamp, reference):

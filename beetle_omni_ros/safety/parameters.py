@@ -167,6 +167,8 @@ class Envelope:
                                     choices=('none', 'landing', 'emergency_stop'))
     fence_margin: float = parameter(2.0, doc='outside the fence by so much while landing: motors '
                                     'off', unit='m', low=0, high=100)
+    recovery_time: float = parameter(1.0, doc='in which a landing may bring a robot that tumbles '
+                                     'or has left the fence back', unit='s', low=0, high=60)
     fallback_time: float = parameter(30.0, doc='longest fallback, then landing', unit='s', low=1,
                                      high=3600)
     rate: float = parameter(15.0, doc='tumbling above this angular rate', unit='rad/s', low=1,

@@ -234,7 +234,7 @@ class Supervisor(Inputs):
         """Limits that hold while landing and in fallback, too; whether one was passed."""
         vehicle, envelope = self.vehicle, self._parameters.envelope
         limits = self._parameters.landing
-        if self.state == LANDING:
+        if self.state == LANDING and self._landing_for > envelope.recovery_time:
             if vehicle.far_outside_fence:
                 self.emergency_stop(now, 'left the fence while landing')
             elif vehicle.lost:

@@ -35,6 +35,7 @@ class Puppet:
         self.status, self.voltage = 'tracking', 24.0
         self.lifts = True           # whether takeoff moves it
         self.command = None
+        self.thrust = np.zeros(4)
         self.sent = []
 
     def run(self, duration):
@@ -65,13 +66,22 @@ class Puppet:
         """All event texts, of one severity."""
         return [e.text for e in self.supervisor.events if severity in (None, e.severity)]
 
+    def _felt(self, tilt):
+        """Specific force: that of the rotors in the air, of the ground on it."""
+        asked = self.command.thrust if self.command is not None else np.zeros(4)
+        self.thrust += -np.expm1(-TICK / ROBOT.rotors.time_constant) * (asked - self.thrust)
+        if self.supervisor.airborne:
+            return ALLOCATOR.wrench(tilt, self.thrust)[0] / ALLOCATOR.mass
+        return np.array([0, 0, ROBOT.gravity])
+
     def _talk(self):
         supervisor, alive = self.supervisor, self.alive
         tilt = self.command.tilt if self.command is not None else np.zeros(4)
         if 'imu' in alive:
-            supervisor.on_imu(self.now, np.array([0, 0, ROBOT.gravity]), self.rate)
+            supervisor.on_imu(self.now, self._felt(tilt), self.rate)
         if 'mocap' in alive:
-            supervisor.on_mocap(self.now - 0.01, self.position, self.quaternion)
+            noise = 1e-6 * np.array([round(self.now / TICK) % 2, 0, 0])
+            supervisor.on_mocap(self.now - 0.01, self.position + noise, self.quaternion)
         joints = (self.now - 0.01, tilt) if 'joints' in alive else (np.nan, np.full(4, np.nan))
         if 'joints' in alive:
             supervisor.on_joints(joints[0], tilt, np.zeros(4))

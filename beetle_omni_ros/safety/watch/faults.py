@@ -92,10 +92,11 @@ class FaultWatch:
             self._lose_rotor(self._wrench.lost, stamp, 'the wrench')
         if self._wrench.slipped is not None:
             joint, angle = self._wrench.slipped
-            name = f'joint{joint + 1}_slipped'
+            text = f'the thrust of rotor {joint + 1} points {angle:+.2f} rad from where ' \
+                   f'gimbal{joint + 1} says'
             known = {f'joint{joint + 1}_encoder_jump', f'joint{joint + 1}_astray'}
-            if not known & self.faults.keys() and self._name(name, stamp, f'the thrust of rotor {joint + 1} points {angle:+.2f} rad '
-                                       f'from where gimbal{joint + 1} says'):
+            if not known & self.faults.keys() \
+                    and self._name(f'joint{joint + 1}_slipped', stamp, text):
                 self.offset[joint] += angle
 
     def on_command(self, command: Command) -> None:
@@ -136,7 +137,7 @@ class FaultWatch:
         watch.on_pose(stamp, position, quaternion, attitude, rate)
         if watch.frozen:
             self._name('mocap_frozen', stamp, 'MoCap repeats the same pose')
-        if watch.contradicts and watch.jumped:
+        elif watch.contradicts and watch.jumped:
             self._name('mocap_flipped', stamp, 'the attitude of MoCap jumped, and the gyroscope '
                        'does not show it')
         elif watch.contradicts:
