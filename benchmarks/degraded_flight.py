@@ -29,7 +29,7 @@ from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.readings import Drive
 from beetle_omni_ros.sim.simulator import Simulator
 
-TOLD_AFTER = 0.1        # [s] from the loss until the controller knows
+NEWS = 0.02             # [rad] a stuck joint that is found elsewhere is told anew
 SETTLE = 4.0            # [s] to reach the first pose
 POSE_TIME = 8.0         # [s] between two poses of random100
 RECOVERY = 6.0          # [s] from the loss until the pose must be held
@@ -43,9 +43,9 @@ POWERED = (True,) * 4
 class Robot:
     """Simulator whose actuators can be broken; commands act after the link's delay."""
 
-    def __init__(self, robot, seed, position, quaternion):
+    def __init__(self, robot, conditions, seed, position, quaternion):
         parameters = SimulatorParameters.load()
-        self.sim = Simulator(robot, parameters, seed=seed)
+        self.sim = Simulator(robot, parameters, conditions, seed)
         self.sim.reset(position, quaternion)
         self._link = CommandLink(robot, parameters.actuators, self.sim.conditions)
         self._joints = self.command = None
@@ -100,12 +100,14 @@ def draw(what, start, number, seed, stuck_at):
 class Flight:
     """One case."""
 
-    def __init__(self, robot, case, controllers, name, seed):
+    def __init__(self, robot, case, controllers, arguments, seed):
         self.robot, self.case = robot, case
-        self.body = Robot(robot, seed, case.first.position + [0, 0, ABOVE],
+        self.body = Robot(robot, arguments.conditions, seed, case.first.position + [0, 0, ABOVE],
                           case.first.quaternion)
         self.controllers, self.flying = controllers, controllers['nmpc']
-        self.after = controllers[name]
+        self.after = controllers[arguments.controller]
+        self.told_after = arguments.told_after
+        self.told = ALL_WELL
         self.trace = []
         for controller in controllers.values():
             controller.set_health(ALL_WELL)
@@ -123,8 +125,22 @@ class Flight:
             self.trace.append((state.stamp, *state.position, *state.velocity,
                                np.linalg.norm(reference.position - state.position),
                                rotations.geodesic_angle(reference.quaternion, state.quaternion)))
+            if not self.told.healthy:
+                self.tell(state.tilt)
             self.body.send(self.flying.step(state, target))
         return True
+
+    def tell(self, tilt):
+        """Tell the controller what is broken; a stuck joint's angle is the measured one."""
+        broken = self.body.broken
+        known = ActuatorHealth(broken.rotors, tuple(
+            None if angle is None else float(own) for own, angle in zip(tilt, broken.stuck)))
+        news = self.told.healthy or any(
+            abs(new - old) > NEWS for new, old in zip(known.stuck, self.told.stuck)
+            if new is not None)
+        if news:
+            self.told = known
+            self.flying.set_health(known)
 
     def lose(self):
         """Fly until the loss and until it is known."""
@@ -138,11 +154,11 @@ class Flight:
         self.body.broken = broken
         self.start_height = self.body.sim.truth.position[2]
         self.upright = float(rotations.matrix(self.body.sim.truth.quaternion)[2, 2])
-        alive = self.fly(case.second, case.loss + TOLD_AFTER, watch=True)
+        alive = self.fly(case.second, case.loss + self.told_after, watch=True)
         if self.after is not self.flying:
             self.after.reset()
         self.flying = self.after
-        self.flying.set_health(broken)
+        self.tell(self.body.state().tilt)
         self.holding = Holding(self.robot, broken)
         return alive
 
@@ -190,6 +206,9 @@ def main():
     parser.add_argument('--from', dest='start', choices=('hover', 'random'), default='hover')
     parser.add_argument('--stuck-at', choices=('random', 'here'), default='random')
     parser.add_argument('--controller', choices=('nmpc', 'hover'), default='nmpc')
+    parser.add_argument('--told-after', type=float, default=0.1,
+                        help='from the loss until the controller knows [s]')
+    parser.add_argument('--conditions', choices=('nominal', 'published'), default='nominal')
     parser.add_argument('--json', help='write all rows into this file')
     arguments = parser.parse_args()
     robot = RobotParameters.load()
@@ -198,7 +217,7 @@ def main():
     print('case alive held    m    deg  upright height  turn margin lowest touchdown')
     for number in range(arguments.first, arguments.first + arguments.cases):
         case = draw(arguments.what, arguments.start, number, arguments.seed, arguments.stuck_at)
-        flight = Flight(robot, case, controllers, arguments.controller, number)
+        flight = Flight(robot, case, controllers, arguments, number)
         row, target = flight.recover()
         row['case'] = number
         row['touchdown_m_s'] = flight.land(target) \

@@ -28,7 +28,7 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, State, Target
 from beetle_omni_ros.robot import rotations, schema
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
-from beetle_omni_ros.robot.degraded_allocation import allocator
+from beetle_omni_ros.robot.degraded_allocation import allocator, LocalWeights
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
@@ -71,6 +71,8 @@ class HoverParameters:
     tilt_full_thrust: float = parameter(
         1.0, doc='a rotor with less thrust turns its joint proportionally slower', unit='N',
         low=0, high=20)
+
+    degraded: LocalWeights = group(LocalWeights, 'allocation with what is left of the actuators')
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> HoverParameters:
@@ -129,7 +131,8 @@ class HoverController:
         self.observe(state)
         force, torque = self._wrench(state, target)
         present = in_force.tilt if in_force is not None else state.tilt
-        wished = self._allocator.hover(state.quaternion, present, force, torque)
+        wished = self._allocator.hover(state.quaternion, present, force, torque) \
+            if self._health.healthy else self._near(state, target, present, force, torque)
         self._saturations += bool(wished.saturated.any())
         self._command = Command(state.stamp, *self._targets(state, wished, present, dt))
         self._stamp = state.stamp
@@ -175,6 +178,15 @@ class HoverController:
                 'torque_disturbance_rad_s2': float(np.linalg.norm(self._disturbance[3:])),
                 'saturated_steps': int(self._saturations)}
 
+    def _near(self, state, target, present, force, torque):
+        """Allocation near the present tilts, on the way to what holds a nearby attitude."""
+        turn = rotations.log(rotations.multiply(rotations.conjugate(state.quaternion),
+                                                target.at(state.stamp).quaternion))
+        ahead = rotations.exp(_shortened(turn, self.parameters.attitude.error_limit))
+        aim = self._allocator.hover(rotations.multiply(state.quaternion, ahead), present)
+        force = (self._allocator.weight + force) @ rotations.matrix(state.quaternion)
+        return self._allocator.allocate_near(force, torque, present, aim, self.parameters.degraded)
+
     def _wrench(self, state, target):
         """Force beside the weight's support (world) and torque (base_link)."""
         reference = target.at(state.stamp)
@@ -208,7 +220,7 @@ class HoverController:
     def _targets(self, state, wished, present, dt):
         """Tilt and thrust targets after rate limits, projection and lead."""
         p, rotors = self.parameters, self._robot.rotors
-        busy = np.ones(4) if p.tilt_full_thrust == 0 else \
+        busy = np.ones(4) if p.tilt_full_thrust == 0 or not self._health.healthy else \
             np.minimum(1.0, wished.thrust / p.tilt_full_thrust)
         limit = self._robot.joints.position_limit
         reach = p.tilt_rate * dt * busy

@@ -11,6 +11,7 @@ rest: a short active-set iteration.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -18,8 +19,26 @@ import numpy as np
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.allocation import Allocation, Allocator, ROTORS, SINGULAR
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import parameter
 
 RESIDUAL = 1e-3  # [m/s^2, rad/s^2] two solutions meet a wrench equally well
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalWeights:
+    """Tuning of the allocation near present tilts; params/hover.yaml says why."""
+
+    turning: float = parameter(1.0, doc='weight of an angular against a linear acceleration',
+                               unit='m/rad', low=0.1, high=100)
+    tilt: float = parameter(0.3, doc='pull of tilts towards the aim', unit='m/s^2/rad', low=1e-4,
+                            high=100)
+    thrust: float = parameter(0.05, doc='pull of thrusts towards the aim', unit='1/kg', low=1e-4,
+                              high=100)
+    tilt_reach: float = parameter(0.6, doc='of tilts from the present ones', unit='rad',
+                                  low=0.01, high=4)
+    iterations: int = parameter(4, doc='of Gauss-Newton', low=1, high=20)
+    missed: float = parameter(3.0, doc='acceleration short of the wished one that counts as '
+                              'saturation', unit='m/s^2', low=0, high=20)
 
 
 class DegradedAllocator(Allocator):
@@ -90,6 +109,48 @@ class DegradedAllocator(Allocator):
         held = np.clip(thrust, 0.0, self._thrust_max)
         return Allocation(tilt, held, cut | (not met))
 
+    def allocate_near(self, force: np.ndarray, torque: np.ndarray, tilt: np.ndarray,
+                      aim: Allocation, weights: LocalWeights) -> Allocation:
+        """
+        Thrusts and tilts near given ones that come nearest a wrench.
+
+        Minimum norm swings a joint by half a turn when its rotor's share passes through zero.
+        This is damped Gauss-Newton on tilts and thrusts instead: least squares in accelerations
+        within the thrust range and a reach of tilt, drawn weakly to the aim.
+
+        Args:
+            force: (3,) in base_link [N].
+            torque: (3,) in base_link [N m].
+            tilt: (4,) present tilts [rad].
+            aim: what shall be approached in the end.
+            weights: of the terms.
+
+        """
+        scale = self._scale * np.r_[np.ones(3), np.full(3, weights.turning)]
+        matrix, wrench = scale[:, None] * self.matrix, scale * np.concatenate([force, torque])
+        still = [angle is not None for angle in self._health.stuck]
+        centre, _ = self._health.possible(tilt, aim.thrust)
+        reach = np.where(still, 0.0, weights.tilt_reach)
+        lost = ~np.array(self._health.rotors)
+        limit = self.tilt_limit
+        low = np.r_[np.clip(centre - reach, -limit, limit), np.zeros(ROTORS)]
+        high = np.r_[np.clip(centre + reach, -limit, limit),
+                     np.where(lost, 0.0, self._thrust_max)]
+        pull = np.r_[np.full(ROTORS, weights.tilt), np.full(ROTORS, weights.thrust)]
+        goal = np.r_[aim.tilt, aim.thrust]
+        z = np.clip(np.r_[centre, aim.thrust], low, high)
+        for _ in range(weights.iterations):
+            cos, sin = np.cos(z[:ROTORS]), np.sin(z[:ROTORS])
+            along = matrix[:, 0::2] * cos + matrix[:, 1::2] * sin
+            across = (matrix[:, 1::2] * cos - matrix[:, 0::2] * sin) * z[ROTORS:]
+            jacobian = np.hstack([across, along])
+            error = wrench - along @ z[ROTORS:]
+            z = z + _bounded_step(jacobian, error, pull, goal - z, low - z, high - z)
+        cos, sin = np.cos(z[:ROTORS]), np.sin(z[:ROTORS])
+        made = (matrix[:, 0::2] * cos + matrix[:, 1::2] * sin) @ z[ROTORS:]
+        missed = np.linalg.norm(made - wrench) > weights.missed
+        return Allocation(z[:ROTORS], z[ROTORS:], np.full(ROTORS, missed))
+
     def _solved(self, wrench):
         """Best choice of stuck rotors: its columns and the (8,) components."""
         best = None
@@ -124,6 +185,23 @@ class DegradedAllocator(Allocator):
             for i in self.stuck:
                 components[2 * i] = max(components[2 * i], 0.0)
         return components, self._rest(columns, components, wrench) < RESIDUAL
+
+
+def _bounded_step(jacobian, error, pull, towards, low, high):
+    """Damped least-squares step (8,) within bounds: those that it would cross hold it."""
+    step = np.zeros(len(pull))
+    free = high > low
+    for _ in range(ROTORS):
+        columns, weight = jacobian[:, free], pull[free] ** 2
+        rest = error - jacobian[:, ~free] @ step[~free]
+        step[free] = np.linalg.solve(columns.T @ columns + np.diag(weight),
+                                     columns.T @ rest + weight * towards[free])
+        outside = (step < low) | (step > high)
+        step = np.clip(step, low, high)
+        if not (outside & free).any():
+            break
+        free &= ~outside
+    return step
 
 
 def allocator(robot: RobotParameters, health: ActuatorHealth = ALL_WELL) -> Allocator:
