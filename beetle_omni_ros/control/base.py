@@ -8,6 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+
 ROTORS = 4
 
 
@@ -167,6 +169,9 @@ class Controller(Protocol):
 
     def reset(self) -> None:
         """Forget all memory, as before the first step."""
+
+    def set_health(self, health: ActuatorHealth) -> None:
+        """Fly with what is left from now on; who cannot leaves it to those who can."""
 
     def step(self, state: State, target: Target) -> Command:
         """One command for one state."""

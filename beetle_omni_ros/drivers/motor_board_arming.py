@@ -38,7 +38,8 @@ class Arming:
         self.phase = RESTS
 
     def follow(self, state: str) -> None:
-        """Take the supervisor's ``state`` and act on it at once."""
+        """Take the supervisor's ``state``, perhaps with a fault's name, and act on it at once."""
+        state = state.partition(':')[0]
         before, self._supervisor = self._supervisor, state
         if state in RESTING:
             if self.phase != LOST or state == DISARMED:

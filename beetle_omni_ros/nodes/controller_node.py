@@ -44,7 +44,7 @@ class ControllerNode(FlightNode):
         super().__init__(f'{controller_name}_node', parameter_class, file, file_key)
         self._controller: Controller = self.make_controller(self.parameters)
         self._target = self._joints = self._command = None
-        self._hold = None
+        self._hold = self._wish = None
         self._mode, self._own_mode = '', f'flying:{controller_name}'
         self._last_step = 0.0
         self._publisher = self.create_publisher(JointState, f'{controller_name}/command',
@@ -62,6 +62,10 @@ class ControllerNode(FlightNode):
         self.listen(MultiDOFJointTrajectory, 'target_trajectory', targets.trajectory_target,
                     self._on_target, qos.EVENT, stale_after=None)
         self.create_subscription(String, 'supervisor/state', self._on_mode, qos.LATCHED)
+        self.listen(MultiDOFJointTrajectory, 'supervisor/target', targets.wished_target,
+                    self._on_wish, qos.LATCHED, stale_after=None)
+        self.listen(JointState, 'supervisor/actuators', convert.actuator_health,
+                    self._controller.set_health, qos.LATCHED, stale_after=None)
         self.health.track_compute(self._controller.period)
         self.health.report('controller', self._controller_status)
 
@@ -88,10 +92,14 @@ class ControllerNode(FlightNode):
             return replace(target, stamp=now)
         return replace(target, stamp=now, times=target.times + now)
 
+    def _on_wish(self, wish):
+        self._wish = wish.target
+
     def _on_mode(self, message):
-        if message.data in ('disarmed', 'emergency_stop') and self._mode != message.data:
+        state = message.data.partition(':')[0]
+        if state in ('disarmed', 'emergency_stop') and self._mode.partition(':')[0] != state:
             self._controller.reset()
-            self._command = self._hold = None
+            self._command = self._hold = self._wish = None
         self._mode = message.data
 
     def _on_odom(self, odom):
@@ -102,7 +110,8 @@ class ControllerNode(FlightNode):
         if self._target is None:
             if self._hold is None or not self._mode.startswith('flying'):
                 self._hold = PoseTarget(odom.position, odom.quaternion, odom.stamp)
-        command = self.timed(self._controller.step, state, self._target or self._hold)
+        target = self._wish or self._target or self._hold
+        command = self.timed(self._controller.step, state, target)
         self._publisher.publish(convert.command_message(command))
 
     def _is_due(self, stamp):

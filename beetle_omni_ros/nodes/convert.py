@@ -9,7 +9,7 @@ for shape and finiteness here, once, and refused with :class:`MessageError`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, isnan
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import (
@@ -26,6 +26,7 @@ from sensor_msgs.msg import BatteryState, Imu, JointState
 from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 
 WORLD, BODY = 'world', 'base_link'
@@ -229,6 +230,30 @@ def rotor_message(stamp: float, speed: np.ndarray) -> JointState:
     message = JointState(name=list(ROTOR_NAMES), velocity=_floats(speed))
     _header(message, stamp, '')
     return message
+
+
+def rotors(message: JointState) -> tuple[float, np.ndarray]:
+    """Read stamp [s] and the four rotors' speeds (4,) [rad/s]; NaN unknown."""
+    if list(message.name) != list(ROTOR_NAMES) or len(message.velocity) != len(ROTOR_NAMES):
+        raise MessageError(f'expected velocities of {list(ROTOR_NAMES)}')
+    return seconds(message.header.stamp), np.array(message.velocity, dtype=float)
+
+
+def health_message(stamp: float, health: ActuatorHealth) -> JointState:
+    """Write which actuators work: the angles of stuck joints, NaN of others, and 1 or 0."""
+    stuck = [np.nan if angle is None else float(angle) for angle in health.stuck]
+    message = JointState(name=[*JOINT_NAMES, *ROTOR_NAMES], position=[*stuck, *[np.nan] * 4],
+                         effort=[*[np.nan] * 4, *map(float, health.rotors)])
+    _header(message, stamp, '')
+    return message
+
+
+def actuator_health(message: JointState) -> ActuatorHealth:
+    """Read which actuators work."""
+    if len(message.position) != 8 or len(message.effort) != 8:
+        raise MessageError('expected four joints and four rotors')
+    return ActuatorHealth(tuple(bool(works) for works in message.effort[4:]), tuple(
+        None if isnan(angle) else float(angle) for angle in message.position[:4]))
 
 
 def battery(message: BatteryState) -> Battery:

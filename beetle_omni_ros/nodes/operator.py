@@ -72,7 +72,8 @@ class Operator:
         return time.monotonic() if self._simulated is None else self._simulated
 
     def _on_state(self, message):
-        self.state = message.data
+        state = message.data.partition(':')[0]
+        self.state = message.data if state == 'flying' else state
         self.states.append(message.data)
 
     def _on_progress(self, message):

@@ -75,7 +75,8 @@ class ReferenceNode(FlightNode):
         if self._state == 'waiting' and message.data.startswith('flying'):
             self._player = TaskPlayer(self._task, self.now())
             self.get_logger().info(f"task '{self._task.name}', {self._task.ends[-1]:g} s")
-        elif self._player and message.data in ('landing', 'disarmed', 'emergency_stop'):
+        elif self._player and message.data.partition(':')[0] in (
+                'landing', 'disarmed', 'emergency_stop'):
             self._player = None
             self._set_state('aborted')
 

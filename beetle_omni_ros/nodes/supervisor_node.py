@@ -10,11 +10,13 @@ import numpy as np
 from sensor_msgs.msg import BatteryState, Imu, JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.control.hover import HoverController
-from beetle_omni_ros.nodes import convert, health, qos, runner
+from beetle_omni_ros.nodes import convert, health, qos, runner, targets
 from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.robot.actuator_health import ALL_WELL
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.safety.events import ERROR, WARNING
@@ -57,6 +59,10 @@ class SupervisorNode(FlightNode):
         self._state = ''
         self._publisher = self.create_publisher(JointState, 'command', qos.COMMAND)
         self._states = self.create_publisher(String, 'supervisor/state', qos.LATCHED)
+        self._targets = self.create_publisher(MultiDOFJointTrajectory, 'supervisor/target',
+                                              qos.LATCHED)
+        self._actuators = self.create_publisher(JointState, 'supervisor/actuators', qos.LATCHED)
+        self._wish, self._healthy = None, ALL_WELL
         self._listen()
         for name in ('arm', 'disarm', 'land', 'emergency_stop'):
             self.create_service(Trigger, f'~/{name}', self._request(name))
@@ -73,6 +79,8 @@ class SupervisorNode(FlightNode):
             s.stamp, s.specific_force, s.angular_velocity), max_age=SENSOR_AGE)
         self.listen(PoseStamped, 'mocap/pose', convert.pose_sample, lambda s: supervisor.on_mocap(
             s.stamp, s.position, s.quaternion), max_age=SENSOR_AGE)
+        self.listen(JointState, 'rotor_states', convert.rotors,
+                    lambda speeds: supervisor.on_rotors(*speeds), stale_after=None)
         self.listen(BatteryState, 'battery_state', convert.battery,
                     lambda b: supervisor.on_battery(b.voltage))
         for name in CONTROLLERS:
@@ -136,11 +144,16 @@ class SupervisorNode(FlightNode):
 
     def _tell(self):
         supervisor = self._supervisor
-        state = f'{FLYING}:{supervisor.active}' if supervisor.state == FLYING \
-            else supervisor.state
+        state = supervisor.told
         if state != self._state:
             self._state = state
             self._states.publish(String(data=state))
+        if supervisor.wish is not self._wish:
+            self._wish = supervisor.wish
+            self._targets.publish(targets.wish_message(self._wish))
+        if supervisor.health is not self._healthy:
+            self._healthy = supervisor.health
+            self._actuators.publish(convert.health_message(self.now(), self._healthy))
         for event in supervisor.events:
             self._log(event)
         supervisor.events.clear()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from geometry_msgs.msg import PoseStamped, Transform, Twist
 import numpy as np
 from trajectory_msgs.msg import MultiDOFJointTrajectory, MultiDOFJointTrajectoryPoint
@@ -52,6 +54,23 @@ def trajectory_target(message: MultiDOFJointTrajectory) -> TrajectoryTarget:
         finite(np.array([xyz(p.velocities[0].linear) for p in points]), 'velocity'),
         finite(np.array([xyz(p.velocities[0].angular) for p in points]), 'angular velocity'),
         stamp=start)
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What the supervisor wants flown in place of the operator's target, or None."""
+
+    target: TrajectoryTarget | None
+
+
+def wished_target(message: MultiDOFJointTrajectory) -> Wish:
+    """Read the supervisor's target; a message without points takes it back."""
+    return Wish(trajectory_target(message) if message.points else None)
+
+
+def wish_message(target: TrajectoryTarget | None) -> MultiDOFJointTrajectory:
+    """Write the supervisor's target; None takes it back."""
+    return MultiDOFJointTrajectory() if target is None else target_message(target)
 
 
 def target_message(target: PoseTarget | TrajectoryTarget) -> PoseStamped | MultiDOFJointTrajectory:

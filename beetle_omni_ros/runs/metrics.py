@@ -131,7 +131,7 @@ def _shares(changes, begin, end):
 def _landing(log, after):
     """When the robot began to land or was switched off, after ``after`` [s]."""
     return next((float(t) for t, state in zip(log.state_t, log.states, strict=True)
-                 if t > after and state in ('landing', 'disarmed')), np.inf)
+                 if t > after and state.partition(':')[0] in ('landing', 'disarmed')), np.inf)
 
 
 def _judge(log, task, flown, expected):
@@ -195,7 +195,7 @@ def _crashed(log, body, flown):
         position = body.position[body.window(begin, end)]
         if not np.all(np.isfinite(position)) or np.any(position[:, 2] < GROUND_HEIGHT):
             return True
-        if any(begin <= t <= end and state == 'emergency_stop'
+        if any(begin <= t <= end and state.startswith('emergency_stop')
                for t, state in zip(log.state_t, log.states, strict=True)):
             return True
     return False

@@ -7,14 +7,20 @@ from math import inf, isfinite
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Command, Controller, Reference
-from beetle_omni_ros.control.levelling import plan
+from beetle_omni_ros.control.base import Command, Controller, Reference, TrajectoryTarget
+from beetle_omni_ros.control.levelling import plan, Way
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.holding import Holding
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import ERROR, EventLog
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.ramp import inclination, Ramp
 from beetle_omni_ros.safety.support import SupportGauge
 from beetle_omni_ros.safety.vehicle import Vehicle
+
+AHEAD, BETWEEN = 20.0, 0.1      # [s] how far ahead, and how densely, a way is told
 
 
 class Landing:
@@ -23,6 +29,7 @@ class Landing:
 
     Args:
         parameters: rates and thresholds.
+        robot: as believed.
         hover: the controller that flies it.
         allocator: of the robot.
         gauge: what the rotors carry.
@@ -36,14 +43,31 @@ class Landing:
 
     """
 
-    def __init__(self, parameters: SupervisorParameters, hover: Controller, allocator: Allocator,
-                 gauge: SupportGauge, vehicle: Vehicle, events: EventLog, floor: float = 0.0):
+    def __init__(self, parameters: SupervisorParameters, robot: RobotParameters,
+                 hover: Controller, allocator: Allocator, gauge: SupportGauge, vehicle: Vehicle,
+                 events: EventLog, floor: float = 0.0):
         self._parameters, self._blind_limit = parameters.landing, parameters.state.blind_limit
         self._allocator, self._floor = allocator, floor
         self._hover, self._gauge, self._vehicle, self._events = hover, gauge, vehicle, events
         self.grounded, self.given_up = False, ''
         self._standing_for, self._blind_for = 0.0, 0.0
         self._blind = False
+        self._robot, self._health = robot, ALL_WELL
+
+    @property
+    def way(self) -> TrajectoryTarget:
+        """Where it goes, for a controller that can fly a trajectory."""
+        ramp = self._ramp
+        times = ramp.stamp + np.arange(0.0, ramp.wait + AHEAD, BETWEEN)
+        samples = [ramp.at(time) for time in times]
+        return TrajectoryTarget(times, *(np.array([getattr(one, name) for one in samples]) for name
+                                in ('position', 'quaternion', 'velocity', 'angular_velocity')),
+                                ramp.stamp)
+
+    def degrade(self, health: ActuatorHealth, now: float, in_force: Command | None) -> None:
+        """Go on with the actuators that are left."""
+        self._health = health
+        self.set_out(now, in_force)
 
     def start(self, now: float, in_force: Command | None, distrusted: bool = False) -> None:
         """
@@ -98,7 +122,8 @@ class Landing:
         state = vehicle.backup_state(now) if vehicle.backup.running else vehicle.seen(in_force)
         p, blind = self._parameters, self._without_mocap
         level = replace(p.level, rate=p.blind_level_rate) if blind else p.level
-        way = plan(state.quaternion, state.tilt, self._allocator, level)
+        way = plan(state.quaternion, state.tilt, self._allocator, level) if self._health.healthy \
+            else self._way_with_what_is_left(state.quaternion, level.rate)
         wait = way.duration if inclination(state.quaternion) > p.level_first else 0.0
         height = max(0.0, state.position[2] - self._floor)
         fast = max(0.0, height - p.flare_height) if blind else 0.0
@@ -107,6 +132,15 @@ class Landing:
             else (-inf, p.speed, p.acceleration)))
         self._due = now + wait + (height - fast) / p.speed + (
             self._ramp.duration - wait if fast else 0.0)
+
+    def _way_with_what_is_left(self, quaternion, rate):
+        """To the attitude nearest level that leaves a margin, by attitudes that can be held."""
+        holding = Holding(self._robot, self._health)
+        level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(quaternion)[2])
+        goal = holding.nearest(level, holding.parameters.flying_margin)
+        attitudes = holding.way(quaternion, goal)
+        turns = [rotations.geodesic_angle(b, a) for a, b in zip(attitudes[:-1], attitudes[1:])]
+        return Way(np.concatenate([[0.0], np.cumsum(np.maximum(turns, 1e-3) / rate)]), attitudes)
 
     @property
     def _without_mocap(self):
@@ -137,7 +171,7 @@ class Landing:
         reference = replace(reference, velocity=velocity, position=np.array(
             [*reference.position[:2], height]))
         self._feel_ground(state, dt, specific_force_up, reference)
-        # Differences of rates that come from MoCap alone are late and noisy: nothing to learn from.
+        # Rates from MoCap alone are late and noisy: nothing to learn from.
         self._hover.observe(state, free=self._vehicle.backup.imu_alive)
         return self._hover.step(state, _Now(reference))
 

@@ -34,6 +34,11 @@ class Selection:
         """The active controller's commands."""
         return self._streams[self.active]
 
+    def good(self, controller: str) -> Command | None:
+        """The latest command of a controller that may be given control, else None."""
+        stream = self._streams.get(controller)
+        return stream.accepted if stream is not None and stream.good else None
+
     def offer(self, controller: str, command: Command, now: float) -> str:
         """Check one command; '' when it is good, else the reason (counted)."""
         if controller not in self._streams:

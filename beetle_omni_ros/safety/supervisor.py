@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Command, Controller, PoseTarget
+from beetle_omni_ros.control.base import Command, Controller, PoseTarget, Target
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
 from beetle_omni_ros.safety.handover import Handover
@@ -24,6 +25,7 @@ from beetle_omni_ros.safety.watch.faults import CRASH
 
 DISARMED, TAKEOFF, FLYING = 'disarmed', 'takeoff', 'flying'
 FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
+PILOT = 'nmpc'      # flies with actuators missing, where it is good; else the hover law
 IN_FLIGHT = (TAKEOFF, FLYING, FALLBACK, LANDING)
 
 
@@ -56,6 +58,7 @@ class Supervisor(Inputs):
         self._target: PoseTarget | None = None
         self._stop_left = 0.0
         self._landing_for = self._fallback_for = 0.0
+        self._health, self._landing_way = ALL_WELL, None
         self._before = None     # time of the update before [s]
 
     # Requests ---------------------------------------------------------------------------------
@@ -72,6 +75,8 @@ class Supervisor(Inputs):
         self._in_force = None
         self._floor = float(self.vehicle.state.position[2])
         self.watch.reset()
+        self._health = ALL_WELL
+        self._hover.set_health(ALL_WELL)
         self._landing_for = self._fallback_for = 0.0
         return self._enter(TAKEOFF, now, INFO, 'armed: takeoff')
 
@@ -175,6 +180,37 @@ class Supervisor(Inputs):
             self._resume(now, paused)
         if self.watch.contact:
             self._crash(now, self.watch.contact)
+        elif self.watch.health != self._health:
+            self._degrade(now)
+
+    def _degrade(self, now):
+        """Fly with what is left: land in the attitude nearest level that leaves a margin."""
+        moved = _same_actuators(self._health, self.watch.health)
+        self._health = health = self.watch.health
+        self._hover.set_health(health)
+        if self.state != LANDING:
+            self._land(now, ERROR, f"{', '.join(self.faults)}: landing with what is left")
+        if self.state == LANDING and not moved:
+            self._landing.degrade(health, now, self._in_force)
+            self._landing_way = self._landing.way
+
+    @property
+    def told(self) -> str:
+        """The state with its controller ('flying:nmpc') or its last fault ('landing:crash')."""
+        if self.state == FLYING:
+            return f'{FLYING}:{self.active}'
+        fault = next(reversed(self.faults), '') if self.state != TAKEOFF else ''
+        return f'{self.state}:{fault}' if fault else self.state
+
+    @property
+    def health(self) -> ActuatorHealth:
+        """Which actuators work; controllers that can fly without some are told."""
+        return self._health
+
+    @property
+    def wish(self) -> Target | None:
+        """What controllers shall fly to in place of the operator's target, or None."""
+        return self._landing_way if self.state == LANDING else None
 
     def _resume(self, now, paused):
         """After a pause of this process, in which the actuators have stopped."""
@@ -315,6 +351,10 @@ class Supervisor(Inputs):
         if self._landing.given_up:
             self.emergency_stop(now, self._landing.given_up)
             return self._stand(now, dt)
+        pilot = self._selection.good(PILOT) if self._landing_way is not None else None
+        if pilot is not None and not self.vehicle.backup.running:
+            self.source = PILOT
+            command = self._handover.limit(pilot, self._in_force)
         if self._landing.grounded:
             self._motors_off(DISARMED, now, INFO, 'on the ground: motors off, disarmed')
             return self._stand(now, dt)
@@ -333,8 +373,9 @@ class Supervisor(Inputs):
         if self._on_ground:
             return self._motors_off(DISARMED, now, severity, f'{text}; still on the ground: '
                                                              'motors off')
-        self._landing = Landing(self._parameters, self._hover, self._allocator, self._gauge,
-                                self.vehicle, self.events, self._floor)
+        self._landing = Landing(self._parameters, self._robot, self._hover, self._allocator,
+                                self._gauge, self.vehicle, self.events, self._floor)
+        self._landing_way = None
         answer = self._enter(LANDING, now, severity, text)
         self._landing.start(now, self._in_force, 'estimator_wrong' in self.faults)
         return answer
@@ -382,3 +423,9 @@ class Supervisor(Inputs):
     def _refuse(self, now, text):
         self._say(now, WARNING, text)
         return Answer(False, text)
+
+
+def _same_actuators(before, after):
+    """Whether only angles of stuck joints differ."""
+    return before.rotors == after.rotors and [a is None for a in before.stuck] \
+        == [a is None for a in after.stuck]
