@@ -17,6 +17,7 @@ import json
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State
+from beetle_omni_ros.control.feasible import feasible_target
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.robot import rotations
@@ -167,7 +168,8 @@ class Flight:
         alive = self.lose()
         truth = self.body.sim.truth
         margin = self.holding.parameters.flying_margin
-        wish = self.holding.nearest(truth.quaternion, margin)
+        wish = self.holding.quickest(truth.quaternion, truth.angular_velocity, truth.tilt,
+                                     margin)
         target = PoseTarget(self.case.second.position, wish)
         lost_at = len(self.trace)
         alive = alive and self.fly(target, self.case.loss + RECOVERY, watch=True)
@@ -183,6 +185,14 @@ class Flight:
                 'margin_at_loss': self.holding.margin(truth.quaternion),
                 'lowest_m': float(trace[lost_at - 10:, 3].min()),
                 'time_s': float(self.body.sim.time - self.case.loss)}, target
+
+    def pose(self):
+        """Fly to what is feasible of the pose asked for; how far off at the end, or None."""
+        target = feasible_target(self.case.second, self.told, self.robot, self.holding)
+        if not self.fly(target, self.body.sim.time + RECOVERY, watch=True):
+            return None
+        last = np.array(self.trace)[-round(HELD / self.flying.period):, 7:]
+        return [float(last[:, 0].max()), float(np.degrees(last[:, 1].max()))]
 
     def land(self, target):
         """Sink in the attitude of ``target``; speed at the first touch [m/s] or None."""
@@ -201,6 +211,8 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0].strip())
     parser.add_argument('--cases', type=int, default=12)
     parser.add_argument('--first', type=int, default=0, help='number of the first case')
+    parser.add_argument('--only', type=int, nargs='*',
+                        help='numbers of the cases, in place of these')
     parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--what', choices=('rotor', 'servo'), default='rotor')
     parser.add_argument('--from', dest='start', choices=('hover', 'random'), default='hover')
@@ -209,24 +221,28 @@ def main():
     parser.add_argument('--told-after', type=float, default=0.1,
                         help='from the loss until the controller knows [s]')
     parser.add_argument('--conditions', choices=('nominal', 'published'), default='nominal')
+    parser.add_argument('--poses', action='store_true',
+                        help='afterwards fly to what is feasible of the pose asked for')
     parser.add_argument('--json', help='write all rows into this file')
     arguments = parser.parse_args()
     robot = RobotParameters.load()
     controllers = {'nmpc': NmpcController(robot), 'hover': HoverController(robot)}
     rows = []
     print('case alive held    m    deg  upright height  turn margin lowest touchdown')
-    for number in range(arguments.first, arguments.first + arguments.cases):
+    for number in arguments.only or range(arguments.first,
+                                          arguments.first + arguments.cases):
         case = draw(arguments.what, arguments.start, number, arguments.seed, arguments.stuck_at)
         flight = Flight(robot, case, controllers, arguments, number)
         row, target = flight.recover()
         row['case'] = number
+        row['pose_m_deg'] = flight.pose() if row['alive'] and arguments.poses else None
         row['touchdown_m_s'] = flight.land(target) \
             if row['alive'] and arguments.start == 'hover' else None
         rows.append(row)
         print(f"{number:4d} {row['alive']!s:5} {row['held']!s:5} {row['position_m']:5.3f} "
               f"{row['attitude_deg']:5.1f} {row['upright']:7.2f} {row['height_m']:6.2f} "
               f"{row['turn_deg']:5.0f} {row['margin_at_loss']:6.2f} {row['lowest_m']:6.2f} "
-              f"{row['touchdown_m_s']}", flush=True)
+              f"{row['touchdown_m_s']} {row['pose_m_deg']}", flush=True)
     alive, held = (sum(row[key] for row in rows) for key in ('alive', 'held'))
     print(f'{arguments.what}, from {arguments.start}, {arguments.controller}: '
           f'{alive} of {len(rows)} in the air, {held} hold the pose')

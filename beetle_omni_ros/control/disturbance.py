@@ -24,7 +24,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
 SHORT = 0.002           # [s] nearer to an end of a span a command changes there
-UNNOTICED = 0.3     # [s] what was learnt since so long before a fault was named was the fault itself
+UNNOTICED = 0.3     # [s] what was learnt since then, before a fault was named, was the fault
 HISTORY = 64        # states and commands kept, far more than any latency needs
 
 

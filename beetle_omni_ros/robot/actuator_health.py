@@ -36,7 +36,7 @@ class ActuatorHealth:
         return all(self.rotors) and all(angle is None for angle in self.stuck)
 
     def possible(self, tilt: np.ndarray, thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What remains of tilts (4,) [rad] and thrusts (4,) [N]: stuck angles, lost rotors at 0."""
+        """Tilts (4,) [rad] and thrusts (4,) [N] with stuck joints and lost rotors as they are."""
         angles = [own if angle is None else angle for own, angle in zip(tilt, self.stuck)]
         return np.array(angles, dtype=float), np.where(self.rotors, thrust, 0.0)
 

@@ -36,7 +36,7 @@ class LocalWeights:
                               high=100)
     tilt_reach: float = parameter(0.6, doc='of tilts from the present ones', unit='rad',
                                   low=0.01, high=4)
-    iterations: int = parameter(4, doc='of Gauss-Newton', low=1, high=20)
+    iterations: int = parameter(6, doc='of Gauss-Newton', low=1, high=20)
     missed: float = parameter(3.0, doc='acceleration short of the wished one that counts as '
                               'saturation', unit='m/s^2', low=0, high=20)
 
@@ -139,17 +139,30 @@ class DegradedAllocator(Allocator):
         pull = np.r_[np.full(ROTORS, weights.tilt), np.full(ROTORS, weights.thrust)]
         goal = np.r_[aim.tilt, aim.thrust]
         z = np.clip(np.r_[centre, aim.thrust], low, high)
+        made, cost = self._made(matrix, z), np.inf
         for _ in range(weights.iterations):
             cos, sin = np.cos(z[:ROTORS]), np.sin(z[:ROTORS])
             along = matrix[:, 0::2] * cos + matrix[:, 1::2] * sin
             across = (matrix[:, 1::2] * cos - matrix[:, 0::2] * sin) * z[ROTORS:]
-            jacobian = np.hstack([across, along])
-            error = wrench - along @ z[ROTORS:]
-            z = z + _bounded_step(jacobian, error, pull, goal - z, low - z, high - z)
-        cos, sin = np.cos(z[:ROTORS]), np.sin(z[:ROTORS])
-        made = (matrix[:, 0::2] * cos + matrix[:, 1::2] * sin) @ z[ROTORS:]
+            step = _bounded_step(np.hstack([across, along]), wrench - made, pull, goal - z,
+                                 low - z, high - z)
+            for share in (1.0, 0.5, 0.25):
+                tried = z + share * step
+                new = self._made(matrix, tried)
+                new_cost = np.sum((new - wrench) ** 2) + np.sum((pull * (goal - tried)) ** 2)
+                if new_cost < cost:
+                    break
+            else:
+                break
+            z, made, cost = tried, new, new_cost
         missed = np.linalg.norm(made - wrench) > weights.missed
         return Allocation(z[:ROTORS], z[ROTORS:], np.full(ROTORS, missed))
+
+    @staticmethod
+    def _made(matrix, z):
+        """(6,) wrench of tilts and thrusts (8,) by a scaled matrix."""
+        return matrix[:, 0::2] @ (z[ROTORS:] * np.cos(z[:ROTORS])) \
+            + matrix[:, 1::2] @ (z[ROTORS:] * np.sin(z[:ROTORS]))
 
     def _solved(self, wrench):
         """Best choice of stuck rotors: its columns and the (8,) components."""

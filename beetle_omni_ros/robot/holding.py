@@ -28,6 +28,7 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter
 
 BISECTIONS = 5          # towards a wished attitude: 6 deg / 2^5
+LITTLE = 1.0            # [N] a rotor with less may turn its joint later
 GOLDEN = np.pi * (1 + np.sqrt(5))
 
 
@@ -42,6 +43,10 @@ class HoldingParameters:
                                 high=10000)
     flying_margin: float = parameter(2.0, doc='of the attitude to fly in',
                                      unit='m/s^2, rad/s^2', low=0, high=20)
+    turn_rate: float = parameter(6.0, doc='at which the body turns', unit='rad/s', low=0.1,
+                                 high=50)
+    coast_time: float = parameter(0.1, doc='of a turn that is being stopped, at its first rate',
+                                  unit='s', low=0, high=1)
     holding_margin: float = parameter(1.0, doc='with which a wished attitude is held as it is',
                                       unit='m/s^2, rad/s^2', low=0, high=20)
 
@@ -74,7 +79,8 @@ class Holding:
         self._allocator = DegradedAllocator(robot, health)
         self._scale = 1 / np.r_[np.full(3, self._allocator.mass), robot.inertia]
         self.directions = sphere(self.parameters.directions)
-        self.margins = self._margins(self.directions)
+        self._tilts, self._thrusts, met = self._held(self.directions)
+        self.margins = self._measured(self._tilts, self._thrusts, met)
 
     def margin(self, quaternion: np.ndarray) -> float:
         """Margin of one attitude (4,) [m/s^2, rad/s^2], 0 where it cannot be held."""
@@ -109,8 +115,43 @@ class Holding:
             low, high = (low, middle) if self.margin(way) >= margin else (middle, high)
         return rotations.normalized(rotations.multiply(quaternion, rotations.exp(high * whole)))
 
+    def quickest(self, quaternion: np.ndarray, angular_velocity: np.ndarray, tilt: np.ndarray,
+                 margin: float) -> np.ndarray:
+        """
+        Attitude with a margin that is reached soonest: how far body and joints have to turn.
+
+        Args:
+            quaternion: (4,) present.
+            angular_velocity: (3,) in base_link [rad/s]; the turn that it leads to counts.
+            tilt: (4,) present [rad].
+            margin: [m/s^2, rad/s^2].
+
+        Returns:
+            (4,) quaternion: where the present turn comes to a stop, leaned.
+
+        """
+        p = self.parameters
+        quaternion = rotations.multiply(quaternion,
+                                        rotations.exp(p.coast_time * angular_velocity))
+        firm = np.flatnonzero(self.margins >= margin)
+        if not firm.size:
+            firm = np.array([np.argmax(self.margins)])
+        angle = np.arccos(np.clip(self.directions[firm] @ up(quaternion), -1.0, 1.0))
+        travel = np.abs(self._on_nearest_turn(self._tilts[firm], tilt) - tilt)
+        travel[self._thrusts[firm] < LITTLE] = 0.0
+        time = angle / p.turn_rate + travel.max(axis=1) / p.tilt_rate
+        return leaned(quaternion, self.directions[firm[np.argmin(time)]])
+
+    def _on_nearest_turn(self, tilt, present):
+        """Tilts (N, 4) on the legal turn nearest the present ones (4,)."""
+        limit = self._robot.joints.position_limit
+        turned = tilt + 2 * np.pi * np.round((present - tilt) / (2 * np.pi))
+        return np.where(np.abs(turned) > limit, turned - 2 * np.pi * np.sign(turned), turned)
+
     def _margins(self, directions):
-        tilt, thrust, met = self._held(directions)
+        return self._measured(*self._held(directions))
+
+    def _measured(self, tilt, thrust, met):
         limit = self._robot.rotors.thrust_max
         jacobian = self._jacobian(tilt, thrust)
         squared = jacobian @ jacobian.transpose(0, 2, 1) + 1e-9 * np.eye(6)

@@ -1,0 +1,138 @@
+"""Hover law and NMPC with a rotor lost or a servo stuck: commands, recovery, targets."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
+from beetle_omni_ros.control.call import FunctionCall
+from beetle_omni_ros.control.feasible import feasible_target
+from beetle_omni_ros.control.hover import HoverController
+from beetle_omni_ros.control.nmpc import NmpcController
+from beetle_omni_ros.robot import dynamics as model
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.holding import best_attitude, Holding
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+ROBOT = RobotParameters.load()
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+LOST = ActuatorHealth(rotors=(True, False, True, True))
+STUCK = ActuatorHealth(stuck=(None, None, 0.8, None))
+PLACE = np.array([0.0, 0.0, 2.0])
+
+
+class Body:
+    """The CasADi model with broken actuators; a command acts 10 ms after its state."""
+
+    def __init__(self):
+        self.advance = FunctionCall(model.integrator(ROBOT, 4), None)
+        self.x = np.zeros(25)
+        self.x[:3], self.x[9], self.x[21:] = PLACE, 1.0, ROBOT.hover_thrust
+        self.time, self.broken = 0.0, ALL_WELL
+        self.command = Command(-0.01, self.x[model.TILT], self.x[model.THRUST])
+        self.lowest = np.inf
+
+    def fly(self, controller, target, seconds):
+        for _ in range(round(seconds / 0.01)):
+            x = self.x
+            following = controller.step(
+                State(self.time, x[:3], x[3:6], x[6:10], x[10:13], x[13:17], x[17:21], self.time,
+                      self.command), target)
+            acting = self.broken.possible(self.command.tilt, self.command.thrust)
+            self.x = self.advance(x, np.concatenate(acting), np.zeros(10), 0.01)
+            self.command, self.time = following, self.time + 0.01
+            self.lowest = min(self.lowest, self.x[2])
+        return self
+
+
+@pytest.fixture(scope='module')
+def nmpc():
+    return NmpcController(ROBOT)
+
+
+@pytest.fixture(params=['nmpc', 'hover'])
+def controller(request, nmpc):
+    chosen = nmpc if request.param == 'nmpc' else HoverController(ROBOT)
+    chosen.set_health(ALL_WELL)
+    chosen.reset()
+    return chosen
+
+
+@pytest.mark.parametrize('health', [LOST, STUCK])
+def test_recovers_from_hover_and_holds_the_attitude_to_fly_in(controller, health):
+    body = Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.5)
+    body.broken = health
+    body.fly(controller, PoseTarget(PLACE, LEVEL), 0.1)
+    controller.set_health(health)
+    target = PoseTarget(PLACE, best_attitude(ROBOT, health, LEVEL))
+    body.fly(controller, target, 7.0)
+    assert body.lowest > 1.4
+    assert np.linalg.norm(body.x[:3] - PLACE) < 0.03
+    assert rotations.geodesic_angle(body.x[6:10], target.quaternion) < np.radians(2)
+
+
+@pytest.mark.parametrize('health', [LOST, STUCK])
+def test_commands_keep_to_what_is_left_from_the_first_step(controller, health):
+    body = Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.2)
+    controller.set_health(health)
+    for _ in range(5):
+        body.fly(controller, PoseTarget(PLACE, rotations.from_rpy(0.5, -0.3, 0.2)), 0.01)
+        tilt, thrust = health.possible(body.command.tilt, body.command.thrust)
+        np.testing.assert_array_equal(body.command.tilt, tilt)
+        np.testing.assert_array_equal(body.command.thrust, thrust)
+
+
+def test_a_repaired_controller_commands_as_one_that_never_failed(controller):
+    fresh = Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.3).command
+    controller.set_health(LOST)
+    Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.3)
+    controller.set_health(ALL_WELL)
+    controller.reset()
+    again = Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.3).command
+    np.testing.assert_array_equal(fresh.tilt, again.tilt)
+    np.testing.assert_array_equal(fresh.thrust, again.thrust)
+
+
+def test_the_estimator_forgets_what_it_learnt_from_the_loss(nmpc):
+    nmpc.set_health(ALL_WELL)
+    nmpc.reset()
+    body = Body().fly(nmpc, PoseTarget(PLACE, LEVEL), 0.5)
+    body.broken = LOST
+    body.fly(nmpc, PoseTarget(PLACE, LEVEL), 0.1)
+    assert np.linalg.norm(nmpc.disturbance[model.TORQUE]) > 0.1
+    nmpc.set_health(LOST)
+    assert np.linalg.norm(nmpc.disturbance[model.TORQUE]) < 0.01
+
+
+def test_the_plan_knows_the_bounds(nmpc):
+    nmpc.set_health(ALL_WELL)
+    nmpc.reset()
+    body = Body().fly(nmpc, PoseTarget(PLACE, LEVEL), 0.3)
+    nmpc.set_health(LOST)
+    body.fly(nmpc, PoseTarget(PLACE, best_attitude(ROBOT, LOST, LEVEL)), 0.1)
+    assert np.abs(nmpc.predicted_states[:, 18]).max() < 0.01
+    assert nmpc.diagnostics()['unsolved'] == 0
+
+
+def test_a_feasible_pose_is_held_firmly_at_the_same_place():
+    for health in (LOST, STUCK):
+        wished = PoseTarget(PLACE, rotations.from_rpy(1.4, 0.3, 0.7), 3.0)
+        got = feasible_target(wished, health, ROBOT)
+        np.testing.assert_array_equal(got.position, PLACE)
+        assert got.stamp == 3.0
+        assert Holding(ROBOT, health).margin(got.quaternion) >= 1.0 - 1e-9
+    assert feasible_target(wished, ALL_WELL, ROBOT) is wished
+
+
+def test_a_trajectory_that_cannot_be_held_is_flown_in_one_attitude():
+    times = np.linspace(0.0, 2.0, 5)
+    quaternions = np.array([rotations.from_rpy(0.8 * t, 0.0, 0.0) for t in times])
+    wished = TrajectoryTarget(times, np.outer(times, [1.0, 0, 0]), quaternions,
+                              np.tile([1.0, 0, 0], (5, 1)), np.tile([0.8, 0, 0], (5, 1)))
+    got = feasible_target(wished, LOST, ROBOT)
+    np.testing.assert_array_equal(got.positions, wished.positions)
+    assert not got.angular_velocities.any()
+    assert Holding(ROBOT, LOST).margin(got.quaternions[0]) >= 2.0
+    still = TrajectoryTarget(times, wished.positions, np.tile(got.quaternions[0], (5, 1)),
+                             wished.velocities, np.zeros((5, 3)))
+    assert feasible_target(still, LOST, ROBOT) is still

@@ -1,0 +1,125 @@
+"""Allocation with what is left: residual, limits, idle and stuck actuators, agreement with all."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.allocation import Allocation, Allocator
+from beetle_omni_ros.robot.degraded_allocation import (
+    allocator,
+    DegradedAllocator,
+    LocalWeights,
+)
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+ROBOT = RobotParameters.load()
+LIMIT = ROBOT.joints.position_limit
+WEIGHTS = LocalWeights()
+
+
+def lost(*rotors):
+    return ActuatorHealth(rotors=tuple(i not in rotors for i in range(4)))
+
+
+def stuck(joint, angle):
+    return ActuatorHealth(stuck=tuple(angle if i == joint else None for i in range(4)))
+
+
+KINDS = [*[lost(i) for i in range(4)], *[stuck(i, 0.9 * i - 1.2) for i in range(4)], stuck(2, 3.5)]
+
+
+def draws(count, seed):
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        yield rng.normal(size=3) * 12, rng.normal(size=3) * 0.5, rng.uniform(-LIMIT, LIMIT, 4)
+
+
+def keeps_to(health, tilt, thrust):
+    assert all(thrust[i] == 0.0 for i in range(4) if not health.rotors[i])
+    assert all(tilt[i] == angle for i, angle in enumerate(health.stuck) if angle is not None)
+    assert np.all(np.abs(tilt) <= LIMIT)
+    assert np.all((thrust >= 0.0) & (thrust <= ROBOT.rotors.thrust_max))
+
+
+@pytest.mark.parametrize('health', KINDS)
+def test_makes_the_wrench_with_what_is_left_within_the_limits(health):
+    ours, met = allocator(ROBOT, health), 0
+    for force, torque, present in draws(100, 1):
+        got = ours.allocate(force, torque, present)
+        keeps_to(health, got.tilt, got.thrust)
+        if not got.saturated.any():
+            met += 1
+            made = Allocator(ROBOT).wrench(got.tilt, got.thrust)
+            np.testing.assert_allclose(np.concatenate(made), np.r_[force, torque], atol=0.01)
+    assert met > 60
+
+
+def test_with_all_actuators_it_is_the_healthy_allocation():
+    ours, healthy = DegradedAllocator(ROBOT, ALL_WELL), Allocator(ROBOT)
+    assert type(allocator(ROBOT)) is Allocator
+    for force, torque, present in draws(50, 2):
+        got, right = (a.allocate(force, torque, present) for a in (ours, healthy))
+        if not right.saturated.any():
+            np.testing.assert_allclose(got.tilt, right.tilt, atol=1e-9)
+            np.testing.assert_allclose(got.thrust, right.thrust, atol=1e-9)
+
+
+def test_a_stuck_rotor_that_would_have_to_pull_is_off():
+    health = stuck(0, np.pi)
+    got = allocator(ROBOT, health).hover(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(4))
+    assert got.thrust[0] == 0.0
+    assert not got.saturated.any()
+
+
+@pytest.mark.parametrize('health', [lost(0), stuck(1, 0.8)])
+def test_beyond_the_limits_it_comes_nearer_than_clipping(health):
+    ours = allocator(ROBOT, health)
+    scale = 1 / np.r_[np.full(3, ROBOT.mass), ROBOT.inertia]
+    nearer, clipped = [], []
+    for force, torque, present in draws(200, 3):
+        force, torque = 2 * force, 2 * torque
+        got = ours.allocate(force, torque, present)
+        if not got.saturated.any():
+            continue
+        wrench = np.concatenate([force, torque])
+        columns, inverse = ours.choices[0]
+        pairs = (inverse @ wrench).reshape(4, 2)
+        if any(pairs[i, 0] < 0 for i in ours.stuck):
+            continue
+        lengths = np.maximum(np.linalg.norm(pairs, axis=1), 1e-9)
+        pairs *= np.minimum(1.0, ROBOT.rotors.thrust_max / lengths)[:, None]
+        clipped.append(np.linalg.norm(scale * (columns @ pairs.ravel() - wrench)))
+        nearer.append(np.linalg.norm(scale * (np.concatenate(
+            ours.wrench(got.tilt, got.thrust)) - wrench)))
+    assert len(nearer) > 20
+    assert np.median(nearer) < 0.7 * np.median(clipped)
+
+
+@pytest.mark.parametrize('health', KINDS)
+def test_near_the_present_tilts_it_keeps_to_reach_and_health(health):
+    ours = allocator(ROBOT, health)
+    for force, torque, present in draws(40, 4):
+        present, _ = health.possible(present, np.zeros(4))
+        aim = ours.allocate(force, torque, present)
+        got = ours.allocate_near(force, torque, present, aim, WEIGHTS)
+        keeps_to(health, got.tilt, got.thrust)
+        assert np.all(np.abs(got.tilt - present) <= WEIGHTS.tilt_reach + 1e-9)
+
+
+def test_near_a_solution_it_stays_there():
+    health = lost(3)
+    ours = allocator(ROBOT, health)
+    attitude = rotations.from_rpy(0.25, 0.25, 0.0)
+    aim = ours.hover(attitude, np.zeros(4))
+    force = ours.weight @ rotations.matrix(attitude)
+    got = ours.allocate_near(force, np.zeros(3), aim.tilt,
+                             Allocation(aim.tilt, aim.thrust, aim.saturated), WEIGHTS)
+    np.testing.assert_allclose(got.tilt, aim.tilt, atol=1e-6)
+    np.testing.assert_allclose(got.thrust, aim.thrust, atol=1e-5)
+
+
+def test_health_refuses_what_is_not_four():
+    with pytest.raises(ValueError, match='four rotors'):
+        ActuatorHealth(rotors=(True,) * 3)
+    assert ALL_WELL.healthy and not lost(1).healthy and not stuck(0, 0.0).healthy

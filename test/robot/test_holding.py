@@ -1,0 +1,99 @@
+"""Which attitudes can be held: shares, singular places, the nearest firm one, heading."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.degraded_allocation import allocator
+from beetle_omni_ros.robot.holding import best_attitude, Holding, leaned, sphere, up
+from beetle_omni_ros.robot.parameters import RobotParameters
+
+ROBOT = RobotParameters.load()
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+LOST = ActuatorHealth(rotors=(False, True, True, True))
+STUCK = ActuatorHealth(stuck=(None, 1.5, None, None))
+
+
+@pytest.fixture(scope='module')
+def holdings():
+    return {health: Holding(ROBOT, health) for health in (ALL_WELL, LOST, STUCK)}
+
+
+def attitudes(count, seed=0):
+    return [rotations.normalized(q) for q in np.random.default_rng(seed).normal(size=(count, 4))]
+
+
+def test_a_healthy_robot_holds_every_attitude(holdings):
+    assert holdings[ALL_WELL].margins.min() > 0.0
+
+
+def test_with_a_rotor_lost_every_attitude_near_level_is_held_but_level_is_singular(holdings):
+    holding = holdings[LOST]
+    near = holding.directions[:, 2] > np.cos(np.radians(29))
+    tilt, thrust, met = holding._held(holding.directions[near])
+    assert met.all() and thrust.max() <= ROBOT.rotors.thrust_max
+    assert 0.55 < np.mean(holding.margins > 0) < 0.65
+    assert holding.margin(LEVEL) < 0.05
+
+
+@pytest.mark.parametrize('health', [LOST, STUCK])
+def test_what_has_a_margin_is_held_by_the_allocation(holdings, health):
+    ours = allocator(ROBOT, health)
+    for quaternion in attitudes(60):
+        if holdings[health].margin(quaternion) > 0:
+            got = ours.hover(quaternion, np.zeros(4))
+            force, torque = ours.wrench(got.tilt, got.thrust)
+            np.testing.assert_allclose(rotations.matrix(quaternion) @ force, ours.weight,
+                                       atol=0.01)
+            np.testing.assert_allclose(torque, 0.0, atol=0.01)
+
+
+def test_heading_does_not_matter(holdings):
+    for quaternion in attitudes(20):
+        turned = rotations.multiply(rotations.from_rpy(0, 0, 1.1), quaternion)
+        assert holdings[STUCK].margin(turned) == pytest.approx(holdings[STUCK].margin(quaternion))
+
+
+@pytest.mark.parametrize('health', [LOST, STUCK])
+def test_the_nearest_attitude_is_firm_and_none_of_the_table_is_nearer(holdings, health):
+    holding = holdings[health]
+    for wished in attitudes(30):
+        got = holding.nearest(wished, 1.0)
+        assert holding.margin(got) >= 1.0 - 1e-9
+        firm = holding.directions[holding.margins >= 1.0]
+        least = np.arccos(np.clip((firm @ up(wished)).max(), -1, 1))
+        assert rotations.geodesic_angle(got, wished) <= least + 1e-6
+
+
+def test_an_attitude_that_is_firm_stays(holdings):
+    firm = leaned(LEVEL, holdings[LOST].directions[np.argmax(holdings[LOST].margins)])
+    np.testing.assert_allclose(holdings[LOST].nearest(firm, 2.0), firm)
+
+
+def test_without_any_firm_one_the_firmest_is_taken(holdings):
+    got = holdings[LOST].nearest(LEVEL, 15.0)
+    assert holdings[LOST].margin(got) == pytest.approx(holdings[LOST].margins.max(), rel=1e-6)
+
+
+def test_the_quickest_attitude_needs_no_turn_where_all_is_firm(holdings):
+    got = holdings[ALL_WELL].quickest(LEVEL, np.zeros(3), np.zeros(4), 1.0)
+    assert rotations.geodesic_angle(got, LEVEL) < 0.2
+    turning = holdings[ALL_WELL].quickest(LEVEL, np.array([5.0, 0, 0]), np.zeros(4), 1.0)
+    assert rotations.log(turning)[0] > rotations.log(got)[0] + 0.05
+
+
+def test_best_attitude_has_the_margin_to_fly_near_the_wished_one():
+    got = best_attitude(ROBOT, LOST, LEVEL)
+    assert Holding(ROBOT, LOST).margin(got) >= 2.0
+    assert rotations.geodesic_angle(got, LEVEL) < np.radians(20)
+
+
+def test_leaned_is_the_shortest_turn():
+    for quaternion, direction in zip(attitudes(20), sphere(20)):
+        got = leaned(quaternion, direction)
+        np.testing.assert_allclose(up(got), direction, atol=1e-9)
+        assert rotations.geodesic_angle(got, quaternion) == pytest.approx(
+            np.arccos(np.clip(up(quaternion) @ direction, -1, 1)), abs=1e-6)
+    upside_down = leaned(LEVEL, np.array([0.0, 0.0, -1.0]))
+    np.testing.assert_allclose(up(upside_down), [0, 0, -1], atol=1e-9)
