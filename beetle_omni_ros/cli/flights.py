@@ -91,6 +91,9 @@ def evaluate(controllers: Annotated[str, typer.Option(
              bag: Annotated[Optional[Path], typer.Option(
                  '--bag', metavar='DIR', help='New folder for the bag; with several controllers '
                                               'it holds one bag for each.')] = None,
+             faults: Annotated[Optional[Path], typer.Option(
+                 '--faults', metavar='FILE', help='What fails, when and for how long (YAML, see '
+                                                  'docs/faults.md).')] = None,
              json_path: JsonOption = None):
     """
     Fly a task in one process: deterministic and faster than real time.
@@ -107,12 +110,12 @@ def evaluate(controllers: Annotated[str, typer.Option(
             raise ParameterError(f"{option} {file}: for the controller '{name}', which is not "
                                  f"among {', '.join(names)}")
     check_flight(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
-                 files=(robot, plant, nmpc_file, policy))
+                 files=(robot, plant, nmpc_file, policy, faults))
     from beetle_omni_ros.evaluation.command import ControllerFiles, run_evaluate
     from beetle_omni_ros.evaluation.loop import FlightError
     try:
         run_evaluate(controllers=names, task=task, conditions=conditions, robot=robot,
-                     plant=plant, seed=seed, bag=bag, json_path=json_path,
+                     plant=plant, seed=seed, bag=bag, json_path=json_path, faults=faults,
                      files=ControllerFiles(nmpc=nmpc_file, policy=policy,
                                            allow_other_robot=allow_other_robot))
     except FlightError as error:

@@ -78,6 +78,10 @@ class Inputs:
             self.vehicle.mocap.heard()
         return good
 
+    def on_rotors(self, stamp: float, speed: np.ndarray) -> bool:
+        """Take rotor speeds (4,) [rad/s] from the speed controllers."""
+        return True
+
     def on_battery(self, voltage: float) -> bool:
         """Take the pack voltage under load [V]; not finite or negative is refused."""
         if not (isfinite(voltage) and voltage >= 0):

@@ -29,9 +29,8 @@ class ProcessEffect(Effect):
         """Commands of the active controller that arrive now; also called with None."""
         return [] if command is None else [command]
 
-    def target(self, position: np.ndarray,
-               quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """A pose that somebody asks for in place of the one in force, or None."""
+    def target(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Position [m] and quaternion in world that somebody else asks for, or None."""
         return None
 
 
@@ -216,7 +215,7 @@ class Target(ProcessEffect):
     numbers = {**vector('m', 'in world', x=0.0, y=0.0, z=1.0),
                **vector('rad', 'in world', roll=0.0, pitch=0.0, yaw=0.0)}
 
-    def target(self, position, quaternion):
+    def target(self):
         """The pose."""
         n = self._numbers
         return (np.array([n['x'], n['y'], n['z']]),
