@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -108,14 +108,18 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         estimator = EkfParameters.load()
         supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
                                 CONTROLLERS)
+        simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed)
         loop = FlightLoop(
-            Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed),
+            simulator,
             ErrorStateEkf(estimator, robot.gravity),
             {controller: make_controller(controller, robot, files)}, supervisor, recorder,
             estimator.imu.gyroscope_noise, faults)
         supervisor.select(controller)
         stayed = loop.fly(task, progress)
-        recorder.write_meta({'crashed': not stayed, 'ended': loop.ending})
+        recorder.write_meta({'crashed': not stayed, 'ended': loop.ending,
+                             'broken': simulator.broken})
+        if simulator.truth.impact is not None:
+            recorder.write_meta({'impact': asdict(simulator.truth.impact)})
     return memory.log()
 
 

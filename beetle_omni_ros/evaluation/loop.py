@@ -132,7 +132,7 @@ class FlightLoop:
                 progress(min(1.0, (self._simulator.time - player.start) / task.duration))
         self._report_compute()
         progress(1.0)
-        return not (self._crashed or moment.lost)
+        return not (self._crashed or moment.lost or self._simulator.broken)
 
     def start_faults(self) -> None:
         """Let the time of the faults begin now."""

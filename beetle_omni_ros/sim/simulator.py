@@ -147,6 +147,11 @@ class Simulator:
         return self._schedule.names
 
     @property
+    def thrust_command(self) -> np.ndarray:
+        """(4,) thrusts that the rotors are asked for [N]; zero once commands have ceased."""
+        return self._link.thrust
+
+    @property
     def broken(self) -> bool:
         """Whether a crash broke the robot."""
         return self._crash.broken
