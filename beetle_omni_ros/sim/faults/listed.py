@@ -11,6 +11,7 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.sim.faults.base import Fault, KINDS
 
+GROUPS = ('limits', 'flight', 'healthy')
 OUTCOMES = ('flies_on', 'lands', 'stops', 'refused')
 
 
@@ -56,6 +57,15 @@ class FlightPlan:
                                 unit='s', low=0, high=100)
 
 
+@dataclass(frozen=True, kw_only=True)
+class HealthyFlights:
+    """Flights in which no fault may be named."""
+
+    flight_time: float = parameter(doc='of poses in one flight', unit='s', low=1, high=1e5)
+    pose_time: float = parameter(doc='of each pose', unit='s', low=0.5, high=1e4)
+    effects: dict = parameter(doc="of the plant, as a robot file's")
+
+
 @dataclass(frozen=True)
 class Case:
     """
@@ -81,6 +91,7 @@ class FaultList:
 
     limits: OutcomeLimits = parameter(doc='what counts as what')
     flight: FlightPlan = parameter(doc='how the campaign flies')
+    healthy: HealthyFlights = parameter(doc='flights without a fault')
     faults: dict = parameter(doc='name -> expected, what, strike')
 
     def __post_init__(self):
@@ -103,7 +114,7 @@ class FaultList:
             raise ParameterError(f"{path}: key 'faults': expected a mapping of names, "
                                  f"found {type(given.get('faults')).__name__}")
         defaults = schema.load_yaml(shipped)
-        return schema.bind(cls, {**{key: defaults[key] for key in ('limits', 'flight')}, **given},
+        return schema.bind(cls, {**{key: defaults[key] for key in GROUPS}, **given},
                            str(path))
 
     def chosen(self, names: list[str] | None) -> list[Case]:
