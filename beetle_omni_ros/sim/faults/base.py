@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import inf
 from typing import Any, ClassVar
 
 import numpy as np
 
 from beetle_omni_ros.robot.schema import ParameterError
 
+LARGEST = 1e9       # of any number; what is beyond is a slip of the pen
 KINDS: dict[str, type[Effect]] = {}
 """Name of a kind -> what it does."""
 
@@ -40,12 +41,13 @@ class Number:
         """``value`` as a float; a ParameterError that begins with ``at`` where it is not legal."""
         unit = f' {self.unit}' if self.unit else ''
         if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) \
-                or not isfinite(value) or (self.whole and value != int(value)):
+                or not -inf < value < inf or (self.whole and value != int(value)):
             kind = 'a whole number' if self.whole else 'a number'
             raise ParameterError(f"{at}: expected {kind}{f' [{self.unit}]' if unit else ''}, "
                                  f'found {str(value)[:60]!r}')
-        if not self.low <= value <= self.high:
-            raise ParameterError(f'{at}: {value:g} is outside {self.low:g} to {self.high:g}{unit}')
+        if not max(self.low, -LARGEST) <= value <= min(self.high, LARGEST):
+            raise ParameterError(f'{at}: {str(value)[:60]} is outside {self.low:g} to '
+                                 f'{self.high:g}{unit}')
         return float(value)
 
 
@@ -99,6 +101,11 @@ class Fault:
     def is_process(self) -> bool:
         """Whether it strikes a process of the flight stack, not the robot or its devices."""
         return KINDS[self.kind].process
+
+    def changes(self, *hooks: str) -> bool:
+        """Whether it acts through one of these hooks of Effect."""
+        own = KINDS[self.kind]
+        return any(getattr(own, hook) is not getattr(Effect, hook) for hook in hooks)
 
     def __str__(self) -> str:
         """Kind, numbers and times, as in 'rotor_weak(rotor=2, share=0.5) at 3 s for 1 s'."""

@@ -165,7 +165,7 @@ def load_faults(path: str | Path) -> list[Fault]:
     """
     Read the faults of one flight: a list of what, at [s], duration [s] and numbers.
 
-    ``what`` is a kind, with its numbers, or a name of the shipped list.
+    ``what`` is a name of the shipped list, or a kind with its numbers.
 
     Raises:
         ParameterError: naming file, key and what was expected.
@@ -187,7 +187,7 @@ def _placed(entry, at, named):
         raise ParameterError(f"{at}: expected a mapping with the key 'what'")
     numbers = dict(entry)
     what = numbers.pop('what')
-    if what in KINDS:
+    if what in KINDS and not (what in named and set(numbers) <= {'at', 'duration'}):
         if 'kind' in numbers:
             raise ParameterError(f"{at}: key 'kind': give the kind as 'what'")
         return [_fault({'kind': what, **numbers}, at)]
