@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import inf
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -349,3 +350,10 @@ def test_a_simulator_file_of_other_limits_breaks_elsewhere():
     for _ in range(300):
         simulator.step()
     assert simulator.truth.impact.speed > 5 and not simulator.broken
+
+
+def test_the_docs_name_every_kind():
+    page = (Path(__file__).parents[2] / 'docs' / 'faults.md').read_text()
+    table = page.split('## Kinds')[1].split('## Crashes')[0]
+    named = [line.split('`')[1] for line in table.splitlines() if line.startswith('| `')]
+    assert sorted(named) == sorted(KINDS)
