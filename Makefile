@@ -12,7 +12,7 @@ unexport LD_LIBRARY_PATH
 endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONHOME VIRTUAL_ENV
 
-.PHONY: help setup setup-train fly test lint evaluate compare gap report clean
+.PHONY: help setup setup-train fly test lint evaluate compare faults gap report clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1|/p' Makefile | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -40,6 +40,10 @@ evaluate: setup  ## 100 random poses, in one process and faster than real time
 compare: setup  ## every experiment for RL and NMPC, to docs/comparison/; goes on where it was left
 	@mkdir -p docs/comparison runs_out
 	$(TOOL) compare --output docs/comparison --cache runs_out/comparison $(ARGS)
+
+faults: setup  ## every listed fault from hover, on the move, upside down; to runs_out/faults/ (ARGS='--seeds 10')
+	@mkdir -p runs_out
+	$(TOOL) faults --output runs_out/faults $(ARGS)
 
 gap: setup  ## hide effects in the plant, fly, find and add them, fly better; to runs_out/gap/
 	@mkdir -p runs_out

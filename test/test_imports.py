@@ -20,6 +20,7 @@ ALLOWED = {
     'safety': ('robot', 'control.base'),
     'runs': ('robot', 'control.base'),
     'evaluation': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs'),
+    'faults': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation'),
     'comparison': ('robot', 'runs', 'evaluation'),
     'identify': ('robot', 'runs'),
     'bringup': ('robot', 'drivers', 'runs.json_file'),
@@ -27,7 +28,7 @@ ALLOWED = {
               'bringup.heard'),
     'train': ('robot', 'control.observation', 'control.policy_file', 'runs.json_file'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
-            'nodes', 'train', 'identify', 'bringup'),
+            'faults', 'nodes', 'train', 'identify', 'bringup'),
 }
 
 # Library -> the only room that imports it.

@@ -25,6 +25,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+from beetle_omni_ros.sim.faults.listed import FaultList
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.train.parameters import TrainParameters
 
@@ -39,7 +40,8 @@ KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-r
        'casadi': 'casadi-pip', 'serial': 'python3-serial', 'PIL': 'python3-pil'}
 PARAMETER_CLASSES = {
     'check.yaml': CheckLimits, 'ekf.yaml': EkfParameters,
-    'emulated_board.yaml': EmulatedBoardParameters, 'gap.yaml': GapParameters,
+    'emulated_board.yaml': EmulatedBoardParameters, 'faults.yaml': FaultList,
+    'gap.yaml': GapParameters,
     'hover.yaml': HoverParameters,
     'motor_board.yaml': MotorBoardParameters,
     'nmpc.yaml': NmpcParameters,

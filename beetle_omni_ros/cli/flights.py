@@ -91,6 +91,9 @@ def evaluate(controllers: Annotated[str, typer.Option(
              bag: Annotated[Optional[Path], typer.Option(
                  '--bag', metavar='DIR', help='New folder for the bag; with several controllers '
                                               'it holds one bag for each.')] = None,
+             faults: Annotated[Optional[Path], typer.Option(
+                 '--faults', metavar='FILE', help='What fails, when and for how long (YAML, see '
+                                                  'docs/faults.md).')] = None,
              json_path: JsonOption = None):
     """
     Fly a task in one process: deterministic and faster than real time.
@@ -107,12 +110,12 @@ def evaluate(controllers: Annotated[str, typer.Option(
             raise ParameterError(f"{option} {file}: for the controller '{name}', which is not "
                                  f"among {', '.join(names)}")
     check_flight(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
-                 files=(robot, plant, nmpc_file, policy))
+                 files=(robot, plant, nmpc_file, policy, faults))
     from beetle_omni_ros.evaluation.command import ControllerFiles, run_evaluate
     from beetle_omni_ros.evaluation.loop import FlightError
     try:
         run_evaluate(controllers=names, task=task, conditions=conditions, robot=robot,
-                     plant=plant, seed=seed, bag=bag, json_path=json_path,
+                     plant=plant, seed=seed, bag=bag, json_path=json_path, faults=faults,
                      files=ControllerFiles(nmpc=nmpc_file, policy=policy,
                                            allow_other_robot=allow_other_robot))
     except FlightError as error:
@@ -170,6 +173,59 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
                     cache=cache, fresh=fresh, policy=policy, json_path=json_path)
     except SweepError as error:
         raise typer.Exit(fail(error, FAILED)) from None
+
+
+def faults(faults: Annotated[Optional[Path], typer.Option(
+               '--faults', metavar='FILE', help='The list. Default: the shipped '
+                                                'params/faults.yaml.')] = None,
+           only: Annotated[Optional[str], typer.Option(
+               '--only', metavar='NAME,...', help='Of the list. Default: all.')] = None,
+           starts: Annotated[Optional[str], typer.Option(
+               '--from', metavar='NAME,...', help='hover, moving, upside_down. '
+                                                  'Default: all.')] = None,
+           seeds: Annotated[int, typer.Option(
+               '--seeds', metavar='N', min=1, help='Flights of each fault from each start.')] = 1,
+           conditions: ConditionsOption = 'nominal',
+           controller: Annotated[str, typer.Option(
+               '--controller', metavar='nmpc|rl', help='The active controller.')] = 'nmpc',
+           landings: Annotated[int, typer.Option(
+               '--landings', metavar='N', min=0, help='Fly N landings from random attitudes in '
+                                                      'place of the list.')] = 0,
+           without_mocap: Annotated[bool, typer.Option(
+               '--without-mocap', help='They lose motion capture as they begin.')] = False,
+           healthy: Annotated[float, typer.Option(
+               '--healthy', metavar='HOURS', min=0.0, max=1000.0,
+               help='Fly so long without a fault under each of nominal, published and effects, '
+                    'and count alarms, in place of the list.')] = 0.0,
+           jobs: Annotated[Optional[int], typer.Option(
+               '--jobs', '-j', min=1, help='Flights at a time. Default: one a core.')] = None,
+           bags: Annotated[bool, typer.Option(
+               '--bags', help='Record each flight below --output, and read it back.')] = False,
+           output: Annotated[Optional[Path], typer.Option(
+               '--output', '-o', metavar='DIR', help='Folder for page, Markdown and JSON.')]
+           = None,
+           docs: Annotated[Optional[Path], typer.Option(
+               '--docs', metavar='FILE', help='Markdown file whose fault table is renewed.')]
+           = None,
+           json_path: JsonOption = None):
+    """
+    Fly a list of faults in process, on all cores: what happens, and is it what should.
+
+    Each fault strikes in hover, on the move and upside down; each flight ends with a landing.
+    Example: beetle_omni faults --only rotor_1_stops,mocap_lost --seeds 3 --output runs_out/faults
+    """
+    from beetle_omni_ros.comparison.arguments import names
+    if conditions not in CONDITIONS:
+        raise ParameterError(f"--conditions '{conditions}': expected {' or '.join(CONDITIONS)}")
+    if faults and not faults.is_file():
+        raise ParameterError(f'{faults}: no such file')
+    if without_mocap and not landings:
+        raise ParameterError('--without-mocap: expected --landings N with it')
+    from beetle_omni_ros.faults.command import run_faults
+    run_faults(faults=faults, only=names('--only', only), starts=names('--from', starts),
+               seeds=seeds, conditions=conditions, controller=controller, jobs=jobs,
+               output=output, json_path=json_path, docs=docs, bags=bags, landings=landings,
+               without_mocap=without_mocap, healthy=healthy)
 
 
 def report(runs: Annotated[list[Path], typer.Argument(

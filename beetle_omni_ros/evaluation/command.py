@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -30,6 +31,8 @@ from beetle_omni_ros.runs.recorder import LogRecorder, Tee
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
+from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.faults.listed import load_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
@@ -86,7 +89,7 @@ def make_controller(name: str, robot: RobotParameters,
 
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,
         conditions: str = 'nominal', seed: int = 0, files: ControllerFiles = ControllerFiles(),
-        bag: Path | None = None, meta: dict | None = None,
+        bag: Path | None = None, meta: dict | None = None, faults: Sequence[Fault] = (),
         progress=lambda part: None) -> FlightLog:
     """
     Fly one task with one controller; see :func:`run_evaluate` for the arguments.
@@ -105,21 +108,25 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         estimator = EkfParameters.load()
         supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
                                 CONTROLLERS)
+        simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed)
         loop = FlightLoop(
-            Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed),
+            simulator,
             ErrorStateEkf(estimator, robot.gravity),
             {controller: make_controller(controller, robot, files)}, supervisor, recorder,
-            estimator.imu.gyroscope_noise)
+            estimator.imu.gyroscope_noise, faults)
         supervisor.select(controller)
         stayed = loop.fly(task, progress)
-        recorder.write_meta({'crashed': not stayed, 'ended': loop.ending})
+        recorder.write_meta({'crashed': not stayed, 'ended': loop.ending,
+                             'broken': simulator.broken})
+        if simulator.truth.impact is not None:
+            recorder.write_meta({'impact': asdict(simulator.truth.impact)})
     return memory.log()
 
 
 def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nominal',
                  robot: Path | None = None, plant: Path | None = None, seed: int = 0,
                  bag: Path | None = None, json_path: Path | None = None,
-                 files: ControllerFiles = ControllerFiles(),
+                 files: ControllerFiles = ControllerFiles(), faults: Path | None = None,
                  console: Console | None = None) -> dict:
     """
     Fly a task with each controller and report.
@@ -134,6 +141,7 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
         bag: folder for a bag; with several controllers, one bag for each inside it.
         json_path: file for the results.
         files: of controllers, in place of the shipped ones.
+        faults: file of what fails, when since the task's start and how long; by default nothing.
         console: where to print.
 
     Returns:
@@ -155,6 +163,9 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
             'plant': str(plant) if plant else None, 'version': __version__}
     if files.policy:
         meta['policy'] = str(files.policy)
+    struck = load_faults(faults) if faults else []
+    if struck:
+        meta['faults'] = [str(fault) for fault in struck]
     results: dict = {'meta': meta}
     columns = (TextColumn('{task.description}'), BarColumn(),
                TextColumn('{task.percentage:>3.0f} %'), TimeElapsedColumn(), TimeRemainingColumn())
@@ -163,7 +174,7 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
             bar = bars.add_task(f'{name}: {task}, {conditions}', total=1.0)
             folder = bag / name if bag and len(controllers) > 1 else bag
             log = fly(name, flown, robot=believed, plant=true, conditions=conditions, seed=seed,
-                      files=files, bag=folder, meta=meta,
+                      files=files, bag=folder, meta=meta, faults=struck,
                       progress=lambda part, bar=bar: bars.update(bar, completed=part))
             results[name] = metrics_of_runs.metrics(log, flown)
             if log.meta['ended']:

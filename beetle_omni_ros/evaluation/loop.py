@@ -10,19 +10,25 @@ gives the same numbers every time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from beetle_omni_ros.control.base import Controller, PoseTarget, State, Target
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
+from beetle_omni_ros.evaluation.processes import Processes
+from beetle_omni_ros.robot.actuator_health import ALL_WELL
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.supervisor import Supervisor
+from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.readings import Frame
 from beetle_omni_ros.sim.simulator import Simulator
 
 TAKEOFF_TIMEOUT = 30.0   # [s] of simulated time before a flight that does not start is given up
 COMPUTE_REPORT = 1.0     # [s] between two records of compute times, as the nodes report
 SWAP_CHARGE = 0.3         # [-] a pack below this is swapped at the next target, or once warned of
+CLOCK_SET_BACK = 0.1     # [s] a command that much older comes from a clock that was set back
 SETTLE_TIME = 0.5        # [s] on the ground before arming, in which the estimator starts
 
 
@@ -41,14 +47,25 @@ class FlightLoop:
         supervisor: with the active controller selected.
         recorder: takes ``write_*`` calls (LogRecorder, BagWriter or both).
         gyroscope_noise: of one sample, for the covariance of the recorded twist [rad/s].
+        faults: of robot, devices and processes; their ``at`` counts from the task's start.
+        check_target: reason why a target that somebody else asks for is refused, or ''.
+
+    Attributes:
+        refusals: reasons for which targets were refused.
 
     """
 
     def __init__(self, simulator: Simulator, estimator: ErrorStateEkf,
                  controllers: dict[str, Controller], supervisor: Supervisor, recorder,
-                 gyroscope_noise: float):
+                 gyroscope_noise: float, faults: Sequence[Fault] = (),
+                 check_target: Callable[[Target], str] = lambda target: ''):
         """See the class."""
         self._gyroscope_noise = gyroscope_noise
+        self._faults, self._check_target = tuple(faults), check_target
+        self._processes = Processes(simulator.tick, supervisor)
+        self._intruder: Target | None = None
+        self._obeys_intruder = False
+        self.refusals: list[str] = []
         self._simulator, self._estimator = simulator, estimator
         self._controllers, self._supervisor, self._recorder = controllers, supervisor, recorder
         self._timers = {name: ComputeTimer(c.period) for name, c in controllers.items()}
@@ -58,7 +75,8 @@ class FlightLoop:
         self._hold: Target | None = None
         self._joints = self._battery = self._command = None
         self._ticks = 0
-        self._state_name = ''
+        self._state_name = self._told = ''
+        self._health = ALL_WELL
         self._crashed = False
         self._ending = ''
 
@@ -88,18 +106,18 @@ class FlightLoop:
 
         """
         with collector_off():
-            self._take_off()
+            self.take_off()
             return self._play(task, progress)
 
     def _play(self, task, progress):
         player = TaskPlayer(task, self._simulator.time)
+        self.start_faults()
         reported = self._simulator.time
         while True:
             truth = self._simulator.truth
             moment = player.update(self._simulator.time, truth.position, truth.quaternion)
             if moment.target is not None:
-                self._target = moment.target
-                self._recorder.write_target(moment.target)
+                self.aim(moment.target)
                 if self._simulator.charge < SWAP_CHARGE or self._supervisor.vehicle.battery_low:
                     self._simulator.swap_battery()
             if moment.changed:
@@ -109,60 +127,99 @@ class FlightLoop:
                                             moment.torque_body)
             if moment.finished or self._crashed:
                 break
-            self._tick()
+            self.step()
             if self._simulator.time - reported >= COMPUTE_REPORT:
                 reported += COMPUTE_REPORT
                 self._report_compute()
                 progress(min(1.0, (self._simulator.time - player.start) / task.duration))
         self._report_compute()
         progress(1.0)
-        return not (self._crashed or moment.lost)
+        return not (self._crashed or moment.lost or self._simulator.broken)
 
-    def _take_off(self):
+    def start_faults(self) -> None:
+        """Let the time of the faults begin now."""
+        if self._faults:
+            self._simulator.set_faults([fault for fault in self._faults if not fault.is_process])
+            self._processes.set_faults([fault for fault in self._faults if fault.is_process],
+                                       self._simulator.time)
+
+    def aim(self, target: Target) -> None:
+        """Make ``target`` the one in force."""
+        self._target = target
+        self._recorder.write_target(target)
+
+    @property
+    def now(self) -> float:
+        """Time on the flight computer's clock [s]."""
+        return self._simulator.time + self._processes.clock_step
+
+    def take_off(self) -> None:
+        """
+        Arm and climb until a controller flies.
+
+        Raises:
+            FlightError: it did not take off.
+
+        """
         while self._simulator.time < SETTLE_TIME:
-            self._tick()
+            self.step()
         answer = self._supervisor.arm(self._simulator.time)
         if not answer:
             raise FlightError(answer.text)
         while self._supervisor.state != 'flying':
-            self._tick()
+            self.step()
             if self._simulator.time > TAKEOFF_TIMEOUT or self._supervisor.state == 'disarmed':
                 events = [event.text for event in self._supervisor.events]
                 raise FlightError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
                                   f"'{self._supervisor.state}' ({'; '.join(events[-3:])})")
 
-    def _tick(self):
-        simulator, recorder, supervisor = self._simulator, self._recorder, self._supervisor
-        frame = simulator.step()
+    def step(self) -> Frame:
+        """One tick of the simulator and of every process that is due in it."""
+        simulator, processes = self._simulator, self._processes
+        frame = processes.frame(simulator.step())
         self._ticks += 1
         now = frame.time
         self._sense(frame)
         estimate = self._estimator.estimate
         if estimate is not None and self._joints is not None:
-            state = self._state(estimate)
-            supervisor.on_state(state, self._estimator.status)
-            self._control(state, now)
-            covariances = () if not recorder.keeps_covariances else (
-                pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
-            recorder.write_odom(estimate.stamp, estimate.position, estimate.quaternion,
-                                estimate.velocity, estimate.angular_velocity, *covariances)
-        command = supervisor.update(now)
+            state = processes.estimate(self._state(estimate))
+            if state is not None:
+                self._answer(state, estimate, now)
+        for late in processes.requests(None, now):
+            self._request(self._supervisor.active, late, now)
+        if not processes.supervisor_waits:
+            self._execute(self._supervisor.update(now), now)
+            self._note_state(now)
+        return frame
+
+    def _answer(self, state, estimate, now):
+        """Let supervisor and controllers have the estimator's state."""
+        recorder = self._recorder
+        self._processes.tell('on_state', state, self._estimator.status)
+        self._control(state, now)
+        covariances = () if not recorder.keeps_covariances else (
+            pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
+        recorder.write_odom(state.stamp, state.position, state.quaternion, state.velocity,
+                            state.angular_velocity, *covariances)
+
+    def _execute(self, command, now):
         if command is None:
             self._command = None
-        elif self._command is None or command.stamp > self._command.stamp:
+        elif self._command is None or command.stamp > self._command.stamp \
+                or command.stamp < self._command.stamp - CLOCK_SET_BACK:
             self._command = command
-            simulator.command(command)
-            recorder.write_command(command.stamp, command.tilt, command.thrust, received=now)
-        self._note_state(now)
+            self._simulator.command(replace(
+                command, stamp=command.stamp - self._processes.clock_step))
+            self._recorder.write_command(command.stamp, command.tilt, command.thrust, received=now)
 
     def _sense(self, frame):
-        recorder, supervisor, now = self._recorder, self._supervisor, frame.time
+        recorder, tell, now = self._recorder, self._processes.tell, frame.time
         truth = frame.truth
         recorder.write_truth(truth.stamp, truth.position, truth.quaternion, truth.velocity,
                              truth.angular_velocity)
         if frame.mocap is not None:
             self._estimator.pose(frame.mocap)
-            supervisor.on_mocap(frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion)
+            tell('on_mocap', frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion)
             recorder.write_mocap(frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion,
                                  received=now)
         if frame.joints is not None:
@@ -170,14 +227,18 @@ class FlightLoop:
             recorder.write_joints(joints.stamp, joints.position, joints.velocity, joints.effort,
                                   received=now)
         if frame.battery is not None:
-            supervisor.on_battery(frame.battery.voltage)
+            tell('on_battery', frame.battery.voltage)
             recorder.write_battery(frame.battery.stamp, frame.battery.voltage,
                                    frame.battery.current)
         if frame.imu is not None:
             imu = frame.imu
             self._estimator.imu(imu)
-            supervisor.on_imu(imu.stamp, imu.specific_force, imu.angular_velocity)
+            tell('on_imu', imu.stamp, imu.specific_force, imu.angular_velocity)
             recorder.write_imu(imu.stamp, imu.specific_force, imu.angular_velocity)
+        if frame.rotors is not None:
+            tell('on_rotors', frame.rotors.stamp, frame.rotors.speed)
+        for name, text in self._processes.bridges.items():
+            tell('on_actuators', name, text, now)
 
     def _state(self, estimate):
         joints = self._joints
@@ -189,19 +250,47 @@ class FlightLoop:
         """Step whoever is due; without a target yet, hold the pose of the take-off's end."""
         if self._target is None and not self._state_name.startswith('flying'):
             self._hold = PoseTarget(state.position, state.quaternion, state.stamp)
+        if self._supervisor.health is not self._health:
+            self._health = self._supervisor.health
+            for controller in self._controllers.values():
+                controller.set_health(self._health)
         for name, controller in self._controllers.items():
             if self._ticks % self._every[name]:
                 continue
-            target = self._target if self._target is not None else self._hold
-            command = self._timers[name].call(controller.step, state, target)
-            self._recorder.write_request(name, command.stamp, command.tilt, command.thrust,
-                                         received=now)
-            self._supervisor.on_command(name, command, now)
+            command = self._timers[name].call(controller.step, state, self._wanted())
+            if name == self._supervisor.active:
+                for passed in self._processes.requests(command, now):
+                    self._request(name, passed, now)
+            else:
+                self._request(name, command, now)
+
+    def _request(self, name, command, now):
+        self._recorder.write_request(name, command.stamp, command.tilt, command.thrust,
+                                     received=now)
+        self._processes.tell('on_command', name, command, now)
+
+    def _wanted(self):
+        """The supervisor's target, else the one in force, unless another's passes the check."""
+        if self._supervisor.wish is not None:
+            return self._supervisor.wish
+        target = self._target if self._target is not None else self._hold
+        other = self._processes.target(target)
+        if other is None:
+            self._intruder = None
+            return target
+        if self._intruder is None:
+            self._intruder = other
+            reason = self._check_target(other)
+            self._obeys_intruder = not reason
+            self.refusals += [reason] if reason else []
+        return self._intruder if self._obeys_intruder else target
 
     def _note_state(self, now):
-        name = self._supervisor.state
-        if name == 'flying':
-            name = f'flying:{self._supervisor.active}'
+        told = self._supervisor.told
+        name = self._supervisor.state if self._supervisor.state != 'flying' else told
+        if told != self._told:
+            self._told = told
+            self._recorder.write_state(now, told)
         if name != self._state_name:
             if self._state_name.startswith(('flying', 'fallback')) \
                     and name in ('landing', 'emergency_stop', 'disarmed'):
@@ -214,7 +303,6 @@ class FlightLoop:
                 for controller in self._controllers.values():
                     controller.reset()
             self._state_name = name
-            self._recorder.write_state(now, name)
 
     def _report_compute(self):
         for name, summary in self.compute.items():

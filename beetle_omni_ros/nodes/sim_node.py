@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import degrees
 import time
 
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -27,9 +28,11 @@ from beetle_omni_ros.sim.emulated.fault_switches import (
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
+from beetle_omni_ros.sim.faults.listed import parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
+DEVICES = 'joints', 'rotors', 'battery', 'command'      # what emulated devices see to themselves
 COMMAND_AGE = 0.1       # s, older commands are not executed
 EVENTS = {*(f'servo_faults.{name}' for name in SERVO_EVENTS),
           *(f'board_faults.{name}' for name in BOARD_EVENTS)}
@@ -62,6 +65,8 @@ class SimNodeParameters:
                            doc='real time, or simulated time on /clock that waits for nodes which '
                            'are late; those need use_sim_time then')
     payload: float = parameter(0.0, doc='mass attached below the body', unit='kg', low=0, high=2)
+    faults: str = parameter('', doc='faults that are on, as "rotor_stops rotor=2; mocap_lost '
+                            'duration=3"; docs/faults.md lists the kinds')
     servo_faults: ServoFaultSwitches = group(ServoFaultSwitches, 'faults of the servo bus')
     board_faults: BoardFaultSwitches = group(BoardFaultSwitches, 'faults of the motor board')
 
@@ -87,6 +92,7 @@ class SimNode(FlightNode):
             self._robot, SimulatorParameters.load(given.simulator_file or None),
             conditions=given.conditions, seed=given.seed)
         self._simulator.set_payload(given.payload)
+        self._strike(given)
         self._pacing = self._make_pacing(given)
         self._latency = health.Distribution()
         self._publish_to = {
@@ -97,6 +103,7 @@ class SimNode(FlightNode):
                     stale_after=None)
         self.health.track_compute(self._simulator.tick)
         self.health.report('pacing', self._pacing_status)
+        self.health.report('robot', self._robot_status)
         if given.actuators == 'emulated':
             self._make_devices()
         else:
@@ -161,7 +168,20 @@ class SimNode(FlightNode):
         if self._devices is not None:
             self._devices.close()
 
+    def _strike(self, given):
+        """Switch faults of robot and sensors on and off; one that stays goes on."""
+        faults = parse_faults(given.faults)
+        for fault in faults:
+            if given.actuators == 'emulated' and fault.changes(*DEVICES):
+                raise ParameterError(f"faults: '{fault.kind}': the emulated devices measure and "
+                                     'listen; use servo_faults and board_faults, or '
+                                     'actuators:=direct')
+        self._simulator.set_faults(faults)
+
     def _changed(self, new):
+        if new.faults != self.parameters.faults:
+            self._strike(new)
+            self.get_logger().info(f"faults: {new.faults or 'none'}")
         if self._devices is None:
             self._refuse_faults(new)
         else:
@@ -240,6 +260,17 @@ class SimNode(FlightNode):
             'ticks': pacing.ticks, 'lost_ticks': pacing.lost_ticks,
             'lost_s': pacing.lost_ticks * self._simulator.tick,
             'clock_steps': pacing.clock_steps, 'simulated_s': self._simulator.time}
+
+    def _robot_status(self):
+        simulator = self._simulator
+        faults, impact = simulator.faults, simulator.truth.impact
+        values = {'faults': ', '.join(faults), 'broken': int(simulator.broken)}
+        if impact is not None:
+            values.update(impact_m_s=impact.speed, impact_s=impact.stamp,
+                          inclination_deg=degrees(impact.inclination))
+        if simulator.broken:
+            return health.ERROR, 'broken by a crash', values
+        return health.WARN if faults else health.OK, values['faults'] or 'whole', values
 
     def _devices_status(self):
         faults = self._devices.faults

@@ -18,6 +18,7 @@ class Battery:
     Attributes:
         charge: what is left, as a fraction of a full pack.
         voltage: under the present load [V].
+        extra_resistance: of a bad contact or cell, beside the pack's own [ohm].
         current: drawn [A], positive.
 
     """
@@ -37,6 +38,7 @@ class Battery:
     def reset(self) -> None:
         """Put in a pack of the initial charge."""
         self.charge = self._pack.initial_charge
+        self.extra_resistance = 0.0
         self.current = 0.0
         self.voltage = self.rest_voltage
 
@@ -52,10 +54,11 @@ class Battery:
             f * sqrt(f) for f in thrust.tolist() if f > 0)
         rest = self.rest_voltage
         # power = V (rest - V) / R; beyond the pack's largest power it gives that, at rest / 2
-        self.voltage = 0.5 * (rest + sqrt(max(0.0, rest * rest - 4 * self._resistance * power)))
+        resistance = self._resistance + self.extra_resistance
+        self.voltage = 0.5 * (rest + sqrt(max(0.0, rest * rest - 4 * resistance * power)))
         self.current = power / self.voltage
-        if self._resistance:
-            self.current = min(self.current, (rest - self.voltage) / self._resistance)
+        if resistance:
+            self.current = min(self.current, (rest - self.voltage) / resistance)
         self.charge = max(0.0, self.charge - self.current * duration / (3600 * pack.capacity))
 
     @property

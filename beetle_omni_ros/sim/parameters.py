@@ -34,6 +34,31 @@ class PlantParameters:
                                      unit='m', low=0, high=5)
     payload_density: float = parameter(doc='of a payload, taken as a ball', unit='kg/m^3', low=10,
                                        high=30000)
+    jam_stiffness: float = parameter(doc='of a jammed joint, relative to its servo', low=1,
+                                     high=100)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CrashParameters:
+    """What a contact with the floor breaks."""
+
+    speed: float = parameter(doc='faster at a contact, the robot breaks', unit='m/s', low=0.01,
+                             high=100)
+    inclination: float = parameter(doc='more inclined in a contact, it breaks', unit='rad', low=0,
+                                   high=4)
+    airborne_time: float = parameter(doc='without contact, after which a contact is a touchdown',
+                                     unit='s', low=0, high=10)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotorSpeedParameters:
+    """The speed controllers' telemetry."""
+
+    rpm_at_1_newton: float = parameter(doc='of a rotor; grows with the root of thrust',
+                                       unit='1/min', low=1, high=1e5)
+    period: float = parameter(doc='between two readings', unit='s', low=0.005, high=10)
+    latency: float = parameter(doc='from capture to arrival', unit='s', low=0, high=1)
+    noise: float = parameter(doc='standard deviation relative to the speed', low=0, high=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,6 +175,8 @@ class SimulatorParameters:
     imu: ImuParameters = parameter(doc='IMU')
     mocap: MocapParameters = parameter(doc='motion capture')
     encoders: EncoderParameters = parameter(doc='joint feedback')
+    rotor_speed: RotorSpeedParameters = parameter(doc='rotor speed telemetry')
+    crash: CrashParameters = parameter(doc='what breaks the robot')
     published: PublishedParameters = parameter(doc='what --conditions published adds')
 
     @classmethod

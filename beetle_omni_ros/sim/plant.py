@@ -59,7 +59,8 @@ class Plant:
         self._ground_height: float | None = None
         self._wrench = np.zeros(6)
         self._payload: float | None = None      # not yet set
-        self._powered = (True,) * 4
+        self._servos = (True,) * 4, (False,) * 4
+        self._powered = (True,) * 4     # by a motor with its limits
         self.reset()
 
     def reset(self, position: np.ndarray | None = None,
@@ -101,21 +102,30 @@ class Plant:
         self.data.ctrl[:4] = thrust
         self.data.ctrl[4:] = tilt
 
-    def set_powered(self, powered: Sequence[bool]) -> None:
+    def set_powered(self, powered: Sequence[bool],
+                   jammed: Sequence[bool] = (False,) * 4) -> None:
         """
-        Switch the torque of each servo, (4,).
+        Switch the torque of each servo (4,), or jam its joint at its target.
 
-        Without it a joint is free but for the servo's damping, which neither the torque limit nor
-        the rate limit of the motor bounds.
+        Without torque a joint is free but for the servo's damping, which neither the torque limit
+        nor the rate limit of the motor bounds. A jammed joint is a far stiffer spring without
+        such limits, critically damped, so its target must not jump.
         """
-        powered = tuple(map(bool, powered))
-        if powered == self._powered:
+        powered, jammed = tuple(map(bool, powered)), tuple(map(bool, jammed))
+        if (powered, jammed) == self._servos:
             return
-        self._powered = powered
-        stiffness = self._robot.joints.kp * np.array(powered)
-        self.model.actuator_gainprm[4:, 0] = stiffness
-        self.model.actuator_biasprm[4:, 1] = -stiffness
-        self.model.actuator_forcelimited[4:] = powered
+        self._servos = powered, jammed
+        stuck = np.array(jammed)
+        joints, model = self._robot.joints, self.model
+        hard = joints.kp * self._parameters.jam_stiffness
+        stiffness = np.where(stuck, hard, joints.kp * np.array(powered))
+        damping = np.where(stuck, 2 * np.sqrt(hard * joints.inertia), joints.kd)
+        model.actuator_gainprm[4:, 0] = stiffness
+        model.actuator_biasprm[4:, 1] = -stiffness
+        model.actuator_biasprm[4:, 2] = -damping
+        # What is limited is the motor's torque, which neither a free nor a jammed joint has.
+        self._powered = tuple(on and not stop for on, stop in zip(powered, jammed))
+        model.actuator_forcelimited[4:] = self._powered
 
     def set_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
         """External force (3,) in world [N] and torque (3,) in base_link [N m] at base_link."""

@@ -54,6 +54,33 @@ class BatteryReading:
 
 
 @dataclass(frozen=True, slots=True)
+class RotorReading:
+    """Speed controllers' telemetry: capture time [s], rotor speeds (4,) [rad/s]."""
+
+    stamp: float
+    speed: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Impact:
+    """
+    A touchdown: how the robot moved when it first touched the floor after flight.
+
+    Attributes:
+        stamp: [s].
+        speed: of base_link [m/s].
+        vertical_speed: downward part of it [m/s].
+        inclination: between base_link's z axis and up [rad].
+
+    """
+
+    stamp: float
+    speed: float
+    vertical_speed: float
+    inclination: float
+
+
+@dataclass(frozen=True, slots=True)
 class Truth:
     """
     The true state.
@@ -68,6 +95,8 @@ class Truth:
         tilt_velocity: (4,) [rad/s].
         thrust: (4,) present thrusts [N].
         contact: whether any part touches the floor.
+        impact: the last touchdown, None before the first.
+        broken: whether the robot broke; rotors and servos are dead then until reset.
 
     """
 
@@ -80,6 +109,8 @@ class Truth:
     tilt_velocity: np.ndarray
     thrust: np.ndarray
     contact: bool
+    impact: Impact | None = None
+    broken: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,3 +145,4 @@ class Frame:
     joints: JointReading | None
     battery: BatteryReading | None
     truth: Truth
+    rotors: RotorReading | None = None

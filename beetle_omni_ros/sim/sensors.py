@@ -17,6 +17,7 @@ from beetle_omni_ros.sim.readings import (
     ImuReading,
     JointReading,
     PoseReading,
+    RotorReading,
     Truth,
 )
 
@@ -55,8 +56,8 @@ class Sensors:
         Args:
             parameters: noise and latencies.
             conditions: this flight's biases and latencies.
-            seeds: four, for IMU, MoCap, encoders and battery, so that a sensor's noise does
-                not depend on another's rate.
+            seeds: five, for IMU, MoCap, encoders, battery and rotor speeds, so that a sensor's
+                noise does not depend on another's rate.
             first: the state at reset.
             effort: (4,) servo torques there [N m].
 
@@ -79,6 +80,11 @@ class Sensors:
                                  conditions.tilt_uniform_noise)
         self._battery_noise = Noise(generators[3], np.zeros(2),
                                     np.array([pack.voltage_noise, pack.current_noise]), 0.0)
+        rotors = parameters.rotor_speed
+        self._rotor_noise = Noise(generators[4], np.ones(4), np.full(4, rotors.noise), 0.0)
+        self._rotor_period = self._ticks('rotor_speed.period', rotors.period, least=1)
+        self._rotors = _delay_line(self._ticks('rotor_speed.latency', rotors.latency))
+        self._speed_at_1_newton = rotors.rpm_at_1_newton * np.pi / 30
         self._mocap_period = self._ticks('mocap.period', mocap.period, least=1)
         self._battery_period = self._ticks('battery.period', pack.period, least=1)
         self._count = 2 * np.pi / parameters.encoders.counts_per_turn
@@ -139,6 +145,23 @@ class Sensors:
                     self._pack_reading(truth.stamp, battery))
         return motion, self._mocap[0], self._joint_reading(), None if \
             tick % self._battery_period else self._pack_reading(truth.stamp, battery)
+
+    def rotor_speeds(self, tick: int, truth: Truth, wear: np.ndarray) -> RotorReading | None:
+        """
+        Rotor speeds that become available at the end of tick number ``tick``.
+
+        Args:
+            tick: number of the tick.
+            truth: state at its end.
+            wear: (4,) share of the thrust that a propeller still gives at its speed.
+
+        """
+        reading = None
+        if tick % self._rotor_period == 0:
+            speed = self._speed_at_1_newton * np.sqrt(np.maximum(truth.thrust, 0.0) / wear)
+            reading = RotorReading(truth.stamp, speed * self._rotor_noise.next())
+        self._rotors.append(reading)
+        return self._rotors[0] if len(self._rotors) == self._rotors.maxlen else None
 
     def _capture(self, truth):
         noise = self._mocap_noise.next()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,12 +13,16 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.battery import Battery
 from beetle_omni_ros.sim.command_link import CommandLink
 from beetle_omni_ros.sim.conditions import draw
+from beetle_omni_ros.sim.crash import CrashWatch
+from beetle_omni_ros.sim.faults.base import Actuation, Fault, World
+from beetle_omni_ros.sim.faults.schedule import Schedule
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.readings import Drive, Frame, Truth
 from beetle_omni_ros.sim.sensors import Sensors
 
-POWERED = (True,) * 4
+SENSORS = ('imu', 'mocap', 'joints', 'rotors', 'battery')     # readings of a Frame
+POWERED, NEW = (True,) * 4, np.ones(4)
 
 
 class Simulator:
@@ -58,12 +64,16 @@ class Simulator:
                                np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0]))
         self._plant = Plant(robot, self._parameters.plant, self.conditions.variation)
         self._battery = Battery(robot, self._parameters.battery)
+        self._crash = CrashWatch(self._parameters.crash, self.tick)
+        self._wrench, self._payload = np.zeros(6), 0.0
         self.reset()
 
     def reset(self, position: np.ndarray | None = None,
               quaternion: np.ndarray | None = None) -> None:
         """
-        Begin anew: at rest, rotors off, full battery, the seed's noise from its start.
+        Begin anew: at rest and whole, rotors off, full battery, the seed's noise from its start.
+
+        Faults are switched off.
 
         Args:
             position: (3,) of base_link in world [m]; by default standing on the floor.
@@ -83,9 +93,12 @@ class Simulator:
         self.time = 0.0
         self._plant.reset(position, quaternion)
         self._battery.reset()
+        self._crash.reset()
+        self._wrench, self._payload = np.zeros(6), 0.0
         self._link = CommandLink(self._robot, self._parameters.actuators, self.conditions)
         self.truth = self._truth()
-        seeds = np.random.SeedSequence(self._seed).spawn(5)[1:]
+        *seeds, fault_seed = np.random.SeedSequence(self._seed).spawn(7)[1:]
+        self._schedule = Schedule(self.tick, fault_seed)
         self._sensors = Sensors(self._parameters, self.conditions, seeds, self.truth,
                                 self._plant.effort)
         self._sensors.start_imu(self.truth, self._plant.specific_force)
@@ -98,7 +111,63 @@ class Simulator:
             whether it was taken; refusals are counted in :attr:`rejected`.
 
         """
-        return self._link.push(command, self.time)
+        taken = True
+        for one in self._passed_on(command):
+            taken = self._link.push(one, self.time)
+        return taken
+
+    def _passed_on(self, command):
+        """Commands that faults let through now, in place of ``command`` (or of none)."""
+        passed = [] if command is None else [command]
+        for effect in self._schedule.active:
+            passed = [out for one in passed or [None] for out in effect.command(one, self.time)]
+        return passed
+
+    def set_faults(self, faults: Sequence[Fault]) -> None:
+        """
+        Fly with these faults from now on, in place of those before.
+
+        Args:
+            faults: of robot and devices; ``at`` counts from now. One that was there goes on.
+
+        Raises:
+            ParameterError: a fault of a process, which is not simulated here.
+
+        """
+        for fault in faults:
+            if fault.is_process:
+                raise ParameterError(f"fault '{fault.kind}': strikes a process, not the simulated "
+                                     'robot')
+        self._schedule.set(faults, self.time, self._world())
+        self._apply_wrench()
+
+    @property
+    def faults(self) -> list[str]:
+        """Kinds of the faults that are on."""
+        return self._schedule.names
+
+    @property
+    def thrust_command(self) -> np.ndarray:
+        """(4,) thrusts that the rotors are asked for [N]; zero once commands have ceased."""
+        return self._link.thrust
+
+    @property
+    def broken(self) -> bool:
+        """Whether a crash broke the robot."""
+        return self._crash.broken
+
+    def _world(self):
+        return World(self.truth, self._battery, self._link.tilt)
+
+    def _apply_wrench(self):
+        """Hand the plant what task and faults do to it from outside."""
+        wrench, payload = self._wrench.copy(), self._payload
+        for effect in self._schedule.active:
+            payload += effect.payload
+            if effect.wrench is not None:
+                wrench += effect.wrench
+        self._plant.set_wrench(wrench[:3], wrench[3:])
+        self._plant.set_payload(payload)
 
     @property
     def rejected(self) -> Counter:
@@ -117,8 +186,9 @@ class Simulator:
             ValueError: not three finite numbers each.
 
         """
-        self._plant.set_wrench(_vector('wrench force', force_world, 3),
-                               _vector('wrench torque', torque_body, 3))
+        self._wrench = np.concatenate([_vector('wrench force', force_world, 3),
+                                       _vector('wrench torque', torque_body, 3)])
+        self._apply_wrench()
 
     def set_payload(self, mass: float) -> None:
         """
@@ -130,7 +200,8 @@ class Simulator:
         """
         if not (np.isfinite(mass) and mass >= 0):
             raise ValueError(f'payload: expected a mass of 0 kg or more, found {mass!r}')
-        self._plant.set_payload(float(mass))
+        self._payload = float(mass)
+        self._apply_wrench()
 
     @property
     def charge(self) -> float:
@@ -161,26 +232,67 @@ class Simulator:
 
         """
         plant, link, battery = self._plant, self._link, self._battery
+        if not self._schedule.empty:
+            self._switch_faults()
         if drive is None:
             link.update(self.time)
-            plant.set_powered(POWERED)
-            plant.set_targets(link.tilt, np.minimum(link.thrust, battery.thrust_limit))
+            wear = self._actuate(link.tilt, np.minimum(link.thrust, battery.thrust_limit), POWERED)
         else:
-            plant.set_powered(drive.powered)
-            plant.set_targets(drive.tilt, drive.thrust)
+            wear = self._actuate(drive.tilt, drive.thrust, drive.powered)
         plant.step()
         self._ticks += 1
         self.time = self._ticks * self.tick
+        self._crash.step(self.truth, plant.contact)
         self.truth = truth = self._truth()
         battery.step(truth.thrust, self.tick)
         imu, mocap, joints, pack = self._sensors.read(self._ticks, truth, plant, battery,
                                                         devices=drive is not None)
-        return Frame(self.time, imu, mocap, joints, pack, truth)
+        frame = Frame(self.time, imu, mocap, joints, pack, truth,
+                      self._sensors.rotor_speeds(self._ticks, truth, wear))
+        return self._as_sensed(frame) if self._schedule.active else frame
+
+    def _switch_faults(self):
+        """Start and end what is due, and release commands that faults hold."""
+        before = self._schedule.active
+        self._schedule.update(self.time, self._world())
+        if self._schedule.active is not before:
+            self._apply_wrench()
+        for command in self._passed_on(None):
+            self._link.push(command, self.time)
+
+    def _actuate(self, tilt, thrust, powered):
+        """Let servos and rotors work as faults and damage allow; return the rotors' wear."""
+        plant, broken = self._plant, self._crash.broken
+        if not (self._schedule.active or broken):
+            plant.set_powered(powered)
+            plant.set_targets(tilt, thrust)
+            return NEW
+        drive = Actuation(np.array(tilt), np.array(thrust), np.array(powered), np.zeros(4, bool),
+                          np.ones(4))
+        for effect in self._schedule.active:
+            effect.drive(drive)
+        if broken:
+            drive.thrust[:], drive.powered[:] = 0.0, False
+        limit = self._robot.joints.position_limit
+        plant.set_powered(drive.powered, drive.jammed)
+        plant.set_targets(np.clip(drive.tilt, -limit, limit), drive.thrust)
+        return drive.wear
+
+    def _as_sensed(self, frame):
+        """The frame as faulty sensors tell it."""
+        changed = {}
+        for name in SENSORS:
+            reading = getattr(frame, name)
+            for effect in self._schedule.active:
+                reading = getattr(effect, name)(reading, self.time)
+            changed[name] = reading
+        return replace(frame, **changed)
 
     def _truth(self):
         qpos, qvel = self._plant.state
         return Truth(self.time, qpos[:3], qvel[:3], qpos[XYZW], qvel[3:6], qpos[7:], qvel[6:],
-                     self._plant.thrust, self._plant.contact)
+                     self._plant.thrust, self._plant.contact, self._crash.impact,
+                     self._crash.broken)
 
 
 def _vector(name, value, length):

@@ -140,3 +140,16 @@ def test_an_empty_pack_is_swapped_at_the_next_target(charge, tmp_path, monkeypat
     assert metrics(log, task)['success_rate'] == 1.0
     drawn = -np.sum(log.battery_current[:-1] * np.diff(log.battery_t)) / 3600
     assert drawn > 0.3   # [A h] more than one pack holds
+
+
+def test_faults_of_a_file_strike_and_are_told(poses, tmp_path):
+    path = tmp_path / 'faults.yaml'
+    path.write_text('faults: [{what: rotor_stops, at: 1.0, rotor: 2}, {what: controller_silent}]')
+    results = evaluate(poses, ('hover',), faults=path, bag=tmp_path / 'bag')
+    told = ['rotor_stops(rotor=2) at 1 s', 'controller_silent at 0 s']
+    assert results['meta']['faults'] == told
+    log = read_bag(tmp_path / 'bag')
+    assert log.meta['faults'] == told
+    assert 'fallback' in log.states
+    assert log.meta['broken'] == results['hover']['crashed']
+    assert not log.meta['broken'] or log.meta['impact']['speed'] > 1.0

@@ -1,0 +1,177 @@
+"""`beetle_omni faults`: the list of faults flown, landings, healthy flights, one page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import ceil
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from beetle_omni_ros import __version__
+from beetle_omni_ros.evaluation.command import CONTROLLERS
+from beetle_omni_ros.faults import campaign, page
+from beetle_omni_ros.faults.flight import STARTS
+from beetle_omni_ros.faults.healthy import CONDITIONS, fly_healthy, HealthyTrial
+from beetle_omni_ros.faults.landings import fly_landing, LandingTrial
+from beetle_omni_ros.faults.trial import fly_trial, Trial
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.json_file import check_writable, write_json
+from beetle_omni_ros.sim.faults.listed import FaultList
+
+
+def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
+               starts: list[str] | None = None, seeds: int = 1, conditions: str = 'nominal',
+               controller: str = 'nmpc', jobs: int | None = None, output: Path | None = None,
+               json_path: Path | None = None, docs: Path | None = None, bags: bool = False,
+               landings: int = 0, without_mocap: bool = False, healthy: float = 0.0,
+               console: Console | None = None) -> dict:
+    """
+    Fly the list of faults; or landings, or healthy flights, where those are asked for.
+
+    Args:
+        faults: file of the list; by default params/faults.yaml.
+        only: names of the list to fly; by default all.
+        starts: of STARTS; by default all.
+        seeds: flights of each fault from each start.
+        conditions: 'nominal' or 'published'; healthy flights are flown in all.
+        controller: the active one.
+        jobs: flights at a time; by default one a core.
+        output: folder for the page, Markdown, JSON and bags.
+        json_path: file for the results, too.
+        docs: Markdown file whose fault table is written between its markers.
+        bags: whether each flight is recorded and its bag read back.
+        landings: number of landings, in place of the list.
+        without_mocap: whether those lose motion capture.
+        healthy: hours of healthy flight under each of its conditions, in place of the list.
+        console: where to print.
+
+    Returns:
+        ``meta``; ``flights`` and ``summary``, or ``landings``, or ``healthy``.
+
+    Raises:
+        ParameterError: unusable input, in one line.
+
+    """
+    console = console or Console()
+    listed = FaultList.load(faults)
+    cases = listed.chosen(only)
+    _check(starts, controller, output, json_path, docs, bags)
+    meta = {'command': _described(faults, only, starts, seeds, conditions, controller, landings,
+                                  without_mocap, healthy), 'version': __version__}
+    fly = _Flyer(console, jobs)
+    results: dict = {'meta': meta}
+    if landings:
+        flown = fly('landings', fly_landing, [
+            LandingTrial(seed, conditions, controller, without_mocap)
+            for seed in range(landings)], listed)
+        results['landings'] = {'flights': flown, 'summary': campaign.landing_summary(flown)}
+    if healthy:
+        number = ceil(3600 * healthy / listed.healthy.flight_time)
+        flown = fly('healthy flights', fly_healthy, [
+            HealthyTrial(seed, name, controller) for name in CONDITIONS
+            for seed in range(number)], listed)
+        results['healthy'] = {'flights': flown, 'summary': campaign.healthy_summary(flown)}
+    if not landings and not healthy:
+        flown = fly('faults', fly_trial, [
+            Trial(case.name, start, seed, conditions, controller) for case in cases
+            for start in starts or STARTS for seed in range(seeds)], listed,
+            output / 'bags' if bags else None)
+        flown.sort(key=lambda one: (list(listed.cases).index(one['case']), one['start'],
+                                    one['seed']))
+        results.update(flights=flown, summary=campaign.summary(flown, listed))
+    _write(results, output, json_path, docs)
+    _print(results, console)
+    return results
+
+
+def _check(starts, controller, output, json_path, docs, bags):
+    for start in starts or ():
+        if start not in STARTS:
+            raise ParameterError(f"--from '{start}': expected {', '.join(STARTS)}")
+    if controller not in CONTROLLERS:
+        raise ParameterError(f"controller '{controller}': expected one of "
+                             f"{', '.join(CONTROLLERS)}")
+    if bags and output is None:
+        raise ParameterError('--bags: expected --output DIR to record to')
+    if json_path:
+        check_writable(json_path)
+    if docs and page.BEGIN not in _text(docs):
+        raise ParameterError(f"{docs}: no line '{page.BEGIN}'")
+    if output:
+        try:
+            output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ParameterError(f'{output}: cannot be made ({error.strerror})') from None
+        check_writable(output / 'faults.json')
+
+
+def _text(path):
+    try:
+        return path.read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterError(f'{path}: cannot be read ({type(error).__name__})') from None
+
+
+def _described(faults, only, starts, seeds, conditions, controller, landings, without_mocap,
+               healthy):
+    parts = ['beetle_omni faults']
+    parts += [f'--faults {faults}'] if faults else []
+    parts += [f"--only {','.join(only)}"] if only else []
+    parts += [f"--from {','.join(starts)}"] if starts else []
+    parts += [f'--landings {landings}'] if landings else []
+    parts += ['--without-mocap'] if without_mocap else []
+    parts += [f'--healthy {healthy:g}'] if healthy else [f'--conditions {conditions}']
+    parts += [] if landings or healthy else [f'--seeds {seeds}']
+    return ' '.join([*parts, f'--controller {controller}'])
+
+
+class _Flyer:
+    """Flies trials with a progress bar."""
+
+    def __init__(self, console, jobs):
+        self._console, self._jobs = console, jobs
+
+    def __call__(self, title: str, function: Callable, trials: list, *arguments) -> list[dict]:
+        """Fly; return results in the order in which they were finished."""
+        columns = (TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
+                   TimeRemainingColumn())
+        results = []
+        with Progress(*columns, console=self._console, transient=True) as bars:
+            bar = bars.add_task(title, total=len(trials))
+            for result in campaign.fly_all(function, trials, *arguments, jobs=self._jobs):
+                results.append(result)
+                bars.advance(bar)
+        return results
+
+
+def _write(results, output, json_path, docs):
+    for path in filter(None, (json_path, output and output / 'faults.json')):
+        write_json(path, results)
+    if output:
+        (output / 'faults.html').write_text(page.as_page(results), encoding='utf-8')
+        (output / 'faults.md').write_text(page.as_markdown(results), encoding='utf-8')
+    if docs and results.get('summary'):
+        table = page.markdown(page.COLUMNS, page.fault_rows(results))
+        docs.write_text(page.in_docs(_text(docs), table), encoding='utf-8')
+
+
+def _print(results, console):
+    if results.get('summary'):
+        _table(console, 'Faults', page.COLUMNS[:1] + page.COLUMNS[2:],
+               [row[:1] + row[2:] for row in page.fault_rows(results)])
+        console.print(page.total_text(results), highlight=False)
+    for title, header, rows in page.other_tables(results):
+        _table(console, title, header, rows)
+
+
+def _table(console, title, header, rows):
+    table = Table(title=title, title_justify='left')
+    for column in header:
+        table.add_column(column)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    console.print(table)

@@ -1,0 +1,74 @@
+"""Landings from random attitudes, with motion capture and without."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from beetle_omni_ros.evaluation.compute import collector_off
+from beetle_omni_ros.faults.flight import Flight
+from beetle_omni_ros.faults.trial import told
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.faults.listed import FaultList
+
+
+@dataclass(frozen=True)
+class LandingTrial:
+    """
+    Which landing.
+
+    Attributes:
+        seed: of attitude and simulation; every fourth one lands from upside down.
+        conditions: 'nominal' or 'published'.
+        controller: the active one.
+        without_mocap: whether motion capture is lost as it lands.
+
+    """
+
+    seed: int
+    conditions: str = 'nominal'
+    controller: str = 'nmpc'
+    without_mocap: bool = False
+
+
+def fly_landing(trial: LandingTrial, listed: FaultList) -> dict:
+    """
+    Fly to an attitude, ask for a landing.
+
+    Returns:
+        the trial's fields, roll, pitch and yaw of the attitude [deg], good, and what
+        :func:`~beetle_omni_ros.faults.trial.told` says.
+
+    """
+    plan, limits = listed.flight, listed.limits
+    random = np.random.default_rng([trial.seed, 1])
+    rpy = random.uniform(-np.pi, np.pi, 3)
+    if trial.seed % 4 == 3:
+        rpy[:2] = np.pi + random.normal(0.0, 0.01, 2), 0.0
+    result = {**asdict(trial), 'attitude_deg': np.degrees(rpy).tolist(), 'error': ''}
+    try:
+        with collector_off():
+            result.update(_fly(trial, listed, plan, rpy))
+    except Exception as error:          # a campaign goes on, and tells what was raised
+        result.update(outcome='error', error=f'{type(error).__name__}: {error}'[:200])
+    speed, inclined = (result.get(key) for key in ('impact_m_s', 'inclination_deg'))
+    result['good'] = result['outcome'] == 'flies_on' and speed <= limits.landing_speed \
+        and np.radians(inclined) <= limits.landing_inclination
+    return result
+
+
+def _fly(trial, listed, plan, rpy):
+    strike = (Fault('mocap_lost'),) if trial.without_mocap else ()
+    flight = Flight(controller=trial.controller, conditions=trial.conditions, seed=trial.seed,
+                    strike=strike)
+    flight.loop.take_off()
+    flight.aim((0.0, 0.0, plan.height), rotations.from_rpy(*rpy))
+    flight.fly(plan.turn_time)
+    watcher = flight.watch(listed)
+    asked = flight.supervisor.state in ('flying', 'fallback')
+    flight.loop.start_faults()
+    flight.supervisor.land(flight.loop.now)
+    flight.fly(plan.landing_time, watcher)
+    return told(flight, watcher, asked=asked)

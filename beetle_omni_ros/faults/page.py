@@ -1,0 +1,120 @@
+"""Results of a campaign as tables: Markdown, and one self-contained page."""
+
+from __future__ import annotations
+
+from html import escape
+
+from beetle_omni_ros.runs.report_page import frame, section
+
+BEGIN = '<!-- faults: begin, written by beetle_omni faults --docs -->'
+END = '<!-- faults: end -->'
+COLUMNS = ('fault', 'what happens', 'expected', 'flights', 'as expected', 'outcomes',
+           'impact median [m/s]', 'impact worst [m/s]', 'named after [s]')
+
+
+def fault_rows(results: dict) -> list[list[str]]:
+    """Rows under COLUMNS, of the summary in ``results``."""
+    return [[name, row['what'], row['expected'], str(row['flights']), str(row['good']),
+             _counted(row['outcomes']), _number(row['impact_median_m_s']),
+             _number(row['impact_worst_m_s']), _number(row['named_s'])]
+            for name, row in results['summary']['faults'].items()]
+
+
+def listed_rows(listed) -> list[list[str]]:
+    """Rows under COLUMNS of a list of which nothing has been flown."""
+    return [[name, case.what, case.expected, *[''] * 6] for name, case in listed.cases.items()]
+
+
+def other_tables(results: dict) -> list[tuple[str, tuple[str, ...], list[list[str]]]]:
+    """Title, header and rows of landings and healthy flights, where they were flown."""
+    tables = []
+    if results.get('landings'):
+        tables.append(('Landings from random attitudes', (
+            'conditions', 'motion capture', 'landings', 'good', 'outcomes', 'impact median [m/s]',
+            'impact worst [m/s]', 'inclination median [deg]', 'inclination worst [deg]'),
+            [[row['conditions'], 'yes' if row['mocap'] else 'lost', str(row['landings']),
+              str(row['good']), _counted(row['outcomes']), _number(row['impact_median_m_s']),
+              _number(row['impact_worst_m_s']), _number(row['inclination_median_deg']),
+              _number(row['inclination_worst_deg'])] for row in results['landings']['summary']]))
+    if results.get('healthy'):
+        tables.append(('Healthy flights', (
+            'conditions', 'flights', 'hours', 'alarms', 'not landed', 'errors'),
+            [[row['conditions'], str(row['flights']), f"{row['hours']:.2f}",
+              _counted(row['alarms']) or 'none', str(row['not_landed']), str(len(row['errors']))]
+             for row in results['healthy']['summary']]))
+    return tables
+
+
+def markdown(header, rows) -> str:
+    """A Markdown table."""
+    lines = [header, ['---'] * len(header), *rows]
+    return ''.join('| ' + ' | '.join(cell.replace('|', '\\|') for cell in line) + ' |\n'
+                   for line in lines)
+
+
+def total_text(results: dict) -> str:
+    """The campaign in one sentence, '' where no fault was flown."""
+    if not results.get('summary'):
+        return ''
+    total = results['summary']['total']
+    bags = 'bags not recorded' if total['lost_bags'] is None else f"{total['lost_bags']} lost bags"
+    return (f"{total['good']} of {total['flights']} flights ended as expected; "
+            f"{total['flyaways']} flyaways, {total['motors_on_after_crash']} with motors on after "
+            f"a crash, {total['takeoffs']} take-offs without arming, {bags}, "
+            f"{total['errors']} errors.")
+
+
+def as_markdown(results: dict) -> str:
+    """Everything as Markdown."""
+    parts = [f'# Faults\n\n{results["meta"]["command"]}\n']
+    if results.get('summary'):
+        parts += [total_text(results) + '\n', markdown(COLUMNS, fault_rows(results))]
+    parts += [f'## {title}\n\n{markdown(header, rows)}'
+              for title, header, rows in other_tables(results)]
+    return '\n'.join(parts)
+
+
+def as_page(results: dict) -> str:
+    """Everything as one HTML page that needs no network."""
+    content = ''
+    if results.get('summary'):
+        content += section('Faults', total_text(results), _html(COLUMNS, fault_rows(results)))
+        bad = [[result['case'], result['start'], str(result['seed']), result['conditions'],
+                result['outcome'], _number(result.get('impact_m_s')),
+                result.get('said') or result['error']]
+               for result in results['flights'] if not result['good']]
+        content += section('Flights that did not end as expected', '', _html(
+            ('fault', 'from', 'seed', 'conditions', 'outcome', 'impact [m/s]', 'first complaint'),
+            bad)) if bad else ''
+    for title, header, rows in other_tables(results):
+        content += section(title, '', _html(header, rows))
+    return frame('Faults', results['meta']['command'], f'<div class="faults">{content}</div>')
+
+
+def in_docs(text: str, table: str) -> str:
+    """
+    Return ``text`` with ``table`` between its markers.
+
+    Raises:
+        ValueError: the markers are not there.
+
+    """
+    if BEGIN not in text or END not in text:
+        raise ValueError(f"expected the lines '{BEGIN}' and '{END}'")
+    before, _, rest = text.partition(BEGIN)
+    return f'{before}{BEGIN}\n{table}{END}{rest.partition(END)[2]}'
+
+
+def _html(header, rows):
+    cells = ''.join(f'<th>{escape(cell)}</th>' for cell in header)
+    lines = ''.join('<tr>' + ''.join(f'<td>{escape(cell)}</td>' for cell in row) + '</tr>\n'
+                    for row in rows)
+    return f'<div class="scroll"><table><tr>{cells}</tr>\n{lines}</table></div>'
+
+
+def _counted(counts):
+    return ', '.join(f'{count} {text}' for text, count in counts.items())
+
+
+def _number(value):
+    return '' if value is None else f'{value:.2f}'

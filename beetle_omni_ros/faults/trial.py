@@ -1,0 +1,149 @@
+"""One flight of the campaign: take off, go there, be struck, fly on, land."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.evaluation.compute import collector_off
+from beetle_omni_ros.faults.flight import Flight, OFF, STARTS, Watcher
+from beetle_omni_ros.faults.watch import as_expected
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.runs.bag import BagWriter
+from beetle_omni_ros.runs.bag_reader import read_bag
+from beetle_omni_ros.sim.faults.listed import FaultList, FlightPlan
+
+IN_FLIGHT = ('flying', 'fallback')
+
+
+@dataclass(frozen=True)
+class Trial:
+    """
+    Which flight.
+
+    Attributes:
+        case: name of what strikes.
+        start: one of STARTS.
+        seed: of poses, moment and everything random in the simulation.
+        conditions: 'nominal' or 'published'.
+        controller: the active one.
+
+    """
+
+    case: str
+    start: str = 'hover'
+    seed: int = 0
+    conditions: str = 'nominal'
+    controller: str = 'nmpc'
+
+    def __str__(self) -> str:
+        """A name for its bag."""
+        return f'{self.case}_{self.start}_{self.conditions}_{self.controller}_{self.seed}'
+
+
+def fly_trial(trial: Trial, listed: FaultList, bags: Path | None = None) -> dict:
+    """
+    Fly one trial.
+
+    Args:
+        trial: which.
+        listed: the list that holds its case, limits and plan.
+        bags: folder in which it records a bag; None: none is recorded.
+
+    Returns:
+        the trial's fields, expected, outcome, good, impact_m_s, inclination_deg, overrun_s,
+        flyaway, takeoffs, named and named_s, said and said_s, state, farthest_m, flown_s;
+        bag_lost (None where none was asked for) and error ('' where nothing was raised).
+
+    """
+    case = listed.cases[trial.case]
+    result = {**asdict(trial), 'expected': case.expected, 'bag_lost': None, 'error': ''}
+    folder = bags / str(trial) if bags else None
+    try:
+        with collector_off(), ExitStack() as stack:
+            recorder = None
+            if folder:
+                recorder = stack.enter_context(BagWriter(
+                    folder, meta={**asdict(trial), 'faults': [str(one) for one in case.strike]}))
+            result.update(_fly(trial, listed, recorder))
+    except Exception as error:          # a campaign goes on, and tells what was raised
+        result.update(outcome='error', error=f'{type(error).__name__}: {error}'[:200])
+    if folder:
+        result['bag_lost'] = _is_lost(folder)
+    result['good'] = as_expected(case.expected, result['outcome']) and not result['bag_lost']
+    return result
+
+
+def _fly(trial, listed, recorder):
+    plan = listed.flight
+    flight = Flight(controller=trial.controller, conditions=trial.conditions, seed=trial.seed,
+                    strike=listed.cases[trial.case].strike, recorder=recorder)
+    loop, supervisor = flight.loop, flight.supervisor
+    loop.take_off()
+    _go(flight, trial.start, plan)
+    watcher = flight.watch(listed)
+    start = flight.simulator.time
+    loop.start_faults()
+    over = _fly_on(flight, trial.start, plan, watcher)
+    asked = supervisor.state in IN_FLIGHT
+    if not over:
+        supervisor.land(loop.now)
+        flight.fly(plan.landing_time, watcher)
+    return {**told(flight, watcher, asked=asked), 'flown_s': flight.simulator.time - start}
+
+
+def _go(flight: Flight, start: str, plan: FlightPlan):
+    """Fly to where the fault strikes."""
+    later = plan.jitter * flight.random.uniform()
+    if start == 'moving':
+        flight.aim_anywhere(plan)
+        flight.fly(plan.move_time)
+        flight.aim_anywhere(plan)
+        flight.fly(later)
+        return
+    upside_down = start == 'upside_down'
+    flight.aim((0.0, 0.0, plan.height), rotations.from_rpy(np.pi if upside_down else 0.0, 0, 0))
+    flight.fly((plan.turn_time if upside_down else plan.hover_time) + later)
+
+
+def _fly_on(flight: Flight, start: str, plan: FlightPlan, watcher: Watcher) -> bool:
+    """Fly on with the fault; return whether the flight ended in it."""
+    left = plan.watch_time
+    while left > 0:
+        time = min(left, plan.move_time) if start == 'moving' else left
+        if flight.fly(time, watcher):
+            return True
+        left -= time
+        if left > 0:
+            flight.aim_anywhere(plan)
+    return False
+
+
+def told(flight: Flight, watcher: Watcher, *, asked: bool) -> dict:
+    """What a flight showed, see :func:`fly_trial`."""
+    seen, supervisor = watcher.seen, flight.supervisor
+    worst = seen.worst
+    inclined = max((impact.inclination for impact in seen.impacts), default=None)
+    return {
+        'outcome': seen.outcome(asked=asked, stopped=supervisor.state in OFF,
+                                refused=bool(flight.loop.refusals)),
+        'impact_m_s': worst.speed if worst else None,
+        'inclination_deg': None if inclined is None else float(np.degrees(inclined)),
+        'broken': flight.simulator.broken, 'overrun_s': seen.overrun, 'flyaway': seen.flyaway,
+        'takeoffs': seen.takeoffs, 'named': watcher.named, 'named_s': watcher.named_after,
+        'said': watcher.said, 'said_s': watcher.said_after, 'state': supervisor.state,
+        'farthest_m': seen.farthest}
+
+
+def _is_lost(folder):
+    """Whether a bag cannot be read or misses the flight."""
+    try:
+        return not len(read_bag(folder).truth_t)
+    except Exception:       # whatever it is, the bag is lost
+        return True
+
+
+__all__ = ['fly_trial', 'STARTS', 'told', 'Trial']

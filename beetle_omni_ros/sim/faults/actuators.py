@@ -1,0 +1,234 @@
+"""Faults of rotors and servos."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import exp
+
+import numpy as np
+
+from beetle_omni_ros.sim.faults.base import Effect, kind, Number, one_of_four, share
+
+
+class RotorEffect(Effect):
+    """A fault of one rotor."""
+
+    numbers = {'rotor': one_of_four('rotor')}
+
+    @property
+    def _k(self):
+        return int(self._numbers['rotor']) - 1
+
+
+@kind('rotor_stops')
+class RotorStops(RotorEffect):
+    """Its ESC gives up; the thrust fades with the rotor's lag."""
+
+    doc = 'a rotor stops; its thrust fades with the rotor lag'
+
+    def drive(self, drive):
+        """No thrust."""
+        drive.thrust[self._k] = 0.0
+
+
+@kind('rotor_weak')
+class RotorWeak(RotorEffect):
+    """It turns slower than asked."""
+
+    doc = 'a rotor turns slower and gives only a share of the thrust asked for'
+    numbers = {**RotorEffect.numbers, 'share': share('of the thrust asked for')}
+
+    def drive(self, drive):
+        """Less thrust."""
+        drive.thrust[self._k] *= self._numbers['share']
+
+
+@kind('propeller_broken')
+class PropellerBroken(RotorEffect):
+    """It turns as asked, and its blades give less."""
+
+    doc = 'a rotor turns at the speed asked for and its propeller gives only a share of the thrust'
+    numbers = {**RotorEffect.numbers, 'share': share('of the thrust at that speed')}
+
+    def drive(self, drive):
+        """Less thrust at the same speed."""
+        drive.thrust[self._k] *= self._numbers['share']
+        drive.wear[self._k] *= max(self._numbers['share'], 1e-6)
+
+
+@kind('rotor_sticks')
+class RotorSticks(RotorEffect):
+    """It no longer hears commands and keeps its thrust."""
+
+    doc = 'a rotor keeps the thrust that it has'
+
+    def start(self, world):
+        """Remember the thrust."""
+        self._thrust = float(world.truth.thrust[self._k])
+
+    def drive(self, drive):
+        """The thrust of then."""
+        drive.thrust[self._k] = self._thrust
+
+
+@kind('rotor_slow')
+class RotorSlow(RotorEffect):
+    """Another first-order lag before its own."""
+
+    doc = 'a rotor follows through one more lag'
+    numbers = {**RotorEffect.numbers,
+               'time_constant': Number('of the additional lag', 's', low=0.005, high=10)}
+
+    def start(self, world):
+        """Begin where it is."""
+        self._thrust = float(world.truth.thrust[self._k])
+        self._gain = 1 - exp(-self._tick / self._numbers['time_constant'])
+
+    def drive(self, drive):
+        """Towards what is asked."""
+        self._thrust += self._gain * (drive.thrust[self._k] - self._thrust)
+        drive.thrust[self._k] = self._thrust
+
+
+class ServoEffect(Effect):
+    """A fault of one servo."""
+
+    numbers = {'servo': one_of_four('servo')}
+
+    @property
+    def _k(self):
+        return int(self._numbers['servo']) - 1
+
+    def _shown(self, reading, position=None, velocity=None):
+        """Reading with this servo's angle [rad] and rate [rad/s] replaced."""
+        changed = {}
+        for name, value in (('position', position), ('velocity', velocity)):
+            if value is not None:
+                changed[name] = getattr(reading, name).copy()
+                changed[name][self._k] = value
+        return replace(reading, **changed)
+
+
+@kind('servo_jammed')
+class ServoJammed(ServoEffect):
+    """The joint is held by force, where it is or after a slip."""
+
+    doc = 'a joint jams where it is, or after it has slipped by an angle'
+    numbers = {**ServoEffect.numbers,
+               'offset': Number('by which it slips first', 'rad', 0.0, -8, 8),
+               'rate': Number('of the slip', 'rad/s', 10.0, 0.1, 100)}
+
+    def start(self, world):
+        """Hold from here."""
+        self._angle = float(world.truth.tilt[self._k])
+        self._left = self._numbers['offset']
+
+    def drive(self, drive):
+        """Slip, then hold."""
+        most = self._numbers['rate'] * self._tick
+        step = float(np.clip(self._left, -most, most))
+        self._left -= step
+        self._angle += step
+        drive.tilt[self._k] = self._angle
+        drive.jammed[self._k] = True
+
+
+@kind('servo_limp')
+class ServoLimp(ServoEffect):
+    """No torque."""
+
+    doc = 'a servo loses its torque, the joint swings freely'
+
+    def drive(self, drive):
+        """Not powered."""
+        drive.powered[self._k] = False
+
+
+@kind('servo_slow')
+class ServoSlow(ServoEffect):
+    """It turns slowly."""
+
+    doc = 'a servo turns at most at a rate'
+    numbers = {**ServoEffect.numbers,
+               'rate': Number('that it reaches', 'rad/s', low=0.01, high=100)}
+
+    def start(self, world):
+        """Begin where it is."""
+        self._angle = float(world.truth.tilt[self._k])
+
+    def drive(self, drive):
+        """A target that moves slowly."""
+        step = self._numbers['rate'] * self._tick
+        self._angle += float(np.clip(drive.tilt[self._k] - self._angle, -step, step))
+        drive.tilt[self._k] = self._angle
+
+
+@kind('servo_deaf')
+class ServoDeaf(ServoEffect):
+    """It hears no new target."""
+
+    doc = 'a servo holds the target that it had'
+
+    def start(self, world):
+        """Remember the target."""
+        self._target = float(world.tilt[self._k])
+
+    def drive(self, drive):
+        """The target of then."""
+        drive.tilt[self._k] = self._target
+
+
+@kind('encoder_shifted')
+class EncoderShifted(ServoEffect):
+    """The magnet slips; the servo regulates by what it reads, so the joint moves away."""
+
+    doc = 'an encoder reads too much by an angle, and its servo regulates by that'
+    numbers = {**ServoEffect.numbers,
+               'angle': Number('reading minus true tilt', 'rad', low=-8, high=8)}
+
+    def drive(self, drive):
+        """The servo turns until its reading is the target."""
+        drive.tilt[self._k] -= self._numbers['angle']
+
+    def joints(self, reading, now):
+        """Read too much."""
+        return reading and self._shown(reading,
+                                       reading.position[self._k] + self._numbers['angle'])
+
+
+@kind('encoder_frozen')
+class EncoderFrozen(ServoEffect):
+    """Its last angle is told again and again; the servo itself works."""
+
+    doc = 'the told angle of a servo stays as it is, the servo works'
+    _angle: float | None = None
+
+    def joints(self, reading, now):
+        """The first reading since it began."""
+        if reading is None:
+            return None
+        if self._angle is None:
+            self._angle = float(reading.position[self._k])
+        return self._shown(reading, self._angle, 0.0)
+
+
+@kind('joints_lost')
+class JointsLost(Effect):
+    """No feedback of any joint."""
+
+    doc = 'no joint feedback arrives'
+
+    def joints(self, reading, now):
+        """Nothing."""
+        return None
+
+
+@kind('rotor_speed_lost')
+class RotorSpeedLost(Effect):
+    """No ESC telemetry."""
+
+    doc = 'no rotor speed arrives'
+
+    def rotors(self, reading, now):
+        """Nothing."""
+        return None

@@ -1,0 +1,124 @@
+"""Faults of processes: what estimator, controllers and supervisor say and hear."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.base import Command, PoseTarget, State
+from beetle_omni_ros.evaluation.processes import Processes, QUEUE
+from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.readings import BatteryReading, Frame, ImuReading
+
+TICK = 0.005
+STATE = State(1.0, np.ones(3), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(4),
+              np.zeros(4), 1.0)
+
+
+class Ear:
+    """A supervisor that only listens."""
+
+    def __init__(self):
+        self.heard = []
+
+    def __getattr__(self, method):
+        """Note every message."""
+        return lambda *message: self.heard.append((method, *message))
+
+
+@pytest.fixture
+def struck():
+    """Make processes with faults, begun at 0 s; beside them the ear."""
+    def make(*faults):
+        ear = Ear()
+        processes = Processes(TICK, ear)
+        processes.set_faults(faults, 0.0)
+        processes.frame(frame(0.0))
+        return processes, ear
+    return make
+
+
+def frame(time):
+    return Frame(time, ImuReading(time, np.ones(3), np.ones(3)), None, None,
+                 BatteryReading(time, 24.0, -5.0), None)
+
+
+def command(stamp):
+    return Command(stamp, np.full(4, 0.1), np.full(4, 8.0))
+
+
+def test_without_a_fault_everything_passes_as_it_is(struck):
+    processes, ear = struck()
+    one, state = frame(1.0), command(1.0)
+    assert processes.frame(one) is one
+    assert processes.estimate(STATE) is STATE
+    assert processes.requests(state, 1.0) == [state] and processes.requests(None, 1.0) == []
+    assert processes.target(PoseTarget(np.zeros(3), STATE.quaternion)) is None
+    processes.tell('on_battery', 24.0)
+    assert ear.heard == [('on_battery', 24.0)]
+
+
+def test_a_supervisor_that_waits_finds_the_newest_messages_in_its_queues(struck):
+    processes, ear = struck(Fault('supervisor_waits', duration=0.1))
+    assert processes.supervisor_waits
+    for k in range(20):
+        processes.tell('on_battery', k)
+    processes.tell('on_imu', 0)
+    assert ear.heard == []
+    processes.frame(frame(0.1))
+    assert not processes.supervisor_waits
+    assert [value for method, value in ear.heard if method == 'on_battery'] \
+        == list(range(20 - QUEUE, 20))
+    assert ('on_imu', 0) in ear.heard
+
+
+def test_a_clock_that_is_set_moves_every_stamp_and_back_again(struck):
+    processes, _ = struck(Fault('clock_jumps', at=0.1, duration=0.2, step=-3.0))
+    for time, step in ((0.05, 0), (0.15, -3), (0.35, 0)):
+        shifted = processes.frame(frame(time))
+        assert processes.clock_step == step
+        assert shifted.time == time + step == shifted.imu.stamp == shifted.battery.stamp
+
+
+@pytest.mark.parametrize(('kind', 'numbers'), [
+    ('controller_nan', {}), ('controller_rubbish', {}), ('controller_noisy', {'tilt': 0.1}),
+    ('controller_constant', {})])
+def test_a_controller_that_talks_rubbish_keeps_its_stamps(struck, kind, numbers):
+    processes, _ = struck(Fault(kind, **numbers))
+    first, = processes.requests(command(1.0), 1.0)
+    second, = processes.requests(Command(1.01, np.zeros(4), np.ones(4)), 1.01)
+    assert (first.stamp, second.stamp) == (1.0, 1.01)
+    same = np.array_equal(first.tilt, second.tilt) and np.array_equal(first.thrust, second.thrust)
+    assert same == (kind == 'controller_constant')
+
+
+def test_a_silent_controller_says_nothing_and_a_slow_one_says_it_late(struck):
+    silent, _ = struck(Fault('controller_silent'))
+    assert silent.requests(command(1.0), 1.0) == []
+    slow, _ = struck(Fault('controller_slow', delay=0.08))
+    assert slow.requests(command(1.0), 1.0) == []
+    assert slow.requests(None, 1.075) == []
+    late, = slow.requests(None, 1.08)
+    assert late.stamp == 1.0
+
+
+def test_estimates(struck):
+    assert struck(Fault('estimator_dead'))[0].estimate(STATE) is None
+    assert np.isnan(struck(Fault('estimator_nan'))[0].estimate(STATE).position).all()
+    frozen, _ = struck(Fault('estimator_frozen'))
+    frozen.estimate(STATE)
+    later = State(**{**vars(STATE), 'stamp': 2.0, 'position': np.zeros(3)})
+    told = frozen.estimate(later)
+    assert told.stamp == 2.0 and told.position[0] == 1.0
+    away, _ = struck(Fault('estimator_diverges', acceleration=2.0))
+    for _ in range(200):
+        told = away.estimate(STATE)
+    assert np.isclose(told.position[0] - 1.0, 1.0) and np.isclose(told.velocity[0], 2.0)
+    random, _ = struck(Fault('estimator_rubbish'))
+    assert np.isclose(np.linalg.norm(random.estimate(STATE).quaternion), 1.0)
+
+
+def test_somebody_elses_target_and_what_bridges_say(struck):
+    processes, _ = struck(Fault('target', z=-5.0, roll=np.pi), Fault('motor_board_lost', at=0.0))
+    target = processes.target(PoseTarget(np.zeros(3), STATE.quaternion, 4.0))
+    assert target.position[2] == -5.0 and target.stamp == 4.0
+    assert processes.bridges == {'rotor': 'lost: motor board silent'}
+    assert processes.bridges == {}

@@ -1,0 +1,132 @@
+"""The campaign: repeatable flights, sums that add up, tables that match the list."""
+
+from dataclasses import replace
+import io
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from beetle_omni_ros import cli
+from beetle_omni_ros.faults import page
+from beetle_omni_ros.faults.campaign import healthy_summary, landing_summary, summary
+from beetle_omni_ros.faults.command import run_faults
+from beetle_omni_ros.faults.healthy import fly_healthy, HealthyTrial
+from beetle_omni_ros.faults.landings import fly_landing, LandingTrial
+from beetle_omni_ros.faults.trial import fly_trial, Trial
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope='module')
+def quick(listed):
+    """The shipped list with short flights."""
+    plan = replace(listed.flight, hover_time=0.5, watch_time=1.0, jitter=0.2, height=1.1,
+                   end_time=0.3, turn_time=0.5, landing_time=10.0)
+    return replace(listed, flight=plan, healthy=replace(
+        listed.healthy, flight_time=1.0, pose_time=1.0, effects={'wind': {'force': [1.0, 0, 0]}}))
+
+
+@pytest.fixture(scope='module')
+def soft(quick, tmp_path_factory):
+    """A flight with a fault that does not matter, twice, the first with a bag."""
+    bags = tmp_path_factory.mktemp('bags')
+    trial = Trial('commands_lost_for_a_moment')
+    return fly_trial(trial, quick, bags), fly_trial(trial, quick)
+
+
+def test_a_trial_is_deterministic_and_its_bag_is_read_back(soft):
+    first, again = soft
+    assert first['bag_lost'] is False and again['bag_lost'] is None
+    assert {**first, 'bag_lost': None} == again
+    assert first['outcome'] == 'flies_on' and first['good'] and not first['error']
+    assert 0.1 < first['impact_m_s'] < 1.0
+
+
+def test_lost_commands_end_in_a_crash_that_is_told(quick):
+    flown = fly_trial(Trial('commands_lost'), quick)
+    assert flown['broken'] and flown['impact_m_s'] > 2
+    assert flown['overrun_s'] == 0.0
+
+
+def test_an_error_in_a_flight_is_told_and_the_campaign_goes_on(quick):
+    flown = fly_trial(Trial('gust', controller='none'), quick)
+    assert flown['outcome'] == 'error' and not flown['good'] and 'none' in flown['error']
+
+
+def test_a_landing_and_a_healthy_flight(quick):
+    landed = fly_landing(LandingTrial(0), replace(quick, flight=replace(
+        quick.flight, height=1.1, turn_time=0.05)))
+    assert landed['good'], landed
+    flown = fly_healthy(HealthyTrial(0, 'effects'), quick)
+    assert flown['state'] == 'disarmed' and flown['alarms'] == [] and not flown['error']
+
+
+def result(case, **values):
+    return {'case': case, 'start': 'hover', 'seed': 0, 'conditions': 'nominal',
+            'controller': 'nmpc', 'expected': 'lands', 'outcome': 'lands', 'good': True,
+            'impact_m_s': 0.3, 'bag_lost': None, 'error': '', 'overrun_s': 0.0,
+            'flyaway': False, 'takeoffs': 0, **values}
+
+
+def test_sums_add_up(listed):
+    flown = [result('gust'), result('gust', outcome='flyaway', good=False, flyaway=True,
+                                    impact_m_s=None),
+             result('impact', named='push', named_s=0.2, impact_m_s=0.5, takeoffs=1),
+             result('impact', outcome='error', error='x', good=False, bag_lost=True)]
+    told = summary(flown, listed)
+    assert told['faults']['gust']['outcomes'] == {'lands': 1, 'flyaway': 1}
+    assert told['faults']['gust']['impact_worst_m_s'] == 0.3
+    assert told['faults']['impact']['named_s'] == 0.2
+    assert told['total'] == {'flights': 4, 'good': 2, 'share': 0.5, 'flyaways': 1,
+                             'motors_on_after_crash': 0, 'takeoffs': 1, 'errors': 1,
+                             'lost_bags': 1}
+
+
+def test_landings_and_healthy_flights_are_summed_by_conditions():
+    landings = [{'conditions': 'nominal', 'without_mocap': lost, 'good': lost, 'outcome': 'lands',
+                 'impact_m_s': 0.3, 'inclination_deg': 4.0} for lost in (True, True, False)]
+    assert [(row['mocap'], row['landings'], row['good']) for row in landing_summary(landings)] \
+        == [(True, 1, 0), (False, 2, 2)]
+    flights = [{'conditions': 'nominal', 'flown_s': 1800.0, 'alarms': [[1.0, 'error', 'x']],
+                'state': 'disarmed', 'error': ''}] * 2
+    assert healthy_summary(flights) == [{'conditions': 'nominal', 'flights': 2, 'hours': 1.0,
+                                         'alarms': {'x': 2}, 'not_landed': 0, 'errors': []}]
+
+
+def test_the_command_writes_page_markdown_and_json(listed, tmp_path, monkeypatch):
+    monkeypatch.setattr('beetle_omni_ros.faults.command.campaign.fly_all',
+                        lambda function, trials, *rest, jobs: (
+                            result(trial.case, start=trial.start, seed=trial.seed,
+                                   outcome='<b>') for trial in trials))
+    docs = tmp_path / 'safety.md'
+    docs.write_text(f'before\n{page.BEGIN}\nold\n{page.END}\nafter\n')
+    told = run_faults(only=['gust', 'impact'], starts=['hover'], seeds=2, docs=docs,
+                      output=tmp_path / 'out', console=Console(file=io.StringIO()))
+    assert len(told['flights']) == 4
+    html = (tmp_path / 'out' / 'faults.html').read_text()
+    assert '&lt;b&gt;' in html and 'http' not in html
+    assert json.loads((tmp_path / 'out' / 'faults.json').read_text())['summary']['total']['good']
+    assert '| gust |' in (tmp_path / 'out' / 'faults.md').read_text()
+    assert docs.read_text().startswith('before\n') and docs.read_text().endswith('\nafter\n')
+    assert 'old' not in docs.read_text() and '| impact |' in docs.read_text()
+
+
+def test_the_table_in_the_docs_is_that_of_the_list(listed):
+    table = (ROOT / 'docs' / 'safety.md').read_text().split(page.BEGIN)[1].split(page.END)[0]
+    rows = [[cell.strip() for cell in line.strip('| ').split(' | ')[:3]]
+            for line in table.strip().splitlines()[2:]]
+    assert rows == [[case.name, case.what, case.expected] for case in listed.cases.values()]
+
+
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (['--only', 'gust,gost'], 'gost'), (['--from', 'floor'], 'hover, moving, upside_down'),
+    (['--controller', 'pid'], 'pid'), (['--conditions', 'windy'], 'windy'),
+    (['--faults', 'none.yaml'], 'no such file'), (['--without-mocap'], '--landings'),
+    (['--bags'], '--output'), (['--json', 'no/x.json'], 'x.json'), (['--seeds', '0'], '--seeds'),
+    (['--docs', 'none.md'], 'none.md')])
+def test_unusable_input_is_refused_in_one_line(capsys, arguments, named):
+    assert cli.main(['faults', *arguments]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and named in lines[0]

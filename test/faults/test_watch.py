@@ -1,0 +1,84 @@
+"""Judging a flight: by the truth, one word for each way to end."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.faults.watch import as_expected, FlightWatch
+from beetle_omni_ros.sim.faults.listed import OUTCOMES
+from beetle_omni_ros.sim.readings import Impact, Truth
+
+TICK = 0.005
+
+
+def truth(t, height=1.0, x=0.0, contact=False, impact=None, broken=False):
+    return Truth(t, np.array([x, 0.0, height]), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3),
+                 np.zeros(4), np.zeros(4), np.zeros(4), contact, impact, broken)
+
+
+@pytest.fixture
+def watch(listed):
+    return FlightWatch(listed.limits, 20.0, 20.0, np.zeros(3))
+
+
+def soft(t=1.0, speed=0.3, inclination=0.05):
+    return Impact(t, speed, speed, inclination)
+
+
+def judged(watch, asked=True, stopped=True, refused=False):
+    return watch.outcome(asked=asked, stopped=stopped, refused=refused)
+
+
+def test_a_soft_landing_flies_on_or_lands_or_was_refused(watch):
+    watch.step(truth(1.0, 0.15, contact=True, impact=soft()), 0.0, TICK)
+    assert judged(watch) == 'flies_on'
+    assert judged(watch, asked=False) == 'lands'
+    assert judged(watch, refused=True) == 'refused'
+    assert judged(watch, stopped=False) == 'does not land'
+
+
+def test_a_hard_or_tilted_landing_is_none(watch, listed):
+    watch.step(truth(1.0, impact=soft(inclination=1.1 * listed.limits.inclination)), 0.0, TICK)
+    assert judged(watch) == 'tilted'
+    watch.step(truth(2.0, impact=soft(2.0, speed=1.1 * listed.limits.impact_speed)), 0.0, TICK)
+    assert judged(watch) == 'hard'
+    assert watch.worst.stamp == 2.0
+
+
+@pytest.mark.parametrize(('late', 'outcome'), [(0.2, 'stops'), (0.5, 'crash, motors on')])
+def test_motors_must_stop_soon_after_a_crash(watch, late, outcome):
+    for k in range(300):
+        t = k * TICK
+        watch.step(truth(t, 0.1, contact=True, impact=soft(0.1, 3.0), broken=t >= 0.1),
+                   20.0 if t <= 0.1 + late else 0.0, TICK)
+    assert judged(watch) == outcome
+    assert np.isclose(watch.overrun, late, atol=2 * TICK)
+    assert judged(watch, stopped=False) == 'crash, motors on'
+
+
+@pytest.mark.parametrize(('x', 'away'), [(10, False), (24.9, False), (25.1, True), (40, True)])
+def test_a_flyaway_is_far_outside(watch, x, away):
+    watch.step(truth(1.0, x=x), 20.0, TICK)
+    assert (judged(watch) == 'flyaway') == away
+
+
+def test_rising_again_after_lying_down_is_a_takeoff_and_bouncing_is_none(watch):
+    for k in range(200):
+        watch.step(truth(k * TICK, 0.15, contact=k % 40 > 0), 0.0, TICK)
+    watch.step(truth(1.1, 1.0), 20.0, TICK)
+    assert watch.takeoffs == 0
+    for k in range(200):
+        watch.step(truth(2 + k * TICK, 0.15, contact=True), 0.0, TICK)
+    for height in (0.3, 0.7, 1.0):
+        watch.step(truth(4.0, height), 20.0, TICK)
+    assert watch.takeoffs == 1
+    assert judged(watch) == 'takes off'
+
+
+def test_a_better_outcome_is_as_good():
+    for expected in OUTCOMES:
+        assert as_expected(expected, expected)
+        for bad in ('flyaway', 'takes off', 'crash, motors on', 'tilted', 'hard', 'error',
+                    'does not land'):
+            assert not as_expected(expected, bad)
+    assert as_expected('stops', 'lands') and as_expected('lands', 'flies_on')
+    assert not as_expected('refused', 'flies_on') and not as_expected('flies_on', 'lands')

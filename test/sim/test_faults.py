@@ -1,0 +1,359 @@
+"""Faults of the simulated robot: each changes what it says, when it says, and nothing else."""
+
+from dataclasses import replace
+from math import inf
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sim_robots import HIGH, ROBOT, WORLD
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
+from beetle_omni_ros.sim.faults import Fault, KINDS
+from beetle_omni_ros.sim.faults.base import Effect
+from beetle_omni_ros.sim.faults.listed import FaultList, load_faults, parse_faults
+from beetle_omni_ros.sim.simulator import Simulator
+
+HOVER = np.full(4, ROBOT.hover_thrust)
+READINGS = ('imu', 'mocap', 'joints', 'rotors', 'battery')
+# A value for each number that has no default.
+GIVEN = {'rotor': 2, 'servo': 3, 'share': 0.5, 'time_constant': 0.1, 'rate': 1.0, 'angle': 0.5,
+         'delay': 0.03, 'period': 0.1, 'step': 0.5, 'axis': 5, 'charge': 0.3, 'resistance': 0.2,
+         'mass': 0.5, 'mocap_jumps': {'x': 1.0}, 'mocap_turned': {'yaw': 1.0},
+         'mocap_noisy': {'position': 0.1, 'orientation': 0.1}, 'gyroscope_bias': {'y': 0.3},
+         'accelerometer_bias': {'z': 1.0}, 'imu_saturated': {'specific_force': 1.0},
+         'imu_spikes': {'specific_force': 50.0, 'period': 0.01}, 'push': {'x': 30.0},
+         'servo_jammed': {'offset': 0.5}}
+
+
+def some(kind, **times):
+    """A fault of a kind, strong enough to be seen."""
+    numbers = {key: GIVEN[key] for key, number in KINDS[kind].numbers.items()
+               if number.default is None}
+    return Fault(kind, **{**numbers, **GIVEN.get(kind, {}), **times})
+
+
+def flight(*faults, ticks=160, seed=3, conditions='nominal'):
+    """Frames of a flight whose joints and rotors move, with these faults."""
+    simulator = Simulator(ROBOT, WORLD, conditions, seed=seed)
+    simulator.reset(HIGH)
+    simulator.set_faults(faults)
+    frames = []
+    for k in range(ticks):
+        if k % 2 == 0:
+            wave = np.sin(0.15 * k + np.arange(4))
+            simulator.command(Command(simulator.time, 0.6 * wave, HOVER + 2 * wave))
+        frames.append(simulator.step())
+    return frames, simulator
+
+
+def flat(reading):
+    """All numbers of a reading; () where there is none."""
+    if reading is None:
+        return ()
+    return np.concatenate([np.ravel(getattr(reading, name)) for name in reading.__slots__])
+
+
+def differing(frames, others, start=0):
+    """Names of readings that differ after ``start`` ticks, and 'truth'."""
+    found = set()
+    for one, other in zip(frames[start:], others[start:], strict=True):
+        for name in READINGS:
+            if not np.array_equal(flat(getattr(one, name)), flat(getattr(other, name)),
+                                  equal_nan=True):
+                found.add(name)
+        if not np.array_equal(one.truth.position, other.truth.position) \
+                or not np.array_equal(one.truth.tilt, other.truth.tilt):
+            found.add('truth')
+    return found
+
+
+ROBOT_KINDS = sorted(name for name, kind in KINDS.items() if not kind.process)
+SENSING = {name: [hook for hook in READINGS if getattr(kind, hook) is not getattr(Effect, hook)]
+           for name, kind in KINDS.items()}
+PHYSICAL = {name for name in ROBOT_KINDS if KINDS[name].wrench is not Effect.wrench
+            or any(getattr(KINDS[name], hook) is not getattr(Effect, hook)
+                   for hook in ('drive', 'command', 'payload'))}
+
+
+@pytest.fixture(scope='module')
+def healthy():
+    return flight()[0]
+
+
+@pytest.mark.parametrize('kind', ROBOT_KINDS)
+def test_a_kind_changes_what_it_claims_and_nothing_before_its_time(kind, healthy):
+    frames, _ = flight(some(kind, at=0.2))
+    assert differing(frames[:40], healthy[:40]) == set()
+    changed = differing(frames, healthy, 40)
+    if kind in PHYSICAL:
+        assert 'truth' in changed
+    elif kind.startswith('battery_') and kind != 'battery_unread':
+        assert 'battery' in changed
+    else:
+        assert changed == set(SENSING[kind])
+
+
+@pytest.mark.parametrize('kind', ROBOT_KINDS)
+def test_a_kind_is_deterministic(kind):
+    fault = some(kind, at=0.1)
+    assert differing(flight(fault, ticks=80)[0], flight(fault, ticks=80)[0]) == set()
+
+
+@pytest.mark.parametrize('kind', sorted(
+    kind for kind in set(ROBOT_KINDS) - PHYSICAL if SENSING[kind]))
+def test_a_fault_of_a_sensor_ends_without_a_trace(kind, healthy):
+    frames, simulator = flight(some(kind, at=0.1, duration=0.2))
+    assert differing(frames, healthy, 110) == set()
+    assert simulator.faults == []
+
+
+def test_an_empty_list_changes_nothing(healthy):
+    assert differing(flight()[0], healthy) == set()
+
+
+def test_a_stopped_rotor_fades_with_its_lag_and_shows_in_its_speed():
+    frames, _ = flight(Fault('rotor_stops', at=0.3, rotor=2), ticks=160)
+    thrust = np.array([frame.truth.thrust for frame in frames])
+    ratio = thrust[100, 1] / thrust[80, 1]
+    assert np.isclose(ratio, np.exp(-0.1 / ROBOT.rotors.time_constant), rtol=1e-3)
+    assert thrust[150, 0] > 3
+    speed = [frame.rotors.speed for frame in frames if frame.rotors is not None]
+    assert speed[-1][1] < 0.3 * speed[-1][0]
+
+
+def test_rotor_speeds_come_at_50_hz_and_are_those_of_the_thrust():
+    frames, _ = flight(ticks=400)
+    readings = [frame.rotors for frame in frames if frame.rotors is not None]
+    stamps = [reading.stamp for reading in readings]
+    np.testing.assert_allclose(np.diff(stamps), 0.02, atol=1e-9)
+    late = [frame.time - frame.rotors.stamp for frame in frames if frame.rotors is not None]
+    np.testing.assert_allclose(late, WORLD.rotor_speed.latency, atol=1e-9)
+    thrust = {round(frame.time, 6): frame.truth.thrust for frame in frames}
+    rpm = WORLD.rotor_speed.rpm_at_1_newton
+    errors = [reading.speed / (rpm * np.pi / 30 * np.sqrt(thrust[round(reading.stamp, 6)])) - 1
+              for reading in readings[5:]]
+    assert 0.5 < np.std(errors) / WORLD.rotor_speed.noise < 1.5
+
+
+def test_the_rotor_speed_is_that_of_the_emulated_board():
+    assert WORLD.rotor_speed.rpm_at_1_newton == EmulatedBoardParameters.load().rpm_at_1_newton
+
+
+def test_a_broken_propeller_turns_as_fast_as_a_whole_one():
+    whole, _ = flight(ticks=300)
+    broken, _ = flight(Fault('propeller_broken', rotor=1, share=0.5), ticks=300)
+    (a, b), thrust = ([frame.rotors.speed[0] for frame in frames if frame.rotors is not None][-1]
+                      for frames in (whole, broken)), broken[-1].truth.thrust
+    assert np.isclose(a, b, rtol=0.01)
+    assert thrust[0] < 0.6 * whole[-1].truth.thrust[0]
+
+
+def test_a_jammed_joint_slips_at_its_rate_and_then_holds():
+    frames, _ = flight(Fault('servo_jammed', at=0.2, servo=2, offset=0.8), ticks=200)
+    tilt = np.array([frame.truth.tilt[1] for frame in frames])
+    assert np.isclose(tilt[120], tilt[39] + 0.8, atol=0.02)
+    assert np.ptp(tilt[100:]) < 0.005
+    assert np.abs(np.diff(tilt[39:])).max() < 1.3 * 10 * 0.005
+
+
+def test_a_servo_regulates_by_its_shifted_encoder():
+    simulator = Simulator(ROBOT, WORLD)
+    simulator.reset(HIGH)
+    simulator.set_faults([Fault('encoder_shifted', servo=1, angle=1.5)])
+    for _ in range(200):
+        simulator.command(Command(simulator.time, np.full(4, 0.4), np.zeros(4)))
+        frame = simulator.step()
+    np.testing.assert_allclose(frame.truth.tilt, [-1.1, 0.4, 0.4, 0.4], atol=0.01)
+    np.testing.assert_allclose(frame.joints.position, 0.4, atol=0.01)
+
+
+def test_a_turn_of_the_markers_is_in_base_link(healthy):
+    frames, _ = flight(Fault('mocap_turned', roll=np.pi / 2))
+    for frame, other in zip(frames, healthy, strict=True):
+        if frame.mocap is not None:
+            turned = rotations.multiply(other.mocap.quaternion,
+                                        rotations.from_rpy(np.pi / 2, 0, 0))
+            np.testing.assert_allclose(frame.mocap.quaternion, turned, atol=1e-12)
+
+
+def test_late_poses_are_the_same_poses(healthy):
+    frames, _ = flight(Fault('mocap_delayed', delay=0.03))
+    expected = [frame.mocap for frame in healthy if frame.mocap is not None]
+    late = [frame.mocap for frame in frames if frame.mocap is not None]
+    for one, other in zip(late, expected):
+        np.testing.assert_array_equal(flat(one), flat(other))
+    assert len(late) == len(expected) - 3
+
+
+def test_faults_that_stay_in_the_list_go_on():
+    simulator = Simulator(ROBOT, WORLD)
+    simulator.reset(HIGH)
+    slip = Fault('servo_jammed', servo=1, offset=0.5)
+    simulator.set_faults([slip])
+    for _ in range(60):
+        simulator.step()
+    simulator.set_faults([slip, Fault('imu_lost')])
+    for _ in range(60):
+        frame = simulator.step()
+    assert np.isclose(frame.truth.tilt[0], 0.5, atol=0.01)
+    assert simulator.faults == ['servo_jammed', 'imu_lost']
+    simulator.set_faults([])
+    simulator.step()
+    assert simulator.faults == []
+
+
+def test_pushes_and_payloads_add_to_those_of_the_task():
+    simulator = Simulator(ROBOT, WORLD)
+    simulator.reset(HIGH)
+    simulator.set_wrench([0, 0, 5], [0, 0, 0])
+    simulator.set_payload(0.2)
+    simulator.set_faults([Fault('push', duration=0.1, x=3.0),
+                          Fault('payload', duration=0.1, mass=0.3)])
+    simulator.step()
+    plant = simulator._plant
+    np.testing.assert_array_equal(plant._wrench, [3, 0, 5, 0, 0, 0])
+    assert plant._payload == 0.5
+    for _ in range(30):
+        simulator.step()
+    np.testing.assert_array_equal(plant._wrench, [0, 0, 5, 0, 0, 0])
+    assert plant._payload == 0.2
+
+
+# Crashes ---------------------------------------------------------------------------------------
+
+def fallen(height, quaternion=(0, 0, 0, 1)):
+    """A simulator after a fall without thrust."""
+    simulator = Simulator(ROBOT, WORLD)
+    simulator.reset([0, 0, height], quaternion)
+    for _ in range(400):
+        simulator.step()
+    return simulator
+
+
+def test_the_impact_of_a_fall_has_its_speed():
+    simulator = fallen(2.16)
+    impact = simulator.truth.impact
+    drop = 2.16 - WORLD.plant.foot_depth
+    assert np.isclose(impact.speed, np.sqrt(2 * ROBOT.gravity * drop), rtol=0.03)
+    assert np.isclose(impact.vertical_speed, impact.speed, rtol=1e-3)
+    assert impact.inclination < 0.05
+    assert simulator.broken and simulator.truth.broken
+
+
+def test_a_robot_breaks_on_its_side_but_not_when_it_was_put_there():
+    side = rotations.from_rpy(np.pi / 2, 0, 0)
+    assert fallen(0.9, side).broken
+    assert not fallen(0.33, side).broken
+
+
+def test_a_broken_robot_stays_down_until_reset():
+    simulator = fallen(2.0)
+    for _ in range(200):
+        simulator.command(Command(simulator.time, np.zeros(4), np.full(4, 15.0)))
+        frame = simulator.step()
+    assert frame.truth.position[2] < 0.4 and frame.truth.thrust.max() < 0.1
+    assert frame.truth.broken
+    simulator.reset()
+    assert not simulator.broken and simulator.truth.impact is None
+    for _ in range(100):
+        simulator.command(Command(simulator.time, np.zeros(4), np.full(4, 15.0)))
+        frame = simulator.step()
+    assert frame.truth.position[2] > 0.3
+
+
+def test_a_soft_touchdown_breaks_nothing():
+    tall = replace(WORLD, crash=replace(WORLD.crash, airborne_time=0.05))
+    simulator = Simulator(ROBOT, tall)
+    simulator.reset([0, 0, WORLD.plant.foot_depth + 0.03])
+    for _ in range(200):
+        simulator.step()
+    assert 0.5 < simulator.truth.impact.speed < 1.0
+    assert not simulator.broken
+
+
+# Declarations ----------------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('arguments', 'named'), [
+    (('rotor_stop',), 'rotor_stops'), (('rotor_stops',), "'rotor' is missing"),
+    (('mocap_lost', -1.0), "'at'"), (('mocap_lost', 0.0, -inf), "'duration'")])
+def test_a_fault_that_is_none_is_refused(arguments, named):
+    with pytest.raises(ParameterError, match=named):
+        Fault(*arguments)
+
+
+@pytest.mark.parametrize(('numbers', 'named'), [
+    ({'rotor': 5}, '1 to 4'), ({'rotor': 1.5}, 'whole'), ({'rotor': True}, 'whole'),
+    ({'rotor': 'x'}, 'whole'), ({'rotor': 1, 'servo': 1}, "'servo' is unknown"),
+    ({'rotor': 10 ** 400}, '1 to 4'), ({'rotor': float('nan')}, 'whole')])
+def test_numbers_are_checked_by_name(numbers, named):
+    with pytest.raises(ParameterError, match=named):
+        Fault('rotor_stops', **numbers)
+
+
+def test_the_simulator_refuses_faults_of_processes():
+    with pytest.raises(ParameterError, match='controller_silent'):
+        Simulator(ROBOT, WORLD).set_faults([Fault('controller_silent')])
+
+
+def test_the_shipped_list_holds_enough_and_flies_every_kind():
+    listed = FaultList.load()
+    assert len(listed.cases) >= 45
+    flown = {fault.kind for case in listed.cases.values() for fault in case.strike}
+    assert flown == set(KINDS)
+
+
+def test_files_of_one_flight(tmp_path):
+    path = tmp_path / 'faults.yaml'
+    path.write_text('faults:\n- {what: rotor_stops, at: 3, duration: 2, rotor: 2}\n'
+                    '- {what: servo_bus_lost, at: 4}\n- {what: rotor_blinks, at: 1}\n')
+    faults = load_faults(path)
+    assert faults[0] == Fault('rotor_stops', 3.0, 2.0, rotor=2)
+    assert [(fault.kind, fault.at) for fault in faults[1:3]] == [
+        ('servo_bus_lost', 4.0), ('servo_limp', 4.0)]
+    assert faults[-1] == Fault('rotor_stops', 1.0, 0.1, rotor=1)
+
+
+@pytest.mark.parametrize(('text', 'named'), [
+    ('faults: 3', "key 'faults'"), ('fault: []', "key 'fault'"), ('faults: [3]', 'fault 1'),
+    ('faults: [{what: rotor_stop}]', 'known names: rotor_1_stops'),
+    ('faults: [{what: rotor_stops}]', "'rotor' is missing"),
+    ('faults: [{what: rotor_weak, rotor: 1}]', "'share' is missing"),
+    ('faults: [{what: rotor_blinks, share: 1}]', "key 'share'"),
+    ('faults: [{what: mocap_lost, at: .nan}]', "key 'at'"),
+    ('faults: [{what: mocap_lost, self: 1, at: x}]', "key 'at'"),
+    ('faults: [{what: [1]}]', "key 'what'")])
+def test_unusable_files_name_the_key_in_one_line(tmp_path, text, named):
+    path = tmp_path / 'faults.yaml'
+    path.write_text(text)
+    with pytest.raises(ParameterError, match='faults.yaml') as raised:
+        load_faults(path)
+    assert named in str(raised.value) and '\n' not in str(raised.value)
+
+
+def test_short_texts():
+    assert parse_faults(' rotor_stops rotor=2;mocap_lost duration=3 ; ') == [
+        Fault('rotor_stops', rotor=2), Fault('mocap_lost', duration=3)]
+    assert parse_faults('') == []
+    for text in ('rotor_stops 2', 'rotor_stops rotor=x', 'nothing'):
+        with pytest.raises(ParameterError, match='faults'):
+            parse_faults(text)
+
+
+def test_a_simulator_file_of_other_limits_breaks_elsewhere():
+    tough = replace(WORLD, crash=replace(WORLD.crash, speed=50.0))
+    simulator = Simulator(ROBOT, tough)
+    simulator.reset([0, 0, 2.0])
+    for _ in range(300):
+        simulator.step()
+    assert simulator.truth.impact.speed > 5 and not simulator.broken
+
+
+def test_the_docs_name_every_kind():
+    page = (Path(__file__).parents[2] / 'docs' / 'faults.md').read_text()
+    table = page.split('## Kinds')[1].split('## Crashes')[0]
+    named = [line.split('`')[1] for line in table.splitlines() if line.startswith('| `')]
+    assert sorted(named) == sorted(KINDS)
