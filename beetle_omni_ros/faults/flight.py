@@ -137,5 +137,5 @@ class Watcher:
 
 
 def told_faults(supervisor: Supervisor) -> dict[str, float]:
-    """Name -> time [s] of the faults that the supervisor has named; {} for one that names none."""
-    return getattr(supervisor, 'faults', {})
+    """Name -> time [s] of the faults that the supervisor has named."""
+    return supervisor.faults

@@ -26,6 +26,7 @@ from beetle_omni_ros.safety.watch.faults import CRASH
 DISARMED, TAKEOFF, FLYING = 'disarmed', 'takeoff', 'flying'
 FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
 PILOT = 'nmpc'      # flies with actuators missing, where it is good; else the hover law
+RESUMING = 0.1      # [s] after a pause until every source has spoken again
 IN_FLIGHT = (TAKEOFF, FLYING, FALLBACK, LANDING)
 
 
@@ -59,6 +60,7 @@ class Supervisor(Inputs):
         self._stop_left = 0.0
         self._landing_for = self._fallback_for = 0.0
         self._health, self._landing_way = ALL_WELL, None
+        self._resuming = 0.0    # time in which a pause of this process is looked into [s]
         self._before = None     # time of the update before [s]
 
     # Requests ---------------------------------------------------------------------------------
@@ -178,6 +180,8 @@ class Supervisor(Inputs):
         self._fallback_for = self._fallback_for + dt if self.state == FALLBACK else 0.0
         if paused > self._parameters.commands.age_limit:
             self._resume(now, paused)
+        elif self._resuming > 0:
+            self._look_down(now, dt)
         if self.watch.contact:
             self._crash(now, self.watch.contact)
         elif self.watch.health != self._health:
@@ -217,11 +221,17 @@ class Supervisor(Inputs):
         self.watch.name('supervisor_paused', now, '')
         self._say(now, ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: '
                               'the actuators had stopped')
+        self._resuming = RESUMING
+        if self.state == FLYING:
+            self._fall_back(now, ERROR, 'fallback to hover after the pause')
+
+    def _look_down(self, now, dt):
+        """Whether it lies on the floor; what waited in the queues during a pause is older."""
+        self._resuming -= dt
         height = self._height
         if height is not None and height < self._parameters.detection.contact.near_ground:
+            self._resuming = 0.0
             self._crash(now, 'on the floor after the pause')
-        elif self.state == FLYING:
-            self._fall_back(now, ERROR, 'fallback to hover after the pause')
 
     def _crash(self, now, why):
         """Motors off on the ground; a landing that ends upright and softly is none."""
@@ -339,7 +349,7 @@ class Supervisor(Inputs):
         return self._handover.limit(stream.accepted, self._in_force)
 
     def _hold(self, now, dt):
-        if self._selection.stream.good and not self.vehicle.lost:
+        if self._selection.stream.good and not self.vehicle.lost and self._resuming <= 0:
             self._enter(FLYING, now, INFO, f'{self.active}_node good again: it flies')
             return self._fly(now, dt)
         self.source = 'hover'

@@ -337,3 +337,71 @@ def test_parameters_of_the_wrong_kind_are_named():
     from beetle_omni_ros.robot import schema
     with pytest.raises(schema.ParameterError, match='commands.timout.*timeout'):
         schema.bind(SupervisorParameters, {'commands': {'timout': 0.1}})
+
+
+def test_an_impact_near_the_floor_stops_the_motors_for_good():
+    puppet = Puppet().fly()
+    puppet.position = np.array([0.3, -0.2, 0.25])
+    puppet.run(0.05)
+    puppet.supervisor.on_imu(puppet.now + 0.001, np.array([0, 0, 120.0]), np.zeros(3))
+    sent = puppet.run(0.1)
+    assert puppet.supervisor.state == 'emergency_stop'
+    assert puppet.supervisor.told == 'emergency_stop:crash'
+    assert not sent[0].thrust.any()
+    assert not puppet.supervisor.arm(puppet.now)
+
+
+def test_an_impact_high_above_the_floor_is_no_crash():
+    puppet = Puppet().fly()
+    puppet.supervisor.on_imu(puppet.now + 0.001, np.array([0, 120.0, 0]), np.zeros(3))
+    puppet.run(0.2)
+    assert puppet.supervisor.state == 'flying'
+
+
+def test_a_pause_in_the_air_ends_in_fallback_and_on_the_floor_with_motors_off():
+    puppet = Puppet().fly()
+    puppet.now += 0.4
+    puppet.run(0.02)
+    assert 'supervisor_paused' in puppet.supervisor.faults
+    assert puppet.supervisor.state in ('fallback', 'flying')
+    puppet = Puppet().fly()
+    puppet.now += 1.0
+    puppet.position = np.array([0.3, -0.2, 0.2])
+    sent = puppet.run(0.5)
+    assert puppet.supervisor.state in ('disarmed', 'emergency_stop')
+    assert not any(command.thrust.any() for command in sent if command is not None)
+
+
+@pytest.mark.parametrize('spoil', [
+    lambda p: setattr(p, 'position', np.array([0.0, 0.0, 25.0])),
+    lambda p: setattr(p, 'rate', np.array([20.0, 0.0, 0.0]))])
+def test_limits_hold_while_landing(spoil):
+    puppet = Puppet().fly()
+    puppet.supervisor.land(puppet.now)
+    puppet.velocity = np.array([0.0, 0.0, -0.3])
+    spoil(puppet)
+    puppet.run(0.9)
+    assert puppet.supervisor.state == 'landing'
+    puppet.run(0.5)
+    assert puppet.supervisor.state == 'emergency_stop'
+
+
+def test_landing_and_fallback_end_in_time():
+    puppet = Puppet().fly()
+    puppet.alive -= {'nmpc', 'rl'}
+    puppet.run(PARAMETERS.envelope.fallback_time + 0.2)
+    assert puppet.supervisor.state == 'landing'
+    puppet.velocity = np.array([0.0, 0.0, -0.3])
+    puppet.run(PARAMETERS.landing.time_limit + 0.2)
+    assert puppet.supervisor.state == 'emergency_stop'
+
+
+def test_a_flip_of_the_markers_leads_to_a_landing_without_mocap():
+    puppet = Puppet().fly()
+    attitude, puppet.quaternion = puppet.quaternion, rotations.from_rpy(0, 0, np.pi / 2)
+    on_state = puppet.supervisor.on_state
+    puppet.supervisor.on_state = lambda state, status: on_state(
+        replace(state, quaternion=attitude), status)
+    puppet.run(2.0)
+    assert 'mocap_flipped' in puppet.supervisor.faults
+    assert puppet.supervisor.state == 'landing'

@@ -177,5 +177,6 @@ class FaultWatch:
         if name in self.faults:
             return False
         self.faults[name] = float(stamp)
-        self._new.append(text)
+        if text:
+            self._new.append(text)
         return True

@@ -1,0 +1,205 @@
+"""Detectors: what is named, how soon, and what healthy motion never names."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.actuator_health import ALL_WELL
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.watch.faults import FaultWatch
+from beetle_omni_ros.safety.watch.joints import JointWatch
+from beetle_omni_ros.safety.watch.mocap import MocapWatch
+from beetle_omni_ros.safety.watch.speeds import SpeedWatch
+from beetle_omni_ros.safety.watch.wrench import ContactWatch, WrenchWatch
+
+ROBOT = RobotParameters.load()
+ALLOCATOR = Allocator(ROBOT)
+P = SupervisorParameters.load().detection
+TICK = 0.005
+LAG = ROBOT.rotors.time_constant
+
+
+class Body:
+    """A body in space that turns as its thrusts push; the IMU is noisy as in the simulator."""
+
+    def __init__(self, attitude, seed=0):
+        self.hover = ALLOCATOR.hover(attitude, np.zeros(4))
+        self.thrust, self.rate = self.hover.thrust.copy(), np.zeros(3)
+        self.random, self.time = np.random.default_rng(seed), 0.0
+        self.command = Command(0.0, self.hover.tilt, self.hover.thrust)
+
+    def feed(self, watch, duration, works=np.ones(4), turn=np.zeros(4), push=np.zeros(3)):
+        """Let the watch see so much time; returns when it first named a fault [s], or None."""
+        for k in range(round(duration / TICK)):
+            self.time += TICK
+            self.thrust += -np.expm1(-TICK / LAG) * (works * self.hover.thrust - self.thrust)
+            force, torque = ALLOCATOR.wrench(self.hover.tilt + turn, self.thrust)
+            self.rate = self.rate + TICK * (torque - np.cross(
+                self.rate, ROBOT.inertia * self.rate)) / ROBOT.inertia
+            noise = self.random.normal(size=6) * [*[0.05] * 3, *[0.005] * 3]
+            watch.on_imu(self.time, (force + push) / ALLOCATOR.mass + noise[:3],
+                         self.rate + noise[3:], self.hover.tilt, self.hover.thrust, ALL_WELL)
+            if watch.lost is not None or watch.slipped is not None:
+                return (k + 1) * TICK
+        return None
+
+
+def wrench_watch():
+    return WrenchWatch(P.rotor, P.contact, ROBOT, ALLOCATOR)
+
+
+ATTITUDES = [rotations.from_rpy(0, 0, 0), rotations.from_rpy(0.6, -0.3, 1.0),
+             rotations.from_rpy(2.9, 0.2, 0.4)]
+
+
+@pytest.mark.parametrize('attitude', ATTITUDES)
+@pytest.mark.parametrize('rotor', range(4))
+def test_a_lost_rotor_is_named_within_a_sixth_of_a_second(attitude, rotor):
+    body, watch = Body(attitude), wrench_watch()
+    assert body.feed(watch, 2.0) is None
+    works = np.ones(4)
+    works[rotor] = 0.0
+    assert body.feed(watch, 0.5, works) <= 0.16
+    assert watch.lost == rotor and watch.slipped is None
+
+
+@pytest.mark.parametrize('angle', [-1.2, -0.6, 0.6, 1.2])
+@pytest.mark.parametrize('joint', [0, 3])
+def test_a_thrust_that_points_elsewhere_is_a_slipped_joint(joint, angle):
+    body, watch = Body(ATTITUDES[0]), wrench_watch()
+    assert body.feed(watch, 1.0) is None
+    turn = np.zeros(4)
+    turn[joint] = angle
+    assert body.feed(watch, 0.5, turn=turn) <= 0.2
+    assert watch.lost is None
+    assert watch.slipped[0] == joint and watch.slipped[1] == pytest.approx(angle, abs=0.25)
+
+
+def test_a_weaker_rotor_and_a_push_from_outside_are_no_lost_rotor():
+    body, watch = Body(ATTITUDES[0]), wrench_watch()
+    assert body.feed(watch, 0.5, works=np.array([0.8, 1, 1, 1])) is None
+    body, watch = Body(ATTITUDES[0]), wrench_watch()
+    assert body.feed(watch, 2.0, push=np.array([20.0, 0, 0])) is None
+    assert np.linalg.norm(watch.unexplained) == pytest.approx(20.0 / ALLOCATOR.mass, rel=0.05)
+
+
+def test_contact_is_an_impact_or_a_push_near_the_ground_alone():
+    wrench, contact = wrench_watch(), ContactWatch(P.contact, ROBOT.gravity)
+    wrench.impact = 80.0
+    contact.update(TICK, 1.5, wrench)
+    assert not contact.reason
+    contact.update(TICK, 0.1, wrench)
+    assert 'impact' in contact.reason
+    contact.reset()
+    wrench.impact, wrench.unexplained = 0.0, np.array([0, 0, 0.6 * ROBOT.gravity])
+    for height, named in ((1.0, False), (None, False), (0.1, True)):
+        for _ in range(round(2 * P.contact.time / TICK)):
+            contact.update(TICK, height, wrench)
+        assert bool(contact.reason) is named
+    for impact in (10.0, 0.9 * P.contact.impact * 4 * ROBOT.rotors.thrust_max / ALLOCATOR.mass):
+        watch = wrench_watch()
+        watch.on_imu(0.0, np.array([0, 0, impact]), np.zeros(3), np.zeros(4), np.zeros(4),
+                     ALL_WELL)
+        assert watch.impact == 0.0
+
+
+def follow(watch, asked, follows, duration=2.0, delay=0.03, start=0.0, noise=0.05):
+    """A joint set that follows ``asked(t)``; ``follows(t, tilt)`` spoils it."""
+    random, tilt = np.random.default_rng(1), np.zeros(4)
+    lag = ROBOT.joints.kd / ROBOT.joints.kp
+    first = None
+    for k in range(round(duration / TICK)):
+        t = start + k * TICK
+        watch.on_command(t, asked(t))
+        step = (asked(t - delay) - tilt) * -np.expm1(-TICK / lag)
+        tilt = tilt + np.clip(step, -10 * TICK, 10 * TICK)
+        watch.on_joints(t, follows(t, tilt) + noise * random.uniform(-1, 1, 4) * 0.1)
+        if first is None and (watch.jammed | watch.astray | (watch.jump != 0)).any():
+            first = t
+    return first
+
+
+def swings(t):
+    """Turns of 2 rad in 0.3 s, one joint after the other."""
+    return 2.0 * np.tanh(8 * np.sin(2.2 * t + np.arange(4)))
+
+
+def test_joints_that_follow_are_never_named():
+    for delay in (0.01, 0.03, 0.05):
+        assert follow(JointWatch(P.servo, ROBOT), swings, lambda t, q: q, 6.0, delay) is None
+
+
+def test_a_jammed_and_a_wandering_joint_are_told_apart():
+    watch = JointWatch(P.servo, ROBOT)
+    assert follow(watch, swings, lambda t, q: np.where(np.arange(4) == 2, 0.4, q)) < 0.6
+    assert watch.jammed[2] and not watch.astray.any()
+    watch = JointWatch(P.servo, ROBOT)
+    follow(watch, swings, lambda t, q: np.where(np.arange(4) == 1, np.sin(3 * t), q), 1.0)
+    assert watch.astray[1] or watch.jammed[1]
+
+
+def test_an_encoder_that_jumps_is_seen_at_once():
+    watch = JointWatch(P.servo, ROBOT)
+    first = follow(watch, swings, lambda t, q: q + 1.5 * (t > 1.0) * np.eye(4)[3])
+    assert first == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_rotor_that_turns_too_slowly_is_named_by_its_esc():
+    watch, k, named = SpeedWatch(P.rotor, ROBOT), 300.0, None
+    thrust = np.array([7.0, 8.0, 6.0, 9.0])
+    for n in range(200):
+        t, works = 0.02 * n, np.ones(4)
+        if t > 3.0:
+            works[1] = np.exp(-(t - 3.0) / LAG)
+        watch.on_speeds(t, k * np.sqrt(thrust * works), thrust)
+        if watch.lost is not None and named is None:
+            named = t - 3.0, watch.lost
+    assert named[1] == 1 and named[0] < 0.2
+
+
+def test_an_esc_without_telemetry_is_no_lost_rotor():
+    watch = SpeedWatch(P.rotor, ROBOT)
+    for n in range(300):
+        watch.on_speeds(0.02 * n, np.array([800.0, np.nan, 800.0, 800.0]), np.full(4, 7.0))
+    assert watch.lost is None
+
+
+def poses(watch, attitude, at, estimate=lambda t: None):
+    for n in range(100):
+        t = 0.01 * n
+        watch.on_pose(t, np.array([1e-4 * n, 0, 1]), at(t), attitude(t), np.array([0, 0, 0.5]))
+    return watch
+
+
+def test_a_flip_of_the_markers_is_blamed_on_mocap_and_a_wrong_estimate_on_the_estimator():
+    def turning(t):
+        return rotations.from_rpy(0, 0, 0.5 * t)
+
+    def flipped(t):
+        return rotations.from_rpy(0, 0, 0.5 * t + np.pi / 2 * (t > 0.5))
+
+    watch = poses(MocapWatch(P.mocap), turning, turning)
+    assert watch.good and not watch.contradicts
+    watch = poses(MocapWatch(P.mocap), turning, flipped)
+    assert watch.contradicts and watch.jumped and not watch.good
+    watch = poses(MocapWatch(P.mocap), flipped, turning)
+    assert watch.contradicts and not watch.jumped
+
+
+def test_a_fault_stays_named_and_the_health_follows():
+    watch = FaultWatch(P, ROBOT, ALLOCATOR)
+    body = Body(ATTITUDES[0])
+    adapter = type('Adapter', (), {'lost': None, 'slipped': None})()
+    adapter.on_imu = lambda t, f, r, tilt, thrust, health: watch.on_imu(
+        t, f, r, tilt, body.command, 1.0)
+    body.feed(adapter, 1.0)
+    assert watch.faults == {} and watch.health.healthy
+    body.feed(adapter, 0.3, np.array([1, 1, 0, 1]))
+    assert list(watch.faults) == ['rotor3_lost']
+    assert watch.health.rotors == (True, True, False, True)
+    assert watch.news() and not watch.news()
+    watch.reset()
+    assert watch.faults == {} and watch.health.healthy
