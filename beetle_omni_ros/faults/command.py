@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
+import json
 from math import ceil
 from pathlib import Path
 
@@ -62,7 +64,7 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     _check(starts, controller, output, json_path, docs, bags)
     meta = {'command': _described(faults, only, starts, seeds, conditions, controller, landings,
                                   without_mocap, healthy), 'version': __version__}
-    fly = _Flyer(console, jobs)
+    fly = _Flyer(console, jobs, output)
     results: dict = {'meta': meta}
     if landings:
         flown = fly('landings', fly_landing, [
@@ -130,21 +132,26 @@ def _described(faults, only, starts, seeds, conditions, controller, landings, wi
 
 
 class _Flyer:
-    """Flies trials with a progress bar."""
+    """Flies trials with a progress bar; what is finished is kept, whatever comes then."""
 
-    def __init__(self, console, jobs):
-        self._console, self._jobs = console, jobs
+    def __init__(self, console, jobs, output):
+        self._console, self._jobs, self._output = console, jobs, output
 
     def __call__(self, title: str, function: Callable, trials: list, *arguments) -> list[dict]:
         """Fly; return results in the order in which they were finished."""
         columns = (TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
                    TimeRemainingColumn())
         results = []
-        with Progress(*columns, console=self._console, transient=True) as bars:
+        with ExitStack() as stack:
+            bars = stack.enter_context(Progress(*columns, console=self._console, transient=True))
             bar = bars.add_task(title, total=len(trials))
+            kept = stack.enter_context(open(self._output / 'flights.jsonl', 'w')) \
+                if self._output else None
             for result in campaign.fly_all(function, trials, *arguments, jobs=self._jobs):
                 results.append(result)
                 bars.advance(bar)
+                if kept:
+                    print(json.dumps(result), file=kept, flush=True)
         return results
 
 

@@ -54,8 +54,8 @@ def fly_landing(trial: LandingTrial, listed: FaultList) -> dict:
     except Exception as error:          # a campaign goes on, and tells what was raised
         result.update(outcome='error', error=f'{type(error).__name__}: {error}'[:200])
     speed, inclined = (result.get(key) for key in ('impact_m_s', 'inclination_deg'))
-    result['good'] = result['outcome'] == 'flies_on' and speed <= limits.landing_speed \
-        and np.radians(inclined) <= limits.landing_inclination
+    result['good'] = result['outcome'] == 'flies_on' and bool(
+        speed <= limits.landing_speed and np.radians(inclined) <= limits.landing_inclination)
     return result
 
 

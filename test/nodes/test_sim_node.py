@@ -61,6 +61,32 @@ def test_the_direct_path_is_as_it_was(make):
     assert not put(node, board_faults__hang=True).successful
 
 
+def test_faults_are_switched_live_and_told(make):
+    node = make('faults:="mocap_lost"', actuators='direct')
+    assert node._robot_status()[0] == health.OK
+    node._simulator.step()
+    level, text, values = node._robot_status()
+    assert level == health.WARN and text == 'mocap_lost' and values['broken'] == 0
+    assert put(node, faults='mocap_lost; rotor_stops rotor=2').successful
+    node._simulator.step()
+    assert node._simulator.faults == ['mocap_lost', 'rotor_stops']
+    for text, named in (('rotor_stops', "'rotor' is missing"), ('wings', 'rotor_stops'),
+                        ('controller_nan', 'strikes a process')):
+        answer = put(node, faults=text)
+        assert not answer.successful and named in answer.reason
+    assert node._simulator.faults == ['mocap_lost', 'rotor_stops']
+    assert put(node, faults='').successful
+    assert node._simulator.faults == []
+
+
+def test_faults_of_what_devices_measure_are_refused_beside_them(make):
+    node = make()
+    assert put(node, faults='gyroscope_bias x=0.1; rotor_stops rotor=1').successful
+    for text in ('joints_lost', 'battery_unread', 'commands_lost'):
+        answer = put(node, faults=text)
+        assert not answer.successful and 'servo_faults' in answer.reason
+
+
 def test_simulated_time_is_made_here_and_not_with_serial_devices(make):
     node = make('clock:=simulated', actuators='direct')
     assert '/clock' in topics(node)[0] and '/odom' in topics(node)[1]
