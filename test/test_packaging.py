@@ -21,6 +21,7 @@ from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
+from beetle_omni_ros.robot.holding import HoldingParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -39,7 +40,7 @@ DISTRIBUTION = {'yaml': 'pyyaml', 'mcap_ros2': 'mcap-ros2-support', 'serial': 'p
 KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-ros2-support',
        'casadi': 'casadi-pip', 'serial': 'python3-serial', 'PIL': 'python3-pil'}
 PARAMETER_CLASSES = {
-    'check.yaml': CheckLimits, 'ekf.yaml': EkfParameters,
+    'check.yaml': CheckLimits, 'degraded.yaml': HoldingParameters, 'ekf.yaml': EkfParameters,
     'emulated_board.yaml': EmulatedBoardParameters, 'faults.yaml': FaultList,
     'gap.yaml': GapParameters,
     'hover.yaml': HoverParameters,

@@ -18,7 +18,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.recorder import Tee
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.supervisor import Supervisor
+from beetle_omni_ros.safety.supervisor import PILOT, Supervisor
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.faults.listed import FaultList, FlightPlan
 from beetle_omni_ros.sim.parameters import SimulatorParameters
@@ -60,7 +60,8 @@ class Flight:
                                    conditions=conditions, seed=seed)
         self.loop = FlightLoop(
             self.simulator, ErrorStateEkf(estimator, believed.gravity),
-            {controller: make_controller(controller, believed)}, self.supervisor,
+            {name: make_controller(name, believed) for name in dict.fromkeys([controller, PILOT])},
+            self.supervisor,
             Tee() if recorder is None else recorder, estimator.imu.gyroscope_noise, strike)
         self.supervisor.select(controller)
         self.random = np.random.default_rng(seed)

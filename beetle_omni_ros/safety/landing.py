@@ -8,13 +8,13 @@ from math import inf, isfinite
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, Controller, Reference, TrajectoryTarget
-from beetle_omni_ros.control.levelling import plan, Way
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.holding import Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import ERROR, EventLog
+from beetle_omni_ros.safety.levelling import plan, Way
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.ramp import inclination, Ramp
 from beetle_omni_ros.safety.support import SupportGauge

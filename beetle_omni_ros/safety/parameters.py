@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from beetle_omni_ros.control.levelling import LevellingParameters
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
+from beetle_omni_ros.safety.levelling import LevellingParameters
 from beetle_omni_ros.safety.watch.parameters import Detection
 
 

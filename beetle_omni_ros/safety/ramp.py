@@ -8,8 +8,8 @@ from math import sqrt
 import numpy as np
 
 from beetle_omni_ros.control.base import Reference
-from beetle_omni_ros.control.levelling import Way
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.safety.levelling import Way
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, Controller, State
-from beetle_omni_ros.control.levelling import Way
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.safety.levelling import Way
 from beetle_omni_ros.safety.parameters import TakeoffParameters
 from beetle_omni_ros.safety.ramp import Ramp
 

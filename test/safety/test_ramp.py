@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from beetle_omni_ros.control.levelling import Way
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.safety.levelling import Way
 from beetle_omni_ros.safety.ramp import inclination, Ramp
 
 

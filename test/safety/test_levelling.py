@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from beetle_omni_ros.control.levelling import LevellingParameters, plan, Way
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.safety.levelling import LevellingParameters, plan, Way
 from beetle_omni_ros.safety.ramp import inclination
 
 ALLOCATOR = Allocator(RobotParameters.load())
