@@ -43,10 +43,7 @@ def fly_landing(trial: LandingTrial, listed: FaultList) -> dict:
 
     """
     plan, limits = listed.flight, listed.limits
-    random = np.random.default_rng([trial.seed, 1])
-    rpy = random.uniform(-np.pi, np.pi, 3)
-    if trial.seed % 4 == 3:
-        rpy[:2] = np.pi + random.normal(0.0, 0.01, 2), 0.0
+    rpy = attitude(trial.seed)
     result = {**asdict(trial), 'attitude_deg': np.degrees(rpy).tolist(), 'error': ''}
     try:
         with collector_off():
@@ -57,6 +54,14 @@ def fly_landing(trial: LandingTrial, listed: FaultList) -> dict:
     result['good'] = result['outcome'] == 'flies_on' and bool(
         speed <= limits.landing_speed and np.radians(inclined) <= limits.landing_inclination)
     return result
+
+
+def attitude(seed: int) -> np.ndarray:
+    """Roll, pitch, yaw [rad] from which a landing begins; every fourth is upside down."""
+    rpy = np.random.default_rng([seed, 1]).uniform(-np.pi, np.pi, 3)
+    if seed % 4 == 3:
+        rpy[:2] = np.pi, 0.0
+    return rpy
 
 
 def _fly(trial, listed, plan, rpy):

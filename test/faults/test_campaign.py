@@ -5,6 +5,7 @@ import io
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -13,7 +14,7 @@ from beetle_omni_ros.faults import page
 from beetle_omni_ros.faults.campaign import healthy_summary, landing_summary, summary
 from beetle_omni_ros.faults.command import run_faults
 from beetle_omni_ros.faults.healthy import fly_healthy, HealthyTrial
-from beetle_omni_ros.faults.landings import fly_landing, LandingTrial
+from beetle_omni_ros.faults.landings import attitude, fly_landing, LandingTrial
 from beetle_omni_ros.faults.trial import fly_trial, Trial
 
 ROOT = Path(__file__).parents[2]
@@ -62,6 +63,12 @@ def test_a_landing_and_a_healthy_flight(quick):
     assert json.loads(json.dumps(landed)) == landed
     flown = fly_healthy(HealthyTrial(0, 'effects'), quick)
     assert flown['state'] == 'disarmed' and flown['alarms'] == [] and not flown['error']
+
+
+def test_every_fourth_landing_begins_upside_down():
+    drawn = np.array([attitude(seed) for seed in range(40)])
+    np.testing.assert_array_equal(drawn[3::4, :2], np.tile([np.pi, 0.0], (10, 1)))
+    assert np.ptp(drawn[::4], axis=0).min() > 3 and np.abs(drawn).max() <= np.pi
 
 
 def result(case, **values):
