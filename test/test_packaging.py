@@ -24,6 +24,7 @@ from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.robot.holding import HoldingParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
+from beetle_omni_ros.runs.target_checks import TargetLimits
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
 from beetle_omni_ros.sim.faults.listed import FaultList
@@ -51,6 +52,7 @@ PARAMETER_CLASSES = {
     'robot.yaml': RobotParameters, 'robot_weak_and_heavy.yaml': RobotParameters,
     'servo_bus.yaml': ServoBusParameters,
     'simulator.yaml': SimulatorParameters, 'supervisor.yaml': SupervisorParameters,
+    'targets.yaml': TargetLimits,
     'train.yaml': TrainParameters}
 
 

@@ -28,6 +28,7 @@ from beetle_omni_ros.runs.bag import BagWriter
 from beetle_omni_ros.runs.json_file import write_json
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.recorder import LogRecorder, Tee
+from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
@@ -113,7 +114,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
             simulator,
             ErrorStateEkf(estimator, robot.gravity),
             {controller: make_controller(controller, robot, files)}, supervisor, recorder,
-            estimator.imu.gyroscope_noise, faults)
+            estimator.imu.gyroscope_noise, faults, TargetChecks(robot).why_not)
         supervisor.select(controller)
         stayed = loop.fly(task, progress)
         recorder.write_meta({'crashed': not stayed, 'ended': loop.ending,

@@ -16,6 +16,7 @@ from beetle_omni_ros.faults.watch import FlightWatch
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.recorder import Tee
+from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import PILOT, Supervisor
@@ -62,7 +63,8 @@ class Flight:
             self.simulator, ErrorStateEkf(estimator, believed.gravity),
             {name: make_controller(name, believed) for name in dict.fromkeys([controller, PILOT])},
             self.supervisor,
-            Tee() if recorder is None else recorder, estimator.imu.gyroscope_noise, strike)
+            Tee() if recorder is None else recorder, estimator.imu.gyroscope_noise, strike,
+            TargetChecks(believed).why_not)
         self.supervisor.select(controller)
         self.random = np.random.default_rng(seed)
         self._fence = safety.envelope.half_width, safety.envelope.height

@@ -13,6 +13,8 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from beetle_omni_ros.control.base import Controller, PoseTarget
 from beetle_omni_ros.nodes import convert, health, qos, targets
 from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.target_checks import TargetChecks
 
 ODOM_AGE = 0.05         # s, an older estimate is not worth a command
 JOINT_AGE = 0.1         # s
@@ -45,6 +47,7 @@ class ControllerNode(FlightNode):
         self._controller: Controller = self.make_controller(self.parameters)
         self._target = self._joints = self._command = None
         self._hold = self._wish = None
+        self._checks = TargetChecks(RobotParameters.load(self.parameters.robot_file or None))
         self._mode, self._own_mode = '', f'flying:{controller_name}'
         self._last_step = 0.0
         self._publisher = self.create_publisher(JointState, f'{controller_name}/command',
@@ -80,6 +83,10 @@ class ControllerNode(FlightNode):
         self._command = command
 
     def _on_target(self, target):
+        reason = self._checks.why_not(target, self.now())
+        if reason:
+            self.health.rejected('target', reason)
+            return
         if target.stamp == 0.0:     # as quick tools send it: now
             target = self._from_now(target)
         # Latched and volatile copies may overtake each other: the newest stamp counts.

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import csv
+from functools import cache
 from math import isfinite
 from pathlib import Path
 
 import numpy as np
 
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.target_checks import TargetChecks
 
 COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
 
@@ -79,7 +83,16 @@ def _pose(path, line, row, order):
     if pose[2] <= 0:
         raise TaskError(f'{path}: row {line}, column z_m: expected a height above the floor, '
                         f'found {pose[2]:g}')
+    reason = _checks().why_not_pose(pose[:3], rotations.from_rpy(*np.radians(pose[3:])))
+    if reason:
+        raise TaskError(f'{path}: row {line}: {reason}')
     return pose
+
+
+@cache
+def _checks():
+    """Of the shipped robot: a task is for any of its kind."""
+    return TargetChecks(RobotParameters.load())
 
 
 def _number(text):

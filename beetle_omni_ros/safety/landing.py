@@ -21,6 +21,7 @@ from beetle_omni_ros.safety.support import SupportGauge
 from beetle_omni_ros.safety.vehicle import Vehicle
 
 AHEAD, BETWEEN = 20.0, 0.1      # [s] how far ahead, and how densely, a way is told
+ESCAPE = 1.5                    # [s] in which a robot that lost an actuator comes to hover
 
 
 class Landing:
@@ -123,8 +124,9 @@ class Landing:
         p, blind = self._parameters, self._without_mocap
         level = replace(p.level, rate=p.blind_level_rate) if blind else p.level
         way = plan(state.quaternion, state.tilt, self._allocator, level) if self._health.healthy \
-            else self._way_with_what_is_left(state.quaternion, level.rate)
-        wait = way.duration if inclination(state.quaternion) > p.level_first else 0.0
+            else self._way_with_what_is_left(state, level.rate)
+        slanted = inclination(state.quaternion) > p.level_first or not self._health.healthy
+        wait = way.duration if slanted else 0.0
         height = max(0.0, state.position[2] - self._floor)
         fast = max(0.0, height - p.flare_height) if blind else 0.0
         self._ramp = Ramp(state.stamp, state.position, way, wait, *(
@@ -133,14 +135,15 @@ class Landing:
         self._due = now + wait + (height - fast) / p.speed + (
             self._ramp.duration - wait if fast else 0.0)
 
-    def _way_with_what_is_left(self, quaternion, rate):
-        """To the attitude nearest level that leaves a margin, by attitudes that can be held."""
+    def _way_with_what_is_left(self, state, rate):
+        """At once to the attitude that is held soonest, and from there towards level."""
         holding = Holding(self._robot, self._health)
-        level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(quaternion)[2])
-        goal = holding.nearest(level, holding.parameters.flying_margin)
-        attitudes = holding.way(quaternion, goal)
-        turns = [rotations.geodesic_angle(b, a) for a, b in zip(attitudes[:-1], attitudes[1:])]
-        return Way(np.concatenate([[0.0], np.cumsum(np.maximum(turns, 1e-3) / rate)]), attitudes)
+        margin = holding.parameters.flying_margin
+        level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(state.quaternion)[2])
+        escape = holding.quickest(state.quaternion, state.angular_velocity, state.tilt, margin)
+        goal = holding.nearest(level, margin)
+        turn = max(rotations.geodesic_angle(goal, escape) / rate, 1e-3)
+        return Way(np.array([0.0, ESCAPE, ESCAPE + turn]), np.array([escape, escape, goal]))
 
     @property
     def _without_mocap(self):

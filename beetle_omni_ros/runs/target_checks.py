@@ -1,0 +1,120 @@
+"""Which targets are flown: one check for messages and for rows of a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+
+from beetle_omni_ros.control.base import PoseTarget, Target
+from beetle_omni_ros.robot import rotations, schema
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import parameter
+
+UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetLimits:
+    """What a target must keep to; params/targets.yaml says why."""
+
+    half_width: float = parameter(18.0, doc='|x| and |y|', unit='m', low=0.5, high=1000)
+    height: float = parameter(18.0, doc='z', unit='m', low=0.5, high=1000)
+    clearance: float = parameter(0.02, doc='of the lowest point above the floor', unit='m', low=0,
+                                 high=1)
+    feet: float = parameter(0.16, doc='soles below base_link', unit='m', low=0, high=5)
+    feet_spread: float = parameter(0.11, doc='|x| = |y| of a foot', unit='m', low=0, high=5)
+    propeller_radius: float = parameter(0.1143, doc='of a propeller', unit='m', low=0, high=5)
+    ball_radius: float = parameter(0.04, doc='of the end-effector', unit='m', low=0, high=5)
+    oldest: float = parameter(10.0, doc='age of a stamp', unit='s', low=0.1, high=1e5)
+    farthest_ahead: float = parameter(1.0, doc='of a stamp', unit='s', low=0.01, high=1e5)
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> TargetLimits:
+        """Read a file; without a path, the shipped one."""
+        return schema.load(cls, path if path else share_path('params/targets.yaml'))
+
+
+class TargetChecks:
+    """
+    Checks targets of one robot.
+
+    Args:
+        robot: its geometry.
+        limits: by default params/targets.yaml.
+
+    """
+
+    def __init__(self, robot: RobotParameters, limits: TargetLimits | None = None):
+        """See the class."""
+        self._p = p = limits or TargetLimits.load()
+        feet = [(x * p.feet_spread, y * p.feet_spread, -p.feet) for x in (1, -1) for y in (1, -1)]
+        # The joints' axes pass through the rotors' centres and tell where the main body is.
+        ball = robot.rotors.positions.mean(axis=0) + [
+            0.0, 0.0, robot.parts.end_effector.height - robot.parts.module.joint_height]
+        self._points = np.array([*feet, *robot.rotors.positions, ball])
+        self._radii = np.array([*[0.0] * 4, *[p.propeller_radius] * 4, p.ball_radius])
+
+    def why_not(self, target: Target, now: float | None = None) -> str:
+        """
+        Check a target.
+
+        Args:
+            target: a pose, or a trajectory, of which every point is checked.
+            now: present time [s]; without it, and for the stamp 0, the stamp is not looked at.
+
+        Returns:
+            '' where it may be flown, else what is wrong and what was expected, in one line.
+
+        """
+        reason = self._stamp(target.stamp, now)
+        if reason:
+            return reason
+        if isinstance(target, PoseTarget):
+            return self.why_not_pose(target.position, target.quaternion)
+        for k, pose in enumerate(zip(target.positions, target.quaternions)):
+            reason = self.why_not_pose(*pose)
+            if reason:
+                return f'point {k + 1}: {reason}'
+        return ''
+
+    def why_not_pose(self, position: np.ndarray, quaternion: np.ndarray) -> str:
+        """Check a pose: (3,) in world [m], (4,) xyzw; as :meth:`why_not`."""
+        numbers = [*np.asarray(position, dtype=float).tolist(),
+                   *np.asarray(quaternion, dtype=float).tolist()]
+        if len(numbers) != 7 or not all(map(isfinite, numbers)):
+            return 'not seven finite numbers'
+        norm = sum(q * q for q in numbers[3:])
+        if not abs(norm - 1) < UNIT_TOLERANCE:
+            return f'no unit quaternion: its squared length is {norm:.3g}, expected 1'
+        x, y, z = numbers[:3]
+        for name, value, most in (('|x|', abs(x), self._p.half_width),
+                                  ('|y|', abs(y), self._p.half_width),
+                                  ('z', z, self._p.height)):
+            if value > most:
+                return f'{name} = {value:.4g} m, expected at most {most:g} m: the fence'
+        needed = self.lowest_height(quaternion)
+        if z < needed - 1e-9:
+            return f'z = {z:.4g} m, expected at least {needed:.2f} m at this attitude: the floor'
+        return ''
+
+    def lowest_height(self, quaternion: np.ndarray) -> float:
+        """Least height of base_link at an attitude (4,) at which nothing touches the floor [m]."""
+        down = self._points @ rotations.matrix(rotations.normalized(quaternion))[2] - self._radii
+        return self._p.clearance - float(down.min())
+
+    def _stamp(self, stamp, now):
+        if now is None or stamp == 0.0:
+            return ''
+        if not isfinite(stamp):
+            return 'the stamp is not finite'
+        age = now - stamp
+        if age > self._p.oldest:
+            return f'the stamp is {age:.4g} s old, expected at most {self._p.oldest:g} s'
+        if -age > self._p.farthest_ahead:
+            return f'the stamp is {-age:.4g} s ahead, expected at most ' \
+                   f'{self._p.farthest_ahead:g} s'
+        return ''

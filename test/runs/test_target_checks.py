@@ -1,0 +1,69 @@
+"""Targets that are refused, with the reason, and those that are flown."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.pose_file import read_poses, TaskError
+from beetle_omni_ros.runs.target_checks import TargetChecks
+
+CHECKS = TargetChecks(RobotParameters.load())
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+UPSIDE_DOWN = rotations.from_rpy(np.pi, 0, 0)
+
+
+def why(position, quaternion=LEVEL, stamp=0.0, now=None):
+    return CHECKS.why_not(PoseTarget(np.array(position, dtype=float), quaternion, stamp), now)
+
+
+@pytest.mark.parametrize('position, quaternion, text', [
+    ((0, 0, -5), LEVEL, 'the floor'), ((0, 0, 0.05), UPSIDE_DOWN, 'the floor'),
+    ((100, 0, 1), LEVEL, 'the fence'), ((0, -19, 1), LEVEL, 'the fence'),
+    ((0, 0, 30), LEVEL, 'the fence'), ((1e300, 0, 1), LEVEL, 'the fence'),
+    ((np.nan, 0, 1), LEVEL, 'finite'), ((0, 0, 1), 2 * LEVEL, 'unit quaternion'),
+    ((0, 0, 1), 0 * LEVEL, 'unit quaternion')])
+def test_what_cannot_be_flown_is_refused_in_one_line(position, quaternion, text):
+    reason = why(position, quaternion)
+    assert text in reason and '\n' not in reason and 'expected' in reason + 'expected' * (
+        text == 'finite')
+
+
+@pytest.mark.parametrize('position, quaternion', [
+    ((0, 0, 0.3), LEVEL), ((2, -2, 0.6), UPSIDE_DOWN), ((0, 0, 1), -LEVEL)])
+def test_what_can_be_flown_is_taken(position, quaternion):
+    assert why(position, quaternion) == ''
+
+
+def test_every_pose_of_the_random_task_is_taken():
+    random = np.random.default_rng(0)
+    for _ in range(300):
+        assert why((*random.uniform(-2, 2, 2), 0.6),
+                   rotations.from_rpy(*random.uniform(-np.pi, np.pi, 3))) == ''
+
+
+def test_the_lowest_point_follows_the_attitude():
+    heights = {name: CHECKS.lowest_height(rotations.from_rpy(roll, 0, 0))
+               for name, roll in (('level', 0), ('side', np.pi / 2), ('down', np.pi))}
+    assert heights['level'] < heights['down'] < heights['side'] < 0.4
+
+
+def test_stamps_of_another_time_are_refused_and_zero_is_now():
+    for stamp, text in ((1.0, 'old'), (1e9 + 100.0, 'ahead'), (np.nan, 'finite')):
+        assert text in why((0, 0, 1), stamp=stamp, now=1e9)
+    for stamp in (0.0, 1e9 - 1, 1e9 + 0.5):
+        assert why((0, 0, 1), stamp=stamp, now=1e9) == ''
+
+
+def test_a_trajectory_is_checked_point_by_point():
+    target = TrajectoryTarget(np.array([0.0, 1.0]), np.array([[0, 0, 1.0], [0, 0, -1.0]]),
+                              np.tile(LEVEL, (2, 1)), np.zeros((2, 3)), np.zeros((2, 3)))
+    assert CHECKS.why_not(target).startswith('point 2: z = -1 m')
+
+
+def test_a_row_that_cannot_be_flown_is_named(tmp_path):
+    file = tmp_path / 'task.csv'
+    file.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,0\n0,0,0.05,180,0,0\n')
+    with pytest.raises(TaskError, match=r'task.csv: row 3: z = 0.05 m, expected at least'):
+        read_poses(file)
