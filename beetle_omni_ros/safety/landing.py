@@ -21,7 +21,6 @@ from beetle_omni_ros.safety.support import SupportGauge
 from beetle_omni_ros.safety.vehicle import Vehicle
 
 AHEAD, BETWEEN = 20.0, 0.1      # [s] how far ahead, and how densely, a way is told
-ESCAPE = 1.5                    # [s] in which a robot that lost an actuator comes to hover
 
 
 class Landing:
@@ -136,14 +135,13 @@ class Landing:
             self._ramp.duration - wait if fast else 0.0)
 
     def _way_with_what_is_left(self, state, rate):
-        """At once to the attitude that is held soonest, and from there towards level."""
+        """Towards the attitude nearest level that leaves a margin for control."""
         holding = Holding(self._robot, self._health)
         margin = holding.parameters.flying_margin
         level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(state.quaternion)[2])
-        escape = holding.quickest(state.quaternion, state.angular_velocity, state.tilt, margin)
         goal = holding.nearest(level, margin)
-        turn = max(rotations.geodesic_angle(goal, escape) / rate, 1e-3)
-        return Way(np.array([0.0, ESCAPE, ESCAPE + turn]), np.array([escape, escape, goal]))
+        turn = max(rotations.geodesic_angle(goal, state.quaternion) / rate, 1e-3)
+        return Way(np.array([0.0, turn]), np.array([state.quaternion, goal]))
 
     @property
     def _without_mocap(self):
