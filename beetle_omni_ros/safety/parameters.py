@@ -57,7 +57,7 @@ class StateLimits:
     imu_timeout: float = parameter(0.05, doc='silence of the raw IMU', unit='s', low=0.01, high=1)
     mocap_timeout: float = parameter(0.2, doc='silence of the raw MoCap', unit='s', low=0.02,
                                      high=5)
-    mocap_patience: float = parameter(1.0, doc='silence of the raw MoCap: landing', unit='s',
+    mocap_patience: float = parameter(1.5, doc='silence of the raw MoCap: landing', unit='s',
                                       low=0.1, high=60)
     blind_limit: float = parameter(0.3, doc='time without any sensor before motors off', unit='s',
                                    low=0.02, high=5)
