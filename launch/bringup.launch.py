@@ -150,6 +150,8 @@ def actions(context):
 
 def generate_launch_description():
     """Declare the arguments; the rest follows from them."""
+    from beetle_omni_ros.nodes.discovery import confine
+    confine()       # here, so that it holds for `ros2 bag record` too
     declared = []
     for name, (default, choices, description) in ARGUMENTS.items():
         options = {'choices': choices} if choices else {}
