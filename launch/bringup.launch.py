@@ -7,7 +7,6 @@ The robot stays on the ground until ``supervisor_node/arm`` is called.
 import shutil
 import subprocess
 import sys
-import tempfile
 
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
@@ -86,11 +85,12 @@ def node_parameters(given):
 def bridges(given, robot):
     """Node name -> parameters that the actuators ask for."""
     from beetle_omni_ros.nodes.actuators import bridged, BRIDGES
+    from beetle_omni_ros.nodes.private import scratch
     if given['actuators'] != 'bridges':
         return {}
     if given['backend'] == 'sim':
         # in a folder of its own: ports of two simulations must not meet
-        nodes = bridged(tempfile.mkdtemp(prefix='beetle_omni_ports_'), robot)
+        nodes = bridged(scratch('ports'), robot)
     else:
         nodes = {node: dict(robot) for node in BRIDGES}
     nodes['joint_bridge_node']['autostart'] = given['autostart'] or (
@@ -150,6 +150,8 @@ def actions(context):
 
 def generate_launch_description():
     """Declare the arguments; the rest follows from them."""
+    from beetle_omni_ros.nodes.discovery import confine
+    confine()       # here, so that it holds for `ros2 bag record` too
     declared = []
     for name, (default, choices, description) in ARGUMENTS.items():
         options = {'choices': choices} if choices else {}

@@ -74,12 +74,13 @@ def _absent(topic, source, stream, heard):
     if stream.publishers:
         return Finding(topic, FAIL, f"nothing in {heard.seconds:g} s, although "
                        f"{', '.join(stream.publishers)} publishes it", 'does the sensor deliver? '
-                       'Multicast and MTU of the network, ROS_AUTOMATIC_DISCOVERY_RANGE')
+                       'Multicast and MTU of the network, BEETLE_OMNI_DISCOVERY')
     if stream.other_types:
         return Finding(topic, FAIL, f"published as {', '.join(stream.other_types)}",
                        f'{source} must publish the type of docs/nodes.md: set or remap it')
     return Finding(topic, FAIL, f'nobody publishes it in {where}',
-                   f'start {source}, remap its topic, same ROS_DOMAIN_ID on all computers')
+                   f'start {source}, remap its topic, same ROS_DOMAIN_ID on all computers, and '
+                   'BEETLE_OMNI_DISCOVERY=SUBNET where it runs on another one')
 
 
 def _of_rate(topic, stream, wanted, limits):

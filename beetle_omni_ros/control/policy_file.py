@@ -17,12 +17,14 @@ import numpy as np
 from beetle_omni_ros.control.observation import Block, blocks, DISTURBANCES, size
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.yaml_file import quoted, shortened
 
 FORMAT = 'beetle_omni_policy/1'
 INPUT, OUTPUT = 'observation', 'action'
 ACTIONS = JOINT_NAMES + ROTOR_NAMES
 TILT_SCALE, THRUST_SCALE = 0.25, 0.5   # [rad], [N] for an action of 1, as published
 RATE_HZ = 100.0
+LARGEST = 1e12                         # of a scale or an offset
 TOLERANCE = 1e-6                       # of scales and offsets, which travel as text
 
 
@@ -103,7 +105,7 @@ class PolicyContract:
         """
         found = metadata.get('format')
         if found != FORMAT:
-            raise ParameterError(f"metadata 'format': expected {FORMAT!r}, found {found!r}")
+            raise ParameterError(f"metadata 'format': expected {FORMAT!r}, found {quoted(found)}")
         for key in ('robot', 'robot_hash'):
             if not metadata.get(key):
                 raise ParameterError(f"metadata '{key}' is missing")
@@ -163,7 +165,7 @@ def _entry(metadata, key, kind, what):
         raise ParameterError(f"metadata '{key}' is missing")
     try:
         value = json.loads(metadata[key])
-    except ValueError:
+    except (RecursionError, ValueError):
         value = None
     if not isinstance(value, kind):
         raise ParameterError(f"metadata '{key}': expected {what}, found "
@@ -177,7 +179,7 @@ def _blocks(metadata):
     try:
         return tuple(Block(str(b['name']), int(b['size']), str(b['unit']), str(b['frame']))
                      for b in table)
-    except (TypeError, KeyError, ValueError):
+    except (KeyError, OverflowError, TypeError, ValueError):
         raise ParameterError(f"metadata 'observations': expected {what}, found "
                              f"{_short(metadata['observations'])}") from None
 
@@ -190,7 +192,8 @@ def _eight(metadata, key):
     what = f'a JSON list of {len(ACTIONS)} finite numbers'
     values = _entry(metadata, key, list, what)
     good = len(values) == len(ACTIONS) and all(
-        isinstance(v, (int, float)) and not isinstance(v, bool) and isfinite(v) for v in values)
+        isinstance(v, (int, float)) and not isinstance(v, bool) and abs(v) <= LARGEST
+        for v in values)
     if not good:
         raise ParameterError(f"metadata '{key}': expected {what}, found {_short(metadata[key])}")
     return np.array(values, dtype=float)
@@ -203,7 +206,7 @@ def _rate(metadata):
         rate = 0.0
     if not (isfinite(rate) and rate > 0):
         raise ParameterError("metadata 'rate_hz': expected a positive number, found "
-                             f"{metadata.get('rate_hz')!r}")
+                             f"{quoted(metadata.get('rate_hz'))}")
     return rate
 
 
@@ -212,7 +215,7 @@ def _mapping(metadata, key):
 
 
 def _short(text):
-    return repr(text if len(text) <= 60 else f'{text[:57]}...')
+    return repr(shortened(text, 60))
 
 
 def _check_blocks(found, expected):

@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
+from beetle_omni_ros.control import policy_checksum
 from beetle_omni_ros.control.policy_file import ACTIONS, INPUT, OUTPUT, PolicyContract
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.yaml_file import shortened
 
 log = logging.getLogger(__name__)
 WARM_UP = 20            # calls at start, so that none in flight is the slow first one
+LONGEST = 1000          # characters of a refusal: the metadata may hold anything
 FATAL_ONLY = 4          # onnxruntime's log level: what fails is raised, and said once by us
 LEVEL = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0)   # x and z axis of a level body
 
@@ -43,18 +46,22 @@ class PolicyNetwork:
                  allow_other_robot: bool = False):
         """Load, check, warm up."""
         path = find(path)
-        self._session = _session(path)
         try:
-            self.contract = PolicyContract.from_metadata(
-                self._session.get_modelmeta().custom_metadata_map)
+            data = _content(path)
+            has_checksum = policy_checksum.verify(data)
+            self._session = _session(data)
+            self.contract = PolicyContract.from_metadata(_metadata(self._session))
             warning = self.contract.check(robot, allow_other_robot)
             size = self.contract.observation_size
             _check_tensor('input', self._session.get_inputs(), INPUT, size)
             _check_tensor('output', self._session.get_outputs(), OUTPUT, len(ACTIONS))
+            if not has_checksum:
+                raise ParameterError(f"metadata '{policy_checksum.KEY}' is missing; "
+                                     f'{policy_checksum.ADD}')
             self._bind(size)
             self._warm_up()
         except ParameterError as error:
-            raise ParameterError(f'policy {path}: {error}') from None
+            raise ParameterError(f'policy {path}: {shortened(str(error), LONGEST)}') from None
         if warning:
             log.warning('policy %s: %s', path, warning)
 
@@ -107,8 +114,28 @@ def find(path: str | Path) -> Path:
     return found
 
 
-def _session(path):
-    """Open a file with onnxruntime: one thread that sleeps when it has nothing to do."""
+def _content(path):
+    """Bytes of the file: what is checked is what is flown."""
+    try:
+        with open(path, 'rb') as file:
+            data = file.read(policy_checksum.LARGEST + 1)
+    except OSError as error:
+        raise ParameterError(f'cannot be read ({error.strerror})') from None
+    if len(data) > policy_checksum.LARGEST:
+        raise ParameterError(f'larger than {policy_checksum.LARGEST} bytes')
+    return data
+
+
+def _metadata(session):
+    """Custom metadata of a file."""
+    try:
+        return session.get_modelmeta().custom_metadata_map
+    except UnicodeDecodeError as error:
+        raise ParameterError(f'metadata that are no UTF-8 text ({error.reason})') from None
+
+
+def _session(data):
+    """Open a file's content with onnxruntime: one thread that sleeps when it has nothing to do."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
@@ -116,17 +143,17 @@ def _session(path):
     options.add_session_config_entry('session.inter_op.allow_spinning', '0')
     options.log_severity_level = FATAL_ONLY
     try:
-        return onnxruntime.InferenceSession(str(path), options,
+        return onnxruntime.InferenceSession(data, options,
                                             providers=['CPUExecutionProvider'])
     except Exception as error:      # its exceptions have no common class of their own
-        raise ParameterError(f'policy {path}: not a readable ONNX file, truncated perhaps '
+        raise ParameterError(f'not a readable ONNX file, truncated perhaps '
                              f'({_reason(error)})') from None
 
 
 def _reason(error):
     """The telling end of onnxruntime's messages, which begin with codes."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[0].split(' : ')[-1].strip()
+    return shortened(lines[0].split(' : ')[-1])
 
 
 def _check_tensor(kind, found, name, size):

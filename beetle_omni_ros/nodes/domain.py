@@ -4,9 +4,9 @@ from contextlib import contextmanager
 import fcntl
 from itertools import count
 import os
-from pathlib import Path
 import socket
-import tempfile
+
+from beetle_omni_ros.nodes.private import lock_file
 
 # Linux keeps its ephemeral ports clear of domains up to 101; 0 is everybody's default.
 DOMAINS = range(101, 0, -1)
@@ -28,14 +28,12 @@ def reserved():
         Its number.
 
     Raises:
-        OSError: all are taken.
+        OSError: all are taken, or there is no safe place for the locks.
 
     """
-    folder = Path(tempfile.gettempdir()) / f'beetle_omni_{os.getuid()}'
-    folder.mkdir(mode=0o700, exist_ok=True)
     first = next(_turns) % len(DOMAINS)
     for number in [*DOMAINS[first:], *DOMAINS[:first]]:
-        with open(folder / f'domain{number}.lock', 'w') as file:
+        with lock_file(f'domain{number}.lock') as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:

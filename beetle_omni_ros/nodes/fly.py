@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager, ExitStack
-import os
+from contextlib import ExitStack
 from pathlib import Path
 import shutil
-import signal
 import sys
 import tempfile
-import threading
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -17,8 +14,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from beetle_omni_ros import __version__
 from beetle_omni_ros.nodes import domain, runner
 from beetle_omni_ros.nodes.actuators import ACTUATORS, bridged
+from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.flight import Flight, FlightError, TooSlowError
 from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes.interrupts import terminable, undisturbed
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.standby import controller_nodes
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -68,9 +67,10 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
 
     """
     console = console or Console()
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     try:
+        confine()
         with ExitStack() as stack:
+            stack.enter_context(terminable())
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
             bag = Path(bag).absolute() if bag else folder / 'bag'
             check_new(bag)
@@ -85,7 +85,6 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
             if left_out:
                 _tell(console, f'rl does not stand by: {left_out}')
             number = stack.enter_context(domain.reserved()) if domain_id is None else domain_id
-            stack.enter_context(_terminable())
             meta = {'task': task, 'conditions': conditions, 'seed': seed,
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
@@ -102,6 +101,9 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
                     break
                 except TooSlowError as error:
                     _clear(bag, folder, error, console)
+                except KeyboardInterrupt:
+                    _keep(bag, meta)
+                    raise
             if not bag.exists():
                 return status or runner.FAILED
             return max(status, _report(bag, controller, flown, meta, json_path, console))
@@ -140,6 +142,16 @@ def _clear(bag, folder, error, console):
     shutil.rmtree(bag, ignore_errors=True)
     for log in folder.glob('*.log'):
         log.unlink()
+
+
+def _keep(bag, meta):
+    """Say in the bag of an interrupted flight what was flown, where the recorder left one."""
+    with undisturbed():
+        try:
+            if (bag / 'metadata.yaml').exists():
+                add_meta(bag, {**meta, 'interrupted': True})
+        except BagError as error:
+            print(f'beetle_omni fly: error: {error}', file=sys.stderr)
 
 
 def _tell(console, text):
@@ -190,9 +202,10 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
         operator.report('fly: graph', 'CPU of all nodes, latency of commands', flight.measured)
         operator.spin(0.2)
     finally:
-        stubborn = graph.stop()
-        if operator:
-            operator.close()
+        with undisturbed():
+            stubborn = graph.stop()
+            if operator:
+                operator.close()
     for name in stubborn:
         print(f'beetle_omni fly: error: {name} did not stop and was killed', file=sys.stderr)
     for line in graph.warnings():
@@ -238,20 +251,3 @@ def _print_measured(meta, console):
 def _times(measured, key):
     return (f"median {measured[f'{key}_median_ms']:.2f} ms, 99th percentile "
             f"{measured[f'{key}_p99_ms']:.2f} ms, max {measured[f'{key}_max_ms']:.1f} ms")
-
-
-@contextmanager
-def _terminable():
-    """Let SIGTERM end a flight as Ctrl-C does, so that nothing is left behind."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

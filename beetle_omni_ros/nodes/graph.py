@@ -13,6 +13,7 @@ import yaml
 
 import beetle_omni_ros
 from beetle_omni_ros.nodes.actuators import BRIDGES
+from beetle_omni_ros.nodes.discovery import confine
 
 COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'
 PORT_TIMEOUT = 30.0     # s for the simulator to make its serial ports
@@ -82,7 +83,7 @@ class Graph:
         environment = dict(
             os.environ, ROS_DOMAIN_ID=str(self.domain), BEETLE_OMNI_PARENT=str(os.getpid()),
             PYTHONPATH=os.pathsep.join(filter(None, [root, os.environ.get('PYTHONPATH')])))
-        environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        confine(environment)
         module, *arguments = self._commands[name]
         with open(self.log(name), 'a') as log:
             self.processes[name] = subprocess.Popen(

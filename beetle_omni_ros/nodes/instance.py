@@ -8,10 +8,12 @@ process, however that ends; a node on another computer is seen in the ROS graph.
 
 import fcntl
 import os
-from pathlib import Path
-import tempfile
 
 from rclpy.node import Node
+
+from beetle_omni_ros.nodes.private import open_lock
+
+HOLDER = 20     # characters of a process's number
 
 
 class StartError(RuntimeError):
@@ -28,17 +30,15 @@ def claim(node: Node):
     """
     domain = node.context.get_domain_id()
     name = node.get_fully_qualified_name()
-    folder = Path(tempfile.gettempdir()) / f'beetle_omni_{os.getuid()}'
     try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-        file = open(folder / f"{domain}{name.replace('/', '.')}.lock", 'a+')
-    except OSError:
-        return None     # no place for a lock: the graph check still stands
+        file = open_lock(f"{domain}{name.replace('/', '.')}.lock")
+    except OSError as error:    # the graph check still stands
+        node.get_logger().warning(f'a second {name} on this computer may go unnoticed: {error}')
+        return None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
-        file.seek(0)
-        holder = file.read().strip() or 'unknown'
+        holder = file.read(HOLDER).strip() or 'unknown'
         file.close()
         raise StartError(f'{name} runs already (process {holder}, ROS domain {domain}); '
                          'stop it first') from None

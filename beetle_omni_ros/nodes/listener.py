@@ -16,6 +16,7 @@ from std_msgs.msg import String
 
 from beetle_omni_ros.bringup.heard import BRIDGES, Heard, Status, Stream
 from beetle_omni_ros.nodes import convert, qos, runner
+from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.robot.schema import ParameterError
 
 # Topic -> type, how it is read, what of it no living sensor repeats.
@@ -38,6 +39,7 @@ def listen(seconds: float, namespace: str = '') -> Heard:
         ParameterError: no such namespace is possible.
 
     """
+    confine()
     context = rclpy.Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:

@@ -18,6 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
+from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.instance import StartError
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
@@ -63,6 +64,7 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)   # while starting, as Ctrl-C
     _end_with_parent()
     try:
+        confine()
         # Not rclpy's handlers: they end the context under a callback that still publishes.
         rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
         executor = make_executor()

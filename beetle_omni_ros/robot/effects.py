@@ -24,6 +24,7 @@ from beetle_omni_ros.robot.effect_types import Effect, EffectParameter, ServoTer
 from beetle_omni_ros.robot.effects_actuator import ACTUATOR, SENSOR
 from beetle_omni_ros.robot.effects_body import BODY
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.yaml_file import quoted, shortened
 
 # In the order in which they act together: the true tilt first, for it turns the thrusts.
 CATALOGUE: dict[str, Effect] = {'joint_offset': ACTUATOR['joint_offset'], **BODY, **ACTUATOR,
@@ -60,16 +61,20 @@ def validated(effects: dict | None) -> dict[str, dict]:
 
     """
     checked: dict[str, dict] = {}
+    if not isinstance(effects, dict | None):
+        raise ParameterError(f'effects: expected a mapping, found {quoted(effects)}')
     for name, given in (effects or {}).items():
+        name = shortened(str(name))
         if name not in CATALOGUE:
-            near = get_close_matches(str(name), CATALOGUE, n=1)
+            near = get_close_matches(name, CATALOGUE, n=1)
             hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(CATALOGUE)}"
             raise ParameterError(f'effects.{name}: unknown effect{hint}')
         entry = CATALOGUE[name]
         needed = {key for key, spec in entry.parameters.items() if spec.default is None}
         if not isinstance(given, dict) or not needed <= set(given) <= set(entry.parameters):
             expected = ', '.join(entry.parameters)
-            raise ParameterError(f'effects.{name}: expected the keys {expected}, found {given!r}')
+            raise ParameterError(f'effects.{name}: expected the keys {expected}, '
+                                 f'found {quoted(given)}')
         checked[name] = {key: _value(f'effects.{name}.{key}', spec, given.get(key, spec.default))
                          for key, spec in entry.parameters.items()}
     return checked
@@ -78,8 +83,9 @@ def validated(effects: dict | None) -> dict[str, dict]:
 def _value(at, spec, value):
     try:
         array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise ParameterError(f'{at}: expected numbers [{spec.unit}], found {value!r}') from None
+    except (OverflowError, TypeError, ValueError):
+        raise ParameterError(f'{at}: expected numbers [{spec.unit}], '
+                             f'found {quoted(value)}') from None
     shape = np.shape(spec.neutral)
     if spec.of_each and array.shape == (MEMBERS,):
         shape = array.shape
@@ -87,5 +93,6 @@ def _value(at, spec, value):
         each = f' or {(MEMBERS,)}' if spec.of_each else ''
         raise ParameterError(f'{at}: expected shape {shape}{each}, found {array.shape}')
     if not np.all((array >= spec.low) & (array <= spec.high)):
-        raise ParameterError(f'{at}: {value} is outside {spec.low:g} to {spec.high:g} {spec.unit}')
+        raise ParameterError(f'{at}: {quoted(value)} is outside '
+                             f'{spec.low:g} to {spec.high:g} {spec.unit}')
     return tuple(map(float, array)) if shape else float(array)

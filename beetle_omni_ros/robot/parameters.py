@@ -13,7 +13,9 @@ from beetle_omni_ros.robot import effects as catalogue
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter, ParameterError
+from beetle_omni_ros.robot.yaml_file import quoted
 
+LONGEST_NAME = 255      # characters of a file's name
 JOINT_NAMES = ('gimbal1', 'gimbal2', 'gimbal3', 'gimbal4')
 ROTOR_NAMES = ('rotor1', 'rotor2', 'rotor3', 'rotor4')
 
@@ -260,7 +262,10 @@ def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
     if 'extends' not in content:
         return content
     name = content.pop('extends')
-    base = path.parent / str(name)
+    if not isinstance(name, str) or not name.isprintable() or len(name) > LONGEST_NAME:
+        raise ParameterError(f"{path}: key 'extends': expected the name of a file, "
+                             f'found {quoted(name)}')
+    base = path.parent / name
     # `extends: robot.yaml` in somebody's robot.yaml means the shipped one
     itself = base.resolve() == path.resolve()
     if itself or not base.is_file():

@@ -12,7 +12,12 @@ import types
 from typing import Any, get_args, get_origin, get_type_hints, Union
 
 import numpy as np
-import yaml
+
+from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, shortened, YamlError
+
+# Parameters that hold more than numbers, from lists and mappings of a file.
+STRUCTURED = {tuple: ((list, tuple), 'a list'), dict: ((dict, type(None)), 'a mapping')}
+FILE_NAME, KEY, WHOLE = 500, 80, 1000    # characters of them in a message
 
 
 class ParameterError(ValueError):
@@ -59,23 +64,18 @@ def load_yaml(path: str | Path) -> dict:
         ParameterError: missing or unreadable file, broken YAML, or no mapping in it.
 
     """
-    path = Path(path)
     try:
-        data = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise ParameterError(f'{path}: cannot be read ({error.strerror})') from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        mark = getattr(error, 'problem_mark', None)
-        where = f' at line {mark.line + 1}, column {mark.column + 1}' if mark else ''
-        problem = getattr(error, 'problem', None) or str(error).splitlines()[0]
-        raise ParameterError(f'{path}: not valid YAML{where} ({problem})') from None
+        data = read_yaml(path)
+    except YamlError as error:
+        raise ParameterError(f'{shortened(str(path), FILE_NAME)}: {error}') from None
+    for value in data.values() if isinstance(data, dict) else ():
+        if isinstance(value, dict) and set(value) == {'ros__parameters'}:
+            data = value['ros__parameters']
+            break
     if data is None:
-        data = {}
+        return {}
     if not isinstance(data, dict):
         raise ParameterError(f'{path}: expected a mapping of keys, found {type(data).__name__}')
-    for value in data.values():
-        if isinstance(value, dict) and set(value) == {'ros__parameters'}:
-            return value['ros__parameters'] or {}
     return data
 
 
@@ -105,7 +105,7 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
     known = {f.name: f for f in fields(cls) if f.init}
     for key in mapping:
         if key not in known:
-            near = get_close_matches(str(key), known, n=1)
+            near = get_close_matches(str(key)[:KEY], known, n=1)
             hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(known)}"
             raise ParameterError(f'{_at(where, _join(prefix, key))}: unknown key{hint}')
     values = {}
@@ -124,7 +124,8 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
     try:
         return cls(**values)
     except ParameterError as error:
-        raise ParameterError(f'{_at(where, prefix)}: {error}' if where else str(error)) from None
+        text = f'{_at(where, prefix)}: {error}' if where else str(error)
+        raise ParameterError(shortened(text, FILE_NAME + WHOLE)) from None
 
 
 def _nested(hint):
@@ -153,33 +154,52 @@ def check(entry, hint: type, value: Any, at: str) -> Any:
         return _check_array(meta, value, at)
     if hint is bool:
         if not isinstance(value, bool):
-            raise ParameterError(f'{at}: expected true or false, found {value!r}')
+            raise ParameterError(f'{at}: expected true or false, found {quoted(value)}')
         return value
     if hint in (int, float):
-        if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) \
-                or (hint is int and value != int(value)):
-            kind = 'an integer' if hint is int else 'a number'
-            raise ParameterError(f'{at}: expected {kind}{_unit_text(entry)}, found {value!r}')
-        _check_range(meta, float(value), at)
-        return hint(value)
+        return _check_number(entry, hint, value, at)
     if hint is str:
         if not isinstance(value, str):
-            raise ParameterError(f'{at}: expected text, found {value!r}')
+            raise ParameterError(f'{at}: expected text, found {quoted(value)}')
         if meta.get('choices') and value not in meta['choices']:
             raise ParameterError(f"{at}: expected one of {', '.join(meta['choices'])}, "
-                                 f'found {value!r}')
+                                 f'found {quoted(value)}')
         return value
+    if hint in STRUCTURED:
+        kinds, what = STRUCTURED[hint]
+        if not isinstance(value, kinds):
+            raise ParameterError(f'{at}: expected {what}, found {quoted(value)}')
+        return hint(value or ())
     return value
 
 
+def _check_number(entry, hint, value, at):
+    """Finite int or float within its range."""
+    kind = 'an integer' if hint is int else 'a number'
+    found = f'{at}: expected {kind}{_unit_text(entry)}, found {quoted(value)}'
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+        raise ParameterError(found)
+    try:
+        number = float(value)
+    except (OverflowError, TypeError):      # an integer beyond any float; a complex number
+        raise ParameterError(found) from None
+    _check_range(entry.metadata, number, at)
+    if hint is int and value != int(value):
+        raise ParameterError(found)
+    return hint(value)
+
+
 def _check_array(meta, value, at):
+    """(n,) or the declared shape, of finite numbers within their range."""
     try:
         array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise ParameterError(f'{at}: expected numbers, found {value!r}') from None
+    except (OverflowError, TypeError, ValueError):
+        raise ParameterError(f'{at}: expected numbers, found {quoted(value)}') from None
     shape = meta.get('shape')
     if shape is not None and array.shape != tuple(shape):
         raise ParameterError(f'{at}: expected shape {tuple(shape)}, found {array.shape}')
+    if shape is None and array.ndim != 1:
+        raise ParameterError(f'{at}: expected a list of numbers, found {quoted(value)}')
     for element in array.ravel():
         _check_range(meta, float(element), at)
     return array
@@ -200,11 +220,12 @@ def _unit_text(entry):
 
 
 def _join(prefix, key):
-    return f'{prefix}.{key}' if prefix else str(key)
+    key = shortened(str(key), KEY)
+    return f'{prefix}.{key}' if prefix else key
 
 
 def _at(where, key):
-    parts = (where, f"key '{key}'" if key else '')
+    parts = (shortened(where, FILE_NAME), f"key '{key}'" if key else '')
     return ': '.join(part for part in parts if part) or 'parameters'
 
 

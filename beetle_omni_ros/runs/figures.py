@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
+from beetle_omni_ros.control.base import Target
 from beetle_omni_ros.runs.body import Motion, motion
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.tasks import Task
@@ -55,6 +56,12 @@ class Run:
     def start(self) -> float:
         """Time of the first target, from which the plots count [s]."""
         return self.log.targets[0].stamp if self.log.targets else self.log.start
+
+    @property
+    def pursued(self) -> list[tuple[Target, float]]:
+        """(target, end of its time [s]) of each target; empty where none was recorded."""
+        targets = self.log.targets
+        return list(zip(targets, [t.stamp for t in targets[1:]] + [self.log.end], strict=False))
 
     @property
     def body(self) -> Motion:

@@ -50,8 +50,7 @@ def pose(runs: list[Run]) -> Figure:
 def _targets(run):
     """Steps of pose targets, curves of trajectories; (n,) times, (n, 6) with angles in deg."""
     times, values = [], []
-    ends = [t.stamp for t in run.log.targets[1:]] + [run.log.end]
-    for target, end in zip(run.log.targets, ends, strict=True):
+    for target, end in run.pursued:
         t = np.array([target.stamp, end]) if isinstance(target, PoseTarget) else target.times[::5]
         position, quaternion = reference_poses(target, t)
         times.append(t - run.start)
@@ -65,8 +64,7 @@ def _targets(run):
 def error_series(run: Run):
     """(n,) times since the start, (n,) position errors [m], (n,) orientation errors [deg]."""
     body, parts = run.body, []
-    ends = [t.stamp for t in run.log.targets[1:]] + [run.log.end]
-    for target, end in zip(run.log.targets, ends, strict=True):
+    for target, end in run.pursued:
         window = body.window(target.stamp, end - 1e-3)
         if body.t[window].size:
             parts.append((body.t[window] - run.start, *errors(body, target, window)))
@@ -75,11 +73,13 @@ def error_series(run: Run):
     return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
-def errors_over_time(runs: list[Run]) -> Figure:
+def errors_over_time(runs: list[Run]) -> Figure | None:
     """Both errors on a logarithmic scale; L and U windows shaded where they are few."""
+    series = [(run, error_series(run)) for run in runs]
+    if not any(len(t) for _, (t, _, _) in series):
+        return None
     figure, axes = panels(2, height=2.0, sharex=True)
-    for run in runs:
-        t, position, orientation = error_series(run)
+    for run, (t, position, orientation) in series:
         for panel, values, unit in ((axes[0, 0], position, 'm'), (axes[1, 0], orientation, 'deg')):
             line(panel, t, np.maximum(values, TINY[unit]), color=run.colour, label=run.label)
     for panel, label in ((axes[0, 0], 'position error [m]'),

@@ -144,14 +144,15 @@ def disturbance(runs: list[Run]) -> Figure | None:
 
 def payload(runs: list[Run]) -> Figure | None:
     """Height over time while payloads are attached."""
-    runs = [run for run in runs if run.task and run.task.kind == 'payload']
+    runs = [run for run in runs if run.task and run.task.kind == 'payload' and run.log.targets]
     if not runs:
         return None
     figure, axes = panels(1, height=2.2)
     panel = axes[0, 0]
     for run in runs:
         body = run.body
-        line(panel, body.t - run.start, body.position[:, 2] - run.log.targets[0].position[2],
+        height = run.log.targets[0].at(run.start).position[2]
+        line(panel, body.t - run.start, body.position[:, 2] - height,
              color=run.colour, label=run.label)
     begin = 0.0
     for segment in runs[0].task.segments:

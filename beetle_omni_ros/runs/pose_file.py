@@ -12,6 +12,7 @@ import numpy as np
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.yaml_file import quoted
 from beetle_omni_ros.runs.target_checks import TargetChecks
 
 COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
@@ -58,7 +59,8 @@ def _column_order(path, line, header):
         raise TaskError(f'{path}: row {line}: the header is missing; expected {expected}')
     unknown = [cell for cell in header if cell not in COLUMNS]
     if unknown:
-        raise TaskError(f"{path}: row {line}: unknown column '{unknown[0]}'; expected {expected}")
+        raise TaskError(f'{path}: row {line}: unknown column {quoted(unknown[0])}; '
+                        f'expected {expected}')
     missing = [name for name in COLUMNS if name not in header]
     if missing:
         raise TaskError(f"{path}: row {line}: column '{missing[0]}' is missing; "
@@ -78,7 +80,7 @@ def _pose(path, line, row, order):
         value = _number(row[index])
         if value is None or not isfinite(value):
             raise TaskError(f'{path}: row {line}, column {name}: expected a finite number, '
-                            f"found '{row[index]}'")
+                            f'found {quoted(row[index])}')
         pose.append(value)
     if pose[2] <= 0:
         raise TaskError(f'{path}: row {line}, column z_m: expected a height above the floor, '

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from beetle_omni_ros import __version__
+from beetle_omni_ros.control import policy_checksum
 from beetle_omni_ros.control.policy_file import INPUT, OUTPUT, PolicyContract
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import flatten
@@ -76,6 +77,7 @@ def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
     path = Path(path)
     part = path.with_suffix('.part')
     onnx.save(written, str(part))
+    policy_checksum.add(part)
     difference = compare(actor.mean, part, size)
     if not difference <= AGREEMENT:
         part.unlink()

@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 
 from beetle_omni_ros.robot.schema import bind, flatten, nest, ParameterError
+from beetle_omni_ros.robot.yaml_file import parse_yaml, quoted, YamlError
 from beetle_omni_ros.train.parameters import TrainParameters
 
 PARAMETER_FILE = 'train.yaml'
@@ -97,9 +98,9 @@ def parse_changes(texts: list[str], **others) -> dict:
         if not sign:
             raise ParameterError(f"--set '{text}': expected key=value")
         try:
-            changes[key.strip()] = _number(yaml.safe_load(value))
-        except yaml.YAMLError:
-            raise ParameterError(f"--set '{text}': the value is not valid YAML") from None
+            changes[key.strip()] = _number(parse_yaml(value))
+        except YamlError as error:
+            raise ParameterError(f'--set {quoted(text)}: the value is {error}') from None
     return changes | {key: value for key, value in others.items() if value is not None}
 
 

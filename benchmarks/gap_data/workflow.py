@@ -99,7 +99,8 @@ def run_workflow(workflow: Workflow, case: Path) -> dict:
     """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     began = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix='gap_') as folder:
+    # beside the case, not in the temporary folder: a worker may be killed
+    with tempfile.TemporaryDirectory(prefix='.gap_', dir=case.parent) as folder:
         output = Path(folder)
         try:
             done = subprocess.run(

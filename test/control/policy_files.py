@@ -4,13 +4,15 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper, TensorProto
 
+from beetle_omni_ros.control import policy_checksum
 from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 
 def write(path, *, robot=None, memory=False, metadata=None, drop=(), weights=None, bias=None,
           hidden=None, seed=0, inputs=None, outputs=8, names=('observation', 'action'),
-          dtype=TensorProto.FLOAT, poison=False):
+          dtype=TensorProto.FLOAT, poison=False,
+          checksum=True):
     """
     Write one policy: affine, or a random network with ``hidden`` layers.
 
@@ -28,6 +30,7 @@ def write(path, *, robot=None, memory=False, metadata=None, drop=(), weights=Non
         outputs: output size.
         names: of input and output.
         dtype: of input and output.
+        checksum: whether the file has one.
         poison: whether the first action becomes NaN when the reference is above 1.2 m.
 
     """
@@ -63,11 +66,11 @@ def write(path, *, robot=None, memory=False, metadata=None, drop=(), weights=Non
                   helper.make_node('Add', [last, 'spoilt'], [names[1]])]
     save(path, nodes, constants, size, outputs, names, dtype,
          {k: v for k, v in {**contract.to_metadata(), **(metadata or {})}.items()
-          if k not in drop})
+          if k not in drop}, checksum)
     return path
 
 
-def save(path, nodes, constants, inputs, outputs, names, dtype, metadata):
+def save(path, nodes, constants, inputs, outputs, names, dtype, metadata, checksum=True):
     """Write a graph with its metadata."""
     graph = helper.make_graph(
         nodes, 'policy', [helper.make_tensor_value_info(names[0], dtype, [1, inputs])],
@@ -76,3 +79,5 @@ def save(path, nodes, constants, inputs, outputs, names, dtype, metadata):
     model.ir_version = 8        # read by every onnxruntime that the package admits
     helper.set_model_props(model, metadata)
     onnx.save(model, str(path))
+    if checksum:
+        policy_checksum.add(path)

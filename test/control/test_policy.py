@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from beetle_omni_ros.control import policy_checksum
 from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
 from beetle_omni_ros.control.observation import observation
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
@@ -251,7 +252,9 @@ def test_the_batch_may_be_open(tmp_path):
     network = onnx.load(path)
     for tensor in (network.graph.input[0], network.graph.output[0]):
         tensor.type.tensor_type.shape.dim[0].dim_param = 'batch'
+    del network.metadata_props[-1]      # the checksum of the closed one
     onnx.save(network, path)
+    policy_checksum.add(path)
     assert np.isfinite(controller(path).step(state(), TARGET).thrust).all()
 
 

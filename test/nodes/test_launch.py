@@ -1,12 +1,14 @@
 """The launch file: arguments become processes (launch itself is replaced by recorders)."""
 
 from importlib.util import module_from_spec, spec_from_file_location
+import os
+from pathlib import Path
 import sys
 from types import ModuleType
 
 import pytest
 
-from beetle_omni_ros.nodes import composed, standby
+from beetle_omni_ros.nodes import composed, discovery, private, standby
 from beetle_omni_ros.nodes.actuators import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -32,6 +34,7 @@ def bringup(monkeypatch):
         for member in members:
             setattr(module, member, type(member, (Recorded,), {}))
         monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setenv(discovery.RANGE, 'LOCALHOST')        # put back afterwards
     monkeypatch.setattr(standby, 'unfit', lambda *_: '')    # a policy that fits is there
     spec = spec_from_file_location('bringup', share_path('launch/bringup.launch.py'))
     module = module_from_spec(spec)
@@ -147,3 +150,18 @@ def test_ros2_bag_records_where_it_is_installed_else_the_recorder(bringup, monke
     else:
         recorder = processes[names.index('recorder_node')]
         assert recorder.kwargs['parameters'] == [{'bag': '/data/run'}]
+
+
+def test_a_launch_is_found_on_this_computer_alone(bringup, monkeypatch):
+    for name in (*discovery.CHOSEN, discovery.OWN):
+        monkeypatch.delenv(name, raising=False)
+    bringup.generate_launch_description()
+    assert os.environ[discovery.RANGE] == 'LOCALHOST'
+    monkeypatch.setenv(discovery.OWN, 'SUBNET')
+    bringup.generate_launch_description()
+    assert os.environ[discovery.RANGE] == 'SUBNET'
+
+
+def test_the_ports_of_a_launch_lie_in_the_users_own_folder(bringup):
+    nodes = {n.kwargs['name']: n.kwargs['parameters'][0] for n in bringup.start(composed='false')}
+    assert Path(nodes['sim_node']['servo_port']).parent.parent == private.folder()

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import beetle_omni_ros
+from beetle_omni_ros.control import policy_checksum
 from beetle_omni_ros.control.policy_file import PolicyContract
 from beetle_omni_ros.control.policy_network import PolicyNetwork
 from beetle_omni_ros.train import export
@@ -70,7 +71,8 @@ def test_the_file_is_complete_and_accepted_on_board(tmp_path, memory):
     metrics = {'nominal': {'reached': 1.0, 'U_position_m': 0.013}}
     export_policy(network, path, ROBOT, parameters, {'seconds': 12.5}, metrics)
     entries = {entry.key: entry.value for entry in onnx.load(path).metadata_props}
-    assert set(entries) == set(PolicyContract.default(ROBOT).to_metadata())
+    assert set(entries) == {*PolicyContract.default(ROBOT).to_metadata(), 'checksum'}
+    assert entries['checksum'] == policy_checksum.checksum(path.read_bytes())
     contract = PolicyContract.from_metadata(entries)
     assert contract.check(ROBOT) == ''
     assert contract.memory == memory and contract.observation_size == (39 if memory else 33)

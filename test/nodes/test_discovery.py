@@ -1,0 +1,58 @@
+"""Nodes are found on this computer alone, however they are started, until somebody opens it."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from beetle_omni_ros.nodes import discovery
+from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.robot.schema import ParameterError
+
+PROBE = ('import os, sys\n'
+         'from beetle_omni_ros.nodes import runner\n'
+         'class ProbeNode:\n'
+         '    def __init__(self):\n'
+         '        raise runner.ParameterError(os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE"))\n')
+
+
+@pytest.fixture
+def unset(monkeypatch):
+    for name in (*discovery.CHOSEN, discovery.OWN):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.mark.parametrize('given, holds', [
+    ({}, 'LOCALHOST'), ({'BEETLE_OMNI_DISCOVERY': ''}, 'LOCALHOST'),
+    ({'BEETLE_OMNI_DISCOVERY': 'SUBNET'}, 'SUBNET'),
+    ({'BEETLE_OMNI_DISCOVERY': 'subnet', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}, 'SUBNET'),
+    ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, 'SUBNET'),
+    ({'ROS_STATIC_PEERS': '192.168.1.2'}, None), ({'ROS_LOCALHOST_ONLY': '0'}, None)])
+def test_what_a_user_has_chosen_holds(given, holds):
+    discovery.confine(given)
+    assert given.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == holds
+
+
+def test_an_unknown_range_is_refused():
+    with pytest.raises(ParameterError, match='expected one of LOCALHOST, SUBNET'):
+        discovery.confine({'BEETLE_OMNI_DISCOVERY': 'world'})
+
+
+@pytest.mark.parametrize('start', [
+    'runner.main(ProbeNode, ["probe"])', 'sys.exit(runner.run([ProbeNode], ["x"], "composed"))'])
+def test_every_node_that_is_started_alone_or_composed_is_confined(ros_domain, unset, start):
+    done = subprocess.run([sys.executable, '-c', PROBE + start], capture_output=True, text=True,
+                          check=False, timeout=60)
+    assert done.stderr.strip() == 'probe_node: error: LOCALHOST'
+    done = subprocess.run([sys.executable, '-c', PROBE + start], capture_output=True, text=True,
+                          check=False, timeout=60,
+                          env={**os.environ, 'BEETLE_OMNI_DISCOVERY': 'subnet'})
+    assert done.stderr.strip() == 'probe_node: error: SUBNET'
+
+
+def test_a_graph_is_confined(tmp_path, unset, monkeypatch):
+    given = {}
+    monkeypatch.setattr(subprocess, 'Popen', lambda *_, env, **__: given.update(env))
+    Graph({'ekf_node': {}}, tmp_path, 7).start_process('composed')
+    assert given['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'

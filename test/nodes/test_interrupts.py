@@ -1,0 +1,84 @@
+"""Signals that end a flight: one line, a complete bag, nothing left behind."""
+
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from beetle_omni_ros.nodes.interrupts import terminable, undisturbed
+from beetle_omni_ros.runs.bag import read_bag
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_an_interrupt_whatever_a_library_makes_of_it(number):
+    before = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt), terminable():
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(1)
+        except KeyboardInterrupt:
+            raise RuntimeError('context is not valid') from None
+    assert signal.getsignal(number) is before
+
+
+def test_an_error_without_a_signal_stays_what_it_is():
+    with pytest.raises(RuntimeError, match='mine'), terminable():
+        raise RuntimeError('mine')
+
+
+def test_a_second_signal_does_not_cut_the_clean_up_short():
+    cleaned = []
+    with pytest.raises(KeyboardInterrupt), terminable():
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(1)
+        finally:
+            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)
+            cleaned.append(True)
+    assert cleaned
+
+
+def test_a_signal_while_a_flight_that_is_over_is_cleaned_up_waits():
+    with terminable(), undisturbed():
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize('moment', ['start', 'flight'])
+def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path, moment):
+    bag, temporary = tmp_path / 'bag', tmp_path / 'tmp'
+    temporary.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--bag', str(bag), '--task', 'hover',
+         '--clock', 'simulated'], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, 'TMPDIR': str(temporary)})
+    deadline = time.monotonic() + 120
+    try:
+        while not begun(bag, b'flying:nmpc' if moment == 'flight' else b''):
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
+        process.send_signal(signal.SIGTERM)
+        time.sleep(0.1)
+        process.send_signal(signal.SIGTERM)
+        _, error = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.communicate()
+    assert error.strip() == 'beetle_omni fly: interrupted; everything is stopped'
+    assert process.returncode == 130
+    assert {path.name for path in temporary.glob('*omni*')} <= {f'beetle_omni_{os.getuid()}'}
+    if moment == 'flight':
+        log = read_bag(bag)
+        assert not log.warnings and 'flying:nmpc' in log.states
+        assert log.meta['task'] == 'hover' and log.meta['interrupted']
+
+
+def begun(bag: Path, text: bytes):
+    """Whether the recorder writes, and has written ``text``."""
+    return any(text in file.read_bytes() for file in bag.glob('*.mcap'))

@@ -1,0 +1,124 @@
+"""Locks and ports lie where no other user can reach them; nothing is left behind."""
+
+import os
+from pathlib import Path
+import stat
+import subprocess
+import sys
+
+import pytest
+
+from beetle_omni_ros.nodes import domain, private
+
+
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """Temporary folder of a computer without a runtime folder."""
+    monkeypatch.setattr(private.tempfile, 'gettempdir', lambda: str(tmp_path))
+    monkeypatch.setenv('XDG_RUNTIME_DIR', str(tmp_path / 'none'))
+    return tmp_path
+
+
+@pytest.fixture
+def name():
+    return f'beetle_omni_{os.getuid()}'
+
+
+def test_the_folder_is_for_this_user_alone(temporary, name):
+    assert private.folder() == temporary / name
+    assert stat.S_IMODE(os.lstat(temporary / name).st_mode) == 0o700
+
+
+def test_the_runtime_folder_comes_first_where_it_is_safe(temporary, monkeypatch):
+    runtime = temporary / 'runtime'
+    runtime.mkdir(mode=0o700)
+    monkeypatch.setenv('XDG_RUNTIME_DIR', str(runtime))
+    assert private.folder() == runtime / 'beetle_omni'
+    runtime.chmod(0o755)
+    assert private.folder().parent == temporary
+
+
+def test_a_link_in_place_of_the_folder_is_refused(temporary, name):
+    (temporary / 'victim').mkdir(mode=0o700)
+    (temporary / name).symlink_to(temporary / 'victim')
+    with pytest.raises(OSError, match='found a link or file'), domain.reserved():
+        pass
+    assert not list((temporary / 'victim').iterdir())
+
+
+def test_a_folder_that_others_may_enter_is_refused(temporary, name):
+    (temporary / name).mkdir()
+    (temporary / name).chmod(0o777)
+    with pytest.raises(OSError, match='open to other users .mode 777.'), domain.reserved():
+        pass
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason='only root can give files away')
+def test_a_folder_of_another_user_is_refused(temporary, name):
+    (temporary / name).mkdir(mode=0o700)
+    os.chown(temporary / name, 12345, -1)
+    with pytest.raises(OSError, match='belongs to user 12345'), domain.reserved():
+        pass
+
+
+@pytest.mark.parametrize('link', [os.symlink, os.link])
+def test_a_file_of_the_victim_is_not_emptied(temporary, link):
+    victim = temporary / 'victim'
+    victim.write_text('precious')
+    for number in domain.DOMAINS:
+        link(victim, private.folder() / f'domain{number}.lock')
+    with pytest.raises(OSError, match='lock'), domain.reserved():
+        pass
+    assert victim.read_text() == 'precious'
+
+
+def test_a_pipe_in_place_of_a_lock_is_refused_at_once(temporary):
+    os.mkfifo(private.folder() / 'x.lock')
+    with pytest.raises(OSError, match='expected a file of this user'):
+        private.open_lock('x.lock')
+
+
+def test_a_lock_is_not_emptied_before_it_is_held(temporary):
+    (private.folder() / 'x.lock').write_text('4711')
+    with private.lock_file('x.lock') as file:
+        assert file.read() == '4711'
+
+
+def test_a_node_leaves_the_file_behind_a_link_alone(temporary):
+    from beetle_omni_ros.nodes.instance import claim
+    victim = temporary / 'victim'
+    victim.write_text('precious')
+    told = []
+
+    class Node:
+        context = property(lambda self: self)
+
+        def get_domain_id(self):
+            return 7
+
+        def get_fully_qualified_name(self):
+            return '/ekf_node'
+
+        def get_logger(self):
+            return self
+
+        def warning(self, text):
+            told.append(text)
+
+    (private.folder() / '7.ekf_node.lock').symlink_to(victim)
+    assert claim(Node()) is None
+    assert victim.read_text() == 'precious' and '7.ekf_node.lock' in told[0]
+
+
+def test_folders_go_with_their_process_and_those_of_killed_ones_at_the_next_start(temporary):
+    place = private.folder()
+    (place / 'ports_999999999_abc').mkdir()
+    (place / f'ports_{os.getpid()}_abc').mkdir()
+    script = ('import sys; from beetle_omni_ros.nodes import private\n'
+              f'private.folder = lambda: private.Path({str(place)!r})\n'
+              'print(private.scratch("ports"))')
+    done = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True,
+                          check=True, timeout=60)
+    made = Path(done.stdout.strip())
+    assert made.parent == place and not made.exists()
+    assert [path.name for path in place.iterdir()] == [f'ports_{os.getpid()}_abc']
