@@ -133,6 +133,7 @@ class SimNode(FlightNode):
         self._publish_to['joints'] = self.create_publisher(JointState, 'joint_states', qos.SENSOR)
         self._publish_to['battery'] = self.create_publisher(BatteryState, 'battery_state',
                                                             qos.SENSOR)
+        self._publish_to['rotors'] = self.create_publisher(JointState, 'rotor_states', qos.SENSOR)
         self.listen(JointState, 'command', convert.command, self._on_command, qos.COMMAND,
                     max_age=COMMAND_AGE)
         self.health.report('latency', self._latency_status)
@@ -238,6 +239,9 @@ class SimNode(FlightNode):
         publish_to['truth'].publish(convert.odometry_message(
             epoch + truth.stamp, truth.position, truth.velocity, truth.quaternion,
             truth.angular_velocity))
+        if self._devices is None and frame.rotors is not None:
+            publish_to['rotors'].publish(convert.rotor_message(
+                epoch + frame.rotors.stamp, frame.rotors.speed))
         if self._devices is None and frame.battery is not None:
             publish_to['battery'].publish(convert.battery_message(
                 epoch + frame.battery.stamp, frame.battery.voltage, frame.battery.current,
