@@ -68,7 +68,7 @@ def test_numbers_too_close_for_a_histogram_leave_the_page(tmp_path):
     log = read_bag(bag)
     log.command_t = log.command_received = np.arange(10.0, 13.0)
     log.command_tilt = np.zeros((3, 4))
-    log.command_thrust = np.array([0.0, 1e-320, 1e-320])[:, None] * np.ones(4)
+    log.command_thrust = np.array([1e5, np.nextafter(1e5, 0), 1e5])[:, None] * np.ones(4)
     runs = make_runs([log], ['run'])
     assert '>Pose<' in make_page(runs, results_of(runs))
 
