@@ -22,30 +22,31 @@ import traceback
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [place for place in (str(HERE), str(HERE.parent)) if place not in sys.path]
 
-from beetle_omni_ros.bringup.limits import CheckLimits
-from beetle_omni_ros.control.hover import HoverParameters
-from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
-from beetle_omni_ros.control.policy import PolicyParameters
-from beetle_omni_ros.control.policy_network import PolicyNetwork
-from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
-from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
-from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.recording.limits import RecordingLimits
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs import messages
-from beetle_omni_ros.runs.bag import BagError, BagWriter, read_bag
-from beetle_omni_ros.runs.metrics import metrics_by_controller, task_of
-from beetle_omni_ros.runs.pose_file import COLUMNS
-from beetle_omni_ros.runs.tasks import make_task, WAYPOINTS
-from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
-from beetle_omni_ros.sim.parameters import SimulatorParameters
-from beetle_omni_ros.train.parameters import TrainParameters
+import fuzz_bags  # noqa: E402
+
+from beetle_omni_ros.bringup.limits import CheckLimits  # noqa: E402
+from beetle_omni_ros.control.hover import HoverParameters  # noqa: E402
+from beetle_omni_ros.control.nmpc_parameters import NmpcParameters  # noqa: E402
+from beetle_omni_ros.control.policy import PolicyParameters  # noqa: E402
+from beetle_omni_ros.control.policy_network import PolicyNetwork  # noqa: E402
+from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters  # noqa: E402
+from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters  # noqa: E402
+from beetle_omni_ros.estimation.parameters import EkfParameters  # noqa: E402
+from beetle_omni_ros.identify.gap.parameters import GapParameters  # noqa: E402
+from beetle_omni_ros.identify.recording.limits import RecordingLimits  # noqa: E402
+from beetle_omni_ros.robot.parameters import RobotParameters  # noqa: E402
+from beetle_omni_ros.robot.resources import share_path  # noqa: E402
+from beetle_omni_ros.robot.schema import ParameterError  # noqa: E402
+from beetle_omni_ros.runs.bag import BagError  # noqa: E402
+from beetle_omni_ros.runs.pose_file import COLUMNS  # noqa: E402
+from beetle_omni_ros.runs.tasks import make_task, WAYPOINTS  # noqa: E402
+from beetle_omni_ros.safety.parameters import SupervisorParameters  # noqa: E402
+from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters  # noqa: E402
+from beetle_omni_ros.sim.parameters import SimulatorParameters  # noqa: E402
+from beetle_omni_ros.train.parameters import TrainParameters  # noqa: E402
 
 OWN = (ParameterError, BagError)
 LONGEST_TEXT = 2000     # characters of a refusal
@@ -163,34 +164,19 @@ def tasks(_folder: Path) -> dict[str, bytes]:
     return {'waypoints': text.getvalue().encode()}
 
 
-def bags(folder: Path) -> dict[str, bytes]:
-    """One short bag."""
-    with BagWriter(folder / 'bag', {'task': 'hover', 'seed': 1}) as writer:
-        for k in range(60):
-            t = 1 + 0.05 * k
-            writer.write('ground_truth/odom', messages.odometry(
-                t, np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3)), t)
-            writer.write_state(t, 'flying:nmpc')
-    return {'bag': next((folder / 'bag').glob('*.mcap')).read_bytes()}
-
-
 def policies(_folder: Path) -> dict[str, bytes]:
     """The shipped policies."""
     return {name: share_path(f'policies/{name}').read_bytes()
             for name in ('rl.onnx', 'rl_memory.onnx')}
 
 
-def read_flight(path: Path, _name: str):
-    """Read a bag and judge it, as ``beetle_omni report`` does."""
-    log = read_bag(path)
-    return metrics_by_controller(log, task_of(log))
-
-
 KINDS = {
     'yaml': Kind('.yaml', parameter_files, mutate_yaml,
                  lambda path, name: PARAMETER_FILES[name].load(path)),
     'csv': Kind('.csv', tasks, mutate_csv, lambda path, _: make_task(str(path))),
-    'mcap': Kind('.mcap', bags, mutate_bytes, read_flight),
+    'mcap': Kind('.mcap', fuzz_bags.bags, mutate_bytes, fuzz_bags.read_flight),
+    'messages': Kind('.mcap', fuzz_bags.bags, fuzz_bags.mutate_messages, fuzz_bags.read_flight),
+    'metadata': Kind('.yaml', fuzz_bags.metadata, mutate_yaml, fuzz_bags.read_metadata),
     'onnx': Kind('.onnx', policies, mutate_onnx,
                  lambda path, _: PolicyNetwork(path, RobotParameters.load()))}
 

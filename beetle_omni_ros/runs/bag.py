@@ -12,6 +12,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 import yaml
 
 from beetle_omni_ros.control.base import Target
+from beetle_omni_ros.robot.yaml_file import read_yaml
 from beetle_omni_ros.runs import messages
 from beetle_omni_ros.runs.bag_reader import BagError, META_KEY, read_bag, read_messages
 from beetle_omni_ros.runs.log import COMPUTE_KEYS
@@ -253,7 +254,7 @@ def add_meta(path: str | Path, meta: dict) -> None:
     """
     file = Path(path) / 'metadata.yaml'
     try:
-        content = yaml.safe_load(file.read_text())
+        content = read_yaml(file)
         information = content['rosbag2_bagfile_information']
         custom = information['custom_data'] or {}
         known = json.loads(custom.get(META_KEY, '{}'))
@@ -263,7 +264,7 @@ def add_meta(path: str | Path, meta: dict) -> None:
         temporary.replace(file)
     except OSError as error:
         raise BagError(f'{file}: {error.strerror}') from None
-    except (yaml.YAMLError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError):
         raise BagError(f'{file}: not the metadata of a rosbag2 folder') from None
 
 

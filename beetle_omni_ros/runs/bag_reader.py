@@ -10,14 +10,18 @@ from typing import NamedTuple
 
 from mcap.exceptions import InvalidMagic
 from mcap.reader import NonSeekingReader
-import yaml
 
+from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, YamlError
 from beetle_omni_ros.runs import decode, messages
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.recorder import LogRecorder
 from beetle_omni_ros.runs.topics import split_topic, TOPICS
 
 META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
+
+# Entries of it by which a flight is judged, and how long they may be.
+META_TEXTS = ('task', 'conditions', 'robot', 'plant', 'controller', 'version')
+LONGEST_TEXT = 250
 
 
 class BagError(ValueError):
@@ -208,8 +212,23 @@ def _metadata(path, warnings):
         warnings.append('metadata.yaml is missing: the recorder did not finish')
         return {}
     try:
-        custom = yaml.safe_load(file.read_text())['rosbag2_bagfile_information']['custom_data']
-        return json.loads((custom or {}).get(META_KEY, '{}'))
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError, OSError):
+        custom = read_yaml(file)['rosbag2_bagfile_information']['custom_data']
+        meta = dict(json.loads((custom or {}).get(META_KEY, '{}')))
+    except (YamlError, KeyError, TypeError, AttributeError, ValueError, RecursionError):
         warnings.append('metadata.yaml is not readable')
         return {}
+    unusable = [key for key, value in meta.items() if not _usable(key, value)]
+    warnings.extend(f'metadata.yaml: {quoted(key)} is not usable, found {quoted(meta[key])}'
+                    for key in unusable)
+    return {key: value for key, value in meta.items() if key not in unusable}
+
+
+def _usable(key, value):
+    """Whether a value is of the kind that readers of the log count on."""
+    if value is None:
+        return True
+    if key == 'seed':
+        return isinstance(value, int) and 0 <= value < 1 << 63
+    if key in META_TEXTS:
+        return isinstance(value, str) and len(value) <= LONGEST_TEXT and value.isprintable()
+    return True

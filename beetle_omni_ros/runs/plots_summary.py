@@ -11,6 +11,8 @@ from beetle_omni_ros.runs.body import hold, inside
 from beetle_omni_ros.runs.figures import FAINT, INK, legend, line, panels, Run
 from beetle_omni_ros.runs.metrics import REACHED_ORIENTATION, REACHED_POSITION
 
+ABSURD, TINY = 1e6, 1e-9    # [rad, rad/s, N] what no actuator does; ranges that cannot be divided
+
 
 def steady_errors(runs: list[Run]) -> Figure | None:
     """Share of the poses whose U error is below a value."""
@@ -76,11 +78,13 @@ def _used(run):
 
 def _histograms(panel, runs, columns):
     """All runs in the same bins, so that their shares compare."""
-    columns = [values[np.isfinite(values)] for values in columns]
+    columns = [values[np.abs(values) < ABSURD] for values in columns]
     every = np.concatenate(columns)
     if not every.size:
         return
-    edges = np.histogram_bin_edges(every, bins=60)
+    low, high = every.min(), every.max()
+    spare = 0.5 if high - low < TINY else 0.0
+    edges = np.linspace(low - spare, high + spare, 61)
     for run, values in zip(runs, columns, strict=True):
         share = np.histogram(values, bins=edges)[0] / max(1, values.size)
         panel.stairs(share, edges, color=run.colour, lw=1.3, label=run.label)

@@ -1,14 +1,16 @@
 """The page about flights that nobody gave a target, or that broke off early."""
 
 import io
+import json
 
 import numpy as np
 import pytest
 from rich.console import Console
+import yaml
 
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.runs.bag import BagWriter
-from beetle_omni_ros.runs.report import run_report
+from beetle_omni_ros.runs.bag import BagWriter, read_bag
+from beetle_omni_ros.runs.report import make_page, make_runs, results_of, run_report
 
 LEVEL = np.array([0, 0, 0, 1.0])
 
@@ -36,6 +38,39 @@ def test_a_bag_without_targets_gives_a_page(tmp_path, task, targets):
     assert results['meta']['seed'] == 0
     text = page.read_text()
     assert str(bag) in text and '>Pose<' in text and ('>Errors<' in text) == bool(targets)
+
+
+@pytest.mark.parametrize('meta', [
+    [1], 'x', {'task': ['x']}, {'task': 'x' * 9000}, {'task': 'random10', 'seed': -1},
+    {'task': 'random10', 'seed': 'abc'}, {'task': 'hover', 'seed': 1e999}, {'robot': {'a': 1}},
+    {'robot': 'a\0b'}, {'controller': ['nmpc']}, {'conditions': {'a': 1}, 'seed': [1]}], ids=str)
+def test_metadata_of_any_kind_do_not_hide_the_flight(tmp_path, meta):
+    bag = record(tmp_path / 'bag', task='hover', targets=1)
+    file = bag / 'metadata.yaml'
+    content = yaml.safe_load(file.read_text())
+    content['rosbag2_bagfile_information']['custom_data'] = {'beetle_omni': json.dumps(meta)}
+    file.write_text(yaml.safe_dump(content))
+    log = read_bag(bag)
+    assert any('metadata.yaml' in warning for warning in log.warnings)
+    log.states, log.state_t = [], np.zeros(0)
+    runs = make_runs([log], ['run'])
+    assert results_of(runs)['run'] and '>Pose<' in make_page(runs, results_of(runs))
+
+
+def test_metadata_nested_too_deeply_are_told(tmp_path):
+    bag = record(tmp_path / 'bag', task='hover')
+    (bag / 'metadata.yaml').write_text('a: ' + '[' * 5000)
+    assert 'metadata.yaml is not readable' in read_bag(bag).warnings
+
+
+def test_numbers_too_close_for_a_histogram_leave_the_page(tmp_path):
+    bag = record(tmp_path / 'bag', task='hover', targets=1)
+    log = read_bag(bag)
+    log.command_t = log.command_received = np.arange(10.0, 13.0)
+    log.command_tilt = np.zeros((3, 4))
+    log.command_thrust = np.array([1e5, np.nextafter(1e5, 0), 1e5])[:, None] * np.ones(4)
+    runs = make_runs([log], ['run'])
+    assert '>Pose<' in make_page(runs, results_of(runs))
 
 
 def test_flights_with_and_without_targets_stand_on_one_page(tmp_path):
