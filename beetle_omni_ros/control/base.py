@@ -162,6 +162,9 @@ class Controller(Protocol):
     ``step`` is called once every ``period`` with a fresh state and must not raise on
     finite input. A standby controller is stepped as well, so that it can take over
     without a jump; the command in force stands in ``state.command``.
+
+    A controller that can fly with fewer actuators also has ``set_health(health)``, see
+    :func:`tell_health`; another one is not asked to.
     """
 
     name: str
@@ -170,11 +173,15 @@ class Controller(Protocol):
     def reset(self) -> None:
         """Forget all memory, as before the first step."""
 
-    def set_health(self, health: ActuatorHealth) -> None:
-        """Fly with what is left from now on; who cannot leaves it to those who can."""
-
     def step(self, state: State, target: Target) -> Command:
         """One command for one state."""
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Health of the last step and since reset, for operators and logs."""
+
+
+def tell_health(controller: Controller, health: ActuatorHealth) -> None:
+    """Tell a controller which actuators are left, where it can make use of that."""
+    told = getattr(controller, 'set_health', None)
+    if told is not None:
+        told(health)

@@ -22,7 +22,6 @@ from beetle_omni_ros.control.turning import TurningParameters
 from beetle_omni_ros.control.unwinding import UnwindingParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
@@ -109,9 +108,6 @@ class PolicyController:
             robot, p, FunctionCall(model.integrator(robot), None)) if contract.memory else None
         self._guidance = Guidance(p, robot.tilt_axes)
         self.reset()
-
-    def set_health(self, health: ActuatorHealth) -> None:
-        """Nothing: the policy was trained with all actuators, others fly without some."""
 
     def reset(self) -> None:
         """Forget the last command, the estimate and all counts."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from beetle_omni_ros.control.base import Controller, PoseTarget, State, Target
+from beetle_omni_ros.control.base import Controller, PoseTarget, State, Target, tell_health
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
@@ -253,7 +253,7 @@ class FlightLoop:
         if self._supervisor.health is not self._health:
             self._health = self._supervisor.health
             for controller in self._controllers.values():
-                controller.set_health(self._health)
+                tell_health(controller, self._health)
         for name, controller in self._controllers.items():
             if self._ticks % self._every[name]:
                 continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+import math
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
@@ -10,8 +11,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from beetle_omni_ros.control.base import Controller, PoseTarget
+from beetle_omni_ros.control.base import Controller, PoseTarget, tell_health
 from beetle_omni_ros.nodes import convert, health, qos, targets
+from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.target_checks import TargetChecks
@@ -56,19 +58,21 @@ class ControllerNode(FlightNode):
                     max_age=ODOM_AGE)
         self.listen(JointState, 'joint_states', convert.joints, self._on_joints,
                     max_age=JOINT_AGE)
-        self.listen(JointState, 'command', convert.command, self._on_command, qos.COMMAND,
+        self.listen(JointState, 'command', CommandSource(self).read, self._on_command, qos.COMMAND,
                     stale_after=None)
         # Latched by those who follow INTERFACES, volatile from a quick tool: both are heard.
         for profile in (qos.LATCHED, qos.EVENT):
             self.listen(PoseStamped, 'target_pose', targets.pose_target, self._on_target,
-                        profile, stale_after=None)
+                        profile, stale_after=None, published=True, check=self._check_target)
         self.listen(MultiDOFJointTrajectory, 'target_trajectory', targets.trajectory_target,
-                    self._on_target, qos.EVENT, stale_after=None)
+                    self._on_target, qos.EVENT, stale_after=None, published=True,
+                    check=self._check_target)
         self.create_subscription(String, 'supervisor/state', self._on_mode, qos.LATCHED)
         self.listen(MultiDOFJointTrajectory, 'supervisor/target', targets.wished_target,
                     self._on_wish, qos.LATCHED, stale_after=None)
         self.listen(JointState, 'supervisor/actuators', convert.actuator_health,
-                    self._controller.set_health, qos.LATCHED, stale_after=None)
+                    lambda health: tell_health(self._controller, health), qos.LATCHED,
+                    stale_after=None)
         self.health.track_compute(self._controller.period)
         self.health.report('controller', self._controller_status)
 
@@ -82,15 +86,23 @@ class ControllerNode(FlightNode):
     def _on_command(self, command):
         self._command = command
 
-    def _on_target(self, target):
-        reason = self._checks.why_not(target, self.now())
+    def _check_target(self, target, published):
+        # Held against its publication: a latched target stays good for a node that starts
+        # later. Simulated time has nothing to do with publications.
+        then = None if self.simulated or math.isnan(published) else published
+        reason = self._checks.why_not(target, then)
         if reason:
-            self.health.rejected('target', reason)
-            return
+            raise convert.MessageError(reason, 'cannot be flown')
+
+    def _on_target(self, target, _=math.nan):
+        now = self.now()
         if target.stamp == 0.0:     # as quick tools send it: now
             target = self._from_now(target)
-        # Latched and volatile copies may overtake each other: the newest stamp counts.
-        if self._target is None or target.stamp >= self._target.stamp:
+        elif target.stamp > now:    # from a clock that is ahead: it must not outlast later ones
+            target = replace(target, stamp=now)
+        # Latched and volatile copies may overtake each other: the newest stamp counts, save after
+        # the clock was set back.
+        if self._target is None or not target.stamp < self._target.stamp <= now:
             self._target = target
 
     def _from_now(self, target):

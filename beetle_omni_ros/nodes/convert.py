@@ -37,7 +37,18 @@ UNIT_TOLERANCE = 0.01
 
 
 class MessageError(ValueError):
-    """A message cannot be used; the text is the reason under which it is counted."""
+    """
+    A message cannot be used; the text says why.
+
+    Attributes:
+        kind: under which it is counted: one of a few, where the text holds numbers or names.
+
+    """
+
+    def __init__(self, text: str, kind: str = ''):
+        """Count under ``kind``, or under the text itself."""
+        super().__init__(text)
+        self.kind = kind or text
 
 
 @dataclass(frozen=True)
@@ -204,11 +215,11 @@ def command(message: JointState) -> Command:
                    finite(thrust, 'thrust'))
 
 
-def command_message(value: Command) -> JointState:
-    """Write a command as INTERFACES lays it out."""
+def command_message(value: Command, source: str = '') -> JointState:
+    """Write a command as INTERFACES lays it out; ``source`` is the publisher's identity."""
     message = JointState(name=COMMAND_NAMES, position=_floats(value.tilt) + NO_VALUE,
                          effort=NO_VALUE + _floats(value.thrust))
-    _header(message, value.stamp, '')
+    _header(message, value.stamp, source)
     return message
 
 

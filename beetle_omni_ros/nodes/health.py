@@ -15,6 +15,8 @@ from beetle_omni_ros.nodes import qos
 OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR,
                           DiagnosticStatus.STALE)
 PERIOD = 1.0            # s between two diagnostics
+REPEAT = 1.0            # s between two lines of the log about refusals of one kind
+KINDS = 20              # of refusals that are told apart for each topic
 
 
 class Distribution:
@@ -53,6 +55,8 @@ class Input:
     seen: float | None = None           # elapsed() at the last good message
     rejected: Counter = field(default_factory=Counter)
     rejected_reported: int = 0
+    last_refusal: str = ''
+    logged: dict = field(default_factory=dict)      # kind -> elapsed() of its last line
 
 
 class Health:
@@ -88,12 +92,31 @@ class Health:
         entry.age = age
         entry.seen = self._node.elapsed()
 
-    def rejected(self, topic: str, reason: str) -> None:
-        """Count a refused message; the first of a kind is logged, save backlog at the start."""
+    def rejected(self, topic: str, reason: str, kind: str = '') -> None:
+        """
+        Count a refused message under ``kind``, or under its reason.
+
+        The first of a kind is logged, save backlog at the start; where reasons differ within a
+        kind, one a second is.
+        """
         entry = self._inputs[topic]
-        if reason not in entry.rejected and (entry.received or 'stamp' not in reason):
+        kind, detailed = kind or reason, bool(kind) and kind != reason
+        if kind not in entry.rejected and len(entry.rejected) >= KINDS:
+            kind, detailed = 'other reasons', True
+        if self._is_news(entry, kind, detailed):
             self._node.get_logger().warning(f'{topic}: message refused, {reason}')
-        entry.rejected[reason] += 1
+        entry.rejected[kind] += 1
+        entry.last_refusal = reason if detailed else ''
+
+    def _is_news(self, entry, kind, detailed):
+        if not detailed:
+            return kind not in entry.rejected and (entry.received or 'stamp' not in kind)
+        now = self._node.elapsed()
+        before = entry.logged.get(kind)
+        if before is not None and 0 <= now - before < REPEAT:
+            return False
+        entry.logged[kind] = now
+        return True
 
     def track_compute(self, deadline: float) -> None:
         """Report compute times against a ``deadline`` [s] under '<node>: compute'."""
@@ -139,10 +162,11 @@ class Health:
             if silent:
                 level = ERROR
                 faults.append(f'{topic} silent for {now - entry.seen:.1f} s')
-            elif entry.rejected.total() > entry.rejected_reported:
+            if entry.rejected.total() > entry.rejected_reported:
                 level = max(level, WARN, key=ord)
                 new = entry.rejected.total() - entry.rejected_reported
-                faults.append(f'{topic}: {new} rejected')
+                faults.append(f'{topic}: {new} rejected' + (
+                    f', {entry.last_refusal}' if entry.last_refusal else ''))
             elif entry.seen is None and entry.stale_after is not None:
                 faults.append(f'waiting for {topic}')
             entry.reported = entry.received

@@ -15,6 +15,7 @@ from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import Goal, ServoLoop
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.nodes import convert, health, qos, runner
+from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.joint_bridge_status import bus_status, servo_status
 from beetle_omni_ros.nodes.lifecycle_node import (
     ACTIVE,
@@ -60,7 +61,7 @@ class JointBridgeNode(LifecycleFlightNode):
         self._state = self.create_publisher(String, 'joint_bridge/state', qos.LATCHED)
         self._told = ''
         self._joints = self.create_publisher(JointState, 'joint_states', qos.SENSOR)
-        self.listen(JointState, 'command', convert.command, self._on_command, qos.COMMAND,
+        self.listen(JointState, 'command', CommandSource(self).read, self._on_command, qos.COMMAND,
                     max_age=COMMAND_AGE, stale_after=None, published=True)
         self._bus_status = bus_status()
         self.health.report('bus', lambda: self._bus_status(self.stage, self._told, self._bus,

@@ -52,10 +52,11 @@ class FlightNode(Node):
         self._claim = instance.claim(self)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         # Simulated time may stand still; what times a flight then goes by it, and by nothing else.
-        self.simulated = bool(self.get_parameter('use_sim_time').value)
+        self.simulated = bool(self.get_parameter(parameters.CLOCK).value)
         self.flight_clock = self.get_clock() if self.simulated else self.steady_clock
         self.parameters = parameters.declare(self, parameter_class, file, file_key,
                                              on_change, changeable)
+        parameters.lock_clock(self)
         self.health = Health(self)
         self.get_logger().debug('started')      # the first call is slow: not in flight
         self._twin_checks = 0
@@ -71,7 +72,8 @@ class FlightNode(Node):
 
     def listen(self, message_type: type, topic: str, read: Callable, handle: Callable,
                profile: QoSProfile = qos.SENSOR, max_age: float | None = None,
-               stale_after: float | None = 0.5, published: bool = False) -> None:
+               stale_after: float | None = 0.5, published: bool = False,
+               check: Callable | None = None) -> None:
         """
         Subscribe ``topic``: convert with ``read``, refuse what is bad, pass to ``handle``.
 
@@ -83,7 +85,9 @@ class FlightNode(Node):
             profile: quality of service.
             max_age: refuse stamps older than this, or ahead of the clock [s]; None: any.
             stale_after: silence that is an error, once the topic came [s]; None: none.
-            published: pass the time of publication [s, system time, or nan] to ``handle`` too.
+            published: pass the time of publication [s, system time, or nan] to ``check`` and
+                ``handle`` too.
+            check: called with the dataclass before ``handle``; raises MessageError.
 
         """
         health = self.health
@@ -92,17 +96,15 @@ class FlightNode(Node):
         def callback(message, *publication):
             try:
                 value = read(message)
+                age = self.now() - value.stamp
+                _check_age(age, max_age)
+                if check is not None:
+                    check(value, *publication)
             except convert.MessageError as error:
-                health.rejected(topic, str(error))
+                health.rejected(topic, str(error), error.kind)
                 return
-            age = self.now() - value.stamp
-            if max_age is not None and age > max_age:
-                health.rejected(topic, 'stale stamp')
-            elif max_age is not None and age < -FUTURE:
-                health.rejected(topic, 'stamp in the future')
-            else:
-                health.received(topic, age)
-                handle(value, *publication)
+            health.received(topic, age)
+            handle(value, *publication)
 
         taken = arrival.with_publication(callback) if published else callback
         self.create_subscription(message_type, topic, taken, profile)
@@ -131,3 +133,10 @@ class FlightNode(Node):
         if self._claim:
             self._claim.close()
             self._claim = None
+
+
+def _check_age(age, limit):
+    if limit is not None and age > limit:
+        raise convert.MessageError('stale stamp')
+    if limit is not None and age < -FUTURE:
+        raise convert.MessageError('stamp in the future')

@@ -26,7 +26,8 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 
 # ROS itself puts these into the overrides of a node.
-ROS_OWN = ('use_sim_time', 'start_type_description_service')
+CLOCK = 'use_sim_time'
+ROS_OWN = (CLOCK, 'start_type_description_service')
 ROS_OWN_PREFIX = 'qos_overrides.'
 UNBOUNDED = 1e300       # FloatingPointRange needs both ends
 
@@ -161,3 +162,19 @@ def _validate_changes(node, cls, instance, on_change):
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(changed)
+
+
+def lock_clock(node: Node) -> None:
+    """
+    Refuse to change ``use_sim_time`` from now on: timers and ages go by the clock of the start.
+
+    Call it last: rclpy asks the newest callback first, and its own switches the clock when asked.
+    """
+    def refuse(parameters):
+        if any(parameter.name == CLOCK for parameter in parameters):
+            return SetParametersResult(successful=False, reason=(
+                f"parameter '{CLOCK}' is read-only: expected at the start of the node, "
+                'not in flight'))
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(refuse)

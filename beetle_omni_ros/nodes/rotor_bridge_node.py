@@ -14,6 +14,7 @@ from beetle_omni_ros.drivers.motor_board_arming import Arming, FLIES
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.nodes import convert, qos, runner
+from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.nodes.rotor_bridge_report import RotorBridgeReport
 from beetle_omni_ros.nodes.target_stream import TargetStream
@@ -64,7 +65,7 @@ class RotorBridgeNode(FlightNode):
         self._batteries = self.create_publisher(BatteryState, 'battery_state', qos.SENSOR)
         self._rotors = self.create_publisher(JointState, 'rotor_states', qos.SENSOR)
         self._report = RotorBridgeReport(self.health, self._arming, self._stream)
-        self.listen(JointState, 'command', convert.command, self._on_command, qos.COMMAND,
+        self.listen(JointState, 'command', CommandSource(self).read, self._on_command, qos.COMMAND,
                     max_age=given.stamp_age_limit, stale_after=None, published=True)
         self.create_subscription(String, 'supervisor/state', self._on_supervisor, qos.LATCHED)
         self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)

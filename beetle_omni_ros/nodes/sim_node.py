@@ -14,6 +14,7 @@ from sensor_msgs.msg import BatteryState, Imu, JointState
 
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.nodes import convert, health, qos, runner
+from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.nodes.pacing import Pacing, Waiting
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -134,7 +135,7 @@ class SimNode(FlightNode):
         self._publish_to['battery'] = self.create_publisher(BatteryState, 'battery_state',
                                                             qos.SENSOR)
         self._publish_to['rotors'] = self.create_publisher(JointState, 'rotor_states', qos.SENSOR)
-        self.listen(JointState, 'command', convert.command, self._on_command, qos.COMMAND,
+        self.listen(JointState, 'command', CommandSource(self).read, self._on_command, qos.COMMAND,
                     max_age=COMMAND_AGE)
         self.health.report('latency', self._latency_status)
 

@@ -15,6 +15,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.nodes import convert, health, qos, runner, targets
+from beetle_omni_ros.nodes.command_source import new_identity, TOPIC
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.actuator_health import ALL_WELL
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -58,6 +59,9 @@ class SupervisorNode(FlightNode):
         self._sent = (None, '')     # stamp and source of the last command
         self._state = ''
         self._publisher = self.create_publisher(JointState, 'command', qos.COMMAND)
+        self._identity = new_identity('supervisor_node')
+        self._identities = self.create_publisher(String, TOPIC, qos.LATCHED)
+        self._identities.publish(String(data=self._identity))
         self._states = self.create_publisher(String, 'supervisor/state', qos.LATCHED)
         self._targets = self.create_publisher(MultiDOFJointTrajectory, 'supervisor/target',
                                               qos.LATCHED)
@@ -139,7 +143,7 @@ class SupervisorNode(FlightNode):
         # The same command is not repeated: its age tells the actuators that nothing new came.
         if command is not None and (command.stamp, supervisor.source) != self._sent:
             self._sent = (command.stamp, supervisor.source)
-            self._publisher.publish(convert.command_message(command))
+            self._publisher.publish(convert.command_message(command, self._identity))
         self._tell()
 
     def _tell(self):

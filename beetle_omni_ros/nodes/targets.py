@@ -25,20 +25,27 @@ from beetle_omni_ros.nodes.convert import (
     xyzw,
 )
 
+POINTS = 10_000     # of a trajectory: 100 s at 100 Hz; more would hold up the node that reads it
+
 
 def pose_target(message: PoseStamped) -> PoseTarget:
     """Read a target pose."""
     position, rotation = checked_pose(message.pose)
     if message.header.frame_id not in ('', WORLD):
-        raise MessageError(f"frame_id '{message.header.frame_id}' is not '{WORLD}'")
+        raise MessageError(f"frame_id '{message.header.frame_id[:40]}' is not '{WORLD}'",
+                           'wrong frame')
     return PoseTarget(position, rotation, seconds(message.header.stamp))
 
 
 def trajectory_target(message: MultiDOFJointTrajectory) -> TrajectoryTarget:
     """Read a trajectory; times count from the header's stamp."""
     start, points = seconds(message.header.stamp), message.points
-    if len(points) < 2:
-        raise MessageError(f'a trajectory needs 2 points or more, found {len(points)}')
+    if not 2 <= len(points) <= POINTS:
+        raise MessageError(f'a trajectory of {len(points)} points: expected 2 to {POINTS}',
+                           'too few or too many points')
+    if message.header.frame_id not in ('', WORLD):
+        raise MessageError(f"frame_id '{message.header.frame_id[:40]}' is not '{WORLD}'",
+                           'wrong frame')
     for point in points:
         if len(point.transforms) != 1 or len(point.velocities) != 1:
             raise MessageError('each trajectory point needs one transform and one velocity')

@@ -29,6 +29,10 @@ class TargetLimits:
     feet_spread: float = parameter(0.11, doc='|x| = |y| of a foot', unit='m', low=0, high=5)
     propeller_radius: float = parameter(0.1143, doc='of a propeller', unit='m', low=0, high=5)
     ball_radius: float = parameter(0.04, doc='of the end-effector', unit='m', low=0, high=5)
+    speed: float = parameter(10.0, doc='of a trajectory, along each axis', unit='m/s', low=0.1,
+                             high=100)
+    rate: float = parameter(20.0, doc='of a trajectory, about each axis', unit='rad/s', low=0.1,
+                            high=100)
     oldest: float = parameter(10.0, doc='age of a stamp', unit='s', low=0.1, high=1e5)
     farthest_ahead: float = parameter(1.0, doc='of a stamp', unit='s', low=0.01, high=1e5)
 
@@ -79,7 +83,8 @@ class TargetChecks:
             reason = self.why_not_pose(*pose)
             if reason:
                 return f'point {k + 1}: {reason}'
-        return ''
+        return self._motion(target.velocities, 'velocity', self._p.speed, 'm/s') or self._motion(
+            target.angular_velocities, 'angular velocity', self._p.rate, 'rad/s')
 
     def why_not_pose(self, position: np.ndarray, quaternion: np.ndarray) -> str:
         """Check a pose: (3,) in world [m], (4,) xyzw; as :meth:`why_not`."""
@@ -105,6 +110,15 @@ class TargetChecks:
         """Least height of base_link at an attitude (4,) at which nothing touches the floor [m]."""
         down = self._points @ rotations.matrix(rotations.normalized(quaternion))[2] - self._radii
         return self._p.clearance - float(down.min())
+
+    @staticmethod
+    def _motion(values, name, most, unit):
+        good = np.all(np.abs(values) <= most, axis=1)       # nan is not
+        if good.all():
+            return ''
+        k = int(np.argmin(good))
+        worst = values[k][np.argmax(~(np.abs(values[k]) <= most))]
+        return f'point {k + 1}: {name} {worst:.4g} {unit}, expected within +-{most:g} {unit}'
 
     def _stamp(self, stamp, now):
         if now is None or stamp == 0.0:

@@ -1,0 +1,254 @@
+"""What nodes refuse from topics and in flight, and that what they had stays."""
+
+import re
+import time
+from types import SimpleNamespace
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+import numpy as np
+import pytest
+import rclpy
+
+pytest.importorskip('pymavlink')
+pytest.importorskip('serial')
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from trajectory_msgs.msg import MultiDOFJointTrajectory
+
+from beetle_omni_ros.control.base import Command, TrajectoryTarget
+from beetle_omni_ros.nodes import command_source, convert, qos, targets
+from beetle_omni_ros.nodes.controller_node import ControllerNode
+from beetle_omni_ros.nodes.ekf_node import EkfNode, EkfNodeParameters
+from beetle_omni_ros.nodes.joint_bridge_node import JointBridgeNode
+from beetle_omni_ros.nodes.recorder_node import RecorderNode
+from beetle_omni_ros.nodes.reference_node import ReferenceNode
+from beetle_omni_ros.nodes.rotor_bridge_node import RotorBridgeNode
+from beetle_omni_ros.nodes.sim_node import SimNode
+from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
+from beetle_omni_ros.nodes.viewer_node import ViewerNode
+
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+SOON = 10       # s; a busy test machine must not look like a fault
+
+
+class StillNode(ControllerNode):
+    """The controller node around nothing."""
+
+    def __init__(self):
+        super().__init__('nmpc', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')
+
+    def make_controller(self, parameters):
+        return SimpleNamespace(period=0.01, name='none', diagnostics=dict,
+                               set_health=lambda health: None)
+
+
+class Bench:
+    """One node of this process, and another that publishes to it."""
+
+    def __init__(self, domain, *overrides):
+        arguments = [a for override in overrides for a in ('-p', override)]
+        rclpy.init(args=['--ros-args', *arguments], domain_id=domain)
+        self.user = rclpy.create_node('user')
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.user)
+        self.nodes = [self.user]
+
+    def add(self, node):
+        """Spin this node too; log lines of its refusals are kept in ``node.said``."""
+        node.said = []
+        before = node.health.rejected
+        node.health.rejected = lambda topic, reason, kind='': (
+            node.said.append(f'{topic}: {reason}'), before(topic, reason, kind))
+        self.executor.add_node(node)
+        self.nodes.append(node)
+        return node
+
+    def publisher(self, kind, topic, profile=qos.EVENT, readers=1):
+        """Make a publisher that is heard."""
+        made = self.user.create_publisher(kind, topic, profile)
+        assert self.wait(lambda: made.get_subscription_count() >= readers)
+        return made
+
+    def wait(self, condition, timeout=SOON):
+        """Spin until it holds."""
+        end = time.monotonic() + timeout
+        while not condition() and time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.02)
+        return condition()
+
+    def close(self):
+        """End."""
+        for node in self.nodes:
+            self.executor.remove_node(node)
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+@pytest.fixture
+def bench(ros_domain):
+    """Without a node yet."""
+    made = Bench(ros_domain)
+    yield made
+    made.close()
+
+
+def pose(height=1.0, stamp=0.0, frame='world', x=0.0):
+    message = convert.pose_message(stamp, [x, 0, height], LEVEL)
+    message.header.frame_id = frame
+    return message
+
+
+def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(bench):
+    node = bench.add(StillNode())
+    poses = bench.publisher(PoseStamped, 'target_pose')
+    poses.publish(pose())
+    assert bench.wait(lambda: node._target is not None)
+    first, now = node._target, time.time()
+    for message, said in (
+            (pose(-5.0), 'z = -5 m, expected at least'),
+            (pose(0.05), 'z = 0.05 m, expected at least'), (pose(1e300), 'the fence'),
+            (pose(x=25.0), '|x| = 25 m, expected at most'), (pose(frame='map'), "frame_id 'map'"),
+            (pose(stamp=1.5), 's old, expected at most 10 s'),
+            (pose(stamp=now + 100), 's ahead, expected at most')):
+        heard = len(node.said)
+        poses.publish(message)
+        assert bench.wait(lambda heard=heard: len(node.said) > heard), said
+        assert node.said[-1].startswith('target_pose: ') and said in node.said[-1]
+        assert node._target is first
+    kinds = node.health._inputs['target_pose'].rejected
+    assert kinds['cannot be flown'] == 6 and kinds.total() == 7
+
+
+def test_a_target_from_a_clock_ahead_does_not_block_later_ones(bench):
+    node = bench.add(StillNode())
+    poses = bench.publisher(PoseStamped, 'target_pose')
+    poses.publish(pose(1.0, time.time() + 0.8))
+    assert bench.wait(lambda: node._target is not None)
+    poses.publish(pose(1.5, time.time()))
+    assert bench.wait(lambda: node._target.position[2] == 1.5)
+
+
+def test_a_latched_target_stays_good_for_a_node_that_starts_later(bench, monkeypatch):
+    node = bench.add(StillNode())
+    late = time.time() + 60
+    monkeypatch.setattr(node, 'now', lambda: late)
+    latched = bench.user.create_publisher(PoseStamped, 'target_pose', qos.LATCHED)
+    latched.publish(pose(1.2, time.time()))
+    assert bench.wait(lambda: node._target is not None)
+
+
+def trajectory(heights, stamp):
+    count = len(heights)
+    positions = np.column_stack([np.zeros((count, 2)), heights])
+    return targets.target_message(TrajectoryTarget(
+        stamp + np.arange(count), positions, np.tile(LEVEL, (count, 1)), np.zeros((count, 3)),
+        np.zeros((count, 3)), stamp=stamp))
+
+
+def test_every_point_of_a_target_trajectory_is_checked(bench):
+    node = bench.add(StillNode())
+    paths = bench.publisher(MultiDOFJointTrajectory, 'target_trajectory')
+    paths.publish(trajectory([1.0, 1.1, -5.0], time.time()))
+    assert bench.wait(lambda: node.said)
+    assert node.said[0].startswith('target_trajectory: point 3: z = -5 m, expected')
+    fast = trajectory([1.0, 1.1], time.time())
+    fast.points[1].velocities[0].linear.x = 1e300
+    paths.publish(fast)
+    assert bench.wait(lambda: len(node.said) > 1)
+    assert 'point 2: velocity 1e+300 m/s, expected within +-10 m/s' in node.said[1]
+    assert node._target is None
+    paths.publish(trajectory([1.0, 1.1, 1.2], time.time()))
+    assert bench.wait(lambda: node._target is not None)
+
+
+def test_refusals_of_many_kinds_take_no_memory(bench):
+    node = bench.add(StillNode())
+    for k in range(500):
+        node.health.rejected('target_pose', f'reason {k}')
+    assert len(node.health._inputs['target_pose'].rejected) < 30
+
+
+@pytest.mark.parametrize(('kind', 'overrides'), [
+    (SimNode, ()), (JointBridgeNode, ('port:=/tmp/none/a',)),
+    (RotorBridgeNode, ('port:=/tmp/none/b',)), (StillNode, ())])
+def test_only_the_supervisors_commands_are_obeyed_and_others_are_named(ros_domain, kind,
+                                                                       overrides):
+    bench = Bench(ros_domain, *overrides)
+    try:
+        _fly_with_an_intruder(bench, bench.add(kind()))
+    finally:
+        bench.close()
+
+
+def _fly_with_an_intruder(bench, node):
+    told = []
+    bench.user.create_subscription(
+        DiagnosticArray, 'diagnostics', lambda m: told.extend(s.message for s in m.status), 10)
+    commands = bench.publisher(JointState, 'command', qos.COMMAND)
+    identities = bench.publisher(String, command_source.TOPIC, qos.LATCHED)
+    entry = node.health._inputs['command']
+
+    def answer(source):
+        before = entry.received, entry.rejected.total()
+        end = time.monotonic() + SOON
+        # A message older than 0.1 s would be refused for that: send again where it was late.
+        while (entry.received, entry.rejected.total()) == before and time.monotonic() < end:
+            commands.publish(convert.command_message(
+                Command(time.time(), np.zeros(4), np.full(4, 7.0)), source))
+            bench.wait(lambda: (entry.received, entry.rejected.total()) != before, 0.5)
+        return 'taken' if entry.received > before[0] else 'refused'
+
+    assert answer('') == 'taken' and answer('anybody') == 'taken'   # no supervisor yet
+    for own in ('supervisor_node:0123abcd', 'supervisor_node:deadbeef'):    # started again
+        identities.publish(String(data=own))
+        assert bench.wait(lambda: answer('') == 'refused')
+        assert answer(own) == 'taken'
+        for other in ('', 'x' * 100_000, 'supervisor_node:00000000'):
+            assert answer(other) == 'refused' and len(node.said[-1]) < 200
+        assert f"expected '{own}'" in node.said[-1]
+    time.sleep(0.6)     # silence of the supervisor gives nobody else the actuators
+    assert answer('') == 'refused'
+    assert bench.wait(lambda: any('command: ' in text and '2nd publisher' in text
+                                  for text in told))
+
+
+def test_the_supervisor_signs_its_commands_and_tells_its_identity(bench):
+    heard, sent = [], []
+    bench.user.create_subscription(String, command_source.TOPIC, heard.append, qos.LATCHED)
+    node = bench.add(SupervisorNode())
+    assert bench.wait(lambda: heard)
+    node._publisher = SimpleNamespace(publish=sent.append)
+    node._supervisor.update = lambda now: Command(now, np.zeros(4), np.zeros(4))
+    node._update()
+    assert sent[0].header.frame_id == heard[0].data
+    assert re.fullmatch('supervisor_node:[0-9a-f]{8}', heard[0].data)
+
+
+@pytest.mark.parametrize('kind', [
+    EkfNode, SimNode, SupervisorNode, ReferenceNode, StillNode, RecorderNode, ViewerNode,
+    JointBridgeNode, RotorBridgeNode])
+def test_what_is_read_only_cannot_be_set_in_flight(ros_domain, tmp_path, kind):
+    own = {JointBridgeNode: ('port:=/tmp/none/a',), RotorBridgeNode: ('port:=/tmp/none/b',),
+           RecorderNode: (f'bag:={tmp_path}/bag',)}
+    bench = Bench(ros_domain, *own.get(kind, ()))
+    try:
+        node = bench.add(kind())
+        before = node.now()
+        for simulated in (True, False):
+            new = Parameter('use_sim_time', value=simulated)
+            for answer in (node.set_parameters([new])[0],
+                           node.set_parameters_atomically([new])):
+                assert not answer.successful and '\n' not in answer.reason
+                assert "parameter 'use_sim_time' is read-only" in answer.reason
+        assert node.now() > before and not node.get_parameter('use_sim_time').value
+        for name in node._parameters:
+            if node.describe_parameter(name).read_only:
+                answer = node.set_parameters([Parameter(name, value=node.get_parameter(
+                    name).value)])[0]
+                assert not answer.successful and 'read-only' in answer.reason, name
+    finally:
+        bench.close()
