@@ -31,7 +31,7 @@ from beetle_omni_ros.runs.recorder import LogRecorder, Tee
 from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.supervisor import Supervisor
+from beetle_omni_ros.safety.supervisor import PILOT, Supervisor
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.faults.listed import load_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
@@ -110,10 +110,12 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
                                 CONTROLLERS)
         simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed)
+        # With a lost actuator the NMPC lands the robot, whoever flew it.
+        aboard = dict.fromkeys([controller, PILOT] if faults else [controller])
         loop = FlightLoop(
             simulator,
             ErrorStateEkf(estimator, robot.gravity),
-            {controller: make_controller(controller, robot, files)}, supervisor, recorder,
+            {name: make_controller(name, robot, files) for name in aboard}, supervisor, recorder,
             estimator.imu.gyroscope_noise, faults, TargetChecks(robot).why_not)
         supervisor.select(controller)
         stayed = loop.fly(task, progress)

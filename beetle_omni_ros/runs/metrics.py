@@ -32,6 +32,7 @@ L_WINDOW = (1.0, 7.0)  # [s]
 REACHED_POSITION = 0.10  # [m]
 REACHED_ORIENTATION = 10.0  # [deg]
 COMMAND_PERIOD = 0.010  # [s] to which changes of the command refer
+CRASH = 'emergency_stop:crash'    # what supervisor/state then says
 POSE_KEYS = ('U_position_m', 'U_orientation_deg', 'L_position_m', 'L_orientation_deg')
 
 
@@ -190,7 +191,9 @@ def _reduced(reduce, values):
 
 
 def _crashed(log, body, flown):
-    """Fell to the ground, was stopped in flight, or left the numbers."""
+    """Fell to the ground, was stopped in flight, left the numbers, or crashed in its landing."""
+    if any(state == CRASH for state in log.states):
+        return True
     for begin, end in flown.intervals:
         position = body.position[body.window(begin, end)]
         if not np.all(np.isfinite(position)) or np.any(position[:, 2] < GROUND_HEIGHT):

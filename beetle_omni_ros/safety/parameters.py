@@ -104,11 +104,11 @@ class LandingParameters:
     level: LevellingParameters = group(LevellingParameters)
     level_first: float = parameter(0.3, doc='more inclination is levelled before the descent',
                                    unit='rad', low=0, high=3.15)
-    blind_level_rate: float = parameter(1.2, doc='angular rate of the levelling without MoCap',
+    blind_level_rate: float = parameter(1.6, doc='angular rate of the levelling without MoCap',
                                         unit='rad/s', low=0.05, high=5)
-    blind_speed: float = parameter(0.6, doc='descent speed without MoCap, until the flare',
+    blind_speed: float = parameter(1.0, doc='descent speed without MoCap, until the flare',
                                    unit='m/s', low=0.05, high=3)
-    blind_acceleration: float = parameter(1.5, doc='the same', unit='m/s^2', low=0.05, high=10)
+    blind_acceleration: float = parameter(2.0, doc='the same', unit='m/s^2', low=0.05, high=10)
     flare_height: float = parameter(0.5, doc='above the floor, where it slows down to speed',
                                     unit='m', low=0, high=10)
     time_limit: float = parameter(60.0, doc='longest landing, then motors off', unit='s', low=1,

@@ -15,7 +15,7 @@ class ContactLimits:
         0.3, doc='base_link at most this far above where it stood: the floor is in reach',
         unit='m', low=0.05, high=5)
     impact: float = parameter(
-        1.3, doc='specific force beyond this times what the rotors can give is an impact', low=1,
+        2.0, doc='specific force beyond this times what the rotors can give is an impact', low=1,
         high=20)
     support: float = parameter(
         0.35, doc='force that the rotors do not explain, in weights: something carries it',
@@ -33,7 +33,7 @@ class RotorLimits:
                                     low=0.1, high=20)
     explained: float = parameter(
         0.6, doc='part of the squared residual wrench that the loss explains', low=0.1, high=1)
-    force_noise: float = parameter(1.0, doc='of the residual, healthy', unit='m/s^2', low=0.01,
+    force_noise: float = parameter(0.6, doc='of the residual, healthy', unit='m/s^2', low=0.01,
                                    high=20)
     torque_noise: float = parameter(6.0, doc='of the residual, healthy', unit='rad/s^2', low=0.1,
                                     high=100)
