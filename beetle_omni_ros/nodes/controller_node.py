@@ -71,7 +71,7 @@ class ControllerNode(FlightNode):
         self.listen(MultiDOFJointTrajectory, 'supervisor/target', targets.wished_target,
                     self._on_wish, qos.LATCHED, stale_after=None)
         self.listen(JointState, 'supervisor/actuators', convert.actuator_health,
-                    lambda health: tell_health(self._controller, health), qos.LATCHED,
+                    lambda told: tell_health(self._controller, told.health), qos.LATCHED,
                     stale_after=None)
         self.health.track_compute(self._controller.period)
         self.health.report('controller', self._controller_status)

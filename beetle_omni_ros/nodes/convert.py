@@ -70,6 +70,22 @@ class Battery:
 
 
 @dataclass(frozen=True)
+class RotorSpeeds:
+    """Speeds of the rotors by their ESCs (4,) [rad/s]; NaN unknown."""
+
+    stamp: float
+    speed: np.ndarray
+
+
+@dataclass(frozen=True)
+class ToldHealth:
+    """Which actuators work, by the supervisor."""
+
+    stamp: float
+    health: ActuatorHealth
+
+
+@dataclass(frozen=True)
 class Wrench:
     """External force in world (3,) [N] and torque in base_link (3,) [N m]."""
 
@@ -243,11 +259,11 @@ def rotor_message(stamp: float, speed: np.ndarray) -> JointState:
     return message
 
 
-def rotors(message: JointState) -> tuple[float, np.ndarray]:
-    """Read stamp [s] and the four rotors' speeds (4,) [rad/s]; NaN unknown."""
+def rotors(message: JointState) -> RotorSpeeds:
+    """Read the ESCs' speeds."""
     if list(message.name) != list(ROTOR_NAMES) or len(message.velocity) != len(ROTOR_NAMES):
         raise MessageError(f'expected velocities of {list(ROTOR_NAMES)}')
-    return seconds(message.header.stamp), np.array(message.velocity, dtype=float)
+    return RotorSpeeds(seconds(message.header.stamp), np.array(message.velocity, dtype=float))
 
 
 def health_message(stamp: float, health: ActuatorHealth) -> JointState:
@@ -259,12 +275,14 @@ def health_message(stamp: float, health: ActuatorHealth) -> JointState:
     return message
 
 
-def actuator_health(message: JointState) -> ActuatorHealth:
+def actuator_health(message: JointState) -> ToldHealth:
     """Read which actuators work."""
-    if len(message.position) != 8 or len(message.effort) != 8:
+    stuck, works = message.position[:4], message.effort[4:]
+    if len(message.position) != 8 or len(message.effort) != 8 \
+            or any(abs(angle) > np.pi * 2 for angle in stuck):
         raise MessageError('expected four joints and four rotors')
-    return ActuatorHealth(tuple(bool(works) for works in message.effort[4:]), tuple(
-        None if isnan(angle) else float(angle) for angle in message.position[:4]))
+    return ToldHealth(seconds(message.header.stamp), ActuatorHealth(
+        tuple(map(bool, works)), tuple(None if isnan(a) else float(a) for a in stuck)))
 
 
 def battery(message: BatteryState) -> Battery:

@@ -84,7 +84,7 @@ class SupervisorNode(FlightNode):
         self.listen(PoseStamped, 'mocap/pose', convert.pose_sample, lambda s: supervisor.on_mocap(
             s.stamp, s.position, s.quaternion), max_age=SENSOR_AGE)
         self.listen(JointState, 'rotor_states', convert.rotors,
-                    lambda speeds: supervisor.on_rotors(*speeds), stale_after=None)
+                    lambda told: supervisor.on_rotors(told.stamp, told.speed), stale_after=None)
         self.listen(BatteryState, 'battery_state', convert.battery,
                     lambda b: supervisor.on_battery(b.voltage))
         for name in CONTROLLERS:

@@ -67,12 +67,14 @@ def trajectory_target(message: MultiDOFJointTrajectory) -> TrajectoryTarget:
 class Wish:
     """What the supervisor wants flown in place of the operator's target, or None."""
 
+    stamp: float
     target: TrajectoryTarget | None
 
 
 def wished_target(message: MultiDOFJointTrajectory) -> Wish:
     """Read the supervisor's target; a message without points takes it back."""
-    return Wish(trajectory_target(message) if message.points else None)
+    return Wish(seconds(message.header.stamp),
+                trajectory_target(message) if message.points else None)
 
 
 def wish_message(target: TrajectoryTarget | None) -> MultiDOFJointTrajectory:

@@ -9,6 +9,7 @@ from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.estimation.samples import ImuSample
 from beetle_omni_ros.nodes import convert, targets
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 
 
 @pytest.fixture
@@ -110,3 +111,21 @@ def test_bad_messages_are_refused_with_a_reason(rng):
         targets.pose_target(convert.pose_message(0.0, np.zeros(3), [0, 0, 0, 0.9]))
     with pytest.raises(convert.MessageError, match='position is not finite'):
         convert.pose_sample(convert.pose_message(0.0, [0, float('inf'), 0], [0, 0, 0, 1]))
+
+
+def test_what_the_supervisor_tells_survives_the_way_through_messages():
+    way = TrajectoryTarget(np.array([5.0, 6.0]), np.zeros((2, 3)), np.tile([0, 0, 0, 1.0], (2, 1)),
+                           np.zeros((2, 3)), np.zeros((2, 3)), stamp=5.0)
+    told = targets.wished_target(targets.wish_message(way))
+    assert told.stamp == 5.0 and np.allclose(told.target.times, way.times)
+    assert targets.wished_target(targets.wish_message(None)).target is None
+    health = ActuatorHealth((True, False, True, True), (None, 0.4, None, None))
+    message = convert.health_message(7.0, health)
+    assert convert.actuator_health(message) == convert.ToldHealth(7.0, health)
+    message.position[1] = np.inf
+    with pytest.raises(convert.MessageError):
+        convert.actuator_health(message)
+    speeds = JointState(name=['rotor1', 'rotor2', 'rotor3', 'rotor4'],
+                        velocity=[1.0, 2.0, 3.0, np.nan])
+    speeds.header.stamp = convert.time_message(3.0)
+    assert convert.rotors(speeds).stamp == 3.0 and convert.rotors(speeds).speed[2] == 3.0
