@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import sqrt
 from typing import Protocol
 
 import numpy as np
 
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, NO_ZEROS
 
 ROTORS = 4
 
@@ -178,6 +178,16 @@ class Controller(Protocol):
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Health of the last step and since reset, for operators and logs."""
+
+
+def corrected(state: State, health: ActuatorHealth) -> State:
+    """A state with true tilts, of one with readings and with the joint targets in force."""
+    if health.zeros == NO_ZEROS:
+        return state
+    command = state.command
+    if command is not None:
+        command = replace(command, tilt=health.true(command.tilt))
+    return replace(state, tilt=health.true(state.tilt), command=command)
 
 
 def tell_health(controller: Controller, health: ActuatorHealth) -> None:

@@ -247,6 +247,9 @@ class HoverController:
             + matrix[:, 1::2] @ (wished.thrust * np.sin(wished.tilt))
         helpful = wished.thrust * np.maximum(0.0, np.cos(wished.tilt - tilt))
         thrust, free = helpful.copy(), np.ones(4, dtype=bool)
+        for i, held in enumerate(self._health.held):
+            if held is not None:
+                thrust[i], free[i] = held, False
         for _ in range(4):
             columns = now[:, free]
             rest = wrench - now[:, ~free] @ thrust[~free]

@@ -78,8 +78,8 @@ class NmpcController:
         """
         Fly with what is left, from the next step on; callable in flight.
 
-        Lost rotors are bounded to no thrust and stuck joints to their angle, in prediction,
-        reference and plan.
+        Lost rotors are bounded to no thrust, those that hold a thrust to that, and stuck joints
+        to their angle, in prediction, reference and plan.
         """
         if health == self._health:
             return
@@ -92,6 +92,8 @@ class NmpcController:
                 lower[i], upper[i] = angle - NARROW, angle + NARROW
             if not turns:
                 lower[4 + i], upper[4 + i] = 0.0, NARROW
+            elif health.held[i] is not None:
+                lower[4 + i], upper[4 + i] = health.held[i] - NARROW, health.held[i] + NARROW
         self._iterate = FIRST_ITERATIONS
 
     @staticmethod

@@ -13,7 +13,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from beetle_omni_ros.control.base import Controller, PoseTarget, State, Target, tell_health
+from beetle_omni_ros.control.base import (
+    Controller,
+    corrected,
+    PoseTarget,
+    State,
+    Target,
+    tell_health,
+)
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
@@ -254,6 +261,7 @@ class FlightLoop:
             self._health = self._supervisor.health
             for controller in self._controllers.values():
                 tell_health(controller, self._health)
+        state = corrected(state, self._health)
         for name, controller in self._controllers.items():
             if self._ticks % self._every[name]:
                 continue

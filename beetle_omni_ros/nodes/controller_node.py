@@ -11,10 +11,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from beetle_omni_ros.control.base import Controller, PoseTarget, tell_health
+from beetle_omni_ros.control.base import Controller, corrected, PoseTarget, tell_health
 from beetle_omni_ros.nodes import convert, health, qos, targets
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.robot.actuator_health import ALL_WELL
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.target_checks import TargetChecks
 
@@ -49,6 +50,7 @@ class ControllerNode(FlightNode):
         self._controller: Controller = self.make_controller(self.parameters)
         self._target = self._joints = self._command = None
         self._hold = self._wish = None
+        self._actuators = ALL_WELL
         self._checks = TargetChecks(RobotParameters.load(self.parameters.robot_file or None))
         self._mode, self._own_mode = '', f'flying:{controller_name}'
         self._last_step = 0.0
@@ -71,8 +73,7 @@ class ControllerNode(FlightNode):
         self.listen(MultiDOFJointTrajectory, 'supervisor/target', targets.wished_target,
                     self._on_wish, qos.LATCHED, stale_after=None)
         self.listen(JointState, 'supervisor/actuators', convert.actuator_health,
-                    lambda told: tell_health(self._controller, told.health), qos.LATCHED,
-                    stale_after=None)
+                    self._on_actuators, qos.LATCHED, stale_after=None)
         self.health.track_compute(self._controller.period)
         self.health.report('controller', self._controller_status)
 
@@ -114,6 +115,10 @@ class ControllerNode(FlightNode):
     def _on_wish(self, wish):
         self._wish = wish.target
 
+    def _on_actuators(self, told):
+        self._actuators = told.health
+        tell_health(self._controller, told.health)
+
     def _on_mode(self, message):
         state = message.data.partition(':')[0]
         if state in ('disarmed', 'emergency_stop') and self._mode.partition(':')[0] != state:
@@ -125,7 +130,7 @@ class ControllerNode(FlightNode):
         if self._joints is None or not self._is_due(odom.stamp):
             return
         self._last_step = odom.stamp
-        state = convert.state(odom, self._joints, self._command)
+        state = corrected(convert.state(odom, self._joints, self._command), self._actuators)
         if self._target is None:
             if self._hold is None or not self._mode.startswith('flying'):
                 self._hold = PoseTarget(odom.position, odom.quaternion, odom.stamp)

@@ -31,6 +31,7 @@ from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 
 WORLD, BODY = 'world', 'base_link'
 COMMAND_NAMES = [*JOINT_NAMES, *ROTOR_NAMES]
+HEALTH_NAMES = [*COMMAND_NAMES, *(f'{name}_zero' for name in JOINT_NAMES)]
 NO_VALUE = [float('nan')] * 4
 # A quaternion further from unit length than this is a broken message, not a rounded one.
 UNIT_TOLERANCE = 0.01
@@ -267,22 +268,33 @@ def rotors(message: JointState) -> RotorSpeeds:
 
 
 def health_message(stamp: float, health: ActuatorHealth) -> JointState:
-    """Write which actuators work: the angles of stuck joints, NaN of others, and 1 or 0."""
+    """
+    Write which actuators work.
+
+    Positions: angles of stuck joints, NaN of others, then the encoders' zeros, as if they were
+    joints. Efforts: NaN of rotors that obey, 0 of lost ones, else the thrust that one holds.
+    """
     stuck = [np.nan if angle is None else float(angle) for angle in health.stuck]
-    message = JointState(name=[*JOINT_NAMES, *ROTOR_NAMES], position=[*stuck, *[np.nan] * 4],
-                         effort=[*[np.nan] * 4, *map(float, health.rotors)])
+    efforts = [0.0 if not works else np.nan if held is None else float(held)
+               for works, held in zip(health.rotors, health.held)]
+    message = JointState(name=HEALTH_NAMES,
+                         position=[*stuck, *[np.nan] * 4, *map(float, health.zeros)],
+                         effort=[*[np.nan] * 4, *efforts, *[np.nan] * 4])
     _header(message, stamp, '')
     return message
 
 
 def actuator_health(message: JointState) -> ToldHealth:
     """Read which actuators work."""
-    stuck, works = message.position[:4], message.effort[4:]
-    if len(message.position) != 8 or len(message.effort) != 8 \
-            or any(abs(angle) > np.pi * 2 for angle in stuck):
-        raise MessageError('expected four joints and four rotors')
+    if len(message.position) != len(HEALTH_NAMES) or len(message.effort) != len(HEALTH_NAMES):
+        raise MessageError('expected four joints, four rotors and four zeros')
+    stuck, zeros, efforts = message.position[:4], message.position[8:], message.effort[4:8]
+    if any(abs(angle) > np.pi * 2 for angle in stuck) or not all(map(isfinite, zeros)):
+        raise MessageError('expected angles within one turn and finite zeros')
     return ToldHealth(seconds(message.header.stamp), ActuatorHealth(
-        tuple(map(bool, works)), tuple(None if isnan(a) else float(a) for a in stuck)))
+        tuple(effort != 0 for effort in efforts),
+        tuple(None if isnan(a) else float(a) for a in stuck),
+        tuple(None if isnan(f) or f == 0 else float(f) for f in efforts), tuple(map(float, zeros))))
 
 
 def battery(message: BatteryState) -> Battery:

@@ -6,7 +6,8 @@ along its present direction and with a thrust that cannot be negative; every oth
 its two force components. The minimum-norm solution under the sign constraints has the stuck
 rotors either pushing or off, so it is the best of at most 2^stuck pseudo-inverses. A rotor
 that asks for more than its limit is held there, in its direction, and the others solve for the
-rest: a short active-set iteration.
+rest: a short active-set iteration. A rotor that holds a thrust whatever it is asked pushes along
+the direction of its minimum-norm share; the others solve for what that leaves.
 """
 
 from __future__ import annotations
@@ -54,9 +55,10 @@ class DegradedAllocator(Allocator):
 
     Attributes:
         matrix: (6, 8) as the healthy one, with zero columns for lost rotors.
-        choices: list of (columns (6, 8), inverse (8, 6)): the map with some of the stuck rotors
-            off, most first, and its pseudo-inverse; a stuck rotor's thrust stands in its first
-            component.
+        stuck, held: rotors with a stuck joint; rotor -> thrust that it holds [N].
+        choices: list of (columns (6, 8), inverse (8, 6), rest (8, 6)): the map with some of the
+            stuck rotors off, most first, its pseudo-inverse, and that without the rotors that
+            hold a thrust; a stuck rotor's thrust stands in its first component.
 
     """
 
@@ -68,16 +70,47 @@ class DegradedAllocator(Allocator):
         self._scale = 1 / np.r_[np.full(3, self.mass), robot.inertia]
         self.stuck = [i for i, angle in enumerate(health.stuck)
                       if angle is not None and health.rotors[i]]
+        self.held = {i: thrust for i, thrust in enumerate(health.held)
+                     if thrust is not None and health.rotors[i]}
+        free = [i for i in self.stuck if i not in self.held]
         columns = self.matrix.copy()
         for i in self.stuck:
             columns[:, 2 * i] = self._along(i, health.stuck[i])
             columns[:, 2 * i + 1] = 0.0
         self.choices = []
-        for count in range(len(self.stuck) + 1):
-            for off in combinations(self.stuck, count):
+        for count in range(len(free) + 1):
+            for off in combinations(free, count):
                 chosen = columns.copy()
                 chosen[:, [2 * i for i in off]] = 0.0
-                self.choices.append((chosen, self._pseudo_inverse(chosen)))
+                inverse = self._pseudo_inverse(chosen)
+                self.choices.append((chosen, inverse, self._pseudo_inverse(
+                    self._obeying(chosen)) if self.held else inverse))
+
+    def _obeying(self, columns):
+        """The columns without those of rotors that hold a thrust."""
+        obeying = columns.copy()
+        obeying[:, [k for i in self.held for k in (2 * i, 2 * i + 1)]] = 0.0
+        return obeying
+
+    def components(self, columns: np.ndarray, inverse: np.ndarray, rest: np.ndarray,
+                   wrenches: np.ndarray) -> np.ndarray:
+        """
+        Force components (..., 8) for wrenches (..., 6) by one of the choices.
+
+        Rotors that hold a thrust give it along their minimum-norm share, and straight up where
+        that is nothing.
+        """
+        found = wrenches @ inverse.T
+        if not self.held:
+            return found
+        fixed = np.zeros_like(found)
+        for i, thrust in self.held.items():
+            pair, share = slice(2 * i, 2 * i + 2), found[..., 2 * i:2 * i + 2]
+            length = np.linalg.norm(share, axis=-1, keepdims=True)
+            along = (length > self._negligible) & (i not in self.stuck)
+            fixed[..., pair] = thrust * np.where(
+                along, share / np.maximum(length, self._negligible), [1.0, 0.0])
+        return fixed + (wrenches - fixed @ columns.T) @ rest.T
 
     def _along(self, rotor, angle):
         """(6,) wrench of one newton of a rotor at a tilt [rad]."""
@@ -136,6 +169,8 @@ class DegradedAllocator(Allocator):
         low = np.r_[np.clip(centre - reach, -limit, limit), np.zeros(ROTORS)]
         high = np.r_[np.clip(centre + reach, -limit, limit),
                      np.where(lost, 0.0, self._thrust_max)]
+        for i, thrust in self.held.items():
+            low[ROTORS + i] = high[ROTORS + i] = thrust
         pull = np.r_[np.full(ROTORS, weights.tilt), np.full(ROTORS, weights.thrust)]
         goal = np.r_[aim.tilt, aim.thrust]
         z = np.clip(np.r_[centre, aim.thrust], low, high)
@@ -167,8 +202,8 @@ class DegradedAllocator(Allocator):
     def _solved(self, wrench):
         """Best choice of stuck rotors: its columns and the (8,) components."""
         best = None
-        for columns, inverse in self.choices:
-            components = inverse @ wrench
+        for columns, inverse, others in self.choices:
+            components = self.components(columns, inverse, others, wrench)
             if any(components[2 * i] < -self._negligible for i in self.stuck):
                 continue
             rest = self._rest(columns, components, wrench)
@@ -182,10 +217,11 @@ class DegradedAllocator(Allocator):
 
     def _within_limits(self, columns, components, wrench):
         """Components with no rotor beyond its limit, and whether they meet the wrench."""
-        limit, free = self._thrust_max, columns.copy()
+        limit, free = self._thrust_max, self._obeying(columns)
         for _ in range(ROTORS):
             lengths = np.hypot(components[0::2], components[1::2])
             over = lengths > limit * (1 + 1e-9)
+            over[list(self.held)] = False
             if not over.any():
                 break
             worst = int(np.argmax(lengths))

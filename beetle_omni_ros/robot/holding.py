@@ -165,8 +165,8 @@ class Holding:
         wrenches = np.pad(weight * directions, ((0, 0), (0, 3)))
         pairs, cost = np.zeros((len(directions), 8)), np.full(len(directions), np.inf)
         rest = cost.copy()
-        for columns, inverse in self._allocator.choices:
-            tried = wrenches @ inverse.T
+        for choice in self._allocator.choices:
+            columns, tried = choice[0], self._allocator.components(*choice, wrenches)
             error = np.linalg.norm((tried @ columns.T - wrenches) * self._scale, axis=1)
             pushing = np.all([tried[:, 2 * i] > -RESIDUAL for i in self._allocator.stuck]
                              or [np.full(len(directions), True)], axis=0)
@@ -186,6 +186,7 @@ class Holding:
         up_part, side_part = matrix[:, 0::2], matrix[:, 1::2]
         cos, sin = np.cos(tilt)[:, None], np.sin(tilt)[:, None]
         room = np.minimum(thrust, self._robot.rotors.thrust_max - thrust).clip(0)
+        room[:, list(self._allocator.held)] = 0.0
         swing = thrust * min(p.tilt_rate * p.reach_time, 1.0) \
             * [float(angle is None) for angle in self._health.stuck]
         return np.concatenate([(up_part * cos + side_part * sin) * room[:, None],

@@ -6,7 +6,7 @@ from math import isfinite
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Command, State
+from beetle_omni_ros.control.base import Command, corrected, State
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.actuators import Actuators
@@ -16,6 +16,7 @@ from beetle_omni_ros.safety.selection import Selection
 from beetle_omni_ros.safety.vehicle import Vehicle
 from beetle_omni_ros.safety.watch.faults import FaultWatch
 
+TILT_AGE = 0.05     # [s] older joint angles say nothing of where the thrusts point
 LATEST = 0.1    # [s] between a MoCap pose and the estimate that it is compared with
 
 
@@ -52,11 +53,12 @@ class Inputs:
     def on_state(self, state: State, status: str = 'tracking') -> bool:
         """Take the estimator's state with its status; False when it is refused."""
         before = self.vehicle.status
-        reason = self.vehicle.on_state(state, status, self._now)
+        true = corrected(state, self.watch.health)
+        reason = self.vehicle.on_state(true, status, self._now)
         if reason:
             self._say(self._now, WARNING, f'ekf_node: estimate refused: {reason}', reason)
         else:
-            self.watch.on_joints(state.tilt_stamp, state.tilt, self.airborne)
+            self._watch_joints(state.tilt_stamp, state.tilt)
         if not reason and status != before and status != 'tracking':
             self._say(self._now, WARNING, f"ekf_node reports '{status}'")
         return not reason
@@ -71,10 +73,18 @@ class Inputs:
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
         """Take raw joint feedback (4,), nan where unknown, beside what comes with the state."""
-        good = not self._ahead(stamp) and self.vehicle.on_joints(stamp, position, velocity)
+        good = not self._ahead(stamp) and self.vehicle.on_joints(
+            stamp, self.watch.health.true(position), velocity)
         if good and np.isfinite(position).all():
-            self.watch.on_joints(stamp, np.asarray(position, dtype=float), self.airborne)
+            self._watch_joints(stamp, np.asarray(position, dtype=float))
         return good
+
+    def _watch_joints(self, stamp, reading):
+        """Let the detectors look at a reading (4,); a zero that it moves counts for it, too."""
+        zeros = self.watch.health.zeros
+        self.watch.on_joints(stamp, reading, self.airborne)
+        if self.watch.health.zeros != zeros:
+            self.vehicle.tilt = self.watch.health.true(reading)
 
     def on_imu(self, stamp: float, specific_force: np.ndarray,
                angular_velocity: np.ndarray) -> bool:
@@ -84,9 +94,11 @@ class Inputs:
         if good:
             self.vehicle.imu.heard()
             if self.airborne:
+                known = stamp - self.vehicle.tilt_stamp < TILT_AGE
                 self.watch.on_imu(stamp, np.asarray(specific_force, dtype=float),
-                                  np.asarray(angular_velocity, dtype=float), self.vehicle.tilt,
-                                  self._in_force, self._height)
+                                  np.asarray(angular_velocity, dtype=float),
+                                  self.vehicle.tilt if known else None, self._in_force,
+                                  self._height)
         return good
 
     def on_rotors(self, stamp: float, speed: np.ndarray) -> bool:

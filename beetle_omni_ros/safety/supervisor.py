@@ -7,10 +7,12 @@ in-process evaluation run the same code and get the same answer. See docs/safety
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, Controller, PoseTarget, Target
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL, NO_ZEROS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
 from beetle_omni_ros.safety.handover import Handover
@@ -69,7 +71,7 @@ class Supervisor(Inputs):
         """Start the motors and take off, or say why not."""
         if self.state != DISARMED:
             return self._refuse(now, f'arm refused: {self.state}, not disarmed')
-        reason = self.actuators.why_not_arm or self.vehicle.why_not_arm()
+        reason = self.actuators.why_not_arm or self.vehicle.why_not_arm() or self._moved_zero
         if reason:
             return self._refuse(now, f'arm refused: {reason}')
         self._takeoff = Takeoff(self._parameters.takeoff, self._allocator, self._hover,
@@ -81,6 +83,13 @@ class Supervisor(Inputs):
         self._hover.set_health(ALL_WELL)
         self._landing_for = self._fallback_for = 0.0
         return self._enter(TAKEOFF, now, INFO, 'armed: takeoff')
+
+    @property
+    def _moved_zero(self):
+        """'' or which encoder cannot be trusted on the ground any more."""
+        moved = [f'gimbal{k + 1}' for k, zero in enumerate(self._health.zeros) if zero]
+        return f"the encoder of {' and '.join(moved)} jumped in the last flight: check it, then " \
+               'restart supervisor_node' if moved else ''
 
     def disarm(self, now: float) -> Answer:
         """Motors off, on the ground or after an emergency stop; refused in the air."""
@@ -131,19 +140,29 @@ class Supervisor(Inputs):
         now = self._now
         if now is None:
             return None
+        if self.vehicle.joints.silent:
+            self.vehicle.modelled_tilt = self.watch.silent_joints(now)
         self._look_for_faults(now, dt)
         if self.state in IN_FLIGHT:
             self._watch(now)
         command = {TAKEOFF: self._take_off, FLYING: self._fly, FALLBACK: self._hold,
                    LANDING: self._descend}.get(self.state, self._stand)(now, dt)
         command = self._guarded(command, now)
-        if command is not None:
-            self.watch.on_command(command)
+        asked = self._as_read(command)
+        if asked is not None:
+            self.watch.on_command(asked)
         if self.state in IN_FLIGHT:
             self._gauge.update(command, self.vehicle.attitude(now), dt,
                                self.vehicle.specific_force_up,
                                learn=self.state in (FLYING, FALLBACK))
-        return command
+        return asked
+
+    def _as_read(self, command):
+        """A command in the joints' own angles, where an encoder's zero has moved."""
+        if command is None or self._health.zeros == NO_ZEROS:
+            return command
+        return within_limits(replace(command, tilt=self._health.read(command.tilt)), self._robot,
+                             stopped=True)
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """State, sources and refusals, flat, for operators and logs."""
@@ -189,8 +208,10 @@ class Supervisor(Inputs):
 
     def _degrade(self, now):
         """Fly with what is left: land in the attitude nearest level that leaves a margin."""
-        moved = _same_actuators(self._health, self.watch.health)
+        moved = self._health.same_actuators(self.watch.health)
         self._health = health = self.watch.health
+        if health.healthy:
+            return      # a zero has moved, which commands and readings take into account
         self._hover.set_health(health)
         if self.state != LANDING:
             self._land(now, ERROR, f"{', '.join(self.faults)}: landing with what is left")
@@ -433,9 +454,3 @@ class Supervisor(Inputs):
     def _refuse(self, now, text):
         self._say(now, WARNING, text)
         return Answer(False, text)
-
-
-def _same_actuators(before, after):
-    """Whether only angles of stuck joints differ."""
-    return before.rotors == after.rotors and [a is None for a in before.stuck] \
-        == [a is None for a in after.stuck]

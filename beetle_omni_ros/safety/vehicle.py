@@ -43,6 +43,7 @@ class Vehicle:
         self.state: State | None = None
         self.status = ''
         self.tilt, self.tilt_velocity, self.tilt_stamp = np.zeros(4), np.zeros(4), -np.inf
+        self.modelled_tilt: np.ndarray | None = None    # (4,) of silent joints [rad]
         self.stuck = False
         self.voltage: float | None = None
         self.estimate = Silence(limits.timeout)
@@ -104,11 +105,11 @@ class Vehicle:
         return True
 
     def seen(self, in_force: Command | None, state: State | None = None) -> State:
-        """A state for the hover controller; silent joints that may follow are as commanded."""
+        """A state for the hover controller; silent joints that may follow are where a model says."""
         state = self.state if state is None else state
         if self.joints.silent and in_force is not None and not self.stuck:
-            return replace(state, tilt=in_force.tilt, tilt_velocity=np.zeros(4),
-                           command=in_force)
+            tilt = in_force.tilt if self.modelled_tilt is None else self.modelled_tilt
+            return replace(state, tilt=tilt, tilt_velocity=np.zeros(4), command=in_force)
         return replace(state, tilt=self.tilt, tilt_velocity=self.tilt_velocity,
                        tilt_stamp=self.tilt_stamp, command=in_force)
 

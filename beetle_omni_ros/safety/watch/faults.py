@@ -17,6 +17,7 @@ from beetle_omni_ros.safety.watch.speeds import SpeedWatch
 from beetle_omni_ros.safety.watch.wrench import ContactWatch, WrenchWatch
 
 CRASH = 'crash'
+NOTICEABLE = 0.3        # [N] by which the thrust of a rotor that obeys nobody may drift untold
 
 
 class FaultWatch:
@@ -33,14 +34,14 @@ class FaultWatch:
 
     Attributes:
         faults: name -> when it was named [s].
-        health: which actuators work.
-        offset: (4,) [rad] by which encoders are known to have jumped.
+        health: which actuators work, and the zeros of encoders that jumped.
 
     """
 
     def __init__(self, parameters: Detection, robot: RobotParameters, allocator: Allocator):
         """See the class."""
         self._p, self._limit = parameters, robot.joints.position_limit
+        self._thrust_max = robot.rotors.thrust_max
         self._wrench = WrenchWatch(parameters.rotor, parameters.contact, robot, allocator)
         self._contact = ContactWatch(parameters.contact, robot.gravity)
         self._joints = JointWatch(parameters.servo, robot)
@@ -52,7 +53,6 @@ class FaultWatch:
         """A new flight: everything is well."""
         self.faults: dict[str, float] = {}
         self.health: ActuatorHealth = ALL_WELL
-        self.offset = np.zeros(ROTORS)
         self._new: list[str] = []
         self._stamp = -np.inf
         for watch in (self._wrench, self._contact, self._joints, self._speeds, self._mocap):
@@ -68,7 +68,7 @@ class FaultWatch:
         news, self._new = self._new, []
         return news
 
-    def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray,
+    def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                command: Command | None, height: float | None) -> None:
         """
         Take an IMU sample of a robot in the air.
@@ -77,7 +77,7 @@ class FaultWatch:
             stamp: [s].
             force: (3,) specific force in base_link [m/s^2].
             rate: (3,) in base_link [rad/s].
-            tilt: (4,) measured [rad].
+            tilt: (4,) measured [rad], None: unknown, and only an impact can be told.
             command: in force, None: rotors off.
             height: of base_link above where it stood [m], None: unknown.
 
@@ -95,27 +95,36 @@ class FaultWatch:
             text = f'the thrust of rotor {joint + 1} points {angle:+.2f} rad from where ' \
                    f'gimbal{joint + 1} says'
             known = {f'joint{joint + 1}_encoder_jump', f'joint{joint + 1}_astray'}
-            if not known & self.faults.keys() \
-                    and self._name(f'joint{joint + 1}_slipped', stamp, text):
-                self.offset[joint] += angle
+            if not known & self.faults.keys():
+                self._name(f'joint{joint + 1}_slipped', stamp, text)
 
     def on_command(self, command: Command) -> None:
         """Take what goes out."""
         self._joints.on_command(command.stamp, command.tilt)
 
     def on_joints(self, stamp: float, tilt: np.ndarray, trusted: bool) -> None:
-        """Take a complete reading (4,) [rad]; ``trusted``: joints are driven and in the air."""
+        """
+        Take a complete reading.
+
+        An encoder that jumps keeps its joint where it was: its zero moves by the jump.
+
+        Args:
+            stamp: [s].
+            tilt: (4,) as read [rad].
+            trusted: whether the joints are driven and in the air.
+
+        """
         watch = self._joints
         watch.on_joints(stamp, tilt)
-        for joint in np.flatnonzero(watch.jump):
-            if self._name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
-                          f'gimbal{joint + 1} jumped by {watch.jump[joint]:+.2f} rad at once'):
-                self.offset[joint] -= watch.jump[joint]
         if not trusted:
             return
+        for joint in np.flatnonzero(watch.jump):
+            self._name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
+                       f'gimbal{joint + 1} jumped by {watch.jump[joint]:+.2f} rad at once')
+            self._move_zero(joint, float(watch.jump[joint]))
+        tilt = self.health.true(tilt)
         for joint in np.flatnonzero(watch.jammed | watch.astray):
-            jumped = f'joint{joint + 1}_encoder_jump' in self.faults
-            if jumped or self.health.stuck[joint] is not None:
+            if self.health.stuck[joint] is not None:
                 continue
             kind = 'jammed' if watch.jammed[joint] else 'astray'
             if self._name(f'joint{joint + 1}_{kind}', stamp, f'gimbal{joint + 1} '
@@ -123,6 +132,12 @@ class FaultWatch:
                           + f' its command, at {tilt[joint]:.2f} rad'):
                 self._stick(joint, float(tilt[joint]))
         self._follow(tilt)
+
+    def silent_joints(self, now: float) -> np.ndarray | None:
+        """True tilts (4,) [rad] at ``now`` [s] by the servos' model, for want of readings."""
+        self._joints.advance(now)
+        model = self._joints.model
+        return None if model is None else self.health.true(model)
 
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                  attitude: np.ndarray | None, rate: np.ndarray | None) -> bool:
@@ -151,6 +166,16 @@ class FaultWatch:
         self._speeds.on_speeds(stamp, speed, thrust)
         if self._speeds.lost is not None:
             self._lose_rotor(self._speeds.lost, stamp, 'its ESC')
+        deaf = self._speeds.deaf
+        if deaf is not None and self.health.rotors[deaf] \
+                and self._name(f'rotor{deaf + 1}_deaf', stamp, f'rotor {deaf + 1} does not follow '
+                               f'its commands, by its ESC; it gives '
+                               f'{self._speeds.thrust[deaf]:.1f} N'):
+            self._hold(deaf, self._speeds.thrust[deaf])
+        for rotor, held in enumerate(self.health.held):
+            given = self._speeds.thrust[rotor]
+            if held is not None and abs(given - held) > NOTICEABLE:
+                self._hold(rotor, given)
 
     def name(self, name: str, now: float, text: str) -> bool:
         """Enter a fault that others found; False where it is known."""
@@ -166,6 +191,15 @@ class FaultWatch:
     def _stick(self, joint, angle):
         self.health = replace(self.health, stuck=tuple(
             angle if k == joint else old for k, old in enumerate(self.health.stuck)))
+
+    def _hold(self, rotor, thrust):
+        thrust = float(np.clip(thrust, 0.0, self._thrust_max))
+        self.health = replace(self.health, held=tuple(
+            thrust if k == rotor else old for k, old in enumerate(self.health.held)))
+
+    def _move_zero(self, joint, by):
+        self.health = replace(self.health, zeros=tuple(
+            zero + by if k == joint else zero for k, zero in enumerate(self.health.zeros)))
 
     def _follow(self, tilt):
         """Where joints that do not obey are now."""

@@ -26,7 +26,9 @@ class JointWatch:
     Attributes:
         jammed: joints (4,) bool that stand still beside their command.
         astray: joints (4,) bool that move otherwise than commanded.
-        jump: (4,) [rad] by which the last reading jumped farther than a joint can turn, else 0.
+        jump: (4,) [rad] by which the last reading jumped beyond the motion before it, where that
+            is farther than a joint can turn, else 0.
+        model: (4,) readings that the servos would give [rad], None before the first.
 
     """
 
@@ -40,7 +42,8 @@ class JointWatch:
     def reset(self) -> None:
         """Begin anew at the next reading."""
         self._commands: deque = deque(maxlen=KEPT)
-        self._stamp = -np.inf
+        self._stamp, self._change = -np.inf, np.zeros(ROTORS)
+        self.model: np.ndarray | None = None
         self._for = np.zeros(ROTORS)
         self._low = self._high = np.zeros(ROTORS)
         self.jammed = np.zeros(ROTORS, dtype=bool)
@@ -59,21 +62,34 @@ class JointWatch:
         before, self._stamp = getattr(self, '_tilt', tilt), stamp
         self._tilt = tilt
         asked = self._asked(stamp - self._p.delay)
-        if dt > LONGEST or asked is None:
-            self._model, self._for = tilt.copy(), np.zeros(ROTORS)
-            self.jump = np.zeros(ROTORS)
+        if dt > LONGEST or asked is None or self.model is None:
+            self.model, self._for = tilt.copy(), np.zeros(ROTORS)
+            self._change, self.jump = np.zeros(ROTORS), np.zeros(ROTORS)
             return
         change = tilt - before
-        most = self._rate_limit * dt + self._p.jump
-        self.jump = np.where(np.abs(change) > most, change, 0.0)
-        reach = self._rate_limit * dt
-        step = np.clip((asked - self._model) * -np.expm1(-dt / self._lag), -reach, reach)
-        self._model = self._model + step
+        jumped = np.abs(change) > self._rate_limit * dt + self._p.jump
+        self.jump = np.where(jumped, change - self._change, 0.0)
+        self._change = np.where(jumped, self._change, change)
+        step = self._step(asked, dt)
+        self.model = np.where(jumped, tilt, self.model + step)
         self._judge(tilt, dt, np.abs(step) / dt)
+
+    def advance(self, stamp: float) -> None:
+        """Go on with the model alone to ``stamp`` [s], for want of readings."""
+        dt, asked = stamp - self._stamp, self._asked(stamp - self._p.delay)
+        if self.model is None or asked is None or dt <= 0:
+            return
+        self._stamp = stamp
+        self.model = self.model + self._step(asked, min(dt, LONGEST))
+
+    def _step(self, asked, dt):
+        """Motion (4,) [rad] of servos of first order with a limited rate in ``dt`` [s]."""
+        reach = self._rate_limit * dt
+        return np.clip((asked - self.model) * -np.expm1(-dt / self._lag), -reach, reach)
 
     def _judge(self, tilt, dt, rate):
         p = self._p
-        off = np.abs(tilt - self._model) > p.error + p.spread * rate
+        off = np.abs(tilt - self.model) > p.error + p.spread * rate
         began = off & (self._for == 0)
         self._low = np.where(began, tilt, np.minimum(self._low, tilt))
         self._high = np.where(began, tilt, np.maximum(self._high, tilt))

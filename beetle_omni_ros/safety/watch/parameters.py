@@ -45,6 +45,14 @@ class RotorLimits:
     slip_time: float = parameter(0.1, doc='for this long', unit='s', low=0.005, high=1)
     speed_time: float = parameter(0.06, doc='for this long, by the ESC speed', unit='s', low=0.005,
                                   high=1)
+    slope_window: float = parameter(
+        0.5, doc='over which measured thrust is regressed on commanded thrust', unit='s', low=0.05,
+        high=10)
+    least_variation: float = parameter(
+        1.0, doc='standard deviation of the commanded thrust from which it is judged', unit='N',
+        low=0.05, high=10)
+    least_slope: float = parameter(
+        0.4, doc='slope below which a rotor does not follow its commands', low=0, high=1)
 
 
 @dataclass(frozen=True, kw_only=True)

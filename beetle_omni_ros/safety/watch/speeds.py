@@ -1,6 +1,8 @@
-"""Rotors whose ESC reports less speed than the commanded thrust needs."""
+"""Rotors whose ESC reports another speed than the commanded thrust needs."""
 
 from __future__ import annotations
+
+from math import exp
 
 import numpy as np
 
@@ -16,12 +18,18 @@ class SpeedWatch:
     """
     Thrust goes with the square of the speed; the factor of each rotor is learnt in flight.
 
+    A rotor that no longer answers is told by the slope of the measured over the modelled thrust, a
+    regression over the last half second. It is 1 for a healthy rotor, its share for a weak one, and
+    0 for one that holds its thrust. It is judged where the modelled thrust has varied enough.
+
     Args:
         limits: thresholds.
         robot: as believed.
 
     Attributes:
         lost: the rotor (0 to 3) that turns too slowly, or None.
+        deaf: the rotor (0 to 3) whose speed does not follow its commands, or None.
+        thrust: (4,) by the speeds [N], nan where unknown.
 
     """
 
@@ -36,8 +44,11 @@ class SpeedWatch:
         self._thrust = np.zeros(ROTORS)
         self._factor = np.zeros(ROTORS)     # [N s^2/rad^2]
         self._learnt_for = np.zeros(ROTORS)
-        self._for = np.zeros(ROTORS)
+        self._for, self._deaf_for = np.zeros(ROTORS), np.zeros(ROTORS)
+        self._sums = np.zeros((5, ROTORS))      # moments of modelled and measured thrust
         self.lost: int | None = None
+        self.deaf: int | None = None
+        self.thrust = np.full(ROTORS, np.nan)
 
     def on_speeds(self, stamp: float, speed: np.ndarray, thrust: np.ndarray) -> None:
         """
@@ -55,6 +66,7 @@ class SpeedWatch:
         self._stamp = stamp
         if dt > LONGEST:
             self._thrust = np.array(thrust, dtype=float)
+            self._sums[:] = 0.0
             return
         self._thrust += -np.expm1(-dt / self._lag) * (thrust - self._thrust)
         square = np.asarray(speed, dtype=float)**2
@@ -63,9 +75,27 @@ class SpeedWatch:
         slow = known & (self._factor * square < (1 - self._p.share) * self._thrust)
         self._for = np.where(slow, self._for + dt, 0.0)
         self.lost = int(np.argmax(self._for)) if self._for.max() >= self._p.speed_time else None
+        self.thrust = np.where(known, self._factor * square, np.nan)
+        self._judge(known, dt)
         learn = judged & ~slow & (square > 0)
         ratio = np.divide(self._thrust, square, out=np.zeros(ROTORS), where=learn)
         gain = np.minimum(1.0, dt / np.maximum(self._learnt_for, dt))
         gain = np.maximum(gain, min(1.0, dt / LEARNT))
         self._factor = np.where(learn, self._factor + gain * (ratio - self._factor), self._factor)
         self._learnt_for = np.where(learn, self._learnt_for + dt, self._learnt_for)
+
+    def _judge(self, known, dt):
+        """Whose measured thrust does not follow the modelled one."""
+        x, y = np.where(known, [self._thrust, self.thrust], 0.0)
+        self._sums *= np.where(known, exp(-dt / self._p.slope_window), 0.0)
+        self._sums += np.where(known, dt * np.array([np.ones(ROTORS), x, y, x * x, x * y]), 0.0)
+        weight, sum_x, sum_y, sum_xx, sum_xy = self._sums
+        full = weight > 0.5 * self._p.slope_window
+        count = np.where(full, weight, 1.0)
+        variance = sum_xx / count - (sum_x / count) ** 2
+        slope_times = sum_xy / count - sum_x * sum_y / count**2
+        deaf = full & (variance > self._p.least_variation**2) \
+            & (slope_times < self._p.least_slope * variance)
+        self._deaf_for = np.where(deaf, self._deaf_for + dt, 0.0)
+        self.deaf = int(np.argmax(self._deaf_for)) \
+            if self._deaf_for.max() >= self._p.speed_time else None

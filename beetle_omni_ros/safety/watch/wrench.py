@@ -63,7 +63,7 @@ class WrenchWatch:
         self.impact = 0.0
         self.unexplained = np.zeros(3)
 
-    def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray,
+    def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                thrust: np.ndarray, health: ActuatorHealth) -> None:
         """
         Take one IMU sample.
@@ -72,7 +72,7 @@ class WrenchWatch:
             stamp: [s].
             force: (3,) specific force in base_link [m/s^2].
             rate: (3,) angular rate in base_link [rad/s].
-            tilt: (4,) measured [rad].
+            tilt: (4,) measured [rad], None: unknown, and only an impact can be told.
             thrust: (4,) commanded [N].
             health: of the actuators, as known.
 
@@ -84,9 +84,11 @@ class WrenchWatch:
         size = float(np.sqrt(force @ force))
         self.impact = size if size > self._contact.impact * self._reach else 0.0
         commanded = np.where(health.rotors, thrust, 0.0)
-        if dt > LONGEST:
+        if dt > LONGEST or tilt is None:
+            impact = self.impact
             self.reset()
             self._thrust, self._stamp, self._rate = commanded.copy(), stamp, rate
+            self.impact = impact
             return
         self._thrust += -np.expm1(-dt / self._robot.rotors.time_constant) \
             * (commanded - self._thrust)
