@@ -21,6 +21,7 @@ from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.propagation import TIME_OFFSET
 from beetle_omni_ros.estimation.samples import ATTITUDE, Estimate, ImuSample, PoseSample
 from beetle_omni_ros.estimation.track import interpolate, SAME_INSTANT, Track
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.rotations import geodesic_angle
 
 __all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuSample', 'PoseSample']
@@ -56,6 +57,8 @@ class ErrorStateEkf:
         self._track: Track | None = None
         self._candidate: Track | None = None
         self._estimate: Estimate | None = None
+        self._good_pose: tuple | None = None    # the last one used: stamp, position, quaternion
+        self._contradictions = 0
 
     @property
     def rejected(self) -> Counter:
@@ -149,14 +152,41 @@ class ErrorStateEkf:
             self._model.scale_noise(*self._noise_scale)
         believed = self._believed
         if believed:
-            if self._track.correct(stamp, position, quaternion):
-                self._candidate = None
+            if self._track.correct(stamp, position, quaternion) \
+                    or self._doubt(stamp, position, quaternion):
+                self._candidate, self._contradictions = None, 0
+                self._good_pose = stamp, position, quaternion
                 return True
             self.rejected['outlier'] += 1
         agrees = self._consider(stamp, position, quaternion, believed)
         if not agrees and not believed:
             self.rejected['inconsistent_start'] += 1
         return agrees and not believed
+
+    def _doubt(self, stamp, position, quaternion) -> bool:
+        """Use a refused pose, where poses contradict the IMU and not each other."""
+        goes_on = self._goes_on(stamp, position, quaternion)
+        self._contradictions = self._contradictions + 1 if goes_on else 0
+        if self._contradictions < self._parameters.doubt.poses:
+            return False
+        self.rejected['imu_contradicts'] += 1
+        return self._track.correct(stamp, position, quaternion, doubtful=True)
+
+    def _goes_on(self, stamp, position, quaternion) -> bool:
+        """Whether a pose goes on smoothly from the last good one."""
+        if self._good_pose is None:
+            return False
+        before, from_position, from_quaternion = self._good_pose
+        limits, dt = self._parameters.doubt, stamp - before
+        if not 0 < dt <= self._parameters.imu.gap_limit:
+            return False
+        node = self._track.at(stamp)
+        step = position - from_position - dt * node.velocity
+        was, now = (rotations.multiply(q, self._model.marker_to_base)
+                    for q in (from_quaternion, quaternion))
+        turned = rotations.multiply(was, rotations.exp(dt * (node.rate - node.gyroscope_bias)))
+        return float(np.linalg.norm(step)) < limits.distance + limits.speed * dt \
+            and geodesic_angle(turned, now) < limits.angle + limits.rate * dt
 
     def _consider(self, stamp, position, quaternion, believed) -> bool:
         """

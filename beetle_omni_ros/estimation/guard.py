@@ -6,6 +6,7 @@ from math import inf, isfinite, sqrt
 import numpy as np
 
 from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.estimation.spikes import SpikeFilter
 
 
 class InputGuard:
@@ -30,6 +31,8 @@ class InputGuard:
         self._last_pose = -inf
         self._same_pose, self._pose_values = 0, None
         self._reading_values, self._moved = None, False
+        self._same_reading, self._pose_moved = 0, False
+        self._spikes = SpikeFilter(self._imu.impact_change, self._imu.spike_change)
         self._refused: list[float] = []  # stamps refused in a row, each shortly after the last
 
     def reading(self, sample) -> tuple[float, np.ndarray, np.ndarray] | None:
@@ -58,13 +61,24 @@ class InputGuard:
                                         'backwards' if step < 0 else 'forward_gap')
                 self.clock_jumped = True
                 self._last_pose = -inf
+                self._spikes.reset()
+        if self._repeats((*force.tolist(), *rate.tolist())):
+            return self._refuse('frozen')
+        if not self._spikes.passes(force, rate):
+            return self._refuse('spike')
         self._last_reading = stamp
-        values = (*force.tolist(), *rate.tolist())
-        self._moved |= self._reading_values is not None and values != self._reading_values
-        self._reading_values = values
         self._refused.clear()
-        self.shaken, self._out_of_range = self._out_of_range, False
+        self.shaken, self._out_of_range = self._out_of_range or self._spikes.lasted, False
         return stamp, force, rate
+
+    def _repeats(self, values) -> bool:
+        """Whether readings have long stayed the same to the last digit, while the MoCap moved."""
+        same = values == self._reading_values
+        self._moved |= self._reading_values is not None and not same
+        self._reading_values = values
+        self._same_reading = self._same_reading + 1 if same else 0
+        self._pose_moved &= same
+        return self._same_reading >= self._imu.frozen_samples and self._pose_moved
 
     def _new_time_line(self, stamp) -> bool:
         """Whether refused stamps have gone on so consistently that the clock itself jumped."""
@@ -111,7 +125,9 @@ class InputGuard:
 
     def _frozen(self, values) -> bool:
         """Whether the pose has long stayed the same to the last digit, while the IMU moved."""
-        same, self._pose_values = values == self._pose_values, values
+        same = values == self._pose_values
+        self._pose_moved |= self._pose_values is not None and not same
+        self._pose_values = values
         self._same_pose = self._same_pose + 1 if same and self._moved else 0
         self._moved = False
         return self._same_pose >= self._mocap.frozen_poses

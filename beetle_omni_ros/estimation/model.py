@@ -6,6 +6,8 @@ only what is particular to a rigid body: propagation and residual on SO(3), and 
 injection of the estimated error into the state.
 """
 
+from dataclasses import replace
+
 from filterpy.kalman import KalmanFilter
 import numpy as np
 from scipy.stats import chi2
@@ -32,7 +34,13 @@ MEASURED = 6  # position in world, rotation vector in base_link
 
 
 class ErrorStateModel:
-    """Prediction and correction of one node; holds constants and buffers, no state."""
+    """
+    Prediction and correction of one node; holds constants and buffers, no state.
+
+    Attributes:
+        marker_to_base: (4,) quaternion of base_link's axes seen from the marker body.
+
+    """
 
     def __init__(self, parameters: EkfParameters, gravity: float):
         """
@@ -56,11 +64,17 @@ class ErrorStateModel:
         self._shock[VELOCITY] = imu.specific_force_limit ** 2
         self._shock[ATTITUDE] = imu.angular_velocity_limit ** 2
         self._impact = imu.impact_change ** 2
+        doubt, variance = parameters.doubt, np.zeros(STATES)
+        variance[POSITION] = doubt.position_std ** 2
+        variance[VELOCITY], variance[ATTITUDE] = doubt.velocity_std ** 2, doubt.attitude_std ** 2
+        variance[ACCELEROMETER_BIAS] = doubt.accelerometer_bias_std ** 2
+        variance[GYROSCOPE_BIAS] = doubt.gyroscope_bias_std ** 2
+        self._doubt = np.diag(variance)
 
         # the marker body, as seen from the navigated point (the IMU), in base_link axes
         self._lever = mocap.position - imu.position
         self._has_lever = bool(np.any(self._lever))
-        self._marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
+        self.marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
         self.filter.H[0:3, POSITION] = np.eye(3)
         self.filter.H[3:6, ATTITUDE] = np.eye(3)
         self._claimed_noise = (mocap.position_noise ** 2, mocap.orientation_noise ** 2)
@@ -86,7 +100,7 @@ class ErrorStateModel:
 
         """
         first = self.parameters.initial
-        attitude = rotations.normalized(rotations.multiply(quaternion, self._marker_to_base))
+        attitude = rotations.normalized(rotations.multiply(quaternion, self.marker_to_base))
         rotation = rotations.matrix(attitude)
         arm = rotation @ rotations.skew(self._lever)
         noise = self.filter.R
@@ -125,6 +139,10 @@ class ErrorStateModel:
         change[ATTITUDE] = node.gyroscope_bias - node.rate
         change[TIME_OFFSET] = 1.0
         node.covariance = node.covariance + deviation ** 2 * np.outer(change, change)
+
+    def doubt(self, node: Node) -> Node:
+        """The node with velocity, attitude and biases as uncertain as the parameters say."""
+        return replace(node, covariance=node.covariance + self._doubt)
 
     def forget(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray) -> Node:
         """Move a state across an unknown lapse of time: only the biases are still worth much."""
@@ -182,7 +200,7 @@ class ErrorStateModel:
         residual[:3] = position - prior.position
         residual[3:] = rotations.log(rotations.multiply(
             rotations.conjugate(prior.quaternion),
-            rotations.multiply(quaternion, self._marker_to_base)))
+            rotations.multiply(quaternion, self.marker_to_base)))
         if self._has_lever:
             residual[:3] -= prior.rotation @ self._lever
             kalman.H[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)

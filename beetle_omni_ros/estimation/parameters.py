@@ -40,6 +40,12 @@ class ImuParameters:
     impact_change: float = parameter(
         30.0, doc='a larger change of the specific force between two samples is an impact, '
         'whose impulse is unknown', unit='m/s^2', low=1, high=2000)
+    spike_change: float = parameter(
+        3.0, doc='a lone reading whose angular rate changes by more, or whose specific force '
+        'changes by more than an impact, is refused', unit='rad/s', low=0.1, high=200)
+    frozen_samples: int = parameter(
+        10, doc='samples that repeat the one before to the last digit while the MoCap moves, from '
+        'which they are refused', low=2, high=10000)
     gap_limit: float = parameter(
         0.1, doc='longest time between two samples that is bridged', unit='s', low=0.001, high=1)
     resync_samples: int = parameter(
@@ -137,6 +143,35 @@ class StatusParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DoubtParameters:
+    """What becomes uncertain when the IMU contradicts poses that follow each other smoothly."""
+
+    poses: int = parameter(
+        3, doc='consecutive poses that must contradict', low=1, high=1000)
+    distance: float = parameter(
+        0.05, doc='a longer step from the last good pose is a jump of the MoCap', unit='m',
+        low=0.001, high=10)
+    angle: float = parameter(
+        0.05, doc='likewise a larger turn', unit='rad', low=0.001, high=3)
+    speed: float = parameter(
+        2.0, doc='error of the velocity by which that step may be longer for each second',
+        unit='m/s', low=0, high=100)
+    rate: float = parameter(
+        8.0, doc='error of the angular rate by which that turn may be larger for each second',
+        unit='rad/s', low=0, high=100)
+    position_std: float = parameter(
+        0.05, doc='then added to the deviation of the position', unit='m', low=1e-4, high=10)
+    velocity_std: float = parameter(
+        0.5, doc='then added to the deviation of the velocity', unit='m/s', low=0.001, high=100)
+    attitude_std: float = parameter(
+        0.1, doc='then added to that of the attitude', unit='rad', low=0.001, high=3)
+    accelerometer_bias_std: float = parameter(
+        1.0, doc='then added to that of the accelerometer bias', unit='m/s^2', low=1e-6, high=100)
+    gyroscope_bias_std: float = parameter(
+        0.3, doc='then added to that of the gyroscope bias', unit='rad/s', low=1e-6, high=10)
+
+
+@dataclass(frozen=True, kw_only=True)
 class EkfParameters:
     """Everything that :class:`~beetle_omni_ros.estimation.ekf.ErrorStateEkf` can be told."""
 
@@ -144,6 +179,7 @@ class EkfParameters:
     mocap: MocapParameters = group(MocapParameters)
     initial: InitialParameters = group(InitialParameters)
     time_offset: TimeOffsetParameters = group(TimeOffsetParameters)
+    doubt: DoubtParameters = group(DoubtParameters)
     status: StatusParameters = group(StatusParameters)
 
     def __post_init__(self):

@@ -50,6 +50,10 @@ class Track:
         """The state at the newest reading."""
         return self.nodes[-1]
 
+    def at(self, stamp: float) -> Node:
+        """The last state not after ``stamp`` [s], or the oldest one."""
+        return self.nodes[max(0, bisect_right(self.nodes, stamp + SAME_INSTANT, key=_stamp) - 1)]
+
     def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray, shaken: bool) -> None:
         """Append the state at the next reading."""
         nodes = self.nodes
@@ -57,7 +61,8 @@ class Track:
         while nodes[1].stamp < stamp - self._history:
             del nodes[0]
 
-    def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
+    def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
+                doubtful: bool = False) -> bool:
         """
         Apply a pose at its capture time and replay what came after.
 
@@ -65,6 +70,7 @@ class Track:
             stamp: capture time, not after the newest node; before the oldest, that is used [s].
             position: (3,) of the marker body in world [m].
             quaternion: (4,) marker body to world.
+            doubtful: whether velocity, attitude and biases are less certain than they seem.
 
         Returns:
             False when the pose does not fit; the track is then unchanged.
@@ -79,6 +85,8 @@ class Track:
             prior = self._model.predict(prior, stamp, *interpolate(
                 stamp, (prior.stamp, prior.force, prior.rate),
                 (after.stamp, after.force, after.rate)), after.shaken)
+        if doubtful:
+            prior = self._model.doubt(prior)
         posterior = self._model.correct(prior, position, quaternion)
         if posterior is None:
             return False

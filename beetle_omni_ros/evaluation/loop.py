@@ -231,6 +231,7 @@ class FlightLoop:
                                  received=now)
         if frame.joints is not None:
             self._joints = joints = frame.joints
+            tell('on_joints', joints.stamp, joints.position, joints.velocity)
             recorder.write_joints(joints.stamp, joints.position, joints.velocity, joints.effort,
                                   received=now)
         if frame.battery is not None:

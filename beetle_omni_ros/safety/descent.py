@@ -6,12 +6,13 @@ not fail for the same reason: gyroscope and accelerometer are integrated, and Mo
 position, velocity and attitude by fixed gains, each compared with the own past at its capture
 time. While the EKF lives, the IMU biases are learnt from it. Without MoCap, position and velocity
 are dead reckoning, in which the velocity slowly forgets towards the one that is wished, so that a
-descent stays gentle; without IMU, rates come from MoCap alone.
+descent stays gentle. Without IMU the model of the rotors takes its place between MoCap poses.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.safety.parameters import BackupParameters
 
 KEPT_SAMPLES = 100     # IMU samples before the failure: 0.5 s at 200 Hz
+KEPT_FIXES = 12        # MoCap poses that tell the velocity
+FIXES_TIME = 0.1       # [s] older ones do not
+KEPT_BIASES, BIAS_EVERY = 4, 0.5    # [s] biases of up to 2 s ago, before an estimate went wrong
 KEPT_POSES = 24        # own past for late MoCap frames: 0.12 s at 200 Hz
 LONGEST_STEP = 0.1     # [s] a gap in the samples is not integrated beyond this
 ABSURD = 1e4           # [m, m/s^2, rad/s] no sensor of this robot says that
@@ -48,6 +52,8 @@ class BackupEstimator:
         self._accelerometer_bias, self._gyroscope_bias = np.zeros(3), np.zeros(3)
         self._learnt: State | None = None
         self._mocap_stamp = -np.inf
+        self._poses: deque = deque(maxlen=KEPT_FIXES)
+        self._biases: deque = deque(maxlen=KEPT_BIASES)     # (stamp, accelerometer, gyroscope)
         self.imu_alive = True
         self.stop()
 
@@ -87,6 +93,7 @@ class BackupEstimator:
         position, quaternion = _vector(position, 3), _vector(quaternion, 4)
         dt = min(stamp - self._mocap_stamp, LONGEST_STEP)
         self._mocap_stamp = stamp
+        self._poses.append((stamp, position, rotations.normalized(quaternion)))
         if self.running and self._past:
             self._correct(stamp, position, rotations.normalized(quaternion), dt)
         return True
@@ -102,6 +109,8 @@ class BackupEstimator:
             return
         acceleration = (state.velocity - before.velocity) / dt
         expected = (acceleration - self._gravity) @ rotations.matrix(state.quaternion)
+        if not self._biases or state.stamp - self._biases[-1][0] > BIAS_EVERY:
+            self._biases.append((state.stamp, self._accelerometer_bias, self._gyroscope_bias))
         gain = min(1.0, dt / self._parameters.bias_time)
         self._accelerometer_bias = _shortened(self._accelerometer_bias + gain * (
             sample[1] - expected - self._accelerometer_bias), LARGEST_BIASES[0])
@@ -121,23 +130,54 @@ class BackupEstimator:
             if stamp > state.stamp:
                 self._use(stamp, force, rate)
 
+    @property
+    def velocity_by_poses(self) -> np.ndarray | None:
+        """(3,) in world by the poses of the last 0.1 s alone [m/s], None where there are none."""
+        poses = [pose for pose in self._poses if pose[0] > self._mocap_stamp - FIXES_TIME]
+        if len(poses) < 2:
+            return None
+        return (poses[-1][1] - poses[0][1]) / (poses[-1][0] - poses[0][0])
+
+    def start_from_poses(self, tilt_source: State) -> None:
+        """
+        Continue from MoCap and IMU alone, where the estimate is not to be believed.
+
+        Args:
+            tilt_source: the last estimate, used where there are no poses.
+
+        """
+        velocity = self.velocity_by_poses
+        if velocity is None:
+            return self.start(tilt_source)
+        stamp, position, quaternion = self._poses[-1]
+        if self._biases:    # the wrong estimate has taught wrong ones
+            self._accelerometer_bias, self._gyroscope_bias = self._biases[0][1:]
+        rate = self._samples[-1][2] - self._gyroscope_bias if self._samples else np.zeros(3)
+        self.start(State(stamp, position, velocity, quaternion, rate, tilt_source.tilt,
+                         tilt_source.tilt_velocity, tilt_source.tilt_stamp))
+
     def clock_went_back(self, by: float) -> None:
         """Move everything known to the clock that was set back by ``by`` [s]."""
         self._samples = deque(((t - by, *rest) for t, *rest in self._samples),
                               maxlen=KEPT_SAMPLES)
         self._past = deque(((t - by, *rest) for t, *rest in self._past), maxlen=KEPT_POSES)
         self._mocap_stamp -= by
+        self._poses.clear()
+        self._biases.clear()
         self._learnt = None
         if self.running:
             self._stamp -= by
 
-    def predict(self, now: float, wished_velocity: np.ndarray | None = None) -> None:
+    def predict(self, now: float, wished_velocity: np.ndarray | None = None,
+                motion: tuple[np.ndarray, np.ndarray] | None = None) -> None:
         """
         Advance to ``now`` without a sample.
 
         Args:
             now: [s].
             wished_velocity: (3,) in world, given while MoCap is gone [m/s].
+            motion: specific force (3,) [m/s^2] and angular acceleration (3,) [rad/s^2] in
+                base_link by the model, used while the IMU is gone.
 
         """
         dt = now - self._stamp
@@ -146,7 +186,16 @@ class BackupEstimator:
                 * (wished_velocity - self._velocity)
         if not self.imu_alive:
             self.specific_force_up = None
-            self._advance(now, np.zeros(3))
+            if motion is None or dt <= 0:
+                return self._advance(now, np.zeros(3))
+            force, turning = motion
+            self._rate = self._rate + min(dt, LONGEST_STEP) * turning
+            self._advance(now, rotations.matrix(self._quaternion) @ force + self._gravity)
+
+    def latest(self, other: State) -> State:
+        """Another state with position, velocity, attitude and rates of the last prediction."""
+        return replace(other, position=self._position, velocity=self._velocity,
+                       quaternion=self._quaternion, angular_velocity=self._rate)
 
     def state(self, tilt: np.ndarray, tilt_velocity: np.ndarray, tilt_stamp: float,
               now: float) -> State:

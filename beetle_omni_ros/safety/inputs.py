@@ -7,6 +7,7 @@ from math import isfinite
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, corrected, State
+from beetle_omni_ros.estimation.spikes import SpikeFilter
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.actuators import Actuators
@@ -41,6 +42,9 @@ class Inputs:
         self._allocator = Allocator(robot)
         self.watch = FaultWatch(parameters.detection, robot, self._allocator)
         self._in_force: Command | None = None
+        imu = parameters.detection.imu
+        self._spikes = SpikeFilter(imu.force_change, imu.rate_change)
+        self._sample, self._same_samples = None, 0
         self._floor = 0.0       # height of base_link where it stood [m]
         self.events = EventLog(parameters.quiet_time)
         self._now: float | None = None
@@ -89,8 +93,8 @@ class Inputs:
     def on_imu(self, stamp: float, specific_force: np.ndarray,
                angular_velocity: np.ndarray) -> bool:
         """Take a raw IMU sample (3,), (3,) in base_link, for the descent without estimator."""
-        good = not self._ahead(stamp) and self.vehicle.backup.on_imu(stamp, specific_force,
-                                                                     angular_velocity)
+        good = not self._ahead(stamp) and self._is_real(specific_force, angular_velocity) \
+            and self.vehicle.backup.on_imu(stamp, specific_force, angular_velocity)
         if good:
             self.vehicle.imu.heard()
             if self.airborne:
@@ -100,6 +104,24 @@ class Inputs:
                                   self.vehicle.tilt if known else None, self._in_force,
                                   self._height)
         return good
+
+    def _is_real(self, specific_force, angular_velocity):
+        """Whether a sample is no lone spike, and not the same as many before."""
+        try:
+            force, rate = (np.asarray(vector, dtype=float).reshape(3)
+                           for vector in (specific_force, angular_velocity))
+        except (TypeError, ValueError):
+            return False
+        if not np.isfinite(force).all() or not np.isfinite(rate).all():
+            return False
+        values = (*force.tolist(), *rate.tolist())
+        self._same_samples = self._same_samples + 1 if values == self._sample else 0
+        self._sample = values
+        limits = self._parameters.detection.imu
+        if self.airborne and self._same_samples >= limits.frozen:
+            self.watch.name('imu_frozen', self._now or 0.0, 'the IMU repeats the same sample')
+            return False
+        return self._spikes.passes(force, rate)
 
     def on_rotors(self, stamp: float, speed: np.ndarray) -> bool:
         """Take the rotors' speeds (4,) as their ESCs report them [rad/s], nan where unknown."""
@@ -141,10 +163,10 @@ class Inputs:
         """Whether a MoCap pose fits what is known of the flight."""
         vehicle = self.vehicle
         state = vehicle.state if not vehicle.backup.running else vehicle.backup_state(self._now)
-        attitude = rate = None
+        known = (None,) * 4
         if state is not None and abs(state.stamp - stamp) < LATEST:
-            attitude, rate = state.quaternion, state.angular_velocity
-        good = self.watch.on_mocap(stamp, position, quaternion, attitude, rate)
+            known = state.quaternion, state.angular_velocity, state.position, state.velocity
+        good = self.watch.on_mocap(stamp, position, quaternion, *known)
         if good or 'estimator_wrong' in self.watch.faults:
             return True
         return False

@@ -79,7 +79,9 @@ class Landing:
             distrusted: whether the estimator is there and wrong.
 
         """
-        if self._vehicle.estimate.silent or distrusted:
+        if distrusted:
+            self._vehicle.backup.start_from_poses(self._vehicle.state)
+        elif self._vehicle.estimate.silent:
             self._vehicle.backup.start(self._vehicle.state)
         self._blind = self._without_mocap
         self.set_out(now, in_force)
@@ -98,11 +100,11 @@ class Landing:
         if not backup.running:
             return self._follow(vehicle.seen(in_force), dt, vehicle.specific_force_up
                                 if vehicle.mocap_lost else None)
-        dead_reckoning = self._lean_on_what_is_left(now, dt)
+        dead_reckoning = self._lean_on_what_is_left(now, dt, in_force)
         state = vehicle.seen(in_force, vehicle.backup_state(now))
         return self._follow(state, dt, backup.specific_force_up if dead_reckoning else None)
 
-    def _lean_on_what_is_left(self, now, dt):
+    def _lean_on_what_is_left(self, now, dt, in_force):
         """Advance the backup; whether it is without MoCap."""
         vehicle = self._vehicle
         no_mocap, no_imu = vehicle.mocap.silent, vehicle.imu.silent
@@ -113,7 +115,9 @@ class Landing:
         self._blind_for = self._blind_for + dt if no_mocap and no_imu else 0.0
         if self._blind_for > self._blind_limit:
             self.given_up = 'no estimator, no MoCap, no IMU'
-        vehicle.backup.predict(now, self._ramp.at(now).velocity if no_mocap else None)
+        vehicle.backup.predict(
+            now, self._ramp.at(now).velocity if no_mocap else None,
+            self._gauge.motion(vehicle.seen(in_force).tilt, self._robot.inertia) if no_imu else None)
         return no_mocap
 
     def set_out(self, now: float, in_force: Command | None) -> None:
@@ -191,7 +195,11 @@ class Landing:
     def _feel_ground(self, state, dt, specific_force_up, reference):
         """The rotors carry clearly less than the weight, yet it does not fall."""
         p = self._parameters
-        still = abs(state.velocity[2]) < p.ground_speed
+        # Without IMU the model of the rotors, which knows of no floor, leads the velocity.
+        blind = self._vehicle.backup.running and not self._vehicle.backup.imu_alive
+        by_poses = self._vehicle.backup.velocity_by_poses if blind else None
+        sinks = state.velocity[2] if by_poses is None else by_poses[2]
+        still = abs(sinks) < p.ground_speed
         carried = self._gauge.support(specific_force_up) > p.ground_support
         sinking = reference.velocity[2] < -0.5 * p.speed
         stands = sinking and carried and (still or specific_force_up is not None)

@@ -23,7 +23,7 @@ from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.ramp import inclination
 from beetle_omni_ros.safety.support import SupportGauge
 from beetle_omni_ros.safety.takeoff import Takeoff
-from beetle_omni_ros.safety.watch.faults import CRASH
+from beetle_omni_ros.safety.watch.faults import CRASH, DISPLACED
 
 DISARMED, TAKEOFF, FLYING = 'disarmed', 'takeoff', 'flying'
 FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
@@ -283,6 +283,8 @@ class Supervisor(Inputs):
             why = f' (last refused: {vehicle.last_refusal})' if vehicle.last_refusal else ''
             self._land(now, ERROR, f'ekf_node {vehicle.estimate.text}{why}: controlled descent '
                                    'on raw sensors')
+        elif DISPLACED in self.faults:
+            self._land(now, ERROR, 'the position of MoCap jumped: landing')
         elif vehicle.mocap_lost and vehicle.mocap.elapsed > self._parameters.state.mocap_patience:
             self._land(now, ERROR, f'MoCap {vehicle.mocap.text}: landing by dead reckoning')
         elif no_joints:

@@ -8,7 +8,7 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 
 BASELINE_TIME = 2.0             # [s] over which the thrust that carries the weight is learnt
 BASELINE_RANGE = (0.7, 1.4)     # of the modelled one; more is a disturbance, not the rotors
@@ -28,21 +28,38 @@ class SupportGauge:
         self._baseline = 1.0
         self.thrust = 0.0     # along world up, in weights, as it has built up
         self.lift = 0.0       # the same, corrected by the baseline
+        self._thrusts = np.zeros(ROTORS)    # of each rotor, as built up [N]
 
     def update(self, command: Command | None, quaternion: np.ndarray, dt: float,
                specific_force_up: float | None, learn: bool) -> None:
         """One tick."""
-        now = 0.0
+        now, share = 0.0, 1.0 - exp(-dt / self._lag)
+        self._thrusts += share * ((0.0 if command is None else command.thrust) - self._thrusts)
         if command is not None:
             force, _ = self._allocator.wrench(command.tilt, command.thrust)
             now = float(rotations.matrix(quaternion)[2] @ force) \
                 / (self._allocator.mass * self._gravity)
-        self.thrust += (1.0 - exp(-dt / self._lag)) * (now - self.thrust)
+        self.thrust += share * (now - self.thrust)
         if learn and specific_force_up is not None and self.thrust > LEAST_THRUST:
             low, high = BASELINE_RANGE
             ratio = min(max(specific_force_up / self._gravity / self.thrust, low), high)
             self._baseline += min(1.0, dt / BASELINE_TIME) * (ratio - self._baseline)
         self.lift = self._baseline * self.thrust
+
+    def motion(self, tilt: np.ndarray, inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        What the rotors do to the body, by the model.
+
+        Args:
+            tilt: (4,) true [rad].
+            inertia: (3,) of the body [kg m^2].
+
+        Returns:
+            specific force (3,) [m/s^2] and angular acceleration (3,) [rad/s^2], in base_link.
+
+        """
+        force, torque = self._allocator.wrench(tilt, self._thrusts)
+        return self._baseline * force / self._allocator.mass, torque / inertia
 
     def support(self, specific_force_up: float | None) -> float:
         """Share of the weight that something else carries."""

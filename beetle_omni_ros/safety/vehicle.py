@@ -123,6 +123,11 @@ class Vehicle:
             else self.state.quaternion
 
     @property
+    def _best(self) -> State:
+        """The estimate, or that of last resort where it is in use."""
+        return self.backup.latest(self.state) if self.backup.running else self.state
+
+    @property
     def specific_force_up(self) -> float | None:
         """Latest specific force along world up by the estimator's attitude [m/s^2]."""
         force = self.backup.last_specific_force
@@ -186,14 +191,14 @@ class Vehicle:
 
     def _outside(self, margin):
         fence = self._parameters.envelope
-        x, y, z = np.abs(self.state.position)
+        x, y, z = np.abs(self._best.position)
         return bool(max(x, y) > fence.half_width + margin or z > fence.height + margin)
 
     def _below(self, threshold):
         return self.voltage is not None and self.voltage < threshold * self._cells
 
     def _tumbling(self):
-        fence, state = self._parameters.envelope, self.state
+        fence, state = self._parameters.envelope, self._best
         return np.linalg.norm(state.angular_velocity) > fence.rate \
             or state.velocity[2] < -fence.fall_speed
 

@@ -16,7 +16,7 @@ from beetle_omni_ros.safety.watch.parameters import Detection
 from beetle_omni_ros.safety.watch.speeds import SpeedWatch
 from beetle_omni_ros.safety.watch.wrench import ContactWatch, WrenchWatch
 
-CRASH = 'crash'
+CRASH, DISPLACED = 'crash', 'mocap_jumped'
 NOTICEABLE = 0.3        # [N] by which the thrust of a rotor that obeys nobody may drift untold
 
 
@@ -140,7 +140,8 @@ class FaultWatch:
         return None if model is None else self.health.true(model)
 
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
-                 attitude: np.ndarray | None, rate: np.ndarray | None) -> bool:
+                 attitude: np.ndarray | None, rate: np.ndarray | None,
+                 place: np.ndarray | None = None, velocity: np.ndarray | None = None) -> bool:
         """
         Take a MoCap pose, see :meth:`MocapWatch.on_pose`.
 
@@ -149,9 +150,12 @@ class FaultWatch:
 
         """
         watch = self._mocap
-        watch.on_pose(stamp, position, quaternion, attitude, rate)
+        watch.on_pose(stamp, position, quaternion, attitude, rate, place, velocity)
         if watch.frozen:
             self._name('mocap_frozen', stamp, 'MoCap repeats the same pose')
+        elif watch.displaced:
+            self._name(DISPLACED, stamp, 'the position of MoCap jumped, and the IMU does not '
+                       'show it')
         elif watch.contradicts and watch.jumped:
             self._name('mocap_flipped', stamp, 'the attitude of MoCap jumped, and the gyroscope '
                        'does not show it')

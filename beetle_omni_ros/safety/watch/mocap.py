@@ -9,6 +9,7 @@ from beetle_omni_ros.safety.watch.parameters import MocapLimits
 
 AGE = 0.05              # [s] by which pose and estimate may be apart
 LONGEST = 0.1           # [s] between two poses across which a jump is seen
+FASTEST = 6.0           # [m/s] nothing that flies in the hall is faster
 
 
 class MocapWatch:
@@ -22,6 +23,7 @@ class MocapWatch:
         good: whether the last pose may be used.
         jumped: whether MoCap itself jumped, since when it contradicts the estimate.
         contradicts: whether pose and estimate have contradicted each other for long enough.
+        displaced: whether the position jumped, and has long contradicted the estimate's.
 
     """
 
@@ -33,8 +35,9 @@ class MocapWatch:
     def reset(self) -> None:
         """Begin anew."""
         self._stamp, self._quaternion, self._values = -np.inf, None, None
+        self._position, self._moved, self._far = None, False, 0
         self._same, self._off = 0, 0
-        self.good, self.jumped, self.contradicts = True, False, False
+        self.good, self.jumped, self.contradicts, self.displaced = True, False, False, False
 
     @property
     def frozen(self) -> bool:
@@ -42,7 +45,8 @@ class MocapWatch:
         return self._same >= self._p.frozen
 
     def on_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
-                attitude: np.ndarray | None, rate: np.ndarray | None) -> None:
+                attitude: np.ndarray | None, rate: np.ndarray | None,
+                place: np.ndarray | None = None, velocity: np.ndarray | None = None) -> None:
         """
         Take a pose.
 
@@ -52,6 +56,8 @@ class MocapWatch:
             quaternion: (4,) xyzw.
             attitude: (4,) of the estimate of about that time, None: there is none.
             rate: (3,) measured body rate [rad/s], None: there is none.
+            place: (3,) of the estimate of about that time [m], None: there is none.
+            velocity: (3,) likewise [m/s].
 
         """
         values = (*np.asarray(position, dtype=float).tolist(),
@@ -66,7 +72,21 @@ class MocapWatch:
             self.jumped = True
         off = attitude is not None and rotations.geodesic_angle(
             attitude, self._quaternion) > self._p.attitude + turning * AGE
-        self._off = self._off + 1 if off else 0
+        far = self._is_far(dt, np.asarray(position, dtype=float), place, velocity)
+        self._off = self._off + 1 if off or far else 0
+        self._far = self._far + 1 if far and self._moved else 0
         self.jumped &= off
-        self.contradicts = self._off >= self._p.lasting
-        self.good = not off and not self.frozen
+        self.displaced = self._far >= self._p.displaced
+        self.contradicts = self._off >= self._p.lasting and not self._moved
+        self.good = not off and not far and not self.frozen
+
+    def _is_far(self, dt, position, place, velocity):
+        """Whether the position is not the estimate's, and whether it jumped there."""
+        before, self._position = self._position, position
+        if before is not None and 0 < dt < LONGEST \
+                and np.linalg.norm(position - before) > self._p.distance + FASTEST * dt:
+            self._moved = True
+        far = place is not None and np.linalg.norm(position - place) > \
+            self._p.distance + float(np.linalg.norm(velocity)) * AGE
+        self._moved &= far
+        return far

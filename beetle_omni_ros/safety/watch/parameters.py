@@ -76,10 +76,27 @@ class MocapLimits:
 
     attitude: float = parameter(0.35, doc='jump of the attitude against the gyroscope',
                                 unit='rad', low=0.05, high=3)
+    distance: float = parameter(0.3, doc='of the position from the estimate, or from the pose '
+                                'before', unit='m', low=0.02, high=10)
+    displaced: int = parameter(30, doc='poses in a row after a jump of the position', low=1,
+                               high=1000)
     lasting: int = parameter(10, doc='poses in a row that contradict the estimate', low=1,
                              high=1000)
     frozen: int = parameter(5, doc='poses equal to the last digit while the IMU moves', low=2,
                             high=1000)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuLimits:
+    """Samples of the IMU that no body makes."""
+
+    force_change: float = parameter(
+        30.0, doc='change of the specific force of a lone sample that is not used', unit='m/s^2',
+        low=1, high=2000)
+    rate_change: float = parameter(
+        3.0, doc='change of the angular rate, likewise', unit='rad/s', low=0.1, high=200)
+    frozen: int = parameter(10, doc='samples in a row that are the same to the last digit', low=2,
+                            high=10000)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,3 +107,4 @@ class Detection:
     rotor: RotorLimits = group(RotorLimits)
     servo: ServoLimits = group(ServoLimits)
     mocap: MocapLimits = group(MocapLimits)
+    imu: ImuLimits = group(ImuLimits)
