@@ -58,7 +58,7 @@ class ErrorStateEkf:
         self._candidate: Track | None = None
         self._estimate: Estimate | None = None
         self._good_pose: tuple | None = None    # the last one used: stamp, position, quaternion
-        self._contradictions = 0
+        self._contradictions, self._doubt_until = 0, -np.inf
 
     @property
     def rejected(self) -> Counter:
@@ -167,8 +167,10 @@ class ErrorStateEkf:
         """Use a refused pose, where poses contradict the IMU and not each other."""
         goes_on = self._goes_on(stamp, position, quaternion)
         self._contradictions = self._contradictions + 1 if goes_on else 0
-        if self._contradictions < self._parameters.doubt.poses:
+        needed = 1 if stamp < self._doubt_until else self._parameters.doubt.poses
+        if self._contradictions < needed:
             return False
+        self._doubt_until = stamp + self._parameters.doubt.time
         self.rejected['imu_contradicts'] += 1
         return self._track.correct(stamp, position, quaternion, doubtful=True)
 

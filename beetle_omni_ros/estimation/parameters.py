@@ -148,6 +148,8 @@ class DoubtParameters:
 
     poses: int = parameter(
         3, doc='consecutive poses that must contradict', low=1, high=1000)
+    time: float = parameter(
+        1.0, doc='for which a single pose suffices after that', unit='s', low=0, high=100)
     distance: float = parameter(
         0.05, doc='a longer step from the last good pose is a jump of the MoCap', unit='m',
         low=0.001, high=10)

@@ -93,10 +93,15 @@ class BackupEstimator:
         position, quaternion = _vector(position, 3), _vector(quaternion, 4)
         dt = min(stamp - self._mocap_stamp, LONGEST_STEP)
         self._mocap_stamp = stamp
-        self._poses.append((stamp, position, rotations.normalized(quaternion)))
         if self.running and self._past:
             self._correct(stamp, position, rotations.normalized(quaternion), dt)
         return True
+
+    def remember(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> None:
+        """Keep a pose (see :meth:`is_pose`) for a start without an estimate."""
+        if not self._poses or stamp > self._poses[-1][0]:
+            self._poses.append((stamp, _vector(position, 3),
+                                rotations.normalized(_vector(quaternion, 4))))
 
     def learn(self, state: State) -> None:
         """Compare a good estimate with the IMU sample of its time; learn the biases."""
@@ -133,7 +138,9 @@ class BackupEstimator:
     @property
     def velocity_by_poses(self) -> np.ndarray | None:
         """(3,) in world by the poses of the last 0.1 s alone [m/s], None where there are none."""
-        poses = [pose for pose in self._poses if pose[0] > self._mocap_stamp - FIXES_TIME]
+        if not self._poses:
+            return None
+        poses = [pose for pose in self._poses if pose[0] > self._poses[-1][0] - FIXES_TIME]
         if len(poses) < 2:
             return None
         return (poses[-1][1] - poses[0][1]) / (poses[-1][0] - poses[0][0])

@@ -129,7 +129,7 @@ class Inputs:
         if self._ahead(stamp) or not isfinite(stamp) or speed.shape != (4,):
             return False
         if self.airborne:
-            self.watch.on_speeds(stamp, speed, self._in_force)
+            self.watch.on_speeds(stamp, speed)
         return True
 
     @property
@@ -152,6 +152,7 @@ class Inputs:
         vehicle = self.vehicle
         if self._ahead(stamp) or not vehicle.backup.is_pose(stamp, position, quaternion):
             return False
+        vehicle.backup.remember(stamp, position, quaternion)
         if self.airborne and not self._agrees(stamp, position, quaternion):
             return False
         good = vehicle.backup.on_mocap(stamp, position, quaternion)
@@ -207,6 +208,7 @@ class Inputs:
         if now < before:
             self._say(now, WARNING, f'the clock went back by {before - now:.3f} s')
             self.vehicle.clock_went_back(now, before - now)
+            self.watch.restart(now)
             self._selection.clock_went_back(now)
             self._clock_went_back(now, before - now)
             return 0.0

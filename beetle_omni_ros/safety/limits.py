@@ -22,7 +22,9 @@ OLDER = 'older than the last'
 THRUST = 'thrust out of range'
 TILT = 'tilt out of range'
 JUMP = 'implausible jump'
+FROZEN = 'the same numbers again'
 UNKNOWN = 'unknown controller'
+SAME = 10       # commands in a row that are equal to the last digit
 
 
 class CommandStream:
@@ -51,6 +53,7 @@ class CommandStream:
         self.silence = Silence(limits.timeout)
         self.good_for = 0.0
         self._offered: Command | None = None
+        self._same = 0
 
     @property
     def good(self) -> bool:
@@ -129,6 +132,11 @@ class CommandStream:
         if _farthest(tilt, clean.tilt) > tolerance:
             return TILT
         before, self._offered = self._offered, clean
+        same = before is not None and np.array_equal(before.tilt, clean.tilt) \
+            and np.array_equal(before.thrust, clean.thrust)
+        self._same = self._same + 1 if same else 0
+        if self._same >= SAME:
+            return FROZEN
         # Against the previous one offered, not accepted: a lone spike is refused, a real step
         # costs one period.
         if before is not None and clean.stamp - before.stamp <= self._limits.timeout and (

@@ -240,6 +240,7 @@ class Supervisor(Inputs):
     def _resume(self, now, paused):
         """After a pause of this process, in which the actuators have stopped."""
         self.watch.name('supervisor_paused', now, '')
+        self.watch.restart(now)
         self._say(now, ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: '
                               'the actuators had stopped')
         self._resuming = RESUMING

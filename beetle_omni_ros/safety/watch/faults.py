@@ -17,6 +17,7 @@ from beetle_omni_ros.safety.watch.speeds import SpeedWatch
 from beetle_omni_ros.safety.watch.wrench import ContactWatch, WrenchWatch
 
 CRASH, DISPLACED = 'crash', 'mocap_jumped'
+BUILD_UP = 0.5          # [s] five time constants of a rotor
 NOTICEABLE = 0.3        # [N] by which the thrust of a rotor that obeys nobody may drift untold
 
 
@@ -54,7 +55,15 @@ class FaultWatch:
         self.faults: dict[str, float] = {}
         self.health: ActuatorHealth = ALL_WELL
         self._new: list[str] = []
-        self._stamp = -np.inf
+        self.restart(-np.inf)
+
+    def restart(self, now: float) -> None:
+        """
+        Begin to watch anew after a pause or a step of the clock; what is known stays.
+
+        For BUILD_UP the rotors' thrusts are not those of the commands.
+        """
+        self._stamp, self._blind_until = -np.inf, now + BUILD_UP
         for watch in (self._wrench, self._contact, self._joints, self._speeds, self._mocap):
             watch.reset()
 
@@ -88,6 +97,8 @@ class FaultWatch:
         self._contact.update(min(max(dt, 0.0), 0.05), height, self._wrench)
         if height is not None and height < self._p.contact.near_ground:
             return      # the floor pushes, too
+        if stamp < self._blind_until:
+            return self._wrench.forget()
         if self._wrench.lost is not None:
             self._lose_rotor(self._wrench.lost, stamp, 'the wrench')
         if self._wrench.slipped is not None:
@@ -101,6 +112,7 @@ class FaultWatch:
     def on_command(self, command: Command) -> None:
         """Take what goes out."""
         self._joints.on_command(command.stamp, command.tilt)
+        self._speeds.on_command(command.stamp, command.thrust)
 
     def on_joints(self, stamp: float, tilt: np.ndarray, trusted: bool) -> None:
         """
@@ -164,10 +176,11 @@ class FaultWatch:
                        'jump')
         return watch.good
 
-    def on_speeds(self, stamp: float, speed: np.ndarray, command: Command | None) -> None:
+    def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """Take ESC speeds (4,) [rad/s], nan where unknown."""
-        thrust = np.zeros(ROTORS) if command is None else command.thrust
-        self._speeds.on_speeds(stamp, speed, thrust)
+        self._speeds.on_speeds(stamp, speed)
+        if stamp < self._blind_until:
+            return self._speeds.forget()
         if self._speeds.lost is not None:
             self._lose_rotor(self._speeds.lost, stamp, 'its ESC')
         deaf = self._speeds.deaf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from math import exp
 
 import numpy as np
@@ -11,6 +12,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.watch.parameters import RotorLimits
 
 LEARNT = 1.0            # [s] over which each rotor's speed at a thrust is learnt
+DELAY = 0.01            # [s] from a command's stamp until it acts
+KEPT = 64               # commands, 0.3 s at 200 Hz
 LONGEST = 0.2           # [s] between two reports that still count as one stretch
 
 
@@ -41,6 +44,7 @@ class SpeedWatch:
     def reset(self) -> None:
         """Begin anew, with nothing learnt."""
         self._stamp = -np.inf
+        self._commands: deque = deque(maxlen=KEPT)
         self._thrust = np.zeros(ROTORS)
         self._factor = np.zeros(ROTORS)     # [N s^2/rad^2]
         self._learnt_for = np.zeros(ROTORS)
@@ -50,25 +54,45 @@ class SpeedWatch:
         self.deaf: int | None = None
         self.thrust = np.full(ROTORS, np.nan)
 
-    def on_speeds(self, stamp: float, speed: np.ndarray, thrust: np.ndarray) -> None:
+    def on_command(self, stamp: float, thrust: np.ndarray) -> None:
+        """Take what the rotors were asked at ``stamp`` [s], (4,) [N]."""
+        self._commands.append((stamp + DELAY, thrust))
+
+    def forget(self) -> None:
+        """Suspect no rotor."""
+        self._for, self._deaf_for = np.zeros(ROTORS), np.zeros(ROTORS)
+        self._sums[:] = 0.0
+        self.lost = self.deaf = None
+
+    def _follow(self, start, end):
+        """Thrusts that the commands build up between two times [s]."""
+        commands = self._commands
+        while len(commands) > 1 and commands[1][0] <= start:
+            commands.popleft()
+        for k, (stamp, thrust) in enumerate(commands):
+            until = commands[k + 1][0] if k + 1 < len(commands) else end
+            span = min(until, end) - max(stamp, start)
+            if span > 0:
+                self._thrust = self._thrust - np.expm1(-span / self._lag) * (thrust - self._thrust)
+
+    def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """
         Take a report.
 
         Args:
             stamp: [s].
             speed: (4,) [rad/s], nan where the ESC is offline.
-            thrust: (4,) commanded [N].
 
         """
-        dt = stamp - self._stamp
+        dt, before = stamp - self._stamp, self._stamp
         if dt <= 0:
             return
         self._stamp = stamp
         if dt > LONGEST:
-            self._thrust = np.array(thrust, dtype=float)
-            self._sums[:] = 0.0
-            return
-        self._thrust += -np.expm1(-dt / self._lag) * (thrust - self._thrust)
+            if self._commands:
+                self._thrust = np.array(self._commands[-1][1], dtype=float)
+            return self.forget()
+        self._follow(before, stamp)
         square = np.asarray(speed, dtype=float)**2
         judged = np.isfinite(square) & (self._thrust > self._p.least_thrust)
         known = judged & (self._learnt_for >= LEARNT)

@@ -12,6 +12,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.watch.parameters import ContactLimits, RotorLimits
 
 LONGEST = 0.05          # [s] between two IMU samples; a longer gap starts the filters anew
+USUAL = 1.0             # [s] over which a push that was there in the air is learnt
 
 
 class WrenchWatch:
@@ -62,6 +63,11 @@ class WrenchWatch:
         self.slipped: tuple[int, float] | None = None
         self.impact = 0.0
         self.unexplained = np.zeros(3)
+
+    def forget(self) -> None:
+        """Suspect no rotor."""
+        self._lost_for, self._slipped_for = np.zeros(ROTORS), np.zeros(ROTORS)
+        self.lost = self.slipped = None
 
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                thrust: np.ndarray, health: ActuatorHealth) -> None:
@@ -160,7 +166,7 @@ class ContactWatch:
 
     def reset(self) -> None:
         """Begin anew."""
-        self._for, self.reason = 0.0, ''
+        self._for, self.reason, self._usual = 0.0, '', 0.0
 
     def update(self, dt: float, height: float | None, wrench: WrenchWatch) -> None:
         """
@@ -172,13 +178,14 @@ class ContactWatch:
             wrench: of the same sample.
 
         """
+        push = float(np.linalg.norm(wrench.unexplained)) / self._gravity
         if height is not None and height > self._limits.near_ground:
             self._for = 0.0
+            self._usual += min(1.0, dt / USUAL) * (push - self._usual)
             return
         if wrench.impact:
             self.reason = f'impact of {wrench.impact:.0f} m/s^2'
-        push = float(np.linalg.norm(wrench.unexplained)) / self._gravity
-        carried = height is not None and push > self._limits.support
+        carried = height is not None and push > self._limits.support + self._usual
         self._for = self._for + dt if carried else 0.0
         if self._for >= self._limits.time and not self.reason:
             self.reason = f'{push:.1f} of the weight are carried by something else'
