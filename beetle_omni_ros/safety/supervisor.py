@@ -337,12 +337,18 @@ class Supervisor(Inputs):
     # One function for each state --------------------------------------------------------------
 
     def _stand(self, now, dt):
-        """Motors off: zero thrust for a short while, then nothing."""
+        """
+        Motors off: zero thrust for a short while, then nothing.
+
+        A rotor that holds its thrust whatever it is asked is turned to press on the floor.
+        """
         self.source = 'none'
         if self._stop_left <= 0 or self._in_force is None:
             return None
         self._stop_left -= dt
-        return Command(now, self._in_force.tilt, np.zeros(4))
+        tilt = np.array([own if held is None else np.copysign(np.pi, own) for own, held in zip(
+            self._in_force.tilt, self._health.held)])
+        return Command(now, tilt, np.zeros(4))
 
     def _take_off(self, now, dt):
         self.source = 'hover'
