@@ -144,6 +144,19 @@ def test_what_is_no_recording_of_this_robot_is_one_line_and_status_2(made, words
     assert words in capsys.readouterr().err
 
 
+def test_another_robot_with_the_same_sensors_is_no_recording_of_this_one(made, tmp_path, capsys):
+    other = tmp_path / 'other'
+    with BagWriter(other) as bag:
+        for message in read_messages(made[0] / 'flight0'):
+            data = bytes(message.data)      # names of the same length keep the layout
+            for own, strange in ((b'gimbal', b'swivel'), (b'rotor', b'motor')):
+                data = data.replace(own, strange)
+            bag.write_raw(message.topic, message.type, data, message.received)
+    assert cli.main(['gap', str(other)]) == 2
+    error = capsys.readouterr().err
+    assert 'no recording of this robot' in error and 'swivel1' in error and 'gimbal1' in error
+
+
 def test_the_same_recording_twice_is_refused_under_any_name(made, tmp_path, capsys):
     flight = made[0] / 'flight0'
     (tmp_path / 'link').symlink_to(flight)
