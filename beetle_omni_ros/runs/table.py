@@ -13,6 +13,7 @@ from beetle_omni_ros.runs import published
 
 MANY_POSES = 20  # above, only the summary is shown
 ABSENT = '–'
+LONGEST_TITLE = 78      # that stands on one line of a terminal
 PUBLISHED = ' class="published"'
 
 ERROR_ROWS = (  # text, path in the metrics, digits
@@ -248,7 +249,8 @@ def print_grids(shown: list[Grid], console: Console) -> None:
 
 def _rich(grid):
     table = Table(title=Text(grid.title), title_justify='left', title_style='', box=None,
-                  header_style='dim', padding=(0, 2, 0, 0))
+                  min_width=min(len(grid.title), LONGEST_TITLE), header_style='dim',
+                  padding=(0, 2, 0, 0))
     for k, name in enumerate(grid.header):
         table.add_column(Text(name), justify='left' if k == 0 else 'right', overflow='fold',
                          no_wrap=k == 0, style='dim' if k in grid.faint_columns else None)

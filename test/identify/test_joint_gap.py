@@ -119,6 +119,12 @@ def test_a_log_of_the_files_own_servos_has_no_gap():
     assert result['gap_before'] == pytest.approx(1.0, abs=0.3)
 
 
+def test_limits_that_a_log_does_not_meet_are_listed_and_the_rest_would_have_shown():
+    hidden = judged(made(3))['hidden']
+    assert 'joint_torque_limit' in hidden
+    assert not {'joint_offset', 'joint_friction', 'joint_bandwidth'} & set(hidden)
+
+
 @pytest.mark.parametrize('zeros', [(0.015, 0.0), (0.0, -0.015), (-0.012, 0.018)])
 def test_zeros_that_moved_are_named_with_joint_and_sign(zeros):
     # the encoder shows so much more than the command: the true tilt is so much less than it

@@ -4,20 +4,31 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.gap.joint_changes import changes, sentences
-from beetle_omni_ros.identify.gap.joint_search import Entry, Found, Search, Trial
-from beetle_omni_ros.identify.gap.page import head
+from beetle_omni_ros.identify.gap.joint_changes import change_grids, changes, sentences
+from beetle_omni_ros.identify.gap.joint_search import (
+    Entry,
+    FITTED_PART,
+    Found,
+    Search,
+    Trial,
+)
+from beetle_omni_ros.identify.gap.keys import friction
+from beetle_omni_ros.identify.gap.page import AFTER, BEFORE, head
+from beetle_omni_ros.identify.gap.results import grids
 from beetle_omni_ros.identify.gap.sentence import summary
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
 from beetle_omni_ros.identify.joint_page import joint_page
 from beetle_omni_ros.identify.joint_results import joint_results
 from beetle_omni_ros.identify.joint_servos import file_servos
+from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.figures import legend, line, panels, STYLE, svg
 
 # Error over that of the freest fit, up to which the file predicts what it did not see as well: a
 # log's last part differs from its first by as much where nothing has changed.
@@ -62,8 +73,31 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
                       'robot': str(base) if base else 'params/robot.yaml',
                       'version': __version__}}
     made['summary'] = summary(made)
+    tables = [*grids(made), *change_grids(made['changes'])]
     return made, joint_page(log, others, models, file_servos(robot, log.joints), identified,
-                            head(made))
+                            head(made, _picture(found, log)), tables)
+
+
+def _picture(found, log):
+    """Error of the file's servos, and of the corrected ones, over the log."""
+    joints, t = np.arange(len(log.joints)), log.t - log.t[0]
+    points = [('robot file', BEFORE, found.believed)]
+    if found.accepted:
+        points.append(('with what is named', AFTER, found.point))
+    with matplotlib.rc_context(STYLE):
+        figure, axes = panels(len(joints), 1, height=1.1, sharex=True)
+        for text, colour, point in points:
+            error = simulate(log, joints, found.servos.sets(point[None])[0])[
+                :, :len(t)] - log.measured
+            for k, axis in enumerate(axes[:, 0]):
+                line(axis, t, 1e3 * error[k], color=colour, lw=0.9, label=text)
+                axis.set_ylabel(f'joint {log.joints[k]} [mrad]')
+        held_out = t[log.end_of(FITTED_PART)]
+        for axis in axes[:, 0]:
+            axis.axvspan(t[0], held_out, color='#eef3f8', lw=0)
+        axes[-1, 0].set_xlabel('time [s]; shaded: fitted, the rest is held out')
+        legend(figure, axes[0, 0])
+        return svg(figure, 'error of the servos alone over the log')
 
 
 def gap_of(found: Found, log: JointLog) -> dict:
@@ -86,7 +120,7 @@ def gap_of(found: Found, log: JointLog) -> dict:
                   f'{1e3 * after:.1f} mrad after',
         'closure': closure, 'gap_before': before / floor, 'gap_after': after / floor,
         'noise_floor': 1.0, 'effects': effects, 'partial': [],
-        'candidates': _candidates(found),
+        'candidates': _candidates(found), 'hidden': found.out_of_sight,
         'where': sorted(({'channel': f'joint_{number}', 'regime': 'log',
                           'excess': float(found.errors['believed'][k] / best[k]),
                           'excess_after': float(found.errors['corrected'][k] / best[k])}
@@ -184,16 +218,20 @@ def _parameters(found: Found, entry: Entry, point=None):
     point = found.point if point is None else point
     if entry.name == 'joint_friction':
         return _friction(found, point)
-    made, values = {}, servos.values(point)
+    made, values, believed = {}, servos.values(point), servos.values(found.believed)
     for k in np.flatnonzero(servos.mask(entry.name, entry.joint)):
         number, width = servos.numbers[k], 0.0 if other else found.widths[k] * servos.scale[k]
         ends = [values[k] * np.exp(s * width) if number.logarithmic else values[k] + s * width
                 for s in (-1, 1)]
         less = servos.delays if number.name == 'delay' else 0.0
-        made[number.name] = {'value': float(values[k] - less),
-                             'unit': CATALOGUE[entry.name].parameters[number.name].unit}
+        spec = CATALOGUE[entry.name].parameters[number.name]
+        value = float(values[k] - less)
+        made[number.name] = {'value': value, 'unit': spec.unit,
+                             'file': float(believed[k] - less)}
         if not other:
-            made[number.name]['interval'] = [float(end - less) for end in ends]
+            low, high = (float(end - less) for end in ends)
+            made[number.name]['interval'] = [max(low, min(value, spec.low)),
+                                             min(high, max(value, spec.high))]
     return made
 
 
@@ -206,9 +244,12 @@ def _friction(found, point):
     at = servos.index('stiction')
     extra = servos.values(point)[at] / servos.scale[mask] * torque
     unit = CATALOGUE['joint_friction'].parameters['coulomb'].unit
+    own = dict(zip(('coulomb', 'stiction'), (float(np.median(
+        [value[joint - 1] for joint in servos.joints])) for value in friction(servos.robot)),
+                   strict=True))
     made = {}
     for name, value in (('coulomb', force), ('stiction', force + extra)):
-        made[name] = {'value': float(np.median(value)), 'unit': unit,
+        made[name] = {'value': float(np.median(value)), 'unit': unit, 'file': own[name],
                       'interval': [max(float(np.median(value + s * width)), 0.0)
                                    for s in (-1, 1)],
                       'each': {str(servos.joints[j]): float(value[j]) for j in range(count)}}
