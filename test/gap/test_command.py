@@ -186,6 +186,21 @@ def test_a_damaged_hold_out_is_bad_data_and_not_left_out(made, tmp_path):
     assert 'bad data' in (tmp_path / 'gap.html').read_text()
 
 
+def test_each_cause_is_printed_once(made, tmp_path):
+    folders = []
+    for k in range(2):
+        folders.append(tmp_path / f'damaged{k}')
+        with BagWriter(folders[-1]) as bag:
+            for message in read_messages(made[0] / f'flight{k}'):
+                if not message.topic.endswith('imu/data_raw'):
+                    bag.write_raw(message.topic, message.type, message.data, message.received)
+    console = Console(file=StringIO(), width=300)
+    results = gap_results(folders, console=console)
+    printed = console.file.getvalue()
+    assert [row['run'] for row in results['bad_data']] == ['damaged0', 'damaged1']
+    assert printed.count('damaged1') == 1 and results['findings'] == []
+
+
 def test_the_page_begins_with_verdict_sentence_and_picture(made):
     page = (made[0] / 'gap.html').read_text()
     begin = page.index('class="verdict"')

@@ -38,6 +38,13 @@ def test_names_of_sensors_are_spelled_as_people_do():
     assert text.startswith('IMU accelerometer bias or MoCap misalignment of')
 
 
+def test_bad_data_says_the_first_cause_and_counts_the_others():
+    told = {'verdict': 'bad_data', 'reason': 'a: imu/data_raw: degrees per second?',
+            'bad_data': [{}, {}]}
+    assert summary(told) == 'a: imu/data_raw: degrees per second? 1 more fault is listed below.'
+    assert summary({**told, 'reason': 'a: cut', 'bad_data': [{}]}) == 'a: cut.'
+
+
 def test_the_headline_tells_joints_apart():
     two = [effect(['joint_offset'], 0.01, [0.0, 0.02], 0.0, 'rad', joint=k) for k in (3, 1)]
     assert headline(made(*two)) == 'named: joint_offset 3, joint_offset 1'

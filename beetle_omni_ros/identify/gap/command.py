@@ -102,7 +102,7 @@ def _analysed(runs, holdout, robot, p, fix, progress):
     unusable = [flight for flight in flights if isinstance(flight, UnusableFlight)]
     if unusable:
         # A verdict about the other flights would pass for one about all that were given.
-        return Analysis('bad_data', str(unusable[0]), findings=[str(f) for f in unusable[1:]],
+        return Analysis('bad_data', str(unusable[0]),
                         damages=[damage for f in unusable for damage in f.problems])
     fitted, judging = flights[:len(runs)], flights[len(runs):]
     if not judging and len(fitted) > LEAST_FITTED:

@@ -22,7 +22,11 @@ def summary(made: dict) -> str:
 
 
 def _bad_data(made):
-    return made['reason'] + '.'
+    text = made['reason'] if made['reason'].endswith('?') else f'{made["reason"]}.'
+    further = len(made['bad_data']) - 1
+    if further > 0:
+        text += f' {further} more {"fault is" if further == 1 else "faults are"} listed below.'
+    return text
 
 
 def _no_gap(made):
