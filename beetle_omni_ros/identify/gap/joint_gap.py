@@ -58,8 +58,8 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
     found = Search(log, robot).run()
     models = identify_joints(log, robot.joints)
     identified = joint_results(log, others, models, robot.joints, file_servos(robot, log.joints))
-    made = gap_of(found, log)
     joints = identified['joints']
+    made = gap_of(found, log, joints)
     for k, joint in enumerate(joints):
         joint['file_heldout_rms_rad'] = float(found.errors['believed'][k])
         joint['corrected_heldout_rms_rad'] = float(found.errors['corrected'][k])
@@ -100,26 +100,38 @@ def _picture(found, log):
         return svg(figure, 'error of the servos alone over the log')
 
 
-def gap_of(found: Found, log: JointLog) -> dict:
+def gap_of(found: Found, log: JointLog, apart: list[dict] | tuple = ()) -> dict:
     """
     Verdict, effects and errors of a search, as INTERFACES lays them out.
 
     Args:
         found: by the search.
         log: that was searched.
+        apart: each joint identified by itself, as ``identify joint`` has it, for what no servo
+            that all joints share explains.
 
     """
     effects = _effects(found)
     best = np.minimum(found.errors['free'], found.errors['corrected'])
+    if apart:
+        best = np.minimum(best, [joint['heldout_rms_rad'] for joint in apart])
+    allowed = np.hypot(AS_WELL * best, found.tolerated)
     before, after, floor = (_rms(e) for e in (found.errors['believed'],
                                               found.errors['corrected'], best))
     closure = _closure(before, after, floor)
+    reason = (f'error on the held-out part {1e3 * before:.1f} mrad before, '
+              f'{1e3 * after:.1f} mrad after')
+    partial, different = [], int(np.argmax(found.errors['corrected'] / allowed))
+    if apart and found.errors['corrected'][different] > allowed[different]:
+        # What all joints share is no explanation of one that differs from them.
+        effects, partial = [], effects
+        reason = _different(apart, different, found.errors['corrected'][different])
+        after, closure = before, _closure(before, before, floor)
     return {
-        'verdict': _verdict(found, effects, best),
-        'reason': f'error on the held-out part {1e3 * before:.1f} mrad before, '
-                  f'{1e3 * after:.1f} mrad after',
+        'verdict': _verdict(found, effects, allowed),
+        'reason': reason,
         'closure': closure, 'gap_before': before / floor, 'gap_after': after / floor,
-        'noise_floor': 1.0, 'effects': effects, 'partial': [],
+        'noise_floor': 1.0, 'effects': effects, 'partial': partial,
         'candidates': _candidates(found), 'hidden': found.out_of_sight,
         'where': sorted(({'channel': f'joint_{number}', 'regime': 'log',
                           'excess': float(found.errors['believed'][k] / best[k]),
@@ -132,7 +144,23 @@ def gap_of(found: Found, log: JointLog) -> dict:
         'regimes': {}, 'held_out': True, 'findings': []}
 
 
-def _verdict(found, effects, best):
+def _different(joints, k, error):
+    """Why one joint is not explained by what all share, with the numbers that differ."""
+    own, others = joints[k], [joint for joint in joints if joint is not joints[k]]
+    told = []
+    for term, text, factor, unit in (('natural_frequency', 'natural frequency', 1.0, 'rad/s'),
+                                     ('damping_ratio', 'damping ratio', 1.0, ''),
+                                     ('delay', 'delay', 1e3, 'ms')):
+        usual = np.median([joint['terms'][term]['value'] for joint in others]) if others else 0.0
+        told.append(f'{text} {factor * own["terms"][term]["value"]:.3g}'
+                    + (f' against {factor * usual:.3g}' if others else '')
+                    + (f' {unit}' if unit else ''))
+    return (f'joint {own["joint"]} is off by {1e3 * error:.1f} mrad with what all joints share '
+            f'and by {1e3 * own["heldout_rms_rad"]:.1f} mrad fitted by itself: its servo differs '
+            f'from the others ({", ".join(told)})')
+
+
+def _verdict(found, effects, allowed):
     """
     What the search means.
 
@@ -141,7 +169,6 @@ def _verdict(found, effects, best):
     """
     if effects:
         return 'named_set' if any(len(e['names']) > 1 for e in effects) else 'named'
-    allowed = np.hypot(AS_WELL * best, found.tolerated)
     return 'no_gap' if (found.errors['believed'] <= allowed).all() else 'unknown'
 
 
