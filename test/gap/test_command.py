@@ -167,6 +167,16 @@ def test_the_same_recording_twice_is_refused_under_any_name(made, tmp_path, caps
         assert 'the same recording twice' in error and str(other) in error
 
 
+def test_a_part_of_a_fitted_flight_is_no_flight_held_out(made, tmp_path, capsys):
+    part = tmp_path / 'part'
+    with BagWriter(part) as bag:
+        for message in read_messages(made[0] / 'flight0'):
+            if message.received > 2.0:
+                bag.write_raw(message.topic, message.type, message.data, message.received)
+    assert cli.main(['gap', str(made[0] / 'flight0'), '--holdout', str(part)]) == 2
+    assert 'the same flight in two recordings' in capsys.readouterr().err
+
+
 def test_a_damaged_hold_out_is_bad_data_and_not_left_out(made, tmp_path):
     damaged = tmp_path / 'damaged'
     with BagWriter(damaged) as bag:

@@ -45,6 +45,13 @@ def test_bad_data_says_the_first_cause_and_counts_the_others():
     assert summary({**told, 'reason': 'a: cut', 'bad_data': [{}]}) == 'a: cut.'
 
 
+def test_what_explains_a_part_is_said_once():
+    told = {'verdict': 'unknown', 'reason': 'joint_4 is off, also with centre_of_mass',
+            'partial': [{'names': ['centre_of_mass']}]}
+    assert summary(told).endswith('also with centre_of_mass.')
+    assert 'Wind would explain a part' in summary({**told, 'partial': [{'names': ['wind']}]})
+
+
 def test_the_headline_tells_joints_apart():
     two = [effect(['joint_offset'], 0.01, [0.0, 0.02], 0.0, 'rad', joint=k) for k in (3, 1)]
     assert headline(made(*two)) == 'named: joint_offset 3, joint_offset 1'

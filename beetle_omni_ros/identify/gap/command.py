@@ -10,7 +10,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from beetle_omni_ros.identify.gap.analysis import analyse, Analysis
 from beetle_omni_ros.identify.gap.apply import write_corrected
 from beetle_omni_ros.identify.gap.forks import forked
-from beetle_omni_ros.identify.gap.given import check_apart
+from beetle_omni_ros.identify.gap.given import check_apart, check_flights
 from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
 from beetle_omni_ros.identify.gap.joint_changes import change_grids
 from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log
@@ -104,6 +104,7 @@ def _analysed(runs, holdout, robot, p, fix, progress):
         # A verdict about the other flights would pass for one about all that were given.
         return Analysis('bad_data', str(unusable[0]),
                         damages=[damage for f in unusable for damage in f.problems])
+    check_flights([*runs, *holdout], flights)
     fitted, judging = flights[:len(runs)], flights[len(runs):]
     if not judging and len(fitted) > LEAST_FITTED:
         fitted, judging = fitted[:-1], fitted[-1:]

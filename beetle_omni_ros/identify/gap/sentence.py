@@ -44,7 +44,8 @@ def _named(made):
 
 
 def _unknown(made):
-    partial = [' or '.join(e['names']) for e in made.get('partial') or []]
+    partial = [' or '.join(e['names']) for e in made.get('partial') or []
+               if e['names'][0] not in made['reason']]
     tried = f' {_capital(listed(partial))} would explain a part.' if partial else ''
     return f'No known effect explains the disagreement: {made["reason"]}.{tried}'
 

@@ -66,8 +66,9 @@ def decide(a: Analysis, p: GapParameters) -> None:
                 or repeats and part > p.remainder_share or a.loud:
             a.verdict, a.partial = 'unknown', list(found.accepted)
             rest = strange or (a.loud[0].text if a.loud else a.rest.text)
-            a.reason = (f'{found.accepted[0].candidate.name} and its like explain '
-                        f'{explained:.0%} of what known effects could; the rest: {rest}')
+            known = ', '.join(dict.fromkeys(t.candidate.name for t in found.accepted))
+            a.reason = (f'{rest}, also with {known} ({explained:.0%} of what known effects could '
+                        'explain)')
             found.accepted.clear()
         elif max(names) >= p.crowd or (share > p.most_hidden and max(names) > 1):
             a.verdict = 'not_decidable'
