@@ -15,6 +15,8 @@ MANY_POSES = 20  # above, only the summary is shown
 ABSENT = '–'
 LONGEST_TITLE = 78      # that stands on one line of a terminal
 PUBLISHED = ' class="published"'
+LONG = ' class="long"'
+LONGEST_CELL = 45       # characters that stand on one line of a page
 
 ERROR_ROWS = (  # text, path in the metrics, digits
     ('U position, mean [m]', 'mean.U_position_m', 4),
@@ -279,7 +281,8 @@ def html(grid: Grid) -> str:
     """One table as HTML."""
     def cell(tag, text, row, column):
         faint = row in grid.faint or column in grid.faint_columns
-        return f'<{tag}{PUBLISHED if faint else ""}>{escape(text)}</{tag}>'
+        sort = PUBLISHED if faint else LONG if len(text) > LONGEST_CELL else ''
+        return f'<{tag}{sort}>{escape(text)}</{tag}>'
 
     head = ''.join(cell('th', text, None, k) for k, text in enumerate(grid.header))
     body = ''.join(

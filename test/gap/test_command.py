@@ -193,7 +193,8 @@ def test_a_damaged_hold_out_is_bad_data_and_not_left_out(made, tmp_path):
     assert (row['run'], row['topic']) == ('damaged', 'imu/data_raw')
     assert 'damaged' in results['summary']
     assert console.file.getvalue().count(results['summary']) == 1
-    assert 'bad data' in (tmp_path / 'gap.html').read_text()
+    page = (tmp_path / 'gap.html').read_text()
+    assert 'bad data' in page and page.index('class="said"') < page.index('<img')
 
 
 def test_each_cause_is_printed_once(made, tmp_path):

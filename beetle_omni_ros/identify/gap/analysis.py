@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from beetle_omni_ros.identify.gap.absolute import ceilings, Loud, too_loud
+from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.certainty import (
@@ -76,6 +77,7 @@ class Analysis:
         damages: what is wrong with the recordings.
         unseen: what acts in a regime alone (limits, friction, play, the ground) that these flights
             would not show, where no gap is found.
+        damaged: the recording of the first of ``damages``, and that damage, for the page.
         loud: channels beyond what sensors and gusts may make, with everything that was found.
 
     """
@@ -102,6 +104,7 @@ class Analysis:
     damages: list[Damage] = field(default_factory=list)
     loud: list[Loud] = field(default_factory=list)
     unseen: list[str] = field(default_factory=list)
+    damaged: tuple[Recording, Damage] | None = None
 
     @property
     def accepted(self) -> list[Trial]:

@@ -36,6 +36,16 @@ def check_apart(runs: list[Path]) -> None:
         known[size, digest] = run
 
 
+def names_of(runs: list[Path]) -> list[str]:
+    """As much of each path, from its end, as tells the recordings apart."""
+    paths = [run.absolute().parts for run in runs]
+    for depth in range(1, max((len(parts) for parts in paths), default=1) + 1):
+        names = ['/'.join(parts[-depth:]) for parts in paths]
+        if len(set(names)) == len(names):
+            break
+    return names
+
+
 def check_flights(runs: list[Path], flights: list[Flight]) -> None:
     """
     Refuse one flight in two recordings, whose files differ: cut, converted or recorded twice.

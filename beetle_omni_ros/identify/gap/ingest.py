@@ -78,7 +78,7 @@ class Flight:
 
 
 def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
-                fix: bool = False) -> Flight:
+                fix: bool = False, name: str = '') -> Flight:
     """
     Read and check one recording.
 
@@ -87,13 +87,16 @@ def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
         robot: as believed.
         p: parameters.
         fix: whether corrections that are certain are applied to what was read.
+        name: by which it is spoken of; default: that of its folder.
 
     Raises:
         BagError: no such bag, or no recording of this robot.
         UnusableFlight: naming the recording and what is wrong with it.
 
     """
-    return prepare(read_recording(path), robot, p, fix)
+    recording = read_recording(path)
+    recording.name = name or recording.name
+    return prepare(recording, robot, p, fix)
 
 
 def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,

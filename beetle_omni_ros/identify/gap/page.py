@@ -12,6 +12,7 @@ from beetle_omni_ros.identify.gap.results import _evidence, CANDIDATES, grids, h
 from beetle_omni_ros.identify.gap.rollouts import STATES
 from beetle_omni_ros.identify.gap.rollouts import UNITS as STATE_UNITS
 from beetle_omni_ros.identify.page import page, verdict_head
+from beetle_omni_ros.identify.recording.picture import damage_figure
 from beetle_omni_ros.runs.figures import COLOURS, FAINT, legend, line, panels, STYLE, svg
 from beetle_omni_ros.runs.report_page import section
 from beetle_omni_ros.runs.table import Grid, html
@@ -83,7 +84,10 @@ def head(made: dict, picture: str = '') -> str:
 
 
 def _picture(a):
-    """Free runs before and after, or nothing where there are none."""
+    """Free runs before and after, or the readings that are wrong; '' where there are neither."""
+    if a.damaged is not None:
+        with matplotlib.rc_context(STYLE):
+            return svg(damage_figure(*a.damaged), 'the readings in question')
     if not a.runs:
         return ''
     with matplotlib.rc_context(STYLE):
