@@ -361,6 +361,7 @@ def _wrapped(text: str) -> str:
 def effects() -> str:
     """The catalogue of effects."""
     from beetle_omni_ros.robot.effects import CATALOGUE
+    from beetle_omni_ros.sim.effects import BUILT_IN, FORCES
     text = [f'# Effects\n\n{MADE}\n'
             'An effect is a term that reality may add to the model. A robot file switches an '
             'effect on by naming\nit under `effects:`, for example `effects: {thrust_coefficient: '
@@ -368,8 +369,9 @@ def effects() -> str:
             '*Typical* is a realistic deviation from the neutral value. *Smallest* is the '
             'smallest deviation\nworth naming. Where the neutral value is the number of the robot '
             'file, both are fractions of it.\n\n'
-            + table(['effect', 'layer', 'acts through'],
-                    [[f'[{name}](#{name})', entry.layer, _acts(name, entry)]
+            + table(['effect', 'layer', 'acts through', 'the MuJoCo plant'],
+                    [[f'[{name}](#{name})', entry.layer, _acts(name, entry),
+                      'has it' if name in BUILT_IN + FORCES else 'refuses it']
                      for name, entry in CATALOGUE.items()])]
     for name, entry in CATALOGUE.items():
         rows = [[f'`{key}`', spec.unit, _neutral(spec.neutral),

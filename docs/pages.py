@@ -66,7 +66,7 @@ def paragraphs(text: str) -> Iterator[Line]:
 def sentences(text: str) -> Iterator[Line]:
     """Sentences with the line on which their paragraph begins."""
     for number, paragraph in paragraphs(text):
-        plain = _CODE.sub('code', _LINK.sub(lambda link: link[1], paragraph))
+        plain = _CODE.sub('Code', _LINK.sub(lambda link: link[1], paragraph))
         for short in ABBREVIATIONS:
             plain = plain.replace(short, short.replace('.', ''))
         for sentence in _END.split(plain):
