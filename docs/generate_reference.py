@@ -338,9 +338,11 @@ def command_line() -> str:
     from beetle_omni_ros.cli import app
     text = [f'# Command line\n\n{MADE}\n'
             '`beetle_omni` is also `ros2 run beetle_omni_ros beetle_omni`. Each subcommand has '
-            '`--help`. The exit\nstatus is 0 for success, 1 for a failed flight or check, 2 for '
-            'unusable input with one line on\nstandard error, and 130 for an interruption. '
-            '`gap` ends with 3 for the verdict `bad_data`.\n']
+            '`--help`.\n\n'
+            + table(['exit status', 'meaning'], [
+                ['0', 'success'], ['1', 'a flight or a check failed'],
+                ['2', 'unusable input; one line on standard error'],
+                ['3', '`gap`: the verdict `bad_data`'], ['130', 'interrupted']])]
     for name, command in _commands(get_command(app), 'beetle_omni'):
         told = (command.help or '').replace('\b', '').strip()
         paragraphs = [' '.join(part.split()) for part in told.split('\n\n')]
