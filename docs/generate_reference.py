@@ -275,17 +275,17 @@ def topics() -> str:
     missing = sorted(set(graph) ^ set(MEANINGS))
     if missing:
         raise SystemExit(f'MEANINGS and the nodes differ in {", ".join(missing)}')
-    rows = [[f'`{topic}`', graph[topic]['type'],
-             ', '.join(f'`{node}`' if node != 'every node' else node
-                       for node in graph[topic]['from']) or 'the MoCap or IMU driver, a user',
-             ', '.join(f'`{node}`' for node in graph[topic]['to']),
-             QOS.get(graph[topic]['qos'], ''), meaning] for topic, meaning in MEANINGS.items()]
+    said = [[f'`{topic}`', graph[topic]['type'], meaning] for topic, meaning in MEANINGS.items()]
+    ends = [[f'`{topic}`', *(', '.join(f'`{node}`' if node != 'every node' else node
+                                       for node in graph[topic][way]) for way in ('from', 'to')),
+             QOS.get(graph[topic]['qos'], '')] for topic in MEANINGS]
     return (f'# Topics\n\n{MADE}\n'
             'Names are relative; a launch argument sets a namespace. On the robot the drivers of '
             'MoCap and IMU\npublish what `sim_node` publishes in the simulation. `recorder_node` '
             'subscribes to every topic\nof a bag, and `viewer_node` publishes for viewers.\n\n'
-            + table(['topic', 'type', 'published by', 'subscribed by', 'quality of service',
-                     'meaning'], rows)
+            + table(['topic', 'type', 'meaning'], said)
+            + '\n## Publishers and subscribers\n\n'
+            + table(['topic', 'published by', 'subscribed by', 'quality of service'], ends)
             + '\n## Frames and conventions\n\n'
             '- Units are SI, angles are radians, times are seconds.\n'
             '- Axes follow REP-103: x forward, y left, z up. `world` is the frame of the MoCap, '
