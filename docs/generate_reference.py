@@ -181,7 +181,7 @@ def parameters() -> str:
             'The files of `params/` hold the values below. A comment beside each number says '
             'where it comes from.\nA value outside its range and an unknown key are refused. '
             'In ROS, `ros2 param describe` shows unit\nand range. '
-            '[The nodes](nodes.md#parameters) says which file or argument overrides which.\n']
+            '[The nodes](nodes.md#parameters) says which source overrides which.\n']
     seen: dict[str, str] = {}
     for name, (kind, what) in FILES.items():
         text.append(f'\n## {name}\n\n{what}\n\n')
