@@ -178,8 +178,8 @@ def _undeclared(name: str) -> list[list[str]]:
 def parameters() -> str:
     """Every parameter of every shipped file."""
     text = [f'# Parameters\n\n{MADE}\n'
-            'The files of `params/` hold the values below. A comment beside each number says '
-            'where it comes from.\nA value outside its range and an unknown key are refused. '
+            'The files of `params/` hold the values below. A comment beside each number gives '
+            'its source.\nA value outside its range and an unknown key are refused. '
             'In ROS, `ros2 param describe` shows unit\nand range. '
             '[The nodes](nodes.md#parameters) says which source overrides which.\n']
     seen: dict[str, str] = {}
