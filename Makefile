@@ -12,7 +12,7 @@ unexport LD_LIBRARY_PATH
 endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONHOME VIRTUAL_ENV
 
-.PHONY: help setup setup-train fly test lint evaluate compare faults gap report clean
+.PHONY: help setup setup-train fly test lint docs evaluate compare faults gap report clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1|/p' Makefile | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -32,6 +32,12 @@ test: setup-train  ## the whole test suite
 
 lint: setup  ## style of every Python file
 	@.venv/bin/ruff check .
+
+docs: setup  ## reference pages from the code, then the site with all links checked; to build/site/
+	@.venv/bin/python -c 'import material' 2>/dev/null || \
+	    .venv/bin/python -m pip install --quiet --editable '.[docs]'
+	.venv/bin/python docs/generate_reference.py
+	.venv/bin/python -m mkdocs build --strict
 
 evaluate: setup  ## 100 random poses, in one process and faster than real time
 	@mkdir -p runs_out

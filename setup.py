@@ -95,6 +95,12 @@ TEST = [
     'pytest-xdist>=3.3',
 ]
 
+# The site of docs/ (`make docs`); no test needs it.
+DOCS = [
+    'mkdocs==1.6.1',
+    'mkdocs-material==9.8.2',
+]
+
 DEVELOPMENT = [
     *TEST,
     'colcon-common-extensions>=0.3',
@@ -125,6 +131,7 @@ setup(
         'train': TRAIN,
         'ray': RAY,
         'test': TEST,
+        'docs': DOCS,
         'dev': DEVELOPMENT,
     },
     entry_points={

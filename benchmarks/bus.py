@@ -34,7 +34,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters  # noqa: E402
 
 PERIOD = 0.005          # [s]
 POLL_TICKS = 2          # of the motor board, as rotor_bridge_node does
-# What both bridges together may need is 30 %; see docs/nodes.md for the nodes around the drivers.
+# What both bridges together may need is 30 %; benchmarks/graph.py has the nodes.
 TARGETS = {'to last byte [ms]': 'p99 2', 'missed cycles': '0', 'CPU [%]': '15'}
 FAULTS = (('servo 3 silent from 1 s to 2 s', 'silent 3', 'silent'),
           ('all silent from 1 s to 2 s', 'silent 1 2 3 4', 'silent'),

@@ -24,7 +24,9 @@ from rich.table import Table
 from beetle_omni_ros.identify.gap.apply import effects_with
 from beetle_omni_ros.identify.gap.joint_gap import gap_of
 from beetle_omni_ros.identify.gap.joint_search import Search
+from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
+from beetle_omni_ros.identify.joint_results import joint_results
 from beetle_omni_ros.identify.joint_servos import believed_sets
 from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -36,8 +38,9 @@ KINDS = ('nothing', 'one zero', 'two zeros', 'gains', 'delay', 'friction')
 
 
 def judged(log: JointLog, robot: RobotParameters) -> dict:
-    """Verdict and effects of a log, without the page and the tables of `identify joint`."""
-    return gap_of(Search(log, robot).run(), log)
+    """Verdict and effects of a log, without the page."""
+    apart = joint_results(log, [], identify_joints(log, robot.joints), robot.joints)['joints']
+    return gap_of(Search(log, robot).run(), log, apart)
 
 
 def corrected(robot: RobotParameters, made: dict) -> RobotParameters:

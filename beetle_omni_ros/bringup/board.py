@@ -52,7 +52,7 @@ def check_board(parameters: MotorBoardParameters, robot: RobotParameters, limits
     try:
         board.open()
     except SerialPortError as error:
-        taken = replace(port, level=FAIL, found=str(error), remedy='docs/hardware.md')
+        taken = replace(port, level=FAIL, found=str(error), remedy='docs/how-to/hardware.md')
         return bridge_findings(taken, BRIDGE, heard)
     try:
         update, receptions = _listen(board, seconds)
@@ -127,7 +127,7 @@ def _of_firmware(status):
     if status.contract != CONTRACT_VERSION:
         return Finding('board firmware', FAIL, f'contract {status.contract}, this driver speaks '
                        f'{CONTRACT_VERSION}', f'flash a firmware of contract {CONTRACT_VERSION}: '
-                       'docs/firmware.md', values)
+                       'docs/reference/firmware.md', values)
     if status.armed:
         return Finding('board firmware', WARN, f'contract {status.contract}, {status.state}: '
                        'somebody had armed it; disarmed now', 'find out who', values)
@@ -154,7 +154,7 @@ def _of_battery(battery, cells, limits: BatteryLimits):
 def _of_escs(rotors):
     if rotors is None:
         return [Finding('ESC telemetry', FAIL, 'no ESC_STATUS',
-                        'the firmware must send it: docs/firmware.md')]
+                        'the firmware must send it: docs/reference/firmware.md')]
     findings = []
     for k in range(4):
         online, faults = bool(np.isfinite(rotors.rpm[k])), ', '.join(rotors.failures[k])

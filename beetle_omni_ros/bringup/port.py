@@ -58,7 +58,8 @@ def _absent(item, path, sys_root):
     ports = usb_ports(sys_root)
     if ports:
         there = '; '.join(f'{device}: {product}' for device, product in ports.items())
-        remedy = f'is it one of these? {there}. A udev rule gives it its name: docs/hardware.md'
+        remedy = (f'is it one of these? {there}. A udev rule gives it its name: '
+                  'docs/how-to/hardware.md')
     else:
         remedy = 'no USB serial port is there at all: plug the adapter in, look at `dmesg`'
     return Finding(item, FAIL, f'{path}: no such port', remedy)
@@ -70,7 +71,7 @@ def _forbidden(item, path, status):
     found = f'{path}: no permission for {user} ({stat.filemode(status.st_mode)}, group {group})'
     wanted = stat.S_IRGRP | stat.S_IWGRP
     if status.st_mode & wanted != wanted or group == 'root':
-        remedy = 'install the udev rule of docs/hardware.md: GROUP="dialout", MODE="0660"'
+        remedy = 'install the udev rule of docs/how-to/hardware.md: GROUP="dialout", MODE="0660"'
     elif user in _members(group):
         remedy = f'{user} has joined group {group}, not yet this session: log out and in again'
     else:
@@ -171,7 +172,7 @@ def latency_finding(item: str, path: str, limit: int, sys_root: Path = SYS) -> F
     if timer <= limit:
         return Finding(item, OK, f'{timer} ms', values=values)
     return Finding(item, FAIL, f'{timer} ms: each answer waits for it', f'echo {limit} | sudo tee '
-                   f'{file}, and for good the udev rule of docs/hardware.md', values)
+                   f'{file}, and for good the udev rule of docs/how-to/hardware.md', values)
 
 
 def usb_ports(sys_root: Path = SYS) -> dict[str, str]:

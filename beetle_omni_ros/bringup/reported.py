@@ -8,8 +8,8 @@ from beetle_omni_ros.bringup.finding import FAIL, Finding, OK, WARN
 from beetle_omni_ros.bringup.heard import BRIDGES, Heard
 
 OF_DIAGNOSTICS = {0: OK, 1: WARN}       # errors and stale ones fail
-FAULTS = {'joint_bridge': 'docs/hardware.md: What happens when',
-          'rotor_bridge': 'docs/firmware.md: outcome of faults'}
+FAULTS = {'joint_bridge': 'docs/reference/hardware_faults.md: what happens when',
+          'rotor_bridge': 'docs/reference/firmware.md: outcome of faults'}
 UNUSED = ('node', 'inputs', 'compute')  # of every node; the topics themselves are judged
 
 

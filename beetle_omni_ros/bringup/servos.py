@@ -54,7 +54,7 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters, limits
         return [port, latency, *_of_bus(link, parameters, joints, limits.servos)]
     except PortLost as error:
         return [port, Finding(BUS, FAIL, f'{parameters.port}: {error}',
-                              'look at cable and adapter: docs/hardware.md')]
+                              'look at cable and adapter: docs/how-to/hardware.md')]
     finally:
         link.close()
 
@@ -173,7 +173,7 @@ def _turn(servo, look, parameters, joints, k):
         limit = certain_limit(joints.position_limit)
         return [Finding(f'{look.name} turn', FAIL, f'ambiguous: {doubts}', 'turn it by hand to '
                         f'within +-{limit:.2f} rad, cables untwisted; or set confirmed_tilts and '
-                        'confirm_tilts: docs/hardware.md', {'position_rad': look.position})]
+                        'confirm_tilts: docs/how-to/hardware.md', {'position_rad': look.position})]
     if confirmed:
         return [Finding(f'{look.name} turn', WARN, f'taken as {servo.position:+.2f} rad because '
                         'confirm_tilts is set', 'reset confirm_tilts once it is parked',

@@ -77,7 +77,8 @@ def _absent(topic, source, stream, heard):
                        'Multicast and MTU of the network, BEETLE_OMNI_DISCOVERY')
     if stream.other_types:
         return Finding(topic, FAIL, f"published as {', '.join(stream.other_types)}",
-                       f'{source} must publish the type of docs/nodes.md: set or remap it')
+                       f'{source} must publish the type of docs/reference/topics.md: '
+                       'set or remap it')
     return Finding(topic, FAIL, f'nobody publishes it in {where}',
                    f'start {source}, remap its topic, same ROS_DOMAIN_ID on all computers, and '
                    'BEETLE_OMNI_DISCOVERY=SUBNET where it runs on another one')

@@ -131,7 +131,7 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
                 '--conditions', metavar='NAME,...')] = ','.join(CONDITIONS),
             seeds: Annotated[Optional[str], typer.Option(
                 '--seeds', metavar='N,...',
-                help='Default: 0,1, and 0 for tasks of more than 300 s.')] = None,
+                help='Default: 0,1, and 0 for tasks of more than 50 s.')] = None,
             policy: PolicyOption = None,
             jobs: Annotated[Optional[int], typer.Option(
                 '--jobs', '-j', min=1, help='Flights at a time. Default: one a core.')] = None,

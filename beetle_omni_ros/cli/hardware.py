@@ -21,7 +21,7 @@ ParamsOption = Annotated[Optional[Path], typer.Option(
 
 def joint(logs: Annotated[list[Path], typer.Argument(
               metavar='LOG', help='Response log (CSV) or recorded run (bag), see '
-                                  'docs/identification.md.')],
+                                  'docs/how-to/identification.md.')],
           validate: Annotated[Optional[list[Path]], typer.Option(
               '--validate', metavar='LOG.csv...', help='Further logs, which only judge.')] = None,
           robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,
@@ -41,7 +41,7 @@ def joint(logs: Annotated[list[Path], typer.Argument(
 
 
 def rotor(log: Annotated[Path, typer.Argument(
-              metavar='LOG.csv', help='Bench log, see docs/identification.md.')],
+              metavar='LOG.csv', help='Bench log, see docs/how-to/identification.md.')],
           robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,
           json_path: JsonOption = None):
     """

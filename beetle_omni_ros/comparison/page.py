@@ -206,7 +206,7 @@ def markdown(results: dict, made: list[Section]) -> str:
     """Write the same for readers of the repository, with pictures as files beside it."""
     parts = [f'# {TITLE}\n', 'Made by `make compare`; the same with every detail is '
              '`comparison.html`, all numbers are in `comparison.json`. '
-             '[How it is made](../comparison.md).\n',
+             '[How it is made](../how-to/comparison.md).\n',
              '\n'.join(f'- {line}' for line in facts(results)) + '\n',
              '\n'.join(f'- **{term}**: {text}' for term, text in legend(results)) + '\n']
     for section in made:

@@ -3,7 +3,8 @@ The contract that a policy file carries in its metadata, free of torch and onnx.
 
 A policy is only right together with the names, order, scales, rate and robot that it was
 trained with. All of that stands in the file itself; the loader compares it with what this
-version builds and executes, and refuses a file that does not fit. See docs/policy.md.
+version builds and executes, and refuses a file that does not fit. See
+docs/reference/policy_file.md.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ NOT_SATURATED = np.zeros(4, dtype=bool)
 
 class MotorBoard:
     """
-    Driver of the motor board on a serial port; docs/firmware.md describes the other end.
+    Driver of the motor board on a serial port; docs/reference/firmware.md describes the other end.
 
     A thread reads, sends heartbeats and reconnects. :meth:`send` and :meth:`poll` never wait.
     Rotors stop 100 ms after the last target whatever happens to this process.

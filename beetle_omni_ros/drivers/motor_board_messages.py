@@ -10,7 +10,7 @@ import numpy as np
 from beetle_omni_ros.drivers.mavlink_dialect import common
 from beetle_omni_ros.drivers.mavlink_receiver import ReceiveCounts
 
-# docs/firmware.md: the bytes of HEARTBEAT.custom_mode and COMMAND_ACK.result_param2.
+# docs/reference/firmware.md: the bytes of HEARTBEAT.custom_mode and COMMAND_ACK.result_param2.
 CONTRACT_VERSION = 1
 STATES = {0: 'boot', 1: 'disarmed', 2: 'armed', 3: 'running'}
 STOP_REASONS = {0: 'none', 1: 'asked by the host', 2: 'heartbeat of the host lost',

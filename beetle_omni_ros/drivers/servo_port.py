@@ -11,7 +11,7 @@ from dynamixel_sdk import port_handler
 import serial
 
 # [ms] The SDK's default of 16 makes one missing answer cost 34 ms. The adapter must agree:
-# docs/hardware.md.
+# docs/how-to/hardware.md.
 port_handler.LATENCY_TIMER = 1
 
 

@@ -27,7 +27,7 @@ def run_identify_joint(path: Path, *, validate: list[Path] = (), robot: Path | N
     Identify the tilt servos from a response log.
 
     Args:
-        path: log, see docs/identification.md.
+        path: log, see docs/how-to/identification.md.
         validate: further logs, which only judge.
         robot: file with the published servo and its inertia; default the shipped one.
         json_path: file for the results.
@@ -72,7 +72,7 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
     Identify a rotor's map and torque ratio from a bench log.
 
     Args:
-        path: log, see docs/identification.md.
+        path: log, see docs/how-to/identification.md.
         robot: file whose map is drawn beside and extended; default the shipped one.
         json_path: file for the results.
         report: HTML page to write.

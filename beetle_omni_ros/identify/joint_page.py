@@ -60,8 +60,9 @@ def _value(term):
 
 
 def joint_page(log: JointLog, validations: list[JointLog], models: list[JointModel],
-               published: FileServos, results: dict, head: str = '') -> str:
-    """HTML page with the tables, what cannot be told, and figures of every log."""
+               published: FileServos, results: dict, head: str = '',
+               tables: list[Grid] | tuple = ()) -> str:
+    """HTML page with the tables, further ones first, what cannot be told, and figures."""
     with matplotlib.rc_context(STYLE):
         sections = []
         for k, other in enumerate([log, *validations]):
@@ -75,8 +76,8 @@ def joint_page(log: JointLog, validations: list[JointLog], models: list[JointMod
         sections.append(section('Friction and lag', 'Position error over commanded speed: a '
                                 'straight line is lag, the gap between the branches a dead band.',
                                 svg(_loops(log, models), 'position error over speed')))
-    return page('Tilt servos', f'identified from {log.name}', grids(results), results['text'],
-                sections, head)
+    return page('Tilt servos', f'identified from {log.name}', [*tables, *grids(results)],
+                results['text'], sections, head)
 
 
 def _pairs(log, models):

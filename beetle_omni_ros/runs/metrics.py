@@ -2,7 +2,7 @@
 Metrics of one flight, as ``evaluate --json`` and ``fly --json`` hold them.
 
 A pose lasts 8 s. U, the mean error over 7.0 to 7.5 s, says how accurate the hover is; L,
-the mean over 1.0 to 7.0 s, how fast it was reached (docs/metrics.md). The same function
+the mean over 1.0 to 7.0 s, how fast it was reached (docs/reference/metrics.md). The same function
 judges a flight in memory and one read back from its bag.
 """
 

@@ -39,6 +39,7 @@ th { color: var(--faint); font-weight: 500; border-bottom: 1px solid var(--ink);
 th, td { padding: 5px 14px 5px 0; text-align: right; vertical-align: bottom; }
 th:first-child, td:first-child { text-align: left; }
 td { border-bottom: 1px solid var(--line); white-space: nowrap; }
+td.long { white-space: normal; min-width: 16em; }
 td.published, th.published { color: #98a1ab; }
 tr:hover td { background: var(--wash); }
 .faults td, .faults th { text-align: left; white-space: normal; }

@@ -13,7 +13,10 @@ from beetle_omni_ros.runs import published
 
 MANY_POSES = 20  # above, only the summary is shown
 ABSENT = '–'
+LONGEST_TITLE = 78      # that stands on one line of a terminal
 PUBLISHED = ' class="published"'
+LONG = ' class="long"'
+LONGEST_CELL = 45       # characters that stand on one line of a page
 
 ERROR_ROWS = (  # text, path in the metrics, digits
     ('U position, mean [m]', 'mean.U_position_m', 4),
@@ -248,7 +251,8 @@ def print_grids(shown: list[Grid], console: Console) -> None:
 
 def _rich(grid):
     table = Table(title=Text(grid.title), title_justify='left', title_style='', box=None,
-                  header_style='dim', padding=(0, 2, 0, 0))
+                  min_width=min(len(grid.title), LONGEST_TITLE), header_style='dim',
+                  padding=(0, 2, 0, 0))
     for k, name in enumerate(grid.header):
         table.add_column(Text(name), justify='left' if k == 0 else 'right', overflow='fold',
                          no_wrap=k == 0, style='dim' if k in grid.faint_columns else None)
@@ -277,7 +281,8 @@ def html(grid: Grid) -> str:
     """One table as HTML."""
     def cell(tag, text, row, column):
         faint = row in grid.faint or column in grid.faint_columns
-        return f'<{tag}{PUBLISHED if faint else ""}>{escape(text)}</{tag}>'
+        sort = PUBLISHED if faint else LONG if len(text) > LONGEST_CELL else ''
+        return f'<{tag}{sort}>{escape(text)}</{tag}>'
 
     head = ''.join(cell('th', text, None, k) for k, text in enumerate(grid.header))
     body = ''.join(

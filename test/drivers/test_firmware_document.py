@@ -1,4 +1,4 @@
-"""docs/firmware.md shows the packets that are tested and the numbers that are emulated."""
+"""docs/reference/firmware.md shows the tested packets and the emulated numbers."""
 
 from pathlib import Path
 import re
@@ -9,7 +9,7 @@ import reference_packets as reference
 from beetle_omni_ros.sim.emulated import board_firmware, mavlink
 from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
 
-DOCUMENT = (Path(__file__).resolve().parents[2] / 'docs' / 'firmware.md').read_text()
+DOCUMENT = (Path(__file__).resolve().parents[2] / 'docs' / 'reference' / 'firmware.md').read_text()
 
 
 def test_the_packets_shown_are_the_packets_tested():

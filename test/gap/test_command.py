@@ -144,6 +144,19 @@ def test_what_is_no_recording_of_this_robot_is_one_line_and_status_2(made, words
     assert words in capsys.readouterr().err
 
 
+def test_another_robot_with_the_same_sensors_is_no_recording_of_this_one(made, tmp_path, capsys):
+    other = tmp_path / 'other'
+    with BagWriter(other) as bag:
+        for message in read_messages(made[0] / 'flight0'):
+            data = bytes(message.data)      # names of the same length keep the layout
+            for own, strange in ((b'gimbal', b'swivel'), (b'rotor', b'motor')):
+                data = data.replace(own, strange)
+            bag.write_raw(message.topic, message.type, data, message.received)
+    assert cli.main(['gap', str(other)]) == 2
+    error = capsys.readouterr().err
+    assert 'no recording of this robot' in error and 'swivel1' in error and 'gimbal1' in error
+
+
 def test_the_same_recording_twice_is_refused_under_any_name(made, tmp_path, capsys):
     flight = made[0] / 'flight0'
     (tmp_path / 'link').symlink_to(flight)
@@ -152,6 +165,16 @@ def test_the_same_recording_twice_is_refused_under_any_name(made, tmp_path, caps
         assert cli.main(['gap', str(flight), '--holdout', str(other)]) == 2
         error = capsys.readouterr().err
         assert 'the same recording twice' in error and str(other) in error
+
+
+def test_a_part_of_a_fitted_flight_is_no_flight_held_out(made, tmp_path, capsys):
+    part = tmp_path / 'part'
+    with BagWriter(part) as bag:
+        for message in read_messages(made[0] / 'flight0'):
+            if message.received > 2.0:
+                bag.write_raw(message.topic, message.type, message.data, message.received)
+    assert cli.main(['gap', str(made[0] / 'flight0'), '--holdout', str(part)]) == 2
+    assert 'the same flight in two recordings' in capsys.readouterr().err
 
 
 def test_a_damaged_hold_out_is_bad_data_and_not_left_out(made, tmp_path):
@@ -170,7 +193,23 @@ def test_a_damaged_hold_out_is_bad_data_and_not_left_out(made, tmp_path):
     assert (row['run'], row['topic']) == ('damaged', 'imu/data_raw')
     assert 'damaged' in results['summary']
     assert console.file.getvalue().count(results['summary']) == 1
-    assert 'bad data' in (tmp_path / 'gap.html').read_text()
+    page = (tmp_path / 'gap.html').read_text()
+    assert 'bad data' in page and page.index('class="said"') < page.index('<img')
+
+
+def test_each_cause_is_printed_once(made, tmp_path):
+    folders = []
+    for k in range(2):
+        folders.append(tmp_path / f'damaged{k}')
+        with BagWriter(folders[-1]) as bag:
+            for message in read_messages(made[0] / f'flight{k}'):
+                if not message.topic.endswith('imu/data_raw'):
+                    bag.write_raw(message.topic, message.type, message.data, message.received)
+    console = Console(file=StringIO(), width=300)
+    results = gap_results(folders, console=console)
+    printed = console.file.getvalue()
+    assert [row['run'] for row in results['bad_data']] == ['damaged0', 'damaged1']
+    assert printed.count('damaged1') == 1 and results['findings'] == []
 
 
 def test_the_page_begins_with_verdict_sentence_and_picture(made):

@@ -195,6 +195,17 @@ def test_an_effect_of_one_sign_stays_on_its_side(name):
     assert KEYS[name].low == 0.0 < KEYS[name].high
 
 
+def test_an_effect_that_only_the_file_has_may_fall_to_nothing():
+    own = all_keys(replace(ROBOT, effects={'rotor_drag': {'coefficient': 0.8}}))
+    key = 'rotor_drag.coefficient'
+    gone = Trial(Candidate('rotor_drag', (key,), label='gone'), 100.0, {key: own[key].low})
+    assert own[key].value(own[key].low) == 0.0 and not at_bound(own, gone)
+    weak = 'rotor_thrust_coefficient.scale[0]'
+    dead = Trial(Candidate('rotor_thrust_coefficient', (weak,), label='x'), 1.0,
+                 {weak: KEYS[weak].low})
+    assert at_bound(KEYS, dead)
+
+
 def test_a_reading_may_be_younger_than_the_robot_file_says():
     late = all_keys(replace(ROBOT, effects={'joint_feedback_delay': {'delay': 0.01}}))
     key = 'joint_feedback_delay.delay'

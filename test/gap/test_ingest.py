@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
-from flights import Motion, P, ROBOT
+from flights import model, Motion, P, ROBOT
 import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.bags import Recording
+from beetle_omni_ros.identify.gap.filters import LEAST_SAMPLES, shortest_flight
 from beetle_omni_ros.identify.gap.ingest import load_flight, prepare, UnusableFlight
+from beetle_omni_ros.identify.gap.noise import Noise
+from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.runs.bag_reader import BagError
 
 
@@ -26,6 +29,7 @@ def refused(made, *words):
         prepare(made, ROBOT, P)
     text = str(error.value)
     assert '\n' not in text and text.startswith('case: ')
+    assert error.value.problems and all(d.topic and d.cause for d in error.value.problems)
     for word in words:
         assert word in text
 
@@ -62,6 +66,10 @@ def test_long_silence_of_a_sensor_is_refused_and_short_silence_is_cut_around():
     made = recording()
     t = made.times['imu/data_raw']
     refused(cut(made, 'imu/data_raw', (t < 5) | (t > 9)), 'imu/data_raw', 'silent')
+    with pytest.raises(UnusableFlight) as error:
+        prepare(made, ROBOT, P)
+    silence, = error.value.problems
+    assert silence.topic == 'imu/data_raw' and silence.at_s == pytest.approx(5.0, abs=0.02)
     made = recording(24.0)
     t = made.times['joint_states']
     flight = prepare(cut(made, 'joint_states', (t < 6) | (t > 6.4)), ROBOT, P)
@@ -73,6 +81,21 @@ def test_a_recording_too_short_to_judge_is_refused():
     for topic, t in made.times.items():
         cut(made, topic, t < 4)
     refused(made, 's of usable flight')
+
+
+def test_what_is_too_short_for_the_filters_is_refused_whatever_is_allowed():
+    p = GapParameters.load(least_duration=3.0)
+    made = recording()
+    for topic, t in made.times.items():
+        cut(made, topic, t < 4)
+    with pytest.raises(UnusableFlight, match='s of usable flight'):
+        prepare(made, ROBOT, p)
+    made = recording()
+    for topic, t in made.times.items():
+        cut(made, topic, t < shortest_flight(p) + 0.5)
+    residual = model(prepare(made, ROBOT, p)).residual({})
+    assert min(len(values) for values in residual.values()) >= LEAST_SAMPLES
+    Noise.of([residual], p).whiten(residual)
 
 
 def test_a_robot_that_stays_on_the_ground_is_no_flight():

@@ -114,10 +114,9 @@ def test_a_module_may_be_heavier_about_its_joint_than_the_servo_says():
     assert abs(tolerances(P)['swing.ratio'].residual(0.25)) > 2
 
 
-@pytest.mark.parametrize('loss, kept', [(3.0, 0), (300.0, 1)])
-def test_an_only_step_goes_too_if_the_fit_does_not_miss_it(monkeypatch, loss, kept):
-    trial = Trial(Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag'), 99.0,
-                  {'rotor_drag.coefficient': 0.4})
+def pruned(monkeypatch, name, value, loss):
+    """How many entries are left of one that a fit lacks by ``loss`` of chi2."""
+    trial = Trial(Candidate(name.split('.')[0], (name,), label=name), 99.0, {name: value})
     search = Search.__new__(Search)
     search.p = P
     search.problem = type('Problem', (), {'keys': KEYS, 'beliefs': {},
@@ -129,7 +128,17 @@ def test_an_only_step_goes_too_if_the_fit_does_not_miss_it(monkeypatch, loss, ke
     monkeypatch.setattr(search, '_settle', lambda theta, rest: (state, 100.0), raising=False)
     found = Found(accepted=[trial])
     search._prune(found, state, 100.0)
-    assert len(found.accepted) == kept
+    return len(found.accepted)
+
+
+@pytest.mark.parametrize('loss, kept', [(3.0, 0), (300.0, 1)])
+def test_an_only_step_goes_too_if_the_fit_does_not_miss_it(monkeypatch, loss, kept):
+    assert pruned(monkeypatch, 'rotor_drag.coefficient', 0.4, loss) == kept
+
+
+@pytest.mark.parametrize('value, kept', [(0.004, 1), (-0.012, 0)])
+def test_what_the_fit_of_all_together_makes_impossible_is_dropped(monkeypatch, value, kept):
+    assert pruned(monkeypatch, 'joint_feedback_delay.delay', value, 300.0) == kept
 
 
 def test_each_rotor_may_have_a_lag_of_its_own():

@@ -14,7 +14,7 @@ from beetle_omni_ros.identify.fitting import Noise
 from beetle_omni_ros.identify.gap.apply import effects_with
 from beetle_omni_ros.identify.gap.joint_changes import changes, line
 from beetle_omni_ros.identify.gap.joint_fit import StackFitter
-from beetle_omni_ros.identify.gap.joint_gap import gap_of
+from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log, gap_of
 from beetle_omni_ros.identify.gap.joint_search import Search
 from beetle_omni_ros.identify.gap.keys import all_keys
 from beetle_omni_ros.identify.gap.keys import friction as friction_of
@@ -119,6 +119,12 @@ def test_a_log_of_the_files_own_servos_has_no_gap():
     assert result['gap_before'] == pytest.approx(1.0, abs=0.3)
 
 
+def test_limits_that_a_log_does_not_meet_are_listed_and_the_rest_would_have_shown():
+    hidden = judged(made(3))['hidden']
+    assert 'joint_torque_limit' in hidden
+    assert not {'joint_offset', 'joint_friction', 'joint_bandwidth'} & set(hidden)
+
+
 @pytest.mark.parametrize('zeros', [(0.015, 0.0), (0.0, -0.015), (-0.012, 0.018)])
 def test_zeros_that_moved_are_named_with_joint_and_sign(zeros):
     # the encoder shows so much more than the command: the true tilt is so much less than it
@@ -137,6 +143,17 @@ def test_zeros_that_moved_are_named_with_joint_and_sign(zeros):
 def test_a_change_of_timing_is_named_alone(change, name):
     (found, _), = names(judged(made(5, **change)))
     assert name in found
+
+
+@pytest.mark.parametrize('change', [{'delay': DELAY + 0.015},
+                                    {'frequency': 0.7 * FREQUENCY}])
+def test_one_servo_that_differs_is_not_explained_by_what_all_share(change, tmp_path):
+    result, page = analyse_joint_log([write(tmp_path / 'log.csv', made(31, {}, change))], [],
+                                     robot(), None)
+    assert result['verdict'] == 'unknown' and result['effects'] == []
+    assert 'joint 2 is off by' in result['reason'] and 'joint 2' in result['summary']
+    assert result['where'][0]['channel'] == 'joint_2' and result['where'][0]['excess_after'] > 2
+    assert page.index('class="verdict"') < page.index('<img') < page.index('<table')
 
 
 def test_friction_of_one_joint_is_named_and_its_joint_told():

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from beetle_omni_ros.identify.gap.absolute import ceilings, Loud, too_loud
+from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.certainty import (
@@ -34,7 +35,7 @@ from beetle_omni_ros.identify.gap.rollouts import (
 from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.gap.trial import Found, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
-from beetle_omni_ros.identify.gap.verdict import decide, disagreement, withdraw
+from beetle_omni_ros.identify.gap.verdict import decide, disagreement, not_met, withdraw
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -74,7 +75,9 @@ class Analysis:
         findings: remarks of the checks.
         partial: effects that explain a part and are not named.
         damages: what is wrong with the recordings.
-        unseen: limits, friction and play that these flights would not show, where no gap is found.
+        unseen: what acts in a regime alone (limits, friction, play, the ground) that these flights
+            would not show, where no gap is found.
+        damaged: the recording of the first of ``damages``, and that damage, for the page.
         loud: channels beyond what sensors and gusts may make, with everything that was found.
 
     """
@@ -101,6 +104,7 @@ class Analysis:
     damages: list[Damage] = field(default_factory=list)
     loud: list[Loud] = field(default_factory=list)
     unseen: list[str] = field(default_factory=list)
+    damaged: tuple[Recording, Damage] | None = None
 
     @property
     def accepted(self) -> list[Trial]:
@@ -155,7 +159,7 @@ def _analysed(fitted, judging, robot, p, progress):
     a.loud = too_loud(models, a.found.theta, p)
     decide(a, p)
     if a.verdict == 'no_gap':
-        a.unseen = limits_out_of_sight(a.problem, a.found.state)
+        a.unseen = [*not_met(a, p), *limits_out_of_sight(a.problem, a.found.state)]
     progress('free runs')
     _falsify(a, search.wide)
     return a

@@ -83,11 +83,22 @@ def read_recording(path: str | Path) -> Recording:
         found = ', '.join(sorted(known)) or 'no message'
         raise BagError(f'{path}: no recording of this robot: expected {", ".join(NEEDED)} with '
                        f'its joints and rotors, found {found}')
+    _check_members(path, rows, tables, layouts)
     warnings += [f'{name}: {count} messages not readable' for name, count in bad.items()]
     times, values, received = {}, {}, {}
     for name, table in tables.items():
         times[name], values[name], received[name] = table[:, 0], table[:, 1:-1], table[:, -1]
     return Recording(Path(path).name, times, values, states, warnings, received)
+
+
+def _check_members(path, rows, tables, layouts):
+    """Refuse joints and rotors of another robot, whose IMU and MoCap may have the same topics."""
+    told = [name for name in ('joint_states', 'command') if rows[name]]
+    others = [names for names in layouts.values() if isinstance(names, list)
+              and not {*JOINT_NAMES, *ROTOR_NAMES} & set(names)]
+    if told and others and not any(len(tables[name]) for name in told):
+        raise BagError(f'{path}: no recording of this robot: {" and ".join(told)} hold '
+                       f'{", ".join(others[0])}, expected {", ".join(JOINT_NAMES)}')
 
 
 def _table(name, width, rows, layouts, bad):

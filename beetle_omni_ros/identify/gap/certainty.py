@@ -155,7 +155,7 @@ def visibility(problem: Problem, state: State, always: list[str],
         size = np.array([keys[n].typical for n in own])
         return np.sqrt(max(float(np.max(size**2 * np.diag(schur))), 0.0))
 
-    smooth = [c for c in candidates if not c.starts and not c.fixed]
+    smooth = [c for c in candidates if not c.starts and not any(c.fixed.values())]
     made = {}
     for c in smooth:
         rivals = {}

@@ -9,8 +9,9 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from beetle_omni_ros.identify.gap.analysis import analyse, Analysis
 from beetle_omni_ros.identify.gap.apply import write_corrected
+from beetle_omni_ros.identify.gap.bags import read_recording
 from beetle_omni_ros.identify.gap.forks import forked
-from beetle_omni_ros.identify.gap.given import check_apart
+from beetle_omni_ros.identify.gap.given import check_apart, check_flights, names_of
 from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
 from beetle_omni_ros.identify.gap.joint_changes import change_grids
 from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log
@@ -76,6 +77,8 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
             a = _analysed(runs, holdout, believed, p, fix,
                           lambda text: bars.update(bar, description=text))
         made = results(a, believed, p, meta)
+        if page and a.damages:
+            a.damaged = _first_damaged([*runs, *holdout], a.damages[0])
         html = gap_page(a, made) if page else ''
     _print(console, made)
     if json_path:
@@ -92,24 +95,33 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
 
 
 def _analysed(runs, holdout, robot, p, fix, progress):
-    def loaded(path):
+    def loaded(path_and_name):
+        path, name = path_and_name
         try:
-            return load_flight(path, robot, p, fix)
+            return load_flight(path, robot, p, fix, name)
         except UnusableFlight as error:
             return error
 
-    flights = forked(loaded, [*runs, *holdout])
+    given = [*runs, *holdout]
+    flights = forked(loaded, list(zip(given, names_of(given), strict=True)))
     unusable = [flight for flight in flights if isinstance(flight, UnusableFlight)]
     if unusable:
         # A verdict about the other flights would pass for one about all that were given.
-        return Analysis('bad_data', str(unusable[0]), findings=[str(f) for f in unusable[1:]],
+        return Analysis('bad_data', str(unusable[0]),
                         damages=[damage for f in unusable for damage in f.problems])
+    check_flights(given, flights)
     fitted, judging = flights[:len(runs)], flights[len(runs):]
     if not judging and len(fitted) > LEAST_FITTED:
         fitted, judging = fitted[:-1], fitted[-1:]
     a = analyse(fitted, judging, robot, p, progress)
     a.findings = [text for flight in flights for text in flight.findings] + a.findings
     return a
+
+
+def _first_damaged(paths, damage):
+    """Recording of a damage, read again: what worked on it kept only what is wrong."""
+    path = paths[names_of(paths).index(damage.run)]
+    return read_recording(path), damage
 
 
 def _check_outputs(apply, robot, json_path, page):

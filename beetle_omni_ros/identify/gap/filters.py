@@ -8,7 +8,12 @@ from functools import cache
 import numpy as np
 from scipy.signal import firwin, upfirdn
 
+from beetle_omni_ros.identify.gap.parameters import GapParameters
+
 SHARPNESS = 5.0     # taps for each sampling rate over edge
+THIN = 2            # grid points to each at which the body's equations are evaluated
+EDGE = 1.0              # [s] at both ends that smoothing and history need
+LEAST_SAMPLES = 20  # of each channel, from which the autoregression of its noise is estimated
 
 
 @dataclass(frozen=True)
@@ -78,3 +83,17 @@ def low_pass(edge: float, every: int, period: float) -> LowPass:
     count = step * max(1, round(length / step)) + 1
     # Hann: end taps are zero, so that derivatives of the taps are complete
     return LowPass(firwin(count, edge, window='hann', fs=1 / period), every, period)
+
+
+def channel_filters(p: GapParameters) -> dict[str, LowPass]:
+    """Group of channels -> its filter."""
+    return {'B': low_pass(p.body_edge, p.body_every, THIN * p.grid),
+            'A': low_pass(p.world_edge, p.world_every, p.grid),
+            'W': low_pass(p.rate_edge, p.rate_every, p.grid),
+            'J': low_pass(p.joint_edge, p.joint_every, p.grid)}
+
+
+def shortest_flight(p: GapParameters) -> float:
+    """Duration [s] below which some channel keeps fewer than ``LEAST_SAMPLES`` samples."""
+    return 2 * EDGE + max(kernel.period * (len(kernel.taps) + LEAST_SAMPLES * kernel.every)
+                          for kernel in channel_filters(p).values())

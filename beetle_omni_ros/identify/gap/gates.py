@@ -57,10 +57,10 @@ def believed(p: GapParameters, gain: float, of_beliefs: float, price: float = 0.
 
 def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = ()) -> bool:
     """
-    Whether a number is as far off as it can be; zero is a bound of a friction, too.
+    Whether a number is as far off as it can be.
 
-    Readings that would be younger than their stamps are beyond it, and so are commands that would
-    act before theirs.
+    An effect of one sign may end at zero: the flights lack what the file has. Readings that would
+    be younger than their stamps are beyond it, and so are commands that would act before theirs.
 
     Args:
         keys: by name.
@@ -73,7 +73,8 @@ def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = ())
         return True
     for name in trial.candidate.keys:
         x, key = trial.theta.get(name, 0.0), keys[name]
-        if x >= key.high or x <= key.low != 0.0 or name in AGES and key.value(x) < 0:
+        below = x <= key.low and not key.ends_at_none
+        if x >= key.high or below or name in AGES and key.value(x) < 0:
             return True
     return False
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag_reader import bag_files
+
+SAME = 0.5      # of the IMU's readings that are alike to the last digit; noise makes none
 
 
 def check_apart(runs: list[Path]) -> None:
@@ -31,6 +34,36 @@ def check_apart(runs: list[Path]) -> None:
             raise ParameterError(f'{known[size, digest]} and {run}: the same recording twice; '
                                  'expected different flights, each once')
         known[size, digest] = run
+
+
+def names_of(runs: list[Path]) -> list[str]:
+    """As much of each path, from its end, as tells the recordings apart."""
+    paths = [run.absolute().parts for run in runs]
+    for depth in range(1, max((len(parts) for parts in paths), default=1) + 1):
+        names = ['/'.join(parts[-depth:]) for parts in paths]
+        if len(set(names)) == len(names):
+            break
+    return names
+
+
+def check_flights(runs: list[Path], flights: list[Flight]) -> None:
+    """
+    Refuse one flight in two recordings, whose files differ: cut, converted or recorded twice.
+
+    Args:
+        runs: paths, for the message.
+        flights: what was read there.
+
+    Raises:
+        ParameterError: naming both recordings.
+
+    """
+    readings = [{row.tobytes() for row in flight.imu} for flight in flights]
+    for k, own in enumerate(readings):
+        for j in range(k):
+            if len(own & readings[j]) > SAME * min(len(own), len(readings[j])):
+                raise ParameterError(f'{runs[j]} and {runs[k]}: the same flight in two '
+                                     'recordings; expected different flights, each once')
 
 
 def _digest(file):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, read_recording, Recording
+from beetle_omni_ros.identify.gap.filters import shortest_flight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.damage import Damage
@@ -77,7 +78,7 @@ class Flight:
 
 
 def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
-                fix: bool = False) -> Flight:
+                fix: bool = False, name: str = '') -> Flight:
     """
     Read and check one recording.
 
@@ -86,13 +87,16 @@ def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
         robot: as believed.
         p: parameters.
         fix: whether corrections that are certain are applied to what was read.
+        name: by which it is spoken of; default: that of its folder.
 
     Raises:
         BagError: no such bag, or no recording of this robot.
         UnusableFlight: naming the recording and what is wrong with it.
 
     """
-    return prepare(read_recording(path), robot, p, fix)
+    recording = read_recording(path)
+    recording.name = name or recording.name
+    return prepare(recording, robot, p, fix)
 
 
 def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
@@ -122,9 +126,10 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
     series = {topic: _in_order(name, topic, recording, findings) for topic in recording.times}
     begin, end = _flown(name, recording, series, robot)
     begin, end = _without_gaps(name, series, begin, end, p, findings)
-    if end - begin < p.least_duration:
-        raise UnusableFlight(f'{name}: {max(end - begin, 0.0):.1f} s of usable flight, '
-                             f'{p.least_duration:g} s are needed')
+    least = max(p.least_duration, shortest_flight(p))
+    if end - begin < least:
+        raise _unusable(name, 'all topics', f'{max(end - begin, 0.0):.1f} s of usable flight, '
+                        f'{least:.3g} s are needed')
     cut = {}
     for topic, (t, values) in series.items():
         keep = (t > begin - 1.0) & (t < end + 0.5)
@@ -136,6 +141,12 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
                     findings=findings)
     _check_robot(flight, robot)
     return flight
+
+
+def _unusable(name, topic, cause, at_s=None):
+    """An error with its one cause, which the results list as they list damages."""
+    damage = Damage(name, topic, cause, at_s)
+    return UnusableFlight(damage.text, [damage])
 
 
 def _in_order(name, topic, recording, findings):
@@ -157,8 +168,8 @@ def _flown(name, recording, series, robot):
     t, command = series['command']
     lifted = command[:, 4:].sum(axis=1) > LIFTED * robot.mass * robot.gravity
     if lifted.mean() < 0.2:
-        raise UnusableFlight(f'{name}: the robot does not fly: commanded thrust is above '
-                             f'{LIFTED:g} of its weight in {lifted.mean():.0%} of the time')
+        raise _unusable(name, 'command', 'the robot does not fly: commanded thrust is above '
+                        f'{LIFTED:g} of its weight in {lifted.mean():.0%} of the time')
     begin = t[np.argmax(lifted)]
     height, when = series['mocap/pose'][1][:, 2], series['mocap/pose'][0]
     if begin > when[0] + 0.3:       # the take-off was recorded
@@ -174,7 +185,7 @@ def _flown(name, recording, series, robot):
 
 def _without_gaps(name, series, begin, end, p, findings):
     """The longest piece in which no topic is silent for long."""
-    breaks, lost = [], 0.0
+    breaks, lost, longest = [], 0.0, (0.0, '', 0.0)
     for topic in NEEDED:
         t = series[topic][0]
         begin, end = max(begin, t[0]), min(end, t[-1])
@@ -183,12 +194,13 @@ def _without_gaps(name, series, begin, end, p, findings):
         inside = t[(t >= begin) & (t <= end)]
         for k in np.flatnonzero(np.diff(inside) > p.longest_gap):
             breaks.append((inside[k], inside[k + 1]))
-            lost += inside[k + 1] - inside[k]
-            findings.append(f'{name}: {topic}: silent for {inside[k + 1] - inside[k]:.2f} s at '
-                            f'{inside[k] - begin:.1f} s')
+            silence, at_s = inside[k + 1] - inside[k], inside[k] - series['imu/data_raw'][0][0]
+            lost, longest = lost + silence, max(longest, (silence, topic, at_s))
+            findings.append(f'{name}: {topic}: silent for {silence:.2f} s, from {at_s:.1f} s on')
     if lost > p.most_lost * max(end - begin, 1e-9) and lost > 1.0:
-        raise UnusableFlight(f'{name}: {findings[-1].split(": ", 1)[1]}; {lost:.1f} s of '
-                             f'{end - begin:.1f} s are missing in all')
+        silence, topic, at_s = longest
+        raise _unusable(name, topic, f'silent for {silence:.2f} s; {lost:.1f} s of '
+                        f'{end - begin:.1f} s of flight are missing', at_s)
     edges = [begin, *(x for gap in sorted(breaks) for x in gap), end]
     pieces = [(edges[k], edges[k + 1]) for k in range(0, len(edges), 2)]
     return max(pieces, key=lambda piece: piece[1] - piece[0])
@@ -207,10 +219,10 @@ def _check_robot(flight, robot):
     """A robot file that is of another robot altogether."""
     total = np.median(np.linalg.norm(flight.imu[:, :3], axis=1))
     if total < 0.3 * robot.gravity:
-        raise UnusableFlight(f'{flight.name}: imu/data_raw: specific force is {total:.2f} m/s^2, '
-                             f'near {robot.gravity:.2f} m/s^2 expected')
+        raise _unusable(flight.name, 'imu/data_raw', f'specific force is {total:.2f} m/s^2, '
+                        f'near {robot.gravity:.2f} m/s^2 expected')
     asked = np.median(flight.command[:, 4:].sum(axis=1)) / robot.mass
     # Thrusts also work against each other, so only far too little is impossible.
     if asked < (1 - SPREAD) * total or asked > 3 * total:
-        raise UnusableFlight(f'{flight.name}: the robot file does not fit: commanded thrust over '
-                             f'its mass is {asked:.1f} m/s^2, the IMU measures {total:.1f} m/s^2')
+        raise _unusable(flight.name, 'command', 'the robot file does not fit: commanded thrust '
+                        f'over its mass is {asked:.1f} m/s^2, the IMU measures {total:.1f} m/s^2')

@@ -172,7 +172,10 @@ def change_grids(rows: list[dict]) -> list[Grid]:
                           f'{new:.3g}', f'{difference:+.3g}', f'{low:.3g}..{high:.3g}',
                           'yes' if row['significant'] else ''])
         made.append(Grid(f'Changes to {log}', ['joint', 'parameter', 'before', 'after',
-                                               'difference', '95 %', 'significant'], cells))
+                                               'difference', '95 %', 'significant'], cells,
+                         note='dead_band: friction over stiffness. ramp_lag: lag behind a ramp, '
+                              'delay and damping together. significant: chance makes so large a '
+                              'difference anywhere between two logs in 5 of 100 cases at most.'))
     return made
 
 

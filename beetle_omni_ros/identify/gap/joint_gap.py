@@ -4,20 +4,31 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.gap.joint_changes import changes, sentences
-from beetle_omni_ros.identify.gap.joint_search import Entry, Found, Search, Trial
-from beetle_omni_ros.identify.gap.page import head
+from beetle_omni_ros.identify.gap.joint_changes import change_grids, changes, sentences
+from beetle_omni_ros.identify.gap.joint_search import (
+    Entry,
+    FITTED_PART,
+    Found,
+    Search,
+    Trial,
+)
+from beetle_omni_ros.identify.gap.keys import friction
+from beetle_omni_ros.identify.gap.page import AFTER, BEFORE, head
+from beetle_omni_ros.identify.gap.results import grids
 from beetle_omni_ros.identify.gap.sentence import summary
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
 from beetle_omni_ros.identify.joint_page import joint_page
 from beetle_omni_ros.identify.joint_results import joint_results
 from beetle_omni_ros.identify.joint_servos import file_servos
+from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.figures import legend, line, panels, STYLE, svg
 
 # Error over that of the freest fit, up to which the file predicts what it did not see as well: a
 # log's last part differs from its first by as much where nothing has changed.
@@ -47,8 +58,8 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
     found = Search(log, robot).run()
     models = identify_joints(log, robot.joints)
     identified = joint_results(log, others, models, robot.joints, file_servos(robot, log.joints))
-    made = gap_of(found, log)
     joints = identified['joints']
+    made = gap_of(found, log, joints)
     for k, joint in enumerate(joints):
         joint['file_heldout_rms_rad'] = float(found.errors['believed'][k])
         joint['corrected_heldout_rms_rad'] = float(found.errors['corrected'][k])
@@ -62,31 +73,66 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
                       'robot': str(base) if base else 'params/robot.yaml',
                       'version': __version__}}
     made['summary'] = summary(made)
+    tables = [*grids(made), *change_grids(made['changes'])]
     return made, joint_page(log, others, models, file_servos(robot, log.joints), identified,
-                            head(made))
+                            head(made, _picture(found, log)), tables)
 
 
-def gap_of(found: Found, log: JointLog) -> dict:
+def _picture(found, log):
+    """Error of the file's servos, and of the corrected ones, over the log."""
+    joints, t = np.arange(len(log.joints)), log.t - log.t[0]
+    points = [('robot file', BEFORE, found.believed)]
+    if found.accepted:
+        points.append(('with what is named', AFTER, found.point))
+    with matplotlib.rc_context(STYLE):
+        figure, axes = panels(len(joints), 1, height=1.1, sharex=True)
+        for text, colour, point in points:
+            error = simulate(log, joints, found.servos.sets(point[None])[0])[
+                :, :len(t)] - log.measured
+            for k, axis in enumerate(axes[:, 0]):
+                line(axis, t, 1e3 * error[k], color=colour, lw=0.9, label=text)
+                axis.set_ylabel(f'joint {log.joints[k]} [mrad]')
+        held_out = t[log.end_of(FITTED_PART)]
+        for axis in axes[:, 0]:
+            axis.axvspan(t[0], held_out, color='#eef3f8', lw=0)
+        axes[-1, 0].set_xlabel('time [s]; shaded: fitted, the rest is held out')
+        legend(figure, axes[0, 0])
+        return svg(figure, 'error of the servos alone over the log')
+
+
+def gap_of(found: Found, log: JointLog, apart: list[dict] | tuple = ()) -> dict:
     """
     Verdict, effects and errors of a search, as INTERFACES lays them out.
 
     Args:
         found: by the search.
         log: that was searched.
+        apart: each joint identified by itself, as ``identify joint`` has it, for what no servo
+            that all joints share explains.
 
     """
     effects = _effects(found)
     best = np.minimum(found.errors['free'], found.errors['corrected'])
+    if apart:
+        best = np.minimum(best, [joint['heldout_rms_rad'] for joint in apart])
+    allowed = np.hypot(AS_WELL * best, found.tolerated)
     before, after, floor = (_rms(e) for e in (found.errors['believed'],
                                               found.errors['corrected'], best))
     closure = _closure(before, after, floor)
+    reason = (f'error on the held-out part {1e3 * before:.1f} mrad before, '
+              f'{1e3 * after:.1f} mrad after')
+    partial, different = [], int(np.argmax(found.errors['corrected'] / allowed))
+    if apart and found.errors['corrected'][different] > allowed[different]:
+        # What all joints share is no explanation of one that differs from them.
+        effects, partial = [], effects
+        reason = _different(apart, different, found.errors['corrected'][different])
+        after, closure = before, _closure(before, before, floor)
     return {
-        'verdict': _verdict(found, effects, best),
-        'reason': f'error on the held-out part {1e3 * before:.1f} mrad before, '
-                  f'{1e3 * after:.1f} mrad after',
+        'verdict': _verdict(found, effects, allowed),
+        'reason': reason,
         'closure': closure, 'gap_before': before / floor, 'gap_after': after / floor,
-        'noise_floor': 1.0, 'effects': effects, 'partial': [],
-        'candidates': _candidates(found),
+        'noise_floor': 1.0, 'effects': effects, 'partial': partial,
+        'candidates': _candidates(found), 'hidden': found.out_of_sight,
         'where': sorted(({'channel': f'joint_{number}', 'regime': 'log',
                           'excess': float(found.errors['believed'][k] / best[k]),
                           'excess_after': float(found.errors['corrected'][k] / best[k])}
@@ -98,7 +144,23 @@ def gap_of(found: Found, log: JointLog) -> dict:
         'regimes': {}, 'held_out': True, 'findings': []}
 
 
-def _verdict(found, effects, best):
+def _different(joints, k, error):
+    """Why one joint is not explained by what all share, with the numbers that differ."""
+    own, others = joints[k], [joint for joint in joints if joint is not joints[k]]
+    told = []
+    for term, text, factor, unit in (('natural_frequency', 'natural frequency', 1.0, 'rad/s'),
+                                     ('damping_ratio', 'damping ratio', 1.0, ''),
+                                     ('delay', 'delay', 1e3, 'ms')):
+        usual = np.median([joint['terms'][term]['value'] for joint in others]) if others else 0.0
+        told.append(f'{text} {factor * own["terms"][term]["value"]:.3g}'
+                    + (f' against {factor * usual:.3g}' if others else '')
+                    + (f' {unit}' if unit else ''))
+    return (f'joint {own["joint"]} is off by {1e3 * error:.1f} mrad with what all joints share '
+            f'and by {1e3 * own["heldout_rms_rad"]:.1f} mrad fitted by itself: its servo differs '
+            f'from the others ({", ".join(told)})')
+
+
+def _verdict(found, effects, allowed):
     """
     What the search means.
 
@@ -107,7 +169,6 @@ def _verdict(found, effects, best):
     """
     if effects:
         return 'named_set' if any(len(e['names']) > 1 for e in effects) else 'named'
-    allowed = np.hypot(AS_WELL * best, found.tolerated)
     return 'no_gap' if (found.errors['believed'] <= allowed).all() else 'unknown'
 
 
@@ -184,16 +245,20 @@ def _parameters(found: Found, entry: Entry, point=None):
     point = found.point if point is None else point
     if entry.name == 'joint_friction':
         return _friction(found, point)
-    made, values = {}, servos.values(point)
+    made, values, believed = {}, servos.values(point), servos.values(found.believed)
     for k in np.flatnonzero(servos.mask(entry.name, entry.joint)):
         number, width = servos.numbers[k], 0.0 if other else found.widths[k] * servos.scale[k]
         ends = [values[k] * np.exp(s * width) if number.logarithmic else values[k] + s * width
                 for s in (-1, 1)]
         less = servos.delays if number.name == 'delay' else 0.0
-        made[number.name] = {'value': float(values[k] - less),
-                             'unit': CATALOGUE[entry.name].parameters[number.name].unit}
+        spec = CATALOGUE[entry.name].parameters[number.name]
+        value = float(values[k] - less)
+        made[number.name] = {'value': value, 'unit': spec.unit,
+                             'file': float(believed[k] - less)}
         if not other:
-            made[number.name]['interval'] = [float(end - less) for end in ends]
+            low, high = (float(end - less) for end in ends)
+            made[number.name]['interval'] = [max(low, min(value, spec.low)),
+                                             min(high, max(value, spec.high))]
     return made
 
 
@@ -206,9 +271,12 @@ def _friction(found, point):
     at = servos.index('stiction')
     extra = servos.values(point)[at] / servos.scale[mask] * torque
     unit = CATALOGUE['joint_friction'].parameters['coulomb'].unit
+    own = dict(zip(('coulomb', 'stiction'), (float(np.median(
+        [value[joint - 1] for joint in servos.joints])) for value in friction(servos.robot)),
+                   strict=True))
     made = {}
     for name, value in (('coulomb', force), ('stiction', force + extra)):
-        made[name] = {'value': float(np.median(value)), 'unit': unit,
+        made[name] = {'value': float(np.median(value)), 'unit': unit, 'file': own[name],
                       'interval': [max(float(np.median(value + s * width)), 0.0)
                                    for s in (-1, 1)],
                       'each': {str(servos.joints[j]): float(value[j]) for j in range(count)}}

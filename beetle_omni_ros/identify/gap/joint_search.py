@@ -123,6 +123,7 @@ class Found:
         errors: 'believed', 'corrected', 'free' -> (J,) RMS on the held-out part [rad]; free: with
             gains, delay, friction and zeros fitted, whether they are worth it or not.
         tolerated: (J,) RMS that tolerances of manufacturing make on that part [rad].
+        out_of_sight: names of entries that the log would not show at a realistic size.
 
     """
 
@@ -135,6 +136,7 @@ class Found:
     widths: np.ndarray
     errors: dict[str, np.ndarray]
     tolerated: np.ndarray
+    out_of_sight: list[str]
 
 
 class Search:
@@ -379,7 +381,31 @@ class Search:
             trial.reason = self._reason(trial)
         strongest = sorted(trials, key=lambda t: -t.gain)
         return Found(self.servos, self.servos.believed, point, strongest, sets, rejected, widths,
-                     self._errors(point), self._tolerated())
+                     self._errors(point), self._tolerated(), self._out_of_sight(point))
+
+    def _out_of_sight(self, point):
+        """Entries whose realistic size would change the log by less than chance gains."""
+        servos, kp = self.servos, self.servos.values(point)[self.servos.index('kp')]
+        points = [point]
+        for name in GROUPS:
+            moved = point.copy()
+            for k in np.flatnonzero(servos.mask(name)):
+                number = servos.numbers[k]
+                size = CATALOGUE[name].parameters[number.name].typical
+                if number.logarithmic:      # softer, or a limit that is lower
+                    size = np.log(1 - size)
+                elif number.name == 'coulomb':
+                    size /= kp
+                moved[k] += size / servos.scale[k]
+            points.append(np.clip(moved, servos.low, servos.high))
+        r = self.fitter.residuals(np.array(points), np.tile(self.weight, (len(points), 1)))
+        changes = ((r[1:] - r[0])**2).sum(axis=(1, 2)) / self.scatter
+        return [name for name, change in zip(GROUPS, changes, strict=True)
+                if change < self._needed(Entry(name))]
+
+    def _needed(self, entry):
+        return Trial(entry, 0.0, self._count(entry), self.samples, np.zeros(BLOCKS),
+                     self.servos.believed).needed
 
     def _reason(self, trial):
         if not trial.unlikely:
@@ -403,7 +429,8 @@ class Search:
         if all(e in accepted for e in pair) and not self._told_apart(widths):
             alone = self._alone(accepted, point, pair)
             first, second = sorted(alone, key=lambda t: -t.gain)
-            if second.gain > 0:
+            # One that explains nothing alone is no alternative, but needed beside the other.
+            if second.unlikely:
                 sets[first.entry] = [first, second]
                 del sets[second.entry]
             return sets

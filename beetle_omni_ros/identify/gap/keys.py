@@ -80,6 +80,11 @@ class Key:
         return half * abs(self.value(deviation)) if self.relative else half
 
     @property
+    def ends_at_none(self) -> bool:
+        """Whether the smallest value is an effect that is not there, as of drag or friction."""
+        return not self.relative and self.value(self.low) == 0.0
+
+    @property
     def groups(self) -> str:
         """Channel groups that depend on it."""
         if self.body:

@@ -7,11 +7,12 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from beetle_omni_ros.identify.gap.analysis import Analysis, JUDGED
-from beetle_omni_ros.identify.gap.residual import CHANNELS, UNITS
-from beetle_omni_ros.identify.gap.results import _evidence, grids, headline
+from beetle_omni_ros.identify.gap.residual import CHANNELS
+from beetle_omni_ros.identify.gap.results import _evidence, CANDIDATES, grids, headline
 from beetle_omni_ros.identify.gap.rollouts import STATES
 from beetle_omni_ros.identify.gap.rollouts import UNITS as STATE_UNITS
 from beetle_omni_ros.identify.page import page, verdict_head
+from beetle_omni_ros.identify.recording.picture import damage_figure
 from beetle_omni_ros.runs.figures import COLOURS, FAINT, legend, line, panels, STYLE, svg
 from beetle_omni_ros.runs.report_page import section
 from beetle_omni_ros.runs.table import Grid, html
@@ -33,27 +34,47 @@ def gap_page(a: Analysis, made: dict) -> str:
         made: its results.
 
     """
-    notes = [f'Reason: {made["reason"]}', *([f'Next: {made["next_experiment"]}']
-                               if made['next_experiment'] else []), *made['findings']]
+    said = made['reason'][:1].upper() + made['reason'][1:]
+    notes = [*([] if made['reason'] in made['summary'] else [f'{said}.']),
+             *([f'To fly next: {made["next_experiment"]}.'] if made['next_experiment'] else []),
+             *made['findings']]
     sections = []
     if a.problem is not None:
         with matplotlib.rc_context(STYLE):
             sections = [
-                section('Residuals', 'Measured minus expected, whitened: 1 is one standard '
-                        'deviation of the noise. First flight.', svg(_residuals(a), 'residuals')),
-                section('Free runs', 'Error half a second after each measured state, with the '
-                        'file as it was and with the effects; dashed: noise alone.',
+                section('Residuals', 'Measured minus expected, in standard deviations of the '
+                        'noise, with the colour of the noise taken out. First fitted flight.',
+                        svg(_residuals(a), 'residuals')),
+                section('Free runs', 'Error half a second after each measured state, without and '
+                        'with what is named, tolerances as fitted; dashed: noise alone.',
                         svg(_runs(a), 'free runs')),
-                section('Evidence', 'How much of chi2 each entry explains beside what is '
-                        'accepted, in the last step.', svg(_bars(a), 'evidence')
+                section('Evidence', 'Squared residual over noise (chi2) that each entry takes '
+                        'away beside what is accepted; blue: accepted.', svg(_bars(a), 'evidence')
                         + html(_evidence(made['candidates'], 60))),
                 section('What these flights could show', 'Standard deviations by which an effect '
                         'of realistic size would stand out, alone and beside the entry that it '
-                        'is most like. Below 5 it could not be told.', html(_visible(made))),
-                section('Tolerances', 'What this robot differs by within what any robot does; '
-                        'carried along, not named and not written.', html(_tolerances(made)))]
-    return page('Gap', ', '.join(made['meta']['runs']), grids(made)[:3], notes, sections,
-                head(made, _picture(a)))
+                        f'is most like. Below {a.problem.p.decidable:g} it would not be named.',
+                        html(_visible(made))),
+                section('Tolerances', 'How this robot differs from the file within what any '
+                        'robot of its type does. Fitted with everything else, not named, not '
+                        'written to a robot file.', html(_tolerances(made)))]
+    tables = [grid for grid in grids(made) if grid.title != CANDIDATES]
+    return page('Gap', _about(a, made['meta']), tables, notes, sections, head(made, _picture(a)))
+
+
+def _about(a, meta):
+    """Which flights were fitted, which judged, against which file."""
+    count = len(a.models[0]) or len(meta['runs'])
+    parts = {'fitted': meta['runs'][:count], 'held out': [*meta['runs'][count:], *meta['holdout']],
+             'robot file': [meta['robot']]}
+    return '; '.join(f'{word}: {", ".join(runs)}' for word, runs in parts.items() if runs)
+
+
+def _lines(a, *texts):
+    """Name in ``a.runs``, colour and text of each line; one where nothing is named."""
+    if not a.found.accepted:
+        return [('before', AFTER, 'robot file, tolerances fitted')]
+    return list(zip(('before', 'after'), (BEFORE, AFTER), texts, strict=True))
 
 
 def head(made: dict, picture: str = '') -> str:
@@ -63,17 +84,18 @@ def head(made: dict, picture: str = '') -> str:
 
 
 def _picture(a):
-    """Free runs before and after, or nothing where there are none."""
+    """Free runs before and after, or the readings that are wrong; '' where there are neither."""
+    if a.damaged is not None:
+        with matplotlib.rc_context(STYLE):
+            return svg(damage_figure(*a.damaged), 'the readings in question')
     if not a.runs:
         return ''
     with matplotlib.rc_context(STYLE):
         figure, axes = panels(len(SHOWN), 1, height=1.6, sharex=True)
-        lines = [('before', BEFORE, 'robot file, tolerances fitted')]
-        if a.found.accepted:
-            lines.append(('after', AFTER, 'with what is named'))
+        lines = _lines(a, 'robot file, tolerances fitted', 'with what is named')
         for axis, state in zip(axes[:, 0], SHOWN, strict=True):
             _errors(a, axis, state, lines)
-        axes[-1, 0].set_xlabel('start of the free run, every 0.5 s of flight')
+        axes[-1, 0].set_xlabel('number of the free run, one every 0.5 s of flight')
         legend(figure, axes[0, 0])
         return svg(figure, 'error of the model alone after half a second')
 
@@ -91,16 +113,15 @@ def _errors(a, axis, state, lines):
 
 def _residuals(a) -> Figure:
     problem = a.problem
-    before, after = problem.residual(a.found.base), a.found.state.r
+    values = {'before': problem.residual(a.found.base), 'after': a.found.state.r}
     names = [n for g in problem.noise.taps for n in CHANNELS[g]]
     figure, axes = panels(8, 2, height=1.2, sharex=True)
     for k, (axis, name) in enumerate(zip(axes.T.ravel(), names, strict=False)):
         rows = (problem.where == k) & (problem.flight == 0)
         t = problem.time[rows]
-        line(axis, t, before[rows], color=BEFORE, lw=0.7, label='without the effects')
-        line(axis, t, after[rows], color=AFTER, lw=0.7, label='with them')
-        unit = UNITS[name.rpartition('_')[0]]
-        axis.set_title(f'{name} [{unit} over its noise]')
+        for which, colour, text in _lines(a, 'without what is named', 'with it'):
+            line(axis, t, values[which][rows], color=colour, lw=0.7, label=text)
+        axis.set_title(f'{name} [1]')
     for axis in axes[-1]:
         axis.set_xlabel('time [s]')
     legend(figure, axes[0, 0])
@@ -109,10 +130,10 @@ def _residuals(a) -> Figure:
 
 def _runs(a) -> Figure:
     figure, axes = panels(len(STATES), 1, height=1.4, sharex=True)
-    lines = (('before', BEFORE, 'file as it was'), ('after', AFTER, 'with the effects'))
+    lines = _lines(a, 'without what is named', 'with it')
     for axis, state in zip(axes[:, 0], STATES, strict=True):
         _errors(a, axis, state, lines)
-    axes[-1, 0].set_xlabel('start of the run, every 0.5 s')
+    axes[-1, 0].set_xlabel('number of the free run, one every 0.5 s of flight')
     legend(figure, axes[0, 0])
     return figure
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.filters import low_pass
+from beetle_omni_ros.identify.gap.filters import channel_filters, THIN
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import friction, GYROSCOPIC, Key, MODULES
 from beetle_omni_ros.identify.gap.loads import module_load, spin_load, undescribed_load
@@ -36,7 +36,6 @@ SHIFTS = {'imu_filter_lag.delay': -1.0, 'joint_feedback_delay.delay': 1.0}
 # Taken to both sides, by the same shift of a command: one-sided, delays that data cannot tell
 # apart would differ by the second derivative, and a straight line through all would fit that.
 BOTH_SIDES = 'delay'
-THIN = 2        # grid points to each at which the body's equations are evaluated
 STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
          'kp': 0.01, 'kd': 0.01, 'velocity_limit': 0.01, 'effort_limit': 0.01, 'coulomb': 5e-4,
          'stiction': 5e-4, 'deflection_per_newton': 1e-4, 'gap': 1e-3, 'thrust_max': 0.01,
@@ -67,10 +66,7 @@ class FlightModel:
         self.flight, self.robot, self.keys, self.p, self._body = flight, robot, keys, p, body
         self.modules = 0.0
         self.signals = Signals(flight, robot, p)
-        self.filters = {'B': low_pass(p.body_edge, p.body_every, THIN * p.grid),
-                        'A': low_pass(p.world_edge, p.world_every, p.grid),
-                        'W': low_pass(p.rate_edge, p.rate_every, p.grid),
-                        'J': low_pass(p.joint_edge, p.joint_every, p.grid)}
+        self.filters = channel_filters(p)
         self._length = round(p.servo_window / p.grid)
         count = len(self.signals.t) - round(p.servo_warm_up / p.grid) - 1
         self._starts = np.arange(0, count - self._length + 1, self._length) \

@@ -19,9 +19,10 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.table import ABSENT, Grid
 
 MOST_ROWS = 12
+CANDIDATES = 'Candidates, after the last step'     # title of a table
 WORDS = {'no_gap': 'no gap', 'named': 'named', 'named_set': 'one of a set',
          'unknown': 'unknown: none of the known effects', 'not_decidable': 'not decidable',
-         'bad_data': 'bad data: the recording contradicts itself'}
+         'bad_data': 'bad data: a recording cannot be used'}
 
 
 def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -> dict:
@@ -60,8 +61,15 @@ def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -
 
 def headline(made: dict) -> str:
     """Return the verdict and the names, if any."""
-    names = ', '.join(' or '.join(effect['names']) for effect in made['effects'])
+    names = ', '.join(_label(effect) for effect in made['effects'])
     return f"{WORDS[made['verdict']]}{': ' + names if names else ''}"
+
+
+def _label(effect):
+    """Names of an effect, or of a candidate's row, with the number of its rotor or joint."""
+    member = effect.get('rotor') or effect.get('joint')
+    names = ' or '.join(effect.get('names') or [effect['name']])
+    return names + (f' {member}' if member else '')
 
 
 def _effect(a, trial, robot):
@@ -93,11 +101,15 @@ def parameters(a: Analysis, name: str, free: tuple[str, ...], theta: dict[str, f
         keys = [key for key in own if key.parameter == parameter
                 and (not member or key.name in free)]
         values = [key.value(theta.get(key.name, 0.0)) for key in keys]
-        entry = {'value': values if len(values) > 1 else values[0], 'unit': spec.unit}
+        own = [key.base for key in keys]
+        entry = {'value': values if len(values) > 1 else values[0], 'unit': spec.unit,
+                 'file': own if len(own) > 1 else own[0]}
         if with_intervals:
             widths = [key.width(theta.get(key.name, 0.0), a.widths.get(key.name, 0.0))
                       if key.name in free else 0.0 for key in keys]
-            spans = [[v - w, v + w] for v, w in zip(values, widths, strict=True)]
+            # No interval holds what cannot be, such as a drag that pushes.
+            spans = [[max(v - w, min(v, spec.low)), min(v + w, max(v, spec.high))]
+                     for v, w in zip(values, widths, strict=True)]
             entry['interval'] = spans if len(spans) > 1 else spans[0]
         made[parameter] = entry
     if name == 'joint_friction':
@@ -134,6 +146,8 @@ def _candidates(a):
                'evidence': evidence(a, trial), 'reason': trial.reason,
                'sigma_of_realistic_size': seen.sigma if seen else None,
                'sigma_beside_rivals': seen.rivals if seen else {}}
+        if ' (' in label:
+            row['form'] = label.partition(' (')[2].rstrip(')')
         if trial.candidate.member is not None:
             row[CATALOGUE[trial.candidate.name].each] = trial.candidate.member
         made.append(row)
@@ -155,50 +169,73 @@ def grids(made: dict) -> list[Grid]:
     if made['effects'] or made['partial']:
         rows = []
         for effect in made['effects'] or made['partial']:
-            member = effect.get('rotor') or effect.get('joint')
-            name = ' or '.join(effect['names']) + (f' {member}' if member else '')
+            name = _label(effect)
             for k, (parameter, entry) in enumerate(effect['parameters'].items()):
                 rows.append([name if k == 0 else '', f"{parameter} [{entry['unit']}]",
                              _numbers(entry['value']), _spans(entry.get('interval')),
+                             _numbers(entry['file']),
                              f"{effect['evidence']['delta_bic']:.0f}" if k == 0 else ''])
         title = 'Effects' if made['effects'] else 'Explains a part only, not accepted'
         tables.append(Grid(
-            title, ['effect', 'parameter', 'value', '95 %', 'delta BIC'], rows,
+            title, ['effect', 'parameter', 'value', '95 %', 'in the file', 'delta BIC'], rows,
             note='95 %: interval that holds the true number in 95 of 100 cases. delta BIC: '
-                 'evidence after the price of the numbers; 10 is strong.'))
+                 'evidence less the price of each further number; 10 is strong.'))
     if made['horizons']:
-        flights = 'held-out flights' if made['held_out'] else 'the fitted flights'
-        rows = [[h, *(_cell(v[k]) for k in ('before', 'after', 'effects_alone', 'placebo',
-                                            'closure'))]
-                for h, v in made['horizons'].items()]
-        tables.append(Grid(
-            f'Free runs on {flights}: error over noise floor',
-            ['horizon', 'before', 'after', 'file + effects', 'sign reversed', 'closure'], rows,
-            note='The model runs alone from measured states; 1 is nothing but noise. before, '
-                 'after: without and with what is named, tolerances of this robot as fitted. '
-                 'file + effects: the robot file with the effects and no fitted tolerance. sign '
-                 'reversed: a control that must not help. closure: part of the gap that is gone.'))
+        tables.append(_horizons(made))
     if made['where']:
-        rows = [[w['channel'], w['regime'], _cell(w['excess']), _cell(w['excess_after'])]
-                for w in made['where'][:6]]
+        named = bool(made['effects'])
+        rows = [[w['channel'], w['regime'], _cell(w['excess']),
+                 *([_cell(w['excess_after'])] if named else [])] for w in made['where'][:6]]
         tables.append(Grid('Where model and measurement disagree most',
-                           ['channel', 'regime', 'before', 'after'], rows,
-                           note='RMS of measured minus expected, in standard deviations of the '
-                                'noise: 1 is noise.'))
+                           ['channel', 'regime', *(['before', 'after'] if named else ['RMS'])],
+                           rows, note='RMS of measured minus expected, in standard deviations of '
+                                      'the noise: 1 is noise.'))
     if made['candidates']:
         tables.append(_evidence(made['candidates'], 8))
     return tables
 
 
+def _horizons(made):
+    """Free runs; of what is named only where something is."""
+    columns = {'before': ('before', 'before: without what is named, tolerances as fitted.'),
+               'after': ('after', 'after: with it.'),
+               'effects_alone': ('file + effects', 'file + effects: the robot file with the '
+                                 'effects and without fitted tolerances.'),
+               'placebo': ('sign reversed', 'sign reversed: a control that must not help.'),
+               'closure': ('closure', 'closure: part of the gap that is gone.')}
+    rows = made['horizons']
+    what = 'The model runs alone from measured states; 1 is nothing but noise. '
+    if 'joints' in made:
+        what = 'The servos run alone over the log; 1 is the error of the freest fit. '
+        columns['before'] = ('before', 'before: the robot file.')
+        del columns['effects_alone']        # the same as after
+    if made['effects']:
+        columns = {k: v for k, v in columns.items()
+                   if any(row[k] is not None for row in rows.values())}
+    else:
+        columns = {'before': ('error', '' if 'joints' in made else
+                              'Tolerances of this robot as fitted.')}
+    where = 'the held-out part' if 'joints' in made else \
+        'held-out flights' if made['held_out'] else 'the fitted flights'
+    return Grid(f'Free runs on {where}: error over noise floor',
+                ['horizon', *(head for head, _ in columns.values())],
+                [[h, *(_cell(row[k]) for k in columns)] for h, row in rows.items()],
+                note=what + ' '.join(note for _, note in columns.values()))
+
+
 def _evidence(rows, most):
-    shown = [[r['name'] + (f" {r.get('rotor') or r.get('joint')}"
-                           if r.get('rotor') or r.get('joint') else ''),
-              f"{r['evidence']['delta_chi2']:.0f}", _cell(r['sigma_of_realistic_size']),
+    asked = any(r['sigma_of_realistic_size'] is not None for r in rows)
+    shown = [[_label(r) + (f" ({r['form']})" if r.get('form') else ''),
+              f"{r['evidence']['delta_chi2']:.0f}",
+              *([_cell(r['sigma_of_realistic_size'])] if asked else []),
               'accepted' if r['accepted'] else r['reason']] for r in rows[:most]]
-    return Grid('Candidates, after the last step',
-                ['entry', 'gain of chi2', 'detectability [sigma]', 'decision'], shown,
-                note='gain of chi2: squared residual over noise that the entry takes away. '
-                     'detectability: standard deviations by which a realistic size would show.')
+    note = 'gain of chi2: squared residual over noise that the entry takes away, beside what is ' \
+           'accepted; an accepted entry: what the fit loses without it. (2): a second form of it.'
+    if asked:
+        note += ' detectability: standard deviations by which a realistic size would show.'
+    return Grid(CANDIDATES,
+                ['entry', 'gain of chi2', *(['detectability [sigma]'] if asked else []),
+                 'decision'], shown, note=note)
 
 
 def _damages(rows):

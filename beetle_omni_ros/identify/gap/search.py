@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from beetle_omni_ros.identify.gap.gates import (
 )
 from beetle_omni_ros.identify.gap.keys import SHAPES
 from beetle_omni_ros.identify.gap.proposals import Proposals
-from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, NOT_HELD, TOO_SMALL
+from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, IMPOSSIBLE, NOT_HELD, TOO_SMALL
 
 MOST_TURNS = 4          # of fresh slopes, while a fit runs away from them
 FAR = 0.2               # typical sizes of a curved number
@@ -188,7 +189,7 @@ class Search:
             elif (c.name, c.member) in names_taken:
                 trial.reason = 'named already'
             elif self._impossible(trial):
-                trial.reason = 'beyond what is physical'
+                trial.reason = IMPOSSIBLE
             elif chosen is not None:
                 trial.reason = 'others explain more'
             else:
@@ -221,30 +222,44 @@ class Search:
     def _prune(self, found, state, cost):
         """Drop what later steps, or the noise learnt after the last one, made superfluous."""
         while found.accepted:
-            losses, of_beliefs = [], []
-            everything = [t.candidate for t in found.accepted]
-            for trial in found.accepted:
-                rest = [t.candidate for t in found.accepted if t is not trial]
-                zero = {n: 0.0 for n in trial.candidate.keys
-                        if n not in self.problem.beliefs}
-                theta = {**state.theta, **zero}
-                start = State(theta, self.problem.residual(theta), state.slopes, state.names)
-                there, reached = self._refit(start, rest, 2)
-                losses.append(reached - cost)
-                of_beliefs.append(self.problem.prior(there.theta, self._free(rest))
-                                  - self.problem.prior(state.theta, self._free(everything)))
-            weakest = int(np.argmin(losses))
-            small = not found.accepted[weakest].candidate.large_enough(self.problem.keys,
-                                                                       state.theta)
-            if enough(self.p, losses[weakest], of_beliefs[weakest]) and not small:
+            dropped = self._beyond(found, state) or self._superfluous(found, state, cost)
+            if dropped is None:
                 break
-            dropped = found.accepted.pop(weakest)
-            dropped.reason = 'superfluous beside the others'
+            found.accepted.remove(dropped)
             kept = [t.candidate for t in found.accepted]
             theta = {n: v for n, v in state.theta.items()
                      if n not in dropped.candidate.keys or n in self.problem.beliefs}
             state, cost = self._settle(theta, kept)
         return state, cost
+
+    def _beyond(self, found, state):
+        """Return an accepted entry that the fit of all together made physically impossible."""
+        for trial in found.accepted:
+            if self._impossible(replace(trial, theta=state.theta)):
+                trial.reason = IMPOSSIBLE
+                return trial
+        return None
+
+    def _superfluous(self, found, state, cost):
+        """Return the accepted entry whose loss chance explains, or that is too small by now."""
+        losses, of_beliefs = [], []
+        everything = [t.candidate for t in found.accepted]
+        for trial in found.accepted:
+            rest = [t.candidate for t in found.accepted if t is not trial]
+            zero = {n: 0.0 for n in trial.candidate.keys if n not in self.problem.beliefs}
+            theta = {**state.theta, **zero}
+            start = State(theta, self.problem.residual(theta), state.slopes, state.names)
+            there, reached = self._refit(start, rest, 2)
+            losses.append(reached - cost)
+            of_beliefs.append(self.problem.prior(there.theta, self._free(rest))
+                              - self.problem.prior(state.theta, self._free(everything)))
+        weakest = int(np.argmin(losses))
+        trial = found.accepted[weakest]
+        small = not trial.candidate.large_enough(self.problem.keys, state.theta)
+        if enough(self.p, losses[weakest], of_beliefs[weakest]) and not small:
+            return None
+        trial.reason = 'superfluous beside the others'
+        return trial
 
     def _find_rivals(self, found, state, cost):
         """Exchange each accepted entry for others; what does as well makes a set with it."""

@@ -5,6 +5,9 @@ from __future__ import annotations
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 MOST_NAMED = 6          # entries in a list before it is cut
+LOPSIDED = 0.2          # of an interval's width, from which both ends are said
+# Words that are no words of a sentence.
+SPELLED = {'imu': 'IMU', 'mocap': 'MoCap'}
 
 
 def summary(made: dict) -> str:
@@ -19,14 +22,16 @@ def summary(made: dict) -> str:
 
 
 def _bad_data(made):
-    return made['reason'] + '.'
+    text = made['reason'] if made['reason'].endswith('?') else f'{made["reason"]}.'
+    further = len(made['bad_data']) - 1
+    if further > 0:
+        text += f' {further} more {"fault is" if further == 1 else "faults are"} listed below.'
+    return text
 
 
 def _no_gap(made):
     unseen = made.get('hidden') or []
     text = 'Model and measurement agree to within noise and manufacturing tolerance.'
-    if 'joints' in made:
-        return text
     if not unseen:
         return f'{text} Every known effect of realistic size would have shown.'
     return f'{text} A realistic {listed(unseen, "or")} would not have shown in these data.'
@@ -34,11 +39,13 @@ def _no_gap(made):
 
 def _named(made):
     parts = [_effect(effect) for effect in made['effects']]
-    return f'{_capital(listed(parts))}: the robot file lacks this. {_closing(made)}'
+    explain = 'explain' if len(parts) > 1 else 'explains'
+    return f'{_capital(listed(parts))} {explain} the disagreement. {_closing(made)}'
 
 
 def _unknown(made):
-    partial = [' or '.join(e['names']) for e in made.get('partial') or []]
+    partial = [' or '.join(e['names']) for e in made.get('partial') or []
+               if e['names'][0] not in made['reason']]
     tried = f' {_capital(listed(partial))} would explain a part.' if partial else ''
     return f'No known effect explains the disagreement: {made["reason"]}.{tried}'
 
@@ -56,12 +63,25 @@ def listed(words: list[str], last: str = 'and') -> str:
     words = list(words)
     if len(words) > MOST_NAMED:
         words = [*words[:MOST_NAMED - 1], f'{len(words) - MOST_NAMED + 1} others']
-    words = [word.replace('_', ' ') for word in words]
+    words = [_spelled(word) for word in words]
     return f' {last} '.join(filter(None, [', '.join(words[:-1]), words[-1] if words else '']))
 
 
+def _spelled(name):
+    return ' '.join(SPELLED.get(word, word) for word in name.replace('_', ' ').split(' '))
+
+
+def _of_file(found):
+    """What the robot file has in place of a parameter."""
+    own = found['file'] if isinstance(found['file'], list) else [found['file']]
+    if not any(own):
+        return 'none'
+    text = ', '.join(f'{value:.3g}' for value in own)
+    return text if found['unit'] == '1' else f'{text} {found["unit"]}'
+
+
 def _effect(effect):
-    names = [name.replace('_', ' ') for name in effect['names']]
+    names = [_spelled(name) for name in effect['names']]
     member = next((f' of {kind} {effect[kind]}' for kind in ('rotor', 'joint')
                    if effect.get(kind)), '')
     parameter, found = next(iter(effect['parameters'].items()))
@@ -71,14 +91,18 @@ def _effect(effect):
     spans = spans if spans and isinstance(spans[0], list) else [spans]
     sizes = ', '.join(_size(v, span) for v, span in zip(value, spans, strict=False))
     unit = '' if found['unit'] == '1' else f' {found["unit"]}'
-    what = f' ({parameter})' if len(shapes) > 1 else ''
-    return f'{" or ".join(names)}{member} of {sizes}{unit}{what}'
+    what = f'{parameter}; ' if len(shapes) > 1 else ''
+    return (f'{" or ".join(names)}{member} of {sizes}{unit} ({what}robot file: '
+            f'{_of_file(found)})')
 
 
 def _size(value, span):
     if not span:
         return f'{value:.3g}'
-    return f'{value:.3g} +- {(span[1] - span[0]) / 2:.2g}'
+    below, above = value - span[0], span[1] - value
+    if abs(above - below) > LOPSIDED * (above + below):
+        return f'{value:.3g} ({span[0]:.2g} to {span[1]:.2g})'
+    return f'{value:.3g} +- {(below + above) / 2:.2g}'
 
 
 def _closing(made):

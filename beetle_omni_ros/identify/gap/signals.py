@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from beetle_omni_ros.identify.gap.filters import low_pass
+from beetle_omni_ros.identify.gap.filters import EDGE, low_pass
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import THRUST_BUS, TILT_BUS
 from beetle_omni_ros.identify.gap.parameters import GapParameters
@@ -35,7 +35,6 @@ SMOOTH_READING = 35.0
 # would sample its noise elsewhere, which changes chi2 by more than a delay is worth.
 IMU_LAG = 'imu_filter_lag.delay'
 MEMORY = 0.9            # [s] of rotors and commands before the first sample
-EDGE = 1.0              # [s] at both ends that smoothing and history need
 
 
 class Signals:

@@ -8,6 +8,7 @@ from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import State
 
 TOO_SMALL = 'too small to matter'
+IMPOSSIBLE = 'beyond what is physical'
 NOT_HELD = 'does not hold on data left out'
 FOUGHT = 'in slow or in quick motion alone, as gusts and answers to them'
 

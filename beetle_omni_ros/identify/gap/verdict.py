@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from beetle_omni_ros.identify.gap.candidates import FORMS
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.patterns import SWINGING
 from beetle_omni_ros.identify.gap.trial import FOUGHT, NOT_HELD, TOO_SMALL
@@ -14,7 +15,20 @@ if TYPE_CHECKING:
 
 
 def hidden(a: Analysis, p: GapParameters) -> list[str]:
-    """Names of entries of which these data could not show a realistic size."""
+    """
+    Names of entries of which these data could not show a realistic size.
+
+    Without those that act in one regime alone, near the ground say; see :func:`not_met`.
+    """
+    return [name for name in _out_of_sight(a, p) if name not in FORMS]
+
+
+def not_met(a: Analysis, p: GapParameters) -> list[str]:
+    """Names of entries whose regime these flights did not meet, and so could not show."""
+    return [name for name in _out_of_sight(a, p) if name in FORMS]
+
+
+def _out_of_sight(a, p):
     best: dict[str, float] = {}
     for label, seen in a.visible.items():
         name = label.partition(' ')[0].partition('[')[0]
@@ -36,7 +50,7 @@ def decide(a: Analysis, p: GapParameters) -> None:
     explained = (before - after) / max(before - after + left, 1e-9)
     out_of_sight = hidden(a, p)
     share = len(out_of_sight) / max(len({label.partition(' ')[0].partition('[')[0]
-                                         for label in a.visible}), 1)
+                                         for label in a.visible} - set(FORMS)), 1)
     repeats = _repeats(a.rest, p)
     strange = _strange(a, before - after, p)
     sets = [[t, *found.rivals.get(t.candidate.label, [])] for t in found.accepted]
@@ -52,8 +66,9 @@ def decide(a: Analysis, p: GapParameters) -> None:
                 or repeats and part > p.remainder_share or a.loud:
             a.verdict, a.partial = 'unknown', list(found.accepted)
             rest = strange or (a.loud[0].text if a.loud else a.rest.text)
-            a.reason = (f'{found.accepted[0].candidate.name} and its like explain '
-                        f'{explained:.0%} of what known effects could; the rest: {rest}')
+            known = ', '.join(dict.fromkeys(t.candidate.name for t in found.accepted))
+            a.reason = (f'{rest}, also with {known} ({explained:.0%} of what known effects could '
+                        'explain)')
             found.accepted.clear()
         elif max(names) >= p.crowd or (share > p.most_hidden and max(names) > 1):
             a.verdict = 'not_decidable'

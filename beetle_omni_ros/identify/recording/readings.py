@@ -87,7 +87,9 @@ def _beyond(series, limits):
     if not bad.any() or bad.mean() > MOST_REPAIRED:
         return None         # a unit, if it is all of them
     k = int(np.argmax(bad))
-    return series.damage(f'{int(bad.sum())} spikes beyond what the sensor can measure, such as '
+    count = int(bad.sum())
+    return series.damage(f'{count} spike{"s" if count > 1 else ""} beyond what the sensor can '
+                         'measure, such as '
                          f'{np.abs(series.values[k]).max():.3g}', series.t[k], bad,
                          'drop these readings')
 

@@ -1,5 +1,5 @@
 """
-The motor board's firmware as docs/firmware.md demands it: a state machine without clock or port.
+The motor board's firmware as docs/reference/firmware.md demands it: a pure state machine.
 
 All times are passed in [s], on any clock that does not step. Every question brings the state up
 to its time first, so answers do not depend on how often somebody looks.

@@ -1,0 +1,461 @@
+"""
+Write the pages of docs/reference that are made from code: ``python docs/generate_reference.py``.
+
+| page | made from |
+| --- | --- |
+| parameters.md | the dataclasses that read params/*.yaml, and the values in these files |
+| topics.md | runs/topics.py, and the publishers and subscribers in nodes/*.py |
+| command_line.md | the options of ``beetle_omni`` and its subcommands |
+| effects.md | the catalogue of effects |
+| faults.md | params/faults.yaml |
+
+``--check`` writes nothing and exits with status 1 where a page is out of date. ROS is not needed:
+the files of the nodes are read, not imported.
+"""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import fields, is_dataclass
+from importlib import import_module
+from pathlib import Path
+import re
+import sys
+
+import numpy as np
+
+from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.resources import PACKAGE
+
+ROOT = Path(__file__).resolve().parents[1]
+REFERENCE = ROOT / 'docs' / 'reference'
+MADE = '<!-- Made by docs/generate_reference.py; changes by hand are lost. -->\n'
+
+# Parameter file -> class that reads it, what it holds.
+FILES = {
+    'robot.yaml': ('robot.parameters:RobotParameters', 'What the robot is.'),
+    'robot_weak_and_heavy.yaml': ('robot.parameters:RobotParameters',
+                                  'A robot with less thrust and more mass than it is told.'),
+    'nmpc.yaml': ('control.nmpc_parameters:NmpcParameters', 'The NMPC.'),
+    'nmpc_published.yaml': ('control.nmpc_parameters:NmpcParameters',
+                            'The NMPC with the settings of the publication.'),
+    'rl.yaml': ('control.policy:PolicyParameters', 'The policy and its guidance.'),
+    'hover.yaml': ('control.hover:HoverParameters', 'The hover controller.'),
+    'degraded.yaml': ('robot.holding:HoldingParameters',
+                      'Attitudes that can be held with a failed actuator.'),
+    'ekf.yaml': ('estimation.parameters:EkfParameters', 'The estimator.'),
+    'supervisor.yaml': ('safety.parameters:SupervisorParameters',
+                        'Checks of commands, takeoff, landing, detection of faults.'),
+    'targets.yaml': ('runs.target_checks:TargetLimits', 'What a target pose must keep to.'),
+    'servo_bus.yaml': ('drivers.servo_parameters:ServoBusParameters', 'The bus of tilt servos.'),
+    'motor_board.yaml': ('drivers.motor_board_parameters:MotorBoardParameters',
+                         'The motor board.'),
+    'emulated_board.yaml': ('sim.emulated.board_parameters:EmulatedBoardParameters',
+                            'The emulated motor board.'),
+    'simulator.yaml': ('sim.parameters:SimulatorParameters', 'The simulated world.'),
+    'check.yaml': ('bringup.limits:CheckLimits', 'Limits of `beetle_omni check`.'),
+    'recording.yaml': ('identify.recording.limits:RecordingLimits',
+                       'Limits of the checks of a recording against itself.'),
+    'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
+    'faults.yaml': ('sim.faults.listed:FaultList', 'The listed faults.'),
+    'gap.yaml': (None, 'The gap finder.')}
+
+# Nodes whose code is not in a file of their own name; '' is no node of its own.
+SHARED = {'controller_node': 'nmpc_node, rl_node', 'health': 'every node', 'operator': '',
+          'listener': '', 'node': '', 'recorder_node': '', 'command_source': '', 'graph': ''}
+
+MEANINGS = {
+    'mocap/pose': 'pose of base_link in world, stamped at capture, 100 Hz',
+    'imu/data_raw': 'specific force and angular rate in base_link, without orientation '
+                    '(REP-145), 200 Hz',
+    'joint_states': 'position, velocity and effort of `gimbal1..4`',
+    'battery_state': 'pack voltage and current, negative when discharging',
+    'rotor_states': '`velocity` of `rotor1..4` [rad/s], positive for both spins, NaN where '
+                    'unknown',
+    'odom': 'estimate: pose in world, twist in base_link, both covariances',
+    'target_pose': 'target pose in world; `reference_node` or a user publishes it',
+    'target_trajectory': 'time-parameterised reference; `reference_node` or a user publishes it',
+    '<controller>/command': 'command that a controller asks for: `nmpc/command`, `rl/command`',
+    'command': 'the selected and checked command that the actuators execute',
+    'supervisor/state': 'state, a colon, and the active controller or the last fault',
+    'supervisor/identity': 'identity of the supervisor; actuators obey its commands alone',
+    'supervisor/target': 'what controllers fly to in place of the target of the operator; '
+                         'nothing where it has no points',
+    'supervisor/actuators': '`gimbal1..4` and `rotor1..4`: `position` holds the angles of stuck '
+                            'joints (NaN: the joint moves), `effort` 1 or 0 for each rotor',
+    'reference/state': '`waiting`, `flying 3/15`, `done`, `done: control lost at level 60`, or '
+                       '`aborted` when the flight ended before the task',
+    'joint_bridge/state': '`ready`, `waiting: WHY` or `lost: WHY`',
+    'rotor_bridge/state': '`ready`, `waiting: WHY`, `silent: WHY` or `lost: WHY`',
+    'disturbance': 'external wrench on the simulated robot until the next message: force in '
+                   'world, torque in base_link; a user or an experiment publishes it',
+    'ground_truth/odom': 'the simulated truth',
+    'diagnostics': 'health, rates, ages, timing and faults of each node',
+    '/clock': 'simulated time, where it is simulated',
+    '/tf': 'frames for viewers, where tf2_msgs is installed',
+    'robot_description': 'URDF for viewers',
+    'markers': 'targets and thrusts for viewers'}
+QOS = {'SENSOR': 'best effort, depth 5', 'COMMAND': 'reliable, depth 1',
+       'ESTIMATE': 'reliable, depth 1', 'EVENT': 'reliable, depth 10',
+       'LATCHED': 'reliable, latched'}
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    """Markdown table; bars in cells are escaped."""
+    lines = [head, ['---'] * len(head), *([cell.replace('|', '\\|') for cell in row]
+                                          for row in rows)]
+    return ''.join('| ' + ' | '.join(cell or ' ' for cell in line) + ' |\n' for line in lines)
+
+
+def _number(value: float) -> str:
+    return f'{value:.7g}'
+
+
+def _value(value) -> str:
+    """A parameter's value for a cell."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if value is None:
+        return ''
+    if isinstance(value, (int, float, np.number)):
+        return _number(value)
+    if isinstance(value, (list, tuple, np.ndarray)):
+        flat = list(value)
+        if all(isinstance(one, (int, float, np.number)) for one in flat) and len(flat) <= 24:
+            return '[' + ', '.join(_number(one) for one in flat) + ']'
+        return 'see the file'
+    if isinstance(value, dict):
+        return 'see the file' if value else '{}'
+    return f'`{value}`' if value != '' else '""'
+
+
+def _range(meta) -> str:
+    """Legal values of a declared number, or the choices."""
+    if meta.get('choices'):
+        return ', '.join(f'`{choice}`' for choice in meta['choices'])
+    low, high = meta.get('low'), meta.get('high')
+    if low is None and high is None:
+        return ''
+    if high is None:
+        return f'at least {_number(low)}'
+    return f'at most {_number(high)}' if low is None else f'{_number(low)} to {_number(high)}'
+
+
+def _leaves(instance, prefix=''):
+    """(dotted name, dataclass field, value) of each leaf, optional groups included."""
+    for entry in fields(instance):
+        value = getattr(instance, entry.name)
+        if is_dataclass(value):
+            yield from _leaves(value, f'{prefix}{entry.name}.')
+        elif entry.init:
+            yield prefix + entry.name, entry, value
+
+
+def _load(name: str):
+    """Shipped instance of a parameter file."""
+    module, kind = FILES[name][0].split(':')
+    kind = getattr(import_module(f'{PACKAGE}.{module}'), kind)
+    return kind.load(str(ROOT / 'params' / name))
+
+
+def _undeclared(name: str) -> list[list[str]]:
+    """Rows of a file whose keys are described by its comments alone."""
+    rows, note = [], None
+    for line in (ROOT / 'params' / name).read_text(encoding='utf-8').splitlines():
+        entry = re.match(r'(\w+): *(.*?) *(?:#\s*(?:\[([^\]]*)\])?\s*(.*))?$', line)
+        more = re.match(r'\s{8,}#\s*(.*)$', line)
+        if entry:
+            unit = '' if entry[3] in (None, '-') else entry[3]
+            note = [f'`{entry[1]}`', entry[2], unit, entry[4] or '']
+            rows.append(note)
+        elif more and note and note[3]:
+            note[3] += ' ' + more[1]
+        else:
+            note = None
+    return rows
+
+
+def parameters() -> str:
+    """Every parameter of every shipped file."""
+    text = [f'# Parameters\n\n{MADE}\n'
+            'The files of `params/` hold the values below. A comment beside each number gives '
+            'its source.\nA value outside its range and an unknown key are refused. '
+            'In ROS, `ros2 param describe` shows unit\nand range. '
+            '[The nodes](nodes.md#parameters) says which source overrides which.\n']
+    seen: dict[str, str] = {}
+    for name, (kind, what) in FILES.items():
+        text.append(f'\n## {name}\n\n{what}\n\n')
+        if name == 'faults.yaml':
+            text.append('The faults themselves are in [the list of faults](faults.md).\n\n')
+        if kind is None:
+            text.append(table(['key', 'value', 'unit', 'comment of the file'],
+                              _undeclared(name)))
+            continue
+        if kind in seen:
+            same = {key: value for key, _, value in _leaves(_load(seen[kind]))}
+            rows = [[f'`{key}`', _value(value) if repr(value) != '{}' else 'none',
+                     _value(same[key])] for key, _, value in _leaves(_load(name))
+                    if repr(value) != repr(same[key])]
+            text.append(f'The keys are those of [{seen[kind]}](#{_anchor(seen[kind])}). These '
+                        'values differ:\n\n'
+                        + table(['key', 'value', f'in {seen[kind]}'], rows))
+            continue
+        seen[kind] = name
+        rows = [[f'`{key}`', _value(value), entry.metadata.get('unit', ''),
+                 _range(entry.metadata), entry.metadata.get('doc', '')]
+                for key, entry, value in _leaves(_load(name))]
+        text.append(table(['key', 'value', 'unit', 'range', 'meaning'], rows))
+    return ''.join(text)
+
+
+def _anchor(heading: str) -> str:
+    return re.sub(r'[^\w\- ]', '', heading.lower()).strip().replace(' ', '-')
+
+
+def _names(tree: ast.AST) -> tuple[dict[str, str], dict[str, str]]:
+    """(message class -> ROS type, module constant -> text) of a node's file."""
+    types, constants = {}, {}
+    for item in ast.walk(tree):
+        if isinstance(item, ast.ImportFrom) and (item.module or '').endswith('.msg'):
+            types |= {alias.asname or alias.name: f"{item.module.split('.')[0]}/{alias.name}"
+                      for alias in item.names}
+        elif isinstance(item, ast.Assign) and isinstance(item.value, ast.Constant) \
+                and isinstance(item.value.value, str) and isinstance(item.targets[0], ast.Name):
+            constants[item.targets[0].id] = item.value.value
+    return types, constants
+
+
+def _topic(value, constants) -> list[str]:
+    """Topic names of an argument: text, a constant, or text with the name of a part in it."""
+    if isinstance(value, ast.Constant):
+        return [value.value]
+    if isinstance(value, ast.Name):
+        return [constants[value.id]] if value.id in constants else []
+    if isinstance(value, ast.JoinedStr):
+        end = ''.join(part.value for part in value.values if isinstance(part, ast.Constant))
+        return ['joint_bridge/state', 'rotor_bridge/state'] if end.endswith('bridge/state') \
+            or end == '/state' else [f'<controller>{end}']
+    return []
+
+
+def _graph() -> dict[str, dict]:
+    """Topic -> type, qos, from and to, as the files of the nodes say."""
+    found: dict[str, dict] = {}
+    nodes = ROOT / PACKAGE / 'nodes'
+    shared = _names(ast.parse((nodes / 'command_source.py').read_text(encoding='utf-8')))[1]
+    for path in sorted(nodes.glob('*.py')):
+        node = SHARED.get(path.stem, path.stem)
+        tree = ast.parse(path.read_text(encoding='utf-8'))
+        types, constants = _names(tree)
+        for call in ast.walk(tree):
+            if not node or not isinstance(call, ast.Call) or len(call.args) < 2 \
+                    or not isinstance(call.func, ast.Attribute):
+                continue
+            way = {'create_publisher': 'from', 'create_subscription': 'to',
+                   'listen': 'to'}.get(call.func.attr)
+            kind = call.args[0].id if isinstance(call.args[0], ast.Name) else None
+            if not way or kind not in types and kind != 'TFMessage':
+                continue
+            profile = next((part.attr for part in ast.walk(call)
+                            if isinstance(part, ast.Attribute) and part.attr in QOS
+                            and isinstance(part.value, ast.Name) and part.value.id == 'qos'), '')
+            for topic in _topic(call.args[1], {**shared, **constants}):
+                entry = found.setdefault(topic, {'type': types.get(kind, 'tf2_msgs/TFMessage'),
+                                                 'qos': '', 'from': [], 'to': []})
+                entry[way] += [one for one in node.split(', ') if one not in entry[way]]
+                entry['qos'] = profile if way == 'from' else entry['qos']
+    for topic in ('command',):      # read through the class that checks the publisher
+        found['supervisor/identity']['to'] = list(found[topic]['to'])
+    return found
+
+
+def topics() -> str:
+    """Topics with types, quality of service, publishers and subscribers."""
+    graph = _graph()
+    missing = sorted(set(graph) ^ set(MEANINGS))
+    if missing:
+        raise SystemExit(f'MEANINGS and the nodes differ in {", ".join(missing)}')
+    said = [[f'`{topic}`', graph[topic]['type'], meaning] for topic, meaning in MEANINGS.items()]
+    ends = [[f'`{topic}`', *(', '.join(f'`{node}`' if node != 'every node' else node
+                                       for node in graph[topic][way]) for way in ('from', 'to')),
+             QOS.get(graph[topic]['qos'], '')] for topic in MEANINGS]
+    return (f'# Topics\n\n{MADE}\n'
+            'Names are relative; a launch argument sets a namespace. On the robot the drivers of '
+            'MoCap and IMU\npublish what `sim_node` publishes in the simulation. `recorder_node` '
+            'subscribes to every topic\nof a bag, and `viewer_node` publishes for viewers.\n\n'
+            + table(['topic', 'type', 'meaning'], said)
+            + '\n## Publishers and subscribers\n\n'
+            + table(['topic', 'published by', 'subscribed by', 'quality of service'], ends)
+            + '\n## Frames and conventions\n\n'
+            '- Units are SI, angles are radians, times are seconds.\n'
+            '- Axes follow REP-103: x forward, y left, z up. `world` is the frame of the MoCap, '
+            'with z up.\n'
+            '- `base_link` is at the centre of gravity.\n'
+            '- Quaternions stand in the order (x, y, z, w).\n'
+            '- A command is one `sensor_msgs/JointState` with `name = [gimbal1..4, rotor1..4]`. '
+            '`position` holds\n  the four tilt targets [rad], then four NaN. `effort` holds four '
+            'NaN, then the four thrust targets\n  [N]. `velocity` is empty.\n'
+            '- The stamp of a command is the time of the state estimate that it answers.\n')
+
+
+def _options(command) -> list[list[str]]:
+    rows = []
+    for option in command.params:
+        if 'help' in option.opts or '--help' in option.opts:
+            continue
+        names = '/'.join([', '.join(option.opts), *option.secondary_opts])
+        if option.param_type_name == 'argument':
+            names = (option.metavar or option.name.upper()) + ('...' if option.nargs != 1
+                                                               and not (option.metavar or '')
+                                                               .rstrip(']').endswith('...')
+                                                               else '')
+        elif not option.is_flag:
+            names += f' {option.metavar or option.name.upper()}'
+        default = option.default
+        text = 'required' if option.required else ''
+        told = default is not None and str(default) not in ('', 'False', '()')
+        if not option.required and told and not callable(default) \
+                and not (option.is_flag and not option.secondary_opts):
+            text = (option.opts[0] if default else option.secondary_opts[0]) \
+                if option.is_flag else str(default)
+        rows.append([f'`{names}`', f'`{text}`' if text not in ('', 'required') else text,
+                     ' '.join((getattr(option, 'help', '') or '').split())])
+    return rows
+
+
+def _commands(command, name):
+    if hasattr(command, 'commands'):
+        for part, inner in command.commands.items():
+            yield from _commands(inner, f'{name} {part}')
+    else:
+        yield name, command
+
+
+def command_line() -> str:
+    """Every subcommand with its options."""
+    from typer.main import get_command
+
+    from beetle_omni_ros.cli import app
+    text = [f'# Command line\n\n{MADE}\n'
+            '`beetle_omni` is also `ros2 run beetle_omni_ros beetle_omni`. Each subcommand has '
+            '`--help`.\n\n'
+            + table(['exit status', 'meaning'], [
+                ['0', 'success'], ['1', 'a flight or a check failed'],
+                ['2', 'unusable input; one line on standard error'],
+                ['3', '`gap`: the verdict `bad_data`'], ['130', 'interrupted']])]
+    for name, command in _commands(get_command(app), 'beetle_omni'):
+        told = (command.help or '').replace('\b', '').strip()
+        paragraphs = [' '.join(part.split()) for part in told.split('\n\n')]
+        text.append(f'\n## {name}\n')
+        for paragraph in paragraphs:
+            say, _, example = paragraph.partition('Example: ')
+            text += [f'\n{_wrapped(say.strip())}\n'] if say.strip() else []
+            text += [f'\n```sh\n{example.strip()}\n```\n'] if example else []
+        text.append('\n' + table(['option', 'default', 'meaning'], _options(command)))
+    return ''.join(text)
+
+
+def _wrapped(text: str) -> str:
+    from textwrap import fill
+    return fill(text, 98, break_long_words=False, break_on_hyphens=False)
+
+
+def effects() -> str:
+    """The catalogue of effects."""
+    from beetle_omni_ros.robot.effects import CATALOGUE
+    from beetle_omni_ros.sim.effects import BUILT_IN, FORCES
+    text = [f'# Effects\n\n{MADE}\n'
+            'An effect is a term that reality may add to the model. A robot file switches an '
+            'effect on by naming\nit under `effects:`, for example `effects: {thrust_coefficient: '
+            '{scale: 0.93}}`. [The gap\nfinder](../gap.md) searches the same entries.\n\n'
+            '*Typical* is a realistic deviation from the neutral value. *Smallest* is the '
+            'smallest deviation\nworth naming. Where the neutral value is the number of the robot '
+            'file, both are fractions of it.\n\n'
+            + table(['effect', 'layer', 'acts through', 'the MuJoCo plant'],
+                    [[f'[{name}](#{name})', entry.layer, _acts(name, entry),
+                      'has it' if name in BUILT_IN + FORCES else 'refuses it']
+                     for name, entry in CATALOGUE.items()])]
+    for name, entry in CATALOGUE.items():
+        rows = [[f'`{key}`', spec.unit, _neutral(spec.neutral),
+                 f'{_number(spec.low)} to {_number(spec.high)}', _known(spec.typical),
+                 _known(spec.smallest), entry.settings.get(key) and f'`{entry.settings[key]}`'
+                 or '', '4, one for each ' + entry.each if entry.each
+                 else '1, or 4 for each joint' if spec.of_each
+                 else str(len(spec.neutral)) if isinstance(spec.neutral, tuple) else '1']
+                for key, spec in entry.parameters.items()]
+        text.append(f'\n## {name}\n\n'
+                    + table(['', ''], [['equation, source', entry.source],
+                                       ['shows in', entry.excited_by],
+                                       ['confused with', ', '.join(
+                                           f'[{other}](#{other})'
+                                           for other in entry.confused_with)],
+                                       ['separated by', entry.separated_by]])
+                    + '\n' + table(['parameter', 'unit', 'neutral', 'range', 'typical',
+                                    'smallest', 'replaces', 'numbers'], rows))
+    return ''.join(text)
+
+
+def _acts(name, entry) -> str:
+    ways = [('the body equations', entry.apply), ('the servo equation', entry.servo),
+            ('a number of the robot file', entry.settings)]
+    acting = [way for way, there in ways if there]
+    if acting:
+        return ' and '.join(acting)
+    return 'the delay of commands' if name in ('command_latency', 'joint_command_latency',
+                                               'rotor_dead_time') \
+        else 'a value that the gap finder fits'
+
+
+def _neutral(value) -> str:
+    values = set(value) if isinstance(value, tuple) else {value}
+    one = values.pop()
+    return 'robot file' if one != one else _number(one)
+
+
+def _known(value) -> str:
+    return '' if value != value else _number(value)
+
+
+def faults() -> str:
+    """The listed faults."""
+    from beetle_omni_ros.sim.faults.listed import FaultList
+    cases = FaultList.load().cases
+    rows = []
+    for name, case in cases.items():
+        strikes = '; '.join(' '.join([f'`{fault["kind"]}`', *(f'{key}={_value(value)}' for
+                            key, value in fault.items() if key != 'kind')])
+                            for fault in schema.load_yaml(ROOT / 'params' / 'faults.yaml')[
+                                'faults'][name]['strike'])
+        rows.append([f'`{name}`', case.what, f'`{case.expected}`', strikes])
+    return (f'# The listed faults\n\n{MADE}\n'
+            f'`beetle_omni faults` flies the {len(rows)} faults of `params/faults.yaml`. '
+            '[Faults](../faults.md) explains\nkinds, outcomes and campaigns. '
+            '[Safety](../safety.md) holds the outcomes that were flown.\n\n'
+            + table(['fault', 'what happens', 'expected', 'strikes'], rows))
+
+
+PAGES = {'parameters.md': parameters, 'topics.md': topics, 'command_line.md': command_line,
+         'effects.md': effects, 'faults.md': faults}
+
+
+def out_of_date() -> list[str]:
+    """Names of pages that differ from what the code says."""
+    return [name for name, make in PAGES.items() if not (REFERENCE / name).is_file()
+            or (REFERENCE / name).read_text(encoding='utf-8') != make()]
+
+
+def main(arguments: list[str]) -> int:
+    """Write the pages, or check them; returns the exit status."""
+    if '--check' in arguments:
+        old = out_of_date()
+        for name in old:
+            print(f'docs/reference/{name} is out of date: python docs/generate_reference.py')
+        return bool(old)
+    REFERENCE.mkdir(exist_ok=True)
+    for name, make in PAGES.items():
+        (REFERENCE / name).write_text(make(), encoding='utf-8')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,101 @@
+"""The pages can be read: links lead somewhere, sentences and lines are short, code agrees."""
+
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+import re
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+# Pages with a style of their own: made by a command, or not yet rewritten.
+MADE = ('docs/comparison/', 'docs/gap_campaign', 'docs/reference/parameters.md',
+        'docs/reference/effects.md')
+NOT_YET = ('docs/gap.md', 'docs/safety.md', 'docs/faults.md', 'docs/degraded.md')
+
+
+def module(name):
+    """Load a program of docs/, which is no package."""
+    spec = spec_from_file_location(name, ROOT / 'docs' / f'{name}.py')
+    loaded = module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    return loaded
+
+
+pages = module('pages')
+PAGES = [page.relative_to(ROOT).as_posix() for page in pages.written()]
+REWRITTEN = [page for page in PAGES if not page.startswith(MADE) and page not in NOT_YET]
+
+
+def read(page):
+    """Text of a page."""
+    return (ROOT / page).read_text(encoding='utf-8')
+
+
+@pytest.mark.parametrize('page', PAGES)
+def test_every_relative_link_leads_to_a_file_and_a_heading(page):
+    assert not pages.broken_links(ROOT / page)
+
+
+@pytest.mark.parametrize('page', REWRITTEN)
+def test_no_sentence_is_longer_than_35_words(page):
+    long = [f'{page}:{line}: {pages.words(text)} words: {text}'
+            for line, text in pages.too_long(read(page))]
+    assert not long, '\n'.join(long)
+
+
+@pytest.mark.parametrize('page', REWRITTEN)
+def test_sentences_have_20_words_on_average_at_most(page):
+    lengths = [pages.words(sentence.text) for sentence in pages.sentences(read(page))]
+    assert sum(lengths) <= 20 * max(1, len(lengths))
+
+
+@pytest.mark.parametrize('page', REWRITTEN)
+def test_no_line_of_text_is_wider_than_the_code(page):
+    wide = [f'{page}:{line}: {len(text)} columns' for line, text in pages.too_wide(read(page))]
+    assert not wide, '\n'.join(wide)
+
+
+def test_the_readme_has_150_lines_at_most():
+    assert len(read('README.md').splitlines()) <= 150
+
+
+def test_the_pages_made_from_code_are_up_to_date():
+    old = module('generate_reference').out_of_date()
+    assert not old, f'{old}: run python docs/generate_reference.py'
+
+
+def test_every_page_is_in_the_navigation_and_every_entry_is_a_page():
+    def files(entries):
+        for entry in entries:
+            for value in [entry] if isinstance(entry, str) else entry.values():
+                yield from [value] if isinstance(value, str) else files(value)
+    navigation = yaml.safe_load(read('mkdocs.yml').partition('\nnav:')[2])
+    listed = [f'docs/{file}' for file in files(navigation)]
+    assert sorted(listed) == sorted(page for page in PAGES if page.startswith('docs/'))
+
+
+def test_every_page_that_the_code_names_is_there():
+    for path in [*(ROOT / 'beetle_omni_ros').rglob('*.py'), *(ROOT / 'params').glob('*.yaml'),
+                 *(ROOT / 'benchmarks').rglob('*.py'), ROOT / 'Makefile', ROOT / 'package.xml',
+                 ROOT / '.ci' / 'setup', *(ROOT / 'launch').glob('*.py')]:
+        for named in re.findall(r'(?<![\w/.])docs/[\w/-]+\.md', path.read_text(encoding='utf-8')):
+            assert (ROOT / named).is_file(), f'{path.relative_to(ROOT)} names {named}'
+
+
+@pytest.mark.parametrize(('text', 'words'), [
+    ('One two. Three `four five` six.', [2, 3]),
+    ('- An item\n  of two lines\n- another', [5, 1]),
+    ('# Heading\n\n| a | table |\n\n```\ncode here\n```\nText 1.5 m long.', [4]),
+    ('See [the page of it](page.md), e.g. here.', [7])])
+def test_sentences_are_counted_as_a_reader_would(text, words):
+    assert [pages.words(sentence.text) for sentence in pages.sentences(text)] == words
+
+
+def test_a_long_sentence_and_a_broken_link_are_found(tmp_path):
+    page = tmp_path / 'page.md'
+    page.write_text('# Title here\n\n' + 'word ' * 40 + '.\n\n[a](none.md) [b](#title-here) '
+                    '[c](#none) [d](page.md#title-here) `[e](not.md)`\n')
+    assert [line for line, _ in pages.too_long(page.read_text())] == [3]
+    assert pages.too_wide(page.read_text())
+    assert [broken.split(': ')[1] for broken in pages.broken_links(page)] == ['none.md', '#none']

@@ -1,0 +1,66 @@
+"""A residual beyond what sensors make is a gap, and a name must hold on flights held out."""
+
+from types import SimpleNamespace
+
+from flights import model, Motion, P
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.gap import analysis
+from beetle_omni_ros.identify.gap.absolute import ceilings, too_loud
+from beetle_omni_ros.identify.gap.analysis import Analysis
+from beetle_omni_ros.identify.gap.rollouts import HORIZONS, Runs
+from beetle_omni_ros.identify.gap.verdict import disagreement
+
+MOTION = Motion(5, 20.0)
+
+
+def readings(rate=0.0, drift=0.0):
+    """A flight with white noise, ``rate`` [rad/s] of it in the gyroscope, and a slow error."""
+    rng, flight = np.random.default_rng(0), MOTION.flight()
+    flight.imu[:, 3:] += rate * rng.standard_normal((len(flight.imu), 3))
+    flight.imu[:, 3] += drift * np.sin(2 * np.pi * 0.4 * flight.imu_t)
+    return model(flight)
+
+
+def test_white_noise_of_a_sensor_raises_its_own_ceiling():
+    quiet, noisy = readings(), readings(rate=0.1)
+    assert (ceilings(noisy, P)['W'] > ceilings(quiet, P)['W']).all()
+    assert ceilings(noisy, P)['A'] == pytest.approx(ceilings(quiet, P)['A'])
+    assert 'rate_x' not in [loud.channel for loud in too_loud([noisy], {}, P)]
+
+
+def test_a_slow_error_does_not_pass_for_noise():
+    assert 'rate_x' in [loud.channel for loud in too_loud([readings(drift=0.2)], {}, P)]
+
+
+def runs(size, seed=0, count=160):
+    """Errors of free runs about ``size`` times their floor."""
+    scatter = np.random.default_rng(seed).uniform(0.8, 1.2, (3, count, 5))
+    return [Runs(size * scatter, np.full(count, 'hover', dtype=object), np.ones((3, 5)))]
+
+
+def refuted(monkeypatch, before, after, gain=(0.0, 1.0)):
+    a = Analysis(held_out=True, runs={'before': runs(before), 'after': runs(after, 1)},
+                 gaps={HORIZONS[analysis.JUDGED]: {'before': before, 'after': after}})
+    monkeypatch.setattr(analysis, '_gain_held_out', lambda a: gain)
+    return analysis._refuted(a, np.ones((3, 5)))
+
+
+@pytest.mark.parametrize('before, after, gain, words', [
+    (3.0, 1.0, (500.0, 20.0), ''), (np.nan, np.nan, (500.0, 20.0), 'end nowhere'),
+    (3.0, np.inf, (500.0, 20.0), 'end nowhere'), (1.10, 1.16, (0.0, 1.0), 'worse'),
+    (1.12, 1.15, (500.0, 20.0), 'worse'), (1.0, 1.0, (500.0, 20.0), ''),
+    (1.0, 1.0, (5.0, 20.0), 'does not improve'), (20.0, 15.0, (500.0, 20.0), 'leaves most')])
+def test_a_name_needs_free_runs_that_end_and_flights_held_out_that_gain(monkeypatch, before,
+                                                                        after, gain, words):
+    why = refuted(monkeypatch, before, after, gain)
+    assert words in why and bool(words) == bool(why)
+
+
+@pytest.mark.parametrize('gap, verdict', [(1.2, 'no_gap'), (80.0, 'unknown'),
+                                          (np.nan, 'unknown')])
+def test_no_gap_needs_free_runs_that_agree(gap, verdict):
+    a = Analysis(verdict='no_gap', problem=SimpleNamespace(p=P))
+    disagreement(a, gap)
+    assert a.verdict == verdict

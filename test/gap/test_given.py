@@ -1,0 +1,15 @@
+"""How recordings are spoken of, and that each is given once."""
+
+from pathlib import Path
+
+import pytest
+
+from beetle_omni_ros.identify.gap.given import names_of
+
+
+@pytest.mark.parametrize('paths, names', [
+    (['/a/one', '/a/two'], ['one', 'two']),
+    (['/a/one/bag', '/a/two/bag'], ['one/bag', 'two/bag']),
+    (['/a/1/x/bag', '/b/1/x/bag'], ['a/1/x/bag', 'b/1/x/bag']), (['/a/one'], ['one'])])
+def test_names_tell_recordings_apart(paths, names):
+    assert names_of([Path(path) for path in paths]) == names

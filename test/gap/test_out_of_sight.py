@@ -1,0 +1,35 @@
+"""What flights could not have shown is listed, also what acts in one regime alone."""
+
+from types import SimpleNamespace
+
+from flights import KEYS, model, Motion, P
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.gap.analysis import Analysis
+from beetle_omni_ros.identify.gap.candidates import candidates
+from beetle_omni_ros.identify.gap.certainty import visibility
+from beetle_omni_ros.identify.gap.fit import Problem
+from beetle_omni_ros.identify.gap.keys import SHAPES, tolerances
+from beetle_omni_ros.identify.gap.verdict import hidden, not_met
+
+
+@pytest.mark.parametrize('higher, seen', [(0.0, True), (30.0, False)])
+def test_the_ground_shows_near_the_ground_alone(higher, seen):
+    motion = Motion(3, 24.0)
+    motion.position[:, 2] += higher
+    made = model(motion.flight())
+    problem = Problem([made], KEYS, tolerances(P), P)
+    state = problem.state({}, [name for name, key in KEYS.items() if key.parameter not in SHAPES])
+    visible = visibility(problem, state, list(problem.beliefs), candidates(KEYS, [made]))
+    assert {'ground_effect', 'tilt_thrust_loss', 'propeller_gyroscopic_torque'} <= set(visible)
+    a = Analysis(visible=visible)
+    assert ('ground_effect' not in not_met(a, P)) == seen
+    assert 'ground_effect' not in hidden(a, P)
+
+
+def test_an_entry_in_one_of_its_forms_is_out_of_sight_in_none():
+    a = Analysis(visible={name: SimpleNamespace(sigma=sigma) for name, sigma in (
+        ('rotor_drag', 1.0), ('joint_offset[1]', 1.0), ('joint_offset[2]', 90.0),
+        ('ground_effect', 1.0), ('mass', np.inf))})
+    assert hidden(a, P) == ['rotor_drag'] and not_met(a, P) == ['ground_effect']
