@@ -11,6 +11,7 @@ from beetle_omni_ros.cli.options import (
     check_flight,
     CONDITIONS,
     ConditionsOption,
+    DiscoveryOption,
     fail,
     FAILED,
     JsonOption,
@@ -52,6 +53,7 @@ def fly(bag: Annotated[Path, typer.Option(
                                           'each node.')] = True,
         domain_id: Annotated[Optional[int], typer.Option(
             '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
+        discovery: DiscoveryOption = None,
         json_path: JsonOption = None):
     """
     Fly the whole ROS graph in real time against the simulated robot.
@@ -67,7 +69,7 @@ def fly(bag: Annotated[Path, typer.Option(
                        conditions=conditions, actuators=actuators, clock=clock, robot=robot,
                        plant=plant, policy=policy, allow_other_robot=allow_other_robot,
                        standby=standby, composed=composed, json_path=json_path,
-                       domain_id=domain_id)
+                       domain_id=domain_id, discovery=discovery)
     except FlightError as error:
         raise typer.Exit(fail(error, FAILED)) from None
     raise typer.Exit(code if isinstance(code, int) else 0)
