@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from beetle_omni_ros import __version__
+from beetle_omni_ros.control.reach import reach_of_name
 from beetle_omni_ros.nodes import domain, runner
 from beetle_omni_ros.nodes.actuators import ACTUATORS, bridged
 from beetle_omni_ros.nodes.discovery import confine
@@ -78,7 +79,7 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
             check_new(bag)
             if json_path:
                 check_writable(json_path)
-            flown = make_task(task, seed)
+            flown = make_task(task, seed, reach_of_name(controller))
             RobotParameters.load(plant or robot)
             clocks = _clocks(clock, actuators)
             controllers, left_out = controller_nodes(

@@ -196,7 +196,8 @@ def fault_grids(run: Run) -> list[table.Grid]:
     made = []
     if rows:
         made.append(table.Grid(f'{run.label}: warnings and errors',
-                               ['node', 'level', 'text', 'first at [s]', 'reports'], rows[:MOST_ROWS]))
+                               ['node', 'level', 'text', 'first at [s]', 'reports'],
+                               rows[:MOST_ROWS]))
     if rejected:
         made.append(table.Grid(f'{run.label}: rejected', ['node', 'reason', 'count'], rejected))
     if not made:

@@ -141,6 +141,23 @@ def test_a_latched_target_stays_good_for_a_node_that_starts_later(bench, monkeyp
     assert bench.wait(lambda: node._target is not None)
 
 
+def test_a_target_beyond_the_reach_of_who_flies_is_refused_and_not_taken_over(bench):
+    node = bench.add(StillNode())
+    node._controller.reach = 6.5
+    node._position = np.array([0.0, 0.0, 1.0])
+    poses = bench.publisher(PoseStamped, 'target_pose')
+    poses.publish(pose(x=12.0))
+    assert bench.wait(lambda: node._target is not None)     # on standby: another may get there
+    node._on_mode(String(data='flying:nmpc'))
+    assert node._target is None and 'the present pose is held' in node.said[-1]
+    poses.publish(pose(x=3.0))
+    assert bench.wait(lambda: node._target is not None)
+    near, heard = node._target, len(node.said)
+    poses.publish(pose(x=12.0))
+    assert bench.wait(lambda: len(node.said) > heard)
+    assert node._target is near and '12 m from the robot, expected at most 6.5 m' in node.said[-1]
+
+
 def trajectory(heights, stamp):
     count = len(heights)
     positions = np.column_stack([np.zeros((count, 2)), heights])
