@@ -21,6 +21,7 @@ from beetle_omni_ros.runs.target_checks import out_of_reach, TargetChecks
 
 ODOM_AGE = 0.05         # s, an older estimate is not worth a command
 JOINT_AGE = 0.1         # s
+OTHER_CLOCK = 3600.0    # s between a target's stamp and simulated time
 # A step is due when the stamps say so, within half of the smallest estimate interval.
 STEP_TOLERANCE = 0.0025
 
@@ -89,8 +90,12 @@ class ControllerNode(FlightNode):
 
     def _check_target(self, target, published):
         # Held against its publication: a latched target stays good for a node that starts
-        # later. Simulated time has nothing to do with publications.
-        then = None if self.simulated or math.isnan(published) else published
+        # later. Simulated time has nothing to do with publications: there a stamp counts as another
+        # clock's when it is very far off, once the clock is known.
+        then = None if math.isnan(published) else published
+        if self.simulated:
+            now = self.now()
+            then = now if now and abs(now - target.stamp) > OTHER_CLOCK else None
         reason = self._checks.why_not(target, then) or (
             self._too_far(target) if self._mode == self._own_mode else '')
         if reason:

@@ -132,6 +132,21 @@ def test_a_target_from_a_clock_ahead_does_not_block_later_ones(bench):
     assert bench.wait(lambda: node._target.position[2] == 1.5)
 
 
+def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
+    node = bench.add(StillNode())
+    monkeypatch.setattr(node, 'simulated', True)
+    now = time.time()
+    for time_now, stamp, good in ((now, 1.5, False), (now, now + 1e5, False), (now, now - 60, True),
+                                  (100.0, 1.5, True), (0.0, now, True), (100.0, now, False)):
+        monkeypatch.setattr(node, 'now', lambda told=time_now: told)
+        target = targets.pose_target(pose(stamp=stamp))
+        if good:
+            node._check_target(target, now)
+        else:
+            with pytest.raises(convert.MessageError, match='the stamp is .* expected at most'):
+                node._check_target(target, now)
+
+
 def test_a_latched_target_stays_good_for_a_node_that_starts_later(bench, monkeypatch):
     node = bench.add(StillNode())
     late = time.time() + 60
