@@ -90,7 +90,7 @@ class ControllerNode(FlightNode):
 
     def _check_target(self, target, published):
         # Held against its publication: a latched target stays good for a node that starts
-        # later. Simulated time has nothing to do with publications: there a stamp counts as another
+        # later. Simulated time has nothing to do with publications: there a stamp is another
         # clock's when it is very far off, once the clock is known.
         then = None if math.isnan(published) else published
         if self.simulated:

@@ -136,8 +136,9 @@ def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
     node = bench.add(StillNode())
     monkeypatch.setattr(node, 'simulated', True)
     now = time.time()
-    for time_now, stamp, good in ((now, 1.5, False), (now, now + 1e5, False), (now, now - 60, True),
-                                  (100.0, 1.5, True), (0.0, now, True), (100.0, now, False)):
+    for time_now, stamp, good in (
+            (now, 1.5, False), (now, now + 1e5, False), (now, now - 60, True),
+            (100.0, 1.5, True), (0.0, now, True), (100.0, now, False)):
         monkeypatch.setattr(node, 'now', lambda told=time_now: told)
         target = targets.pose_target(pose(stamp=stamp))
         if good:
