@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 import io
 from pathlib import Path
+import shutil
 import signal
 import sys
 import tempfile
@@ -259,6 +260,8 @@ def main(arguments: list[str] | None = None) -> int:
               f'{time.perf_counter() - begin:.0f} s', flush=True)
         for text in findings:
             print(f'  {text}')
+        if not findings:
+            shutil.rmtree(folder, ignore_errors=True)
         failed |= bool(findings)
     return int(failed)
 
