@@ -217,7 +217,11 @@ def spoil(rng: np.random.Generator, message) -> None:
         low = -2**31 if field == 'sec' else 0
         setattr(message, field, int(rng.choice([0, 1, 255 if low == 0 else low, 200])))
     elif isinstance(value, float):
-        setattr(message, field, float(NUMBERS[rng.integers(len(NUMBERS))]))
+        number = NUMBERS[rng.integers(len(NUMBERS))]
+        if message.get_fields_and_field_types()[field] == 'float':      # of 32 bits
+            with np.errstate(over='ignore'):
+                number = np.float32(number)
+        setattr(message, field, float(number))
     elif isinstance(value, str):
         setattr(message, field, TEXTS[rng.integers(len(TEXTS))])
     else:
@@ -230,7 +234,8 @@ def spoil_sequence(rng, message, field, values) -> None:
     if values and hasattr(values[at], 'get_fields_and_field_types') and rng.random() < 0.7:
         spoil(rng, values[at])
     elif values and isinstance(values[at], float) and rng.random() < 0.7:
-        values[at] = float(NUMBERS[rng.integers(len(NUMBERS))])
+        small = message.get_fields_and_field_types()[field].startswith('sequence<float')
+        values[at] = float(NUMBERS[rng.integers(3 if small else len(NUMBERS))])
     elif values and isinstance(values[at], str) and rng.random() < 0.7:
         values[at] = TEXTS[rng.integers(len(TEXTS))]
     elif type(getattr(message, field)) is not np.ndarray and values:
