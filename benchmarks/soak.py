@@ -38,7 +38,7 @@ from beetle_omni_ros.runs.tasks import POSE_DURATION, WAYPOINTS
 
 PERIOD = 10.0           # s between two samples
 WARM_UP = 0.2           # share of the flight before the fit, at least:
-WARM_UP_LEAST = 60.0    # s
+WARM_UP_LEAST = 180.0   # s; buffers and caches fill in the first minutes
 LIMIT = 5.0             # MB an hour
 CAPACITY = 1000.0       # Ah
 READY, TAKE_OFF, LANDING = 300.0, 30.0, 30.0    # s
