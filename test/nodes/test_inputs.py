@@ -276,8 +276,9 @@ def test_what_is_read_only_cannot_be_set_in_flight(ros_domain, tmp_path, kind):
             for answer in (node.set_parameters([new])[0],
                            node.set_parameters_atomically([new])):
                 assert not answer.successful and '\n' not in answer.reason
-                assert "parameter 'use_sim_time' is read-only" in answer.reason
+                assert 'read-only parameter: use_sim_time' in answer.reason
         assert node.now() > before and not node.get_parameter('use_sim_time').value
+        assert node.describe_parameter('use_sim_time').read_only
         for name in node._parameters:
             if node.describe_parameter(name).read_only:
                 answer = node.set_parameters([Parameter(name, value=node.get_parameter(
