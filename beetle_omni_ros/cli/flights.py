@@ -199,6 +199,9 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
                '--healthy', metavar='HOURS', min=0.0, max=1000.0,
                help='Fly so long without a fault under each of nominal, published and effects, '
                     'and count alarms, in place of the list.')] = 0.0,
+           ros: Annotated[bool, typer.Option(
+               '--ros', help='Fly what only the ROS graph shows, in real time and in hover: '
+                             'processes killed or stopped, strangers on its topics.')] = False,
            jobs: Annotated[Optional[int], typer.Option(
                '--jobs', '-j', min=1, help='Flights at a time. Default: one a core.')] = None,
            bags: Annotated[bool, typer.Option(
@@ -223,11 +226,21 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
         raise ParameterError(f'{faults}: no such file')
     if without_mocap and not landings:
         raise ParameterError('--without-mocap: expected --landings N with it')
+    chosen, through_ros = names('--only', only), None
+    if ros:
+        if landings or healthy:
+            raise ParameterError('--ros: expected without --landings and --healthy')
+        from beetle_omni_ros.nodes import process_faults
+        wanted = process_faults.chosen(chosen)
+
+        def through_ros(listed):
+            return (process_faults.fly_through_ros(name, listed) for name in wanted)
+
     from beetle_omni_ros.faults.command import run_faults
-    run_faults(faults=faults, only=names('--only', only), starts=names('--from', starts),
+    run_faults(faults=faults, only=chosen, starts=names('--from', starts),
                seeds=seeds, conditions=conditions, controller=controller, jobs=jobs,
                output=output, json_path=json_path, docs=docs, bags=bags, landings=landings,
-               without_mocap=without_mocap, healthy=healthy)
+               without_mocap=without_mocap, healthy=healthy, through_ros=through_ros)
 
 
 def report(runs: Annotated[list[Path], typer.Argument(
