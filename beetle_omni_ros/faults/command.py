@@ -184,7 +184,9 @@ def _print(results, console):
                [row[:1] + row[2:] for row in page.fault_rows(results)])
         console.print(page.total_text(results), highlight=False)
     for title, header, rows in page.other_tables(results):
-        _table(console, title, header, rows)
+        # What happens is told on the page, and too long for a terminal.
+        kept = [k for k, name in enumerate(header) if name != 'what happens']
+        _table(console, title, [header[k] for k in kept], [[row[k] for k in kept] for row in rows])
 
 
 def _table(console, title, header, rows):
