@@ -221,6 +221,7 @@ def parse_faults(text: str) -> list[Fault]:
             numbers = {key: float(value) for key, _, value in (one.partition('=')
                                                                for one in given)}
         except ValueError:
-            raise ParameterError(f'faults: {quoted(part)}: expected KIND NAME=NUMBER ...') from None
+            raise ParameterError(f'faults: {quoted(part)}: expected KIND NAME=NUMBER '
+                                 '...') from None
         faults.append(_fault({'kind': kind, **numbers}, 'faults'))
     return faults
