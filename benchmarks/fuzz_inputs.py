@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 import io
 from pathlib import Path
+import shutil
 import signal
 import sys
 import tempfile
@@ -37,14 +38,17 @@ from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters  # noqa:
 from beetle_omni_ros.estimation.parameters import EkfParameters  # noqa: E402
 from beetle_omni_ros.identify.gap.parameters import GapParameters  # noqa: E402
 from beetle_omni_ros.identify.recording.limits import RecordingLimits  # noqa: E402
+from beetle_omni_ros.robot.holding import HoldingParameters  # noqa: E402
 from beetle_omni_ros.robot.parameters import RobotParameters  # noqa: E402
 from beetle_omni_ros.robot.resources import share_path  # noqa: E402
 from beetle_omni_ros.robot.schema import ParameterError  # noqa: E402
 from beetle_omni_ros.runs.bag import BagError  # noqa: E402
 from beetle_omni_ros.runs.pose_file import COLUMNS  # noqa: E402
+from beetle_omni_ros.runs.target_checks import TargetLimits  # noqa: E402
 from beetle_omni_ros.runs.tasks import make_task, WAYPOINTS  # noqa: E402
 from beetle_omni_ros.safety.parameters import SupervisorParameters  # noqa: E402
 from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters  # noqa: E402
+from beetle_omni_ros.sim.faults.listed import FaultList, load_faults  # noqa: E402
 from beetle_omni_ros.sim.parameters import SimulatorParameters  # noqa: E402
 from beetle_omni_ros.train.parameters import TrainParameters  # noqa: E402
 
@@ -52,13 +56,15 @@ OWN = (ParameterError, BagError)
 LONGEST_TEXT = 2000     # characters of a refusal
 LONGEST_TIME = 20       # s for one file
 PARAMETER_FILES = {
-    'check.yaml': CheckLimits, 'ekf.yaml': EkfParameters, 'gap.yaml': GapParameters,
+    'check.yaml': CheckLimits, 'degraded.yaml': HoldingParameters, 'ekf.yaml': EkfParameters,
+    'faults.yaml': FaultList, 'gap.yaml': GapParameters,
     'emulated_board.yaml': EmulatedBoardParameters, 'hover.yaml': HoverParameters,
     'motor_board.yaml': MotorBoardParameters, 'nmpc.yaml': NmpcParameters,
+    'nmpc_published.yaml': NmpcParameters,
     'recording.yaml': RecordingLimits, 'rl.yaml': PolicyParameters, 'robot.yaml': RobotParameters,
     'robot_weak_and_heavy.yaml': RobotParameters, 'servo_bus.yaml': ServoBusParameters,
     'simulator.yaml': SimulatorParameters, 'supervisor.yaml': SupervisorParameters,
-    'train.yaml': TrainParameters}
+    'targets.yaml': TargetLimits, 'train.yaml': TrainParameters}
 LAUGHS = 'a: &a [x, x, x, x, x, x, x, x, x]\n' + ''.join(
     f'{two}: &{two} [{", ".join(["*" + one] * 9)}]\n' for one, two in zip('abcdefgh', 'bcdefghi'))
 # Values that have broken a reader somewhere.
@@ -157,6 +163,13 @@ def parameter_files(_folder: Path) -> dict[str, bytes]:
     return {name: share_path(f'params/{name}').read_bytes() for name in PARAMETER_FILES}
 
 
+def flight_faults(_folder: Path) -> dict[str, bytes]:
+    """A file for ``evaluate --faults``."""
+    return {'faults': b'faults:\n  - {what: rotor_stops, at: 3.0, duration: 2.0, rotor: 2}\n'
+                      b'  - what: mocap_jumps\n    at: 10\n    x: 1.5\n'
+                      b'  - {what: mocap_lost_for_1_s, at: 10}\n'}
+
+
 def tasks(_folder: Path) -> dict[str, bytes]:
     """A CSV task of the real-world poses."""
     text = io.StringIO()
@@ -173,6 +186,7 @@ def policies(_folder: Path) -> dict[str, bytes]:
 KINDS = {
     'yaml': Kind('.yaml', parameter_files, mutate_yaml,
                  lambda path, name: PARAMETER_FILES[name].load(path)),
+    'faults': Kind('.yaml', flight_faults, mutate_yaml, lambda path, _: load_faults(path)),
     'csv': Kind('.csv', tasks, mutate_csv, lambda path, _: make_task(str(path))),
     'mcap': Kind('.mcap', fuzz_bags.bags, mutate_bytes, fuzz_bags.read_flight),
     'messages': Kind('.mcap', fuzz_bags.bags, fuzz_bags.mutate_messages, fuzz_bags.read_flight),
@@ -259,6 +273,8 @@ def main(arguments: list[str] | None = None) -> int:
               f'{time.perf_counter() - begin:.0f} s', flush=True)
         for text in findings:
             print(f'  {text}')
+        if not findings:
+            shutil.rmtree(folder, ignore_errors=True)
         failed |= bool(findings)
     return int(failed)
 

@@ -24,12 +24,12 @@ import sys
 from joblib import delayed, Parallel
 import numpy as np
 import onnx
-import onnxruntime
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 import torch
 
+from beetle_omni_ros.control import onnx_runtime
 from beetle_omni_ros.control.base import Command, PoseTarget, State
 from beetle_omni_ros.control.guidance import Guidance
 from beetle_omni_ros.control.policy import PolicyParameters
@@ -42,6 +42,8 @@ from beetle_omni_ros.runs.tasks import pose_target, random_poses
 from beetle_omni_ros.train.assess import conditions
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 from beetle_omni_ros.train.parameters import StartParameters, TrainParameters
+
+onnxruntime = onnx_runtime.load()
 
 SEGMENT, AT_TARGET, ON_THE_WAY = 750, (700, 750), (100, 700)    # steps of 10 ms
 DEPTHS, HEIGHT = (0.15, 0.25, 0.4), 0.3      # [m] counted: below start and target; above ground

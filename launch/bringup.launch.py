@@ -37,6 +37,8 @@ ARGUMENTS = {
     'allow_other_robot': ('false', ['true', 'false'],
                           'fly a policy that was trained for other robot parameters'),
     'namespace': ('', None, 'namespace of every node and topic'),
+    'discovery': ('', ['', 'LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'],
+                  'who can find the nodes; empty: programs of this computer alone'),
     'composed': ('true', ['true', 'false'], 'all nodes in one process'),
     'viewer': ('false', ['true', 'false'], 'description, tf and markers for RViz and Foxglove'),
     'robot_file': ('', None, 'robot file that estimator and controller believe'),
@@ -129,7 +131,9 @@ def composed(nodes, namespace):
 
 def actions(context):
     """Turn the arguments into processes."""
+    from beetle_omni_ros.nodes.discovery import confine
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    confine(asked=given['discovery'])
     nodes = node_parameters(given)
     processes = []
     if given['record']:

@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-COUNTS = {'yaml': 80, 'csv': 60, 'mcap': 25, 'messages': 6, 'metadata': 15, 'onnx': 15}
+COUNTS = {'yaml': 80, 'faults': 40, 'csv': 60, 'mcap': 25, 'messages': 6, 'metadata': 15,
+          'onnx': 15}
 
 
 def load_benchmark():

@@ -26,8 +26,8 @@ ALLOWED = {
     'bringup': ('robot', 'drivers', 'runs.json_file'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers',
               'bringup.heard'),
-    'train': ('robot', 'control.observation', 'control.policy_file', 'control.policy_checksum',
-              'runs.json_file'),
+    'train': ('robot', 'control.observation', 'control.onnx_runtime', 'control.policy_file',
+              'control.policy_checksum', 'runs.json_file'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
             'faults', 'nodes', 'train', 'identify', 'bringup'),
 }

@@ -11,6 +11,7 @@ from beetle_omni_ros.cli.options import (
     check_flight,
     CONDITIONS,
     ConditionsOption,
+    DiscoveryOption,
     fail,
     FAILED,
     JsonOption,
@@ -52,6 +53,7 @@ def fly(bag: Annotated[Path, typer.Option(
                                           'each node.')] = True,
         domain_id: Annotated[Optional[int], typer.Option(
             '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
+        discovery: DiscoveryOption = None,
         json_path: JsonOption = None):
     """
     Fly the whole ROS graph in real time against the simulated robot.
@@ -67,7 +69,7 @@ def fly(bag: Annotated[Path, typer.Option(
                        conditions=conditions, actuators=actuators, clock=clock, robot=robot,
                        plant=plant, policy=policy, allow_other_robot=allow_other_robot,
                        standby=standby, composed=composed, json_path=json_path,
-                       domain_id=domain_id)
+                       domain_id=domain_id, discovery=discovery)
     except FlightError as error:
         raise typer.Exit(fail(error, FAILED)) from None
     raise typer.Exit(code if isinstance(code, int) else 0)
@@ -197,6 +199,9 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
                '--healthy', metavar='HOURS', min=0.0, max=1000.0,
                help='Fly so long without a fault under each of nominal, published and effects, '
                     'and count alarms, in place of the list.')] = 0.0,
+           ros: Annotated[bool, typer.Option(
+               '--ros', help='Fly what only the ROS graph shows, in real time and in hover: '
+                             'processes killed or stopped, strangers on its topics.')] = False,
            jobs: Annotated[Optional[int], typer.Option(
                '--jobs', '-j', min=1, help='Flights at a time. Default: one a core.')] = None,
            bags: Annotated[bool, typer.Option(
@@ -221,11 +226,21 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
         raise ParameterError(f'{faults}: no such file')
     if without_mocap and not landings:
         raise ParameterError('--without-mocap: expected --landings N with it')
+    chosen, through_ros = names('--only', only), None
+    if ros:
+        if landings or healthy:
+            raise ParameterError('--ros: expected without --landings and --healthy')
+        from beetle_omni_ros.nodes import process_faults
+        wanted = process_faults.chosen(chosen)
+
+        def through_ros(listed):
+            return (process_faults.fly_through_ros(name, listed) for name in wanted)
+
     from beetle_omni_ros.faults.command import run_faults
-    run_faults(faults=faults, only=names('--only', only), starts=names('--from', starts),
+    run_faults(faults=faults, only=chosen, starts=names('--from', starts),
                seeds=seeds, conditions=conditions, controller=controller, jobs=jobs,
                output=output, json_path=json_path, docs=docs, bags=bags, landings=landings,
-               without_mocap=without_mocap, healthy=healthy)
+               without_mocap=without_mocap, healthy=healthy, through_ros=through_ros)
 
 
 def report(runs: Annotated[list[Path], typer.Argument(

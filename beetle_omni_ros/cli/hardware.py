@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from beetle_omni_ros.cli.options import JsonOption
+from beetle_omni_ros.cli.options import DiscoveryOption, JsonOption
 from beetle_omni_ros.robot.schema import ParameterError
 
 PublishedOption = Annotated[Optional[Path], typer.Option(
@@ -72,6 +72,7 @@ def check(servo_port: Annotated[Optional[str], typer.Option(
                                                          'repeated.')] = None,
           namespace: Annotated[str, typer.Option(
               '--namespace', metavar='NAME', help="Of the robot's topics.")] = '',
+          discovery: DiscoveryOption = None,
           json_path: JsonOption = None):
     """
     Look at the real robot before a flight: ports, servos, motor board, MoCap, IMU, clocks.
@@ -81,7 +82,7 @@ def check(servo_port: Annotated[Optional[str], typer.Option(
     """
     def listen(duration):
         from beetle_omni_ros.nodes.listener import listen as listen_to_ros
-        return listen_to_ros(duration, namespace)
+        return listen_to_ros(duration, namespace, discovery)
 
     from beetle_omni_ros.bringup.command import run_check
     raise typer.Exit(run_check(

@@ -32,6 +32,9 @@ PolicyOption = Annotated[Optional[Path], typer.Option(
 OtherRobotOption = Annotated[bool, typer.Option(
     '--allow-other-robot', help='Fly a policy although it was trained for other robot '
                                 'parameters.')]
+DiscoveryOption = Annotated[Optional[str], typer.Option(
+    '--discovery', metavar='LOCALHOST|SUBNET|OFF|SYSTEM_DEFAULT',
+    help='Who can find the nodes. Default: programs of this computer alone.')]
 JsonOption = Annotated[Optional[Path], typer.Option(
     '--json', metavar='FILE', help='Write the results there as JSON.')]
 

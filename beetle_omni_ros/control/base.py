@@ -163,6 +163,7 @@ class Controller(Protocol):
     finite input. A standby controller is stepped as well, so that it can take over
     without a jump; the command in force stands in ``state.command``.
 
+    A controller that flies only to targets near enough says so in ``reach`` [m].
     A controller that can fly with fewer actuators also has ``set_health(health)``, see
     :func:`tell_health`; another one is not asked to.
     """

@@ -48,7 +48,7 @@ class NmpcController:
     def __init__(self, robot: RobotParameters, parameters: NmpcParameters | None = None):
         """Build or load the solver; the first time takes some seconds of compilation."""
         p = _with_delays(robot, parameters or NmpcParameters.load())
-        self._parameters = p
+        self._parameters, self.reach = p, p.reach
         self._robot = robot
         problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag, p.horizon.change_time)
         intervals = p.horizon.intervals

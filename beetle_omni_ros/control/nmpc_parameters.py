@@ -138,6 +138,8 @@ class NmpcParameters:
         4.0, doc='a tilt reference takes its turn within +-pi unless that is farther than the '
         'nearest legal turn by more than this; 0: always nearest, 6.3: always within +-pi',
         unit='rad', low=0, high=6.3)
+    reach: float = parameter(10.0, doc='a target farther from the robot is refused', unit='m',
+                             low=0.5, high=1000, read_only=True)
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> NmpcParameters:

@@ -52,6 +52,8 @@ class PolicyParameters:
     action_limit: float = parameter(
         100.0, doc='a larger output is a fault and not cut to the limits of the actuators',
         unit='1', low=1, high=1e6)
+    reach: float = parameter(6.5, doc='a target farther from the robot is refused', unit='m',
+                             low=0.5, high=1000, read_only=True)
     model: EstimateParameters = group(EstimateParameters, 'for the estimate')
     disturbance: DisturbanceParameters = group(
         DisturbanceParameters, 'what a policy with memory sees')
@@ -87,6 +89,7 @@ class PolicyController:
     Attributes:
         network: what the policy's file computes.
         contract: what the policy's file says about itself.
+        reach: farthest target [m].
 
     Raises:
         ParameterError: the file is missing, broken, or does not fit; one line.
@@ -99,7 +102,7 @@ class PolicyController:
         self.network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
         self.contract = contract = self.network.contract
         self.name = 'rl_memory' if contract.memory else 'rl'
-        self.period = 1 / contract.rate_hz
+        self.period, self.reach = 1 / contract.rate_hz, p.reach
         self._scale, self._offset = contract.action_scale.tolist(), contract.action_offset.tolist()
         tilt, rotors = robot.joints.position_limit, robot.rotors
         self._limits = [(-tilt, tilt)] * 4 + [(rotors.thrust_min, rotors.thrust_max)] * 4

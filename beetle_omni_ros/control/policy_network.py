@@ -7,15 +7,15 @@ from math import isfinite
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
 
-from beetle_omni_ros.control import policy_checksum
+from beetle_omni_ros.control import onnx_runtime, policy_checksum
 from beetle_omni_ros.control.policy_file import ACTIONS, INPUT, OUTPUT, PolicyContract
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.yaml_file import shortened
 
+onnxruntime = onnx_runtime.load()
 log = logging.getLogger(__name__)
 WARM_UP = 20            # calls at start, so that none in flight is the slow first one
 LONGEST = 1000          # characters of a refusal: the metadata may hold anything

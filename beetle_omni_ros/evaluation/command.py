@@ -16,6 +16,7 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
+from beetle_omni_ros.control.reach import reach_of_name
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
@@ -27,6 +28,7 @@ from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import BagWriter
 from beetle_omni_ros.runs.json_file import write_json
 from beetle_omni_ros.runs.log import FlightLog
+from beetle_omni_ros.runs.pose_file import check_steps
 from beetle_omni_ros.runs.recorder import LogRecorder, Tee
 from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.runs.tasks import make_task, Task
@@ -98,7 +100,13 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
     Returns:
         the flight, also when the robot crashed (``meta['crashed']``).
 
+    Raises:
+        TaskError: a pose of the task is beyond the controller's reach.
+
     """
+    if task.kind == 'poses':
+        check_steps(task.poses, reach_of_name(controller, files.nmpc),
+                    lambda k: f"task '{task.name}': pose {k + 1}")
     meta = dict(meta or {}, controller=controller)
     memory = LogRecorder(meta)
     with ExitStack() as stack:
@@ -157,7 +165,7 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
     console = console or Console()
     believed = RobotParameters.load(robot)
     true = RobotParameters.load(plant) if plant else believed
-    flown = make_task(task, seed)
+    flown = make_task(task, seed, min(reach_of_name(name, files.nmpc) for name in controllers))
     for name in controllers:
         if name not in CONTROLLERS or name in POLICIES:     # refused before anything flies
             make_controller(name, believed, files)

@@ -21,11 +21,13 @@ from beetle_omni_ros.control.base import (
     Target,
     tell_health,
 )
+from beetle_omni_ros.control.reach import reach_of
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
 from beetle_omni_ros.evaluation.processes import Processes
 from beetle_omni_ros.robot.actuator_health import ALL_WELL
+from beetle_omni_ros.runs.target_checks import out_of_reach
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.sim.faults import Fault
@@ -289,7 +291,9 @@ class FlightLoop:
             return target
         if self._intruder is None:
             self._intruder = other
-            reason = self._check_target(other)
+            reason = self._check_target(other) or out_of_reach(
+                other, self._estimator.estimate.position,
+                reach_of(self._controllers[self._supervisor.active]), self.now)
             self._obeys_intruder = not reason
             self.refusals += [reason] if reason else []
         return self._intruder if self._obeys_intruder else target

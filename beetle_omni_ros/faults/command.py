@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 import json
 from math import ceil
@@ -20,6 +20,7 @@ from beetle_omni_ros.faults.flight import STARTS
 from beetle_omni_ros.faults.healthy import CONDITIONS, fly_healthy, HealthyTrial
 from beetle_omni_ros.faults.landings import fly_landing, LandingTrial
 from beetle_omni_ros.faults.trial import fly_trial, Trial
+from beetle_omni_ros.faults.watch import as_expected
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import check_writable, write_json
 from beetle_omni_ros.sim.faults.listed import FaultList
@@ -30,6 +31,7 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
                controller: str = 'nmpc', jobs: int | None = None, output: Path | None = None,
                json_path: Path | None = None, docs: Path | None = None, bags: bool = False,
                landings: int = 0, without_mocap: bool = False, healthy: float = 0.0,
+               through_ros: Callable[[FaultList], Iterator[dict]] | None = None,
                console: Console | None = None) -> dict:
     """
     Fly the list of faults; or landings, or healthy flights, where those are asked for.
@@ -49,10 +51,11 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
         landings: number of landings, in place of the list.
         without_mocap: whether those lose motion capture.
         healthy: hours of healthy flight under each of its conditions, in place of the list.
+        through_ros: flies what only the ROS graph shows, in place of the list.
         console: where to print.
 
     Returns:
-        ``meta``; ``flights`` and ``summary``, or ``landings``, or ``healthy``.
+        ``meta``; ``flights`` and ``summary``, or ``landings``, ``healthy`` or ``ros``.
 
     Raises:
         ParameterError: unusable input, in one line.
@@ -60,10 +63,11 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     """
     console = console or Console()
     listed = FaultList.load(faults)
-    cases = listed.chosen(only)
+    cases = listed.chosen(None if through_ros else only)
     _check(starts, controller, output, json_path, docs, bags)
     meta = {'command': _described(faults, only, starts, seeds, conditions, controller, landings,
-                                  without_mocap, healthy), 'version': __version__}
+                                  without_mocap, healthy, bool(through_ros)),
+            'version': __version__}
     fly = _Flyer(console, jobs, output)
     results: dict = {'meta': meta}
     if landings:
@@ -77,7 +81,15 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
             HealthyTrial(seed, name, controller) for name in CONDITIONS
             for seed in range(number)], listed)
         results['healthy'] = {'flights': flown, 'summary': campaign.healthy_summary(flown)}
-    if not landings and not healthy:
+    if through_ros:
+        results['ros'] = []
+        for flown in through_ros(listed):
+            flown['good'] = not flown['bag_lost'] and as_expected(flown['expected'],
+                                                                  flown['outcome'])
+            results['ros'].append(flown)
+            console.print(f"{flown['case']}: {flown['outcome']} {flown['error']}",
+                          markup=False, highlight=False)
+    if not landings and not healthy and not through_ros:
         flown = fly('faults', fly_trial, [
             Trial(case.name, start, seed, conditions, controller) for case in cases
             for start in starts or STARTS for seed in range(seeds)], listed,
@@ -119,8 +131,8 @@ def _text(path):
 
 
 def _described(faults, only, starts, seeds, conditions, controller, landings, without_mocap,
-               healthy):
-    parts = ['beetle_omni faults']
+               healthy, through_ros):
+    parts = ['beetle_omni faults'] + ['--ros'] * through_ros
     parts += [f'--faults {faults}'] if faults else []
     parts += [f"--only {','.join(only)}"] if only else []
     parts += [f"--from {','.join(starts)}"] if starts else []
@@ -172,7 +184,9 @@ def _print(results, console):
                [row[:1] + row[2:] for row in page.fault_rows(results)])
         console.print(page.total_text(results), highlight=False)
     for title, header, rows in page.other_tables(results):
-        _table(console, title, header, rows)
+        # What happens is told on the page, and too long for a terminal.
+        kept = [k for k, name in enumerate(header) if name != 'what happens']
+        _table(console, title, [header[k] for k in kept], [[row[k] for k in kept] for row in rows])
 
 
 def _table(console, title, header, rows):

@@ -18,7 +18,7 @@ def main(args=None):
     """Run the named nodes on one events executor, as one process."""
     argv = list(sys.argv if args is None else args)
     names = runner.own_arguments(argv, 'composed')
-    usage = ('usage: composed NODE... [--ros-args -p NODE:KEY:=VALUE ...]; '
+    usage = ('usage: composed NODE... [--discovery RANGE] [--ros-args -p NODE:KEY:=VALUE ...]; '
              f"NODE: {', '.join(NODES)}")
     if names and names[0] in ('-h', '--help'):
         print(usage)

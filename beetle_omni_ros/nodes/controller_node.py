@@ -12,15 +12,17 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from beetle_omni_ros.control.base import Controller, corrected, PoseTarget, tell_health
+from beetle_omni_ros.control.reach import reach_of
 from beetle_omni_ros.nodes import convert, health, qos, targets
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.actuator_health import ALL_WELL
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.target_checks import TargetChecks
+from beetle_omni_ros.runs.target_checks import out_of_reach, TargetChecks
 
 ODOM_AGE = 0.05         # s, an older estimate is not worth a command
 JOINT_AGE = 0.1         # s
+OTHER_CLOCK = 3600.0    # s between a target's stamp and simulated time
 # A step is due when the stamps say so, within half of the smallest estimate interval.
 STEP_TOLERANCE = 0.0025
 
@@ -49,7 +51,7 @@ class ControllerNode(FlightNode):
         super().__init__(f'{controller_name}_node', parameter_class, file, file_key)
         self._controller: Controller = self.make_controller(self.parameters)
         self._target = self._joints = self._command = None
-        self._hold = self._wish = None
+        self._hold = self._wish = self._position = None
         self._actuators = ALL_WELL
         self._checks = TargetChecks(RobotParameters.load(self.parameters.robot_file or None))
         self._mode, self._own_mode = '', f'flying:{controller_name}'
@@ -89,11 +91,21 @@ class ControllerNode(FlightNode):
 
     def _check_target(self, target, published):
         # Held against its publication: a latched target stays good for a node that starts
-        # later. Simulated time has nothing to do with publications.
-        then = None if self.simulated or math.isnan(published) else published
-        reason = self._checks.why_not(target, then)
+        # later. Simulated time has nothing to do with publications: there a stamp is another
+        # clock's when it is very far off, once the clock is known.
+        then = None if math.isnan(published) else published
+        if self.simulated:
+            now = self.now()
+            then = now if now and abs(now - target.stamp) > OTHER_CLOCK else None
+        reason = self._checks.why_not(target, then) or (
+            self._too_far(target) if self._mode == self._own_mode else '')
         if reason:
             raise convert.MessageError(reason, 'cannot be flown')
+
+    def _too_far(self, target):
+        """Why a target cannot be flown from here, '' where it can."""
+        return '' if self._position is None else out_of_reach(
+            target, self._position, reach_of(self._controller), self.now())
 
     def _on_target(self, target, _=math.nan):
         now = self.now()
@@ -124,9 +136,16 @@ class ControllerNode(FlightNode):
         if state in ('disarmed', 'emergency_stop') and self._mode.partition(':')[0] != state:
             self._controller.reset()
             self._command = self._hold = self._wish = None
+        took_over = message.data == self._own_mode != self._mode
         self._mode = message.data
+        if took_over and self._target is not None and (reason := self._too_far(self._target)):
+            # Another controller was on its way there, or the operator asked in vain.
+            self.health.rejected('target_pose', f'{reason}; the present pose is held',
+                                 'cannot be flown')
+            self._target = self._hold = None
 
     def _on_odom(self, odom):
+        self._position = odom.position
         if self._joints is None or not self._is_due(odom.stamp):
             return
         self._last_step = odom.stamp

@@ -1,12 +1,11 @@
 """A ROS domain that nobody else on this computer uses."""
 
 from contextlib import contextmanager
-import fcntl
 from itertools import count
 import os
 import socket
 
-from beetle_omni_ros.nodes.private import lock_file
+from beetle_omni_ros.nodes.private import forget, HeldError, Lock
 
 # Linux keeps its ephemeral ports clear of domains up to 101; 0 is everybody's default.
 DOMAINS = range(101, 0, -1)
@@ -33,14 +32,19 @@ def reserved():
     """
     first = next(_turns) % len(DOMAINS)
     for number in [*DOMAINS[first:], *DOMAINS[:first]]:
-        with lock_file(f'domain{number}.lock') as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                continue
+        try:
+            lock = Lock(f'domain{number}.lock')
+        except HeldError:
+            continue
+        try:
             if _quiet(number):
-                yield number
+                try:
+                    yield number
+                finally:
+                    forget(f'{number}.*.lock')      # of nodes that were killed in it
                 return
+        finally:
+            lock.close()
     raise OSError('no free ROS domain between 1 and 101')
 
 

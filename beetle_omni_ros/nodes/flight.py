@@ -151,8 +151,10 @@ class Flight:
                     raise FlightError(f'supervisor_node refuses to arm: {answer[1]}')
                 self._look()
             operator.states.clear()
-            self._await('taking off', lambda: operator.state.startswith('flying')
-                        or 'disarmed' in operator.states, TAKEOFF_TIMEOUT)
+            # A fault that kept it on the ground stands behind the state: disarmed:joint1_jammed.
+            self._await('taking off', lambda: operator.state.startswith('flying') or any(
+                told.partition(':')[0] == 'disarmed' for told in operator.states),
+                        TAKEOFF_TIMEOUT)
             if operator.state.startswith('flying'):
                 return
         raise FlightError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from beetle_omni_ros import __version__
+from beetle_omni_ros.control.reach import reach_of_name
 from beetle_omni_ros.nodes import domain, runner
 from beetle_omni_ros.nodes.actuators import ACTUATORS, bridged
 from beetle_omni_ros.nodes.discovery import confine
@@ -37,7 +38,8 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
             clock: str = 'auto', robot: Path | None = None, plant: Path | None = None,
             policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
             composed: bool = True, json_path: Path | None = None,
-            domain_id: int | None = None, console: Console | None = None) -> int:
+            domain_id: int | None = None, discovery: str | None = None,
+            console: Console | None = None) -> int:
     """
     Fly a task through the ROS graph and print what the bag says.
 
@@ -60,6 +62,7 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
         composed: all nodes in one process, or one process for each.
         json_path: file for the results.
         domain_id: ROS domain; default a free one.
+        discovery: who can find the nodes, see :mod:`discovery`; default this computer alone.
         console: where to print.
 
     Returns:
@@ -68,7 +71,7 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
     """
     console = console or Console()
     try:
-        confine()
+        confine(asked=discovery)
         with ExitStack() as stack:
             stack.enter_context(terminable())
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
@@ -76,7 +79,7 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
             check_new(bag)
             if json_path:
                 check_writable(json_path)
-            flown = make_task(task, seed)
+            flown = make_task(task, seed, reach_of_name(controller))
             RobotParameters.load(plant or robot)
             clocks = _clocks(clock, actuators)
             controllers, left_out = controller_nodes(

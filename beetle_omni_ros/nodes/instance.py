@@ -6,14 +6,9 @@ robot. A lock file names the holder at once on the same computer and goes with i
 process, however that ends; a node on another computer is seen in the ROS graph.
 """
 
-import fcntl
-import os
-
 from rclpy.node import Node
 
-from beetle_omni_ros.nodes.private import open_lock
-
-HOLDER = 20     # characters of a process's number
+from beetle_omni_ros.nodes.private import HeldError, Lock
 
 
 class StartError(RuntimeError):
@@ -22,7 +17,7 @@ class StartError(RuntimeError):
 
 def claim(node: Node):
     """
-    Take the node's lock for as long as the returned file stays open.
+    Take the node's lock until it is closed, or the process ends.
 
     Raises:
         StartError: another process of this computer holds it.
@@ -31,21 +26,13 @@ def claim(node: Node):
     domain = node.context.get_domain_id()
     name = node.get_fully_qualified_name()
     try:
-        file = open_lock(f"{domain}{name.replace('/', '.')}.lock")
+        return Lock(f"{domain}{name.replace('/', '.')}.lock")
+    except HeldError as error:
+        raise StartError(f'{name} runs already (process {str(error) or "unknown"}, ROS domain '
+                         f'{domain}); stop it first') from None
     except OSError as error:    # the graph check still stands
         node.get_logger().warning(f'a second {name} on this computer may go unnoticed: {error}')
         return None
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        holder = file.read(HOLDER).strip() or 'unknown'
-        file.close()
-        raise StartError(f'{name} runs already (process {holder}, ROS domain {domain}); '
-                         'stop it first') from None
-    file.truncate(0)
-    file.write(str(os.getpid()))
-    file.flush()
-    return file
 
 
 def refuse_twin(node: Node) -> None:

@@ -27,19 +27,20 @@ STREAMS = {
     'battery_state': (BatteryState, convert.battery, lambda battery: battery.voltage)}
 
 
-def listen(seconds: float, namespace: str = '') -> Heard:
+def listen(seconds: float, namespace: str = '', discovery: str | None = None) -> Heard:
     """
     Join the graph and take in what comes.
 
     Args:
         seconds: how long.
         namespace: of the robot's topics.
+        discovery: who is looked for, see :mod:`discovery`; default this computer alone.
 
     Raises:
-        ParameterError: no such namespace is possible.
+        ParameterError: no such namespace or range of discovery is possible.
 
     """
-    confine()
+    confine(asked=discovery)
     context = rclpy.Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:

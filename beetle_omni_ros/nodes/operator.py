@@ -15,6 +15,7 @@ from std_srvs.srv import Trigger
 
 from beetle_omni_ros.nodes import convert, qos, runner
 from beetle_omni_ros.nodes.actuators import READY, STATES
+from beetle_omni_ros.nodes.discovery import confine
 
 # Where time is simulated and slow, or stands still because its source died, waiting ends with this
 # much steady time for each second of it.
@@ -39,6 +40,7 @@ class Operator:
 
     def __init__(self, domain: int, controller: str = 'nmpc'):
         """Join ``domain`` and watch the flight of ``controller``."""
+        confine()
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context, domain_id=domain,
                    signal_handler_options=SignalHandlerOptions.NO)

@@ -166,15 +166,12 @@ def _validate_changes(node, cls, instance, on_change):
 
 def lock_clock(node: Node) -> None:
     """
-    Refuse to change ``use_sim_time`` from now on: timers and ages go by the clock of the start.
+    Make ``use_sim_time`` read-only from now on: timers and ages go by the clock of the start.
 
-    Call it last: rclpy asks the newest callback first, and its own switches the clock when asked.
+    By its descriptor, which rclpy looks at first: its own callback for this parameter switches
+    the clock when it is asked, whatever others answer.
     """
-    def refuse(parameters):
-        if any(parameter.name == CLOCK for parameter in parameters):
-            return SetParametersResult(successful=False, reason=(
-                f"parameter '{CLOCK}' is read-only: expected at the start of the node, "
-                'not in flight'))
-        return SetParametersResult(successful=True)
-
-    node.add_on_set_parameters_callback(refuse)
+    description = node.describe_parameter(CLOCK)
+    node.set_descriptor(CLOCK, ParameterDescriptor(
+        name=CLOCK, type=description.type, read_only=True,
+        description='go by the time on /clock; expected at the start of the node'))

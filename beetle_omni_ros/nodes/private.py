@@ -1,7 +1,7 @@
 """A folder of the user's own for locks and ports, where nobody else can put anything."""
 
 import atexit
-from contextlib import contextmanager
+import fcntl
 import os
 from pathlib import Path
 import shutil
@@ -9,6 +9,8 @@ import stat
 import tempfile
 
 NAME = 'beetle_omni'
+ATTEMPTS = 10       # to open what others may be removing
+HOLDER = 20         # characters of a process's number
 
 
 def folder() -> Path:
@@ -31,36 +33,97 @@ def folder() -> Path:
         return _own(Path(tempfile.gettempdir()) / f'{NAME}_{os.getuid()}')
 
 
-@contextmanager
-def lock_file(name: str):
+class HeldError(Exception):
+    """A lock is held by another process; the text is its number, or ''."""
+
+
+class Lock:
+    """
+    A lock of this process under a name, until :meth:`close` or the process's end.
+
+    Its file goes with it; that of a process that was killed stays until the name is used again.
+
+    Raises:
+        HeldError: another process holds it.
+        OSError: no folder, or the file is a link, special, or somebody else's; one line.
+
+    """
+
+    def __init__(self, name: str):
+        """Take the lock at once, or not at all."""
+        for _ in range(ATTEMPTS):
+            self._file, self._path = open_lock(name), folder() / name
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                holder = self._file.read(HOLDER).strip()
+                self._file.close()
+                raise HeldError(holder) from None
+            if self._is_in_place():
+                break
+            self._file.close()      # its last holder has just removed it
+        else:
+            raise OSError(f'{folder() / name}: comes and goes, cannot be used as a lock')
+        self._file.truncate(0)
+        self._file.write(str(os.getpid()))
+        self._file.flush()
+
+    def close(self) -> None:
+        """Let go of the lock, and of the folder where it was the last thing in it."""
+        if not self._file.closed:
+            if self._is_in_place():
+                self._path.unlink(missing_ok=True)
+            self._file.close()
+            _leave(self._path.parent)
+
+    def _is_in_place(self):
+        """Whether the file that is locked is the one that others would find."""
+        try:
+            return os.path.samestat(os.lstat(self._path), os.fstat(self._file.fileno()))
+        except OSError:
+            return False
+
+
+def forget(pattern: str) -> None:
+    """Remove the files of locks that nobody holds any more; for names that nobody takes now."""
+    for path in folder().glob(pattern):
+        try:
+            Lock(path.name).close()
+        except (HeldError, OSError):
+            pass
+
+
+def open_lock(name: str):
     """
     Open a file of :func:`folder` for locking, as it is: nothing is truncated, no link followed.
 
     Args:
         name: of the file, without folders.
 
-    Yields:
+    Returns:
         The file, readable and writable, at its beginning.
 
     Raises:
         OSError: no folder, or the file is a link, special, or somebody else's; one line.
 
     """
-    file = open_lock(name)
-    try:
-        yield file
-    finally:
-        file.close()
+    for left in reversed(range(ATTEMPTS)):
+        try:
+            return _open(name)
+        except FileNotFoundError:       # who used the folder last has just removed it
+            if not left:
+                raise
 
 
-def open_lock(name: str):
-    """Like :func:`lock_file`; the caller closes."""
+def _open(name):
     place = folder()
     parent = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         _judge(os.fstat(parent), place)     # the folder that is used, not one of the same name
         number = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o600,
                          dir_fd=parent)
+    except FileNotFoundError:
+        raise
     except OSError as error:
         raise OSError(f'{place / name}: cannot be used as a lock '
                       f'({error.strerror or error})') from None
@@ -87,8 +150,21 @@ def scratch(name: str) -> Path:
         if process.isdigit() and not Path(f'/proc/{process}').exists():
             shutil.rmtree(left, ignore_errors=True)
     made = Path(tempfile.mkdtemp(prefix=f'{name}_{os.getpid()}_', suffix='', dir=place))
-    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    atexit.register(_remove, made)
     return made
+
+
+def _remove(made):
+    shutil.rmtree(made, ignore_errors=True)
+    _leave(made.parent)
+
+
+def _leave(place):
+    """Remove the folder where nothing is left in it."""
+    try:
+        place.rmdir()
+    except OSError:
+        pass
 
 
 def _own(path):

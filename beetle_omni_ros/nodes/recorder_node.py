@@ -20,7 +20,11 @@ from beetle_omni_ros.runs.topics import Topic, TOPICS
 FLUSH_PERIOD = 0.4      # s; a crash loses at most what came after the last flush
 STATE = Topic('std_msgs/msg/String', LATCHED_TOPIC)
 OWN_TOPICS = {'reference/state': STATE, 'joint_bridge/state': STATE, 'rotor_bridge/state': STATE,
-              'rotor_states': Topic('sensor_msgs/msg/JointState', SENSOR_TOPIC)}
+              'rotor_states': Topic('sensor_msgs/msg/JointState', SENSOR_TOPIC),
+              'supervisor/identity': STATE,
+              'supervisor/actuators': Topic('sensor_msgs/msg/JointState', LATCHED_TOPIC),
+              'supervisor/target': Topic('trajectory_msgs/msg/MultiDOFJointTrajectory',
+                                         LATCHED_TOPIC)}
 
 
 @dataclass(frozen=True, kw_only=True)

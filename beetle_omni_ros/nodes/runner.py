@@ -18,7 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
-from beetle_omni_ros.nodes.discovery import confine
+from beetle_omni_ros.nodes import discovery
 from beetle_omni_ros.nodes.instance import StartError
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
@@ -38,7 +38,8 @@ def main(node_class: type, args: Sequence[str] | None = None) -> None:
     name = executable(node_class)
     rest = own_arguments(argv, name)
     if rest:
-        usage = f'usage: {name} [--ros-args -p KEY:=VALUE --params-file FILE ...]'
+        usage = (f'usage: {name} [{discovery.ARGUMENT} RANGE] '
+                 '[--ros-args -p KEY:=VALUE --params-file FILE ...]')
         if rest[0] in ('-h', '--help'):
             print(f'{usage}\n\n{(node_class.__doc__ or "").strip()}')
             sys.exit(OK)
@@ -64,7 +65,7 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)   # while starting, as Ctrl-C
     _end_with_parent()
     try:
-        confine()
+        discovery.confine()
         # Not rclpy's handlers: they end the context under a callback that still publishes.
         rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
         executor = make_executor()
@@ -101,10 +102,14 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
 
 
 def own_arguments(argv: Sequence[str], name: str) -> list[str]:
-    """Arguments that are not for ROS; ends the process when those for ROS are unusable."""
+    """
+    Arguments that are neither for ROS nor for discovery, which is confined here.
+
+    Ends the process when those are unusable.
+    """
     try:
         _check_parameter_files(argv)
-        return remove_ros_args(list(argv))[1:]
+        return discovery.take(remove_ros_args(list(argv))[1:])
     except Exception as error:
         # rclpy does not export the class of what it raises on bad arguments.
         if not isinstance(error, ParameterError) and 'ROSArgs' not in type(error).__name__:

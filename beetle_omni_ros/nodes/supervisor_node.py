@@ -173,8 +173,13 @@ class SupervisorNode(FlightNode):
             logger.info(event.text)
 
     def _supervisor_status(self):
-        return LEVELS.get(self._supervisor.state, health.OK), self._state, \
-            self._supervisor.diagnostics()
+        supervisor = self._supervisor
+        told = supervisor.diagnostics()
+        for name, at in supervisor.faults.items():
+            told[f'fault.{name}'] = f'{at:.3f}'     # [s]: six digits of a stamp tell nothing
+        level = LEVELS.get(supervisor.state, health.WARN if supervisor.faults else health.OK)
+        named = ', '.join(supervisor.faults)
+        return level, f'{self._state}; faults: {named}' if named else self._state, told
 
 
 def main(args=None):

@@ -15,6 +15,7 @@ from beetle_omni_ros.control.base import Target
 from beetle_omni_ros.robot.yaml_file import read_yaml
 from beetle_omni_ros.runs import messages
 from beetle_omni_ros.runs.bag_reader import BagError, META_KEY, read_bag, read_messages
+from beetle_omni_ros.runs.chunk_index import ChunkIndex
 from beetle_omni_ros.runs.log import COMPUTE_KEYS
 from beetle_omni_ros.runs.topics import EVENT, Topic, TOPICS
 
@@ -52,6 +53,7 @@ class BagWriter:
         self._connections: dict[str, Connection] = {}
         self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
         self._writer = _open(self.path)
+        self._index = self._writer.storage.chunks = ChunkIndex(self.path)
         for name in topics:
             self._declare(self._prefix + name, TOPICS[name])
         self._last_t = 0.0
@@ -145,6 +147,8 @@ class BagWriter:
             writer.close()
         except OSError as error:
             raise BagError(f'{self.path}: {error.strerror}') from error
+        finally:
+            self._index.close()
 
     def write_meta(self, meta: dict) -> None:
         """Add to what is known of the flight; also in the bag itself, for a cut-off one."""

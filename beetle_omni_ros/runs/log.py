@@ -29,6 +29,7 @@ WIDTHS = {name: 1 + sum(max(1, width) for width in channels.values())
           for name, channels in SERIES.items()}
 """Series -> numbers in one sample, with its time."""
 
+SUPERVISOR_STATUS, FAULT_KEY = 'supervisor_node: supervisor', 'fault.'
 COMPUTE_KEYS = {'median_ms': 'median', 'p99_ms': 'p99', 'max_ms': 'max',
                 'deadline_misses': 'deadline_misses', 'count': 'count'}
 """Diagnostic key -> key in ``FlightLog.compute``; the times are CPU milliseconds."""
@@ -156,6 +157,21 @@ class FlightLog:
         names = [name for _, name in self.active_controller() if name]
         return list(dict.fromkeys(names))
 
+    def named_faults(self) -> dict[str, float]:
+        """Names of the faults that the supervisor told, with when it first did [s]."""
+        found: dict[str, float] = {}
+        for t, state in zip(self.state_t, self.states, strict=True):
+            kind, _, fault = state.partition(':')
+            if fault and kind != 'flying':
+                found.setdefault(fault, float(t))
+        for entry in self.diagnostics:
+            if entry.name.endswith(SUPERVISOR_STATUS):
+                for key in entry.values:
+                    if key.startswith(FAULT_KEY):
+                        name = key.removeprefix(FAULT_KEY)
+                        found[name] = min(found.get(name, entry.t), entry.t)
+        return dict(sorted(found.items(), key=lambda item: item[1]))
+
     def active_controller(self) -> list[tuple[float, str | None]]:
         """
         Who flew when.
@@ -172,7 +188,7 @@ class FlightLog:
         for t, state in zip(self.state_t, self.states, strict=True):
             if state.startswith('flying:'):
                 name = state.partition(':')[2]
-            elif state == 'fallback':
+            elif state.partition(':')[0] == 'fallback':
                 name = changes[-1][1] if changes else None
             else:
                 name = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import csv
 from functools import cache
 from math import isfinite
@@ -15,6 +16,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.yaml_file import quoted
 from beetle_omni_ros.runs.target_checks import TargetChecks
 
+START = (0.0, 0.0, 1.0)     # [m] where a task begins after the take-off
 COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
 
 
@@ -22,11 +24,16 @@ class TaskError(ParameterError):
     """A task cannot be used; the text names file, row, column and expectation."""
 
 
-def read_poses(path: str | Path) -> np.ndarray:
+def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
     """
     Read a pose file with the header ``x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg``.
 
     Blank lines and spaces around fields do not matter; columns may stand in any order.
+
+    Args:
+        path: of the file.
+        reach: largest step from one pose to the next, and from the take-off at world's
+            origin to the first [m].
 
     Returns:
         (N, 6) x, y, z [m], roll, pitch, yaw [deg].
@@ -50,7 +57,25 @@ def read_poses(path: str | Path) -> np.ndarray:
     order = _column_order(path, *rows[0])
     if len(rows) == 1:
         raise TaskError(f'{path}: no pose below the header; expected at least one row')
-    return np.array([_pose(path, line, row, order) for line, row in rows[1:]])
+    poses = np.array([_pose(path, line, row, order) for line, row in rows[1:]])
+    check_steps(poses, reach, lambda k: f'{path}: row {rows[k + 1][0]}')
+    return poses
+
+
+def check_steps(poses: np.ndarray, reach: float, where: Callable[[int], str]) -> None:
+    """
+    Refuse poses (N, 6) that lie farther from the one before than ``reach`` [m].
+
+    Raises:
+        TaskError: names the pose of index k by ``where(k)``.
+
+    """
+    steps = np.linalg.norm(np.diff(poses[:, :3], axis=0, prepend=[START]), axis=1)
+    if np.any(steps > reach):
+        k = int(np.argmax(steps > reach))
+        raise TaskError(f'{where(k)}: {steps[k]:.4g} m from '
+                        f"{'the pose before' if k else 'the take-off'}, expected at most "
+                        f'{reach:g} m: the reach of the controller')
 
 
 def _column_order(path, line, header):

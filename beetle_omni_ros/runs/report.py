@@ -14,6 +14,7 @@ from rich.console import Console
 from beetle_omni_ros import __version__
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.yaml_file import shortened
 from beetle_omni_ros.runs import figures, plots, plots_summary, report_page, table
 from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.runs.figures import COLOURS, Run
@@ -22,6 +23,7 @@ from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.metrics import metrics_by_controller, task_of
 
 MAX_RUNS = len(COLOURS)  # more could not be told apart
+MOST_ROWS = 40      # of states, faults and warnings
 
 
 def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None,
@@ -133,7 +135,8 @@ def make_page(runs: list[Run], results: dict) -> str:
     tables = ''.join(table.html(grid) for grid in table.grids(results, with_poses=False))
     poses = [table.html(grid) for grid in table.grids(results, with_poses=True)
              if grid.title == 'Poses']
-    faults = ''.join(table.html(grid) for run in runs for grid in fault_grids(run))
+    faults = ''.join(table.html(grid) for run in runs
+                     for grid in (*supervisor_grids(run), *fault_grids(run)))
     return report_page.page(
         'Flight report', _subtitle(results['meta']), [_card(run) for run in runs], tables,
         sections, poses, faults)
@@ -159,7 +162,21 @@ def _card(run):
     facts = [', '.join(log.controllers()), *(f'{key} {meta[key]}' for key in
              ('task', 'conditions', 'seed', 'robot', 'plant') if meta.get(key) is not None),
              f'{log.end - log.start:.0f} s', log.source]
-    return report_page.card(run.label, run.colour, [fact for fact in facts if fact], log.warnings)
+    named = [f'fault: {shortened(name)} at {at - run.start:.2f} s'
+             for name, at in log.named_faults().items()]
+    return report_page.card(run.label, run.colour, [fact for fact in facts if fact],
+                            [*named[:MOST_ROWS], *log.warnings])
+
+
+def supervisor_grids(run: Run) -> list[table.Grid]:
+    """When the supervisor was in which state, and for which controller or fault."""
+    rows: list[list[str]] = []
+    for t, state in zip(run.log.state_t, run.log.states, strict=True):
+        kind, _, what = (shortened(part) for part in state.partition(':'))
+        if not rows or rows[-1][1:] != [kind, what]:
+            rows.append([f'{t - run.start:.2f}', kind, what])
+    return [table.Grid(f'{run.label}: states of the supervisor',
+                       ['at [s]', 'state', 'controller or fault'], rows[:MOST_ROWS])] * bool(rows)
 
 
 def fault_grids(run: Run) -> list[table.Grid]:
@@ -175,11 +192,12 @@ def fault_grids(run: Run) -> list[table.Grid]:
              str(len(times))] for (name, level, message), times in faults.items()]
     rejected = [[name, key, value] for name, values in last.items()
                 for key, value in values.items()
-                if 'reject' in key and value not in ('0', '0.0', '', '{}')]
+                if ('reject' in key or 'refused' in key) and value not in ('0', '0.0', '', '{}')]
     made = []
     if rows:
         made.append(table.Grid(f'{run.label}: warnings and errors',
-                               ['node', 'level', 'text', 'first at [s]', 'reports'], rows[:40]))
+                               ['node', 'level', 'text', 'first at [s]', 'reports'],
+                               rows[:MOST_ROWS]))
     if rejected:
         made.append(table.Grid(f'{run.label}: rejected', ['node', 'reason', 'count'], rejected))
     if not made:

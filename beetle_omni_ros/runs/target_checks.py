@@ -42,6 +42,22 @@ class TargetLimits:
         return schema.load(cls, path if path else share_path('params/targets.yaml'))
 
 
+def out_of_reach(target: Target, position: np.ndarray, reach: float, now: float) -> str:
+    """
+    Check how far a target is from the robot; as :meth:`TargetChecks.why_not`.
+
+    Args:
+        target: a pose, or a trajectory, of which the present point counts.
+        position: (3,) of the robot in world [m].
+        reach: of the controller that flies [m].
+        now: present time [s].
+
+    """
+    away = float(np.linalg.norm(target.at(now).position - position))
+    return '' if away <= reach else (f'{away:.4g} m from the robot, expected at most {reach:g} m: '
+                                     'the reach of the controller')
+
+
 class TargetChecks:
     """
     Checks targets of one robot.
@@ -84,7 +100,8 @@ class TargetChecks:
             if reason:
                 return f'point {k + 1}: {reason}'
         return self._motion(target.velocities, 'velocity', self._p.speed, 'm/s') or self._motion(
-            target.angular_velocities, 'angular velocity', self._p.rate, 'rad/s')
+            target.angular_velocities, 'angular velocity', self._p.rate, 'rad/s') or \
+            self._steps(target)
 
     def why_not_pose(self, position: np.ndarray, quaternion: np.ndarray) -> str:
         """Check a pose: (3,) in world [m], (4,) xyzw; as :meth:`why_not`."""
@@ -119,6 +136,20 @@ class TargetChecks:
         k = int(np.argmin(good))
         worst = values[k][np.argmax(~(np.abs(values[k]) <= most))]
         return f'point {k + 1}: {name} {worst:.4g} {unit}, expected within +-{most:g} {unit}'
+
+    def _steps(self, target):
+        """Whether the way from point to point asks for more than the velocities may."""
+        time = np.maximum(np.diff(target.times), 1e-9)
+        away = np.linalg.norm(np.diff(target.positions, axis=0), axis=1)
+        same = np.abs(np.sum(target.quaternions[:-1] * target.quaternions[1:], axis=1))
+        turn = 2 * np.arccos(np.minimum(same, 1.0))
+        for way, most, unit in ((away, self._p.speed, 'm'), (turn, self._p.rate, 'rad')):
+            fast = way > np.sqrt(3) * most * time + 1e-6     # each axis has the limit
+            if np.any(fast):
+                k = int(np.argmax(fast))
+                return (f'point {k + 2}: {way[k]:.4g} {unit} from the one before within '
+                        f'{time[k]:.3g} s, expected at most {np.sqrt(3) * most:.3g} {unit}/s')
+        return ''
 
     def _stamp(self, stamp, now):
         if now is None or stamp == 0.0:

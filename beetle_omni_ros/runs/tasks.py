@@ -193,13 +193,14 @@ def control_lost(target: PoseTarget, position: np.ndarray,
         rotations.geodesic_angle(quaternion, target.quaternion) > LOST_ORIENTATION
 
 
-def make_task(name: str | Path, seed: int = 0) -> Task:
+def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
     """
     Make a task from its name or from a pose file.
 
     Args:
         name: one of ``NAMES``, ``randomN`` for N random poses, or the path of a CSV file.
         seed: of the random poses.
+        reach: largest step between two poses of a file [m], of the controller that flies.
 
     Raises:
         TaskError: unknown name, or an unusable file: file, row, column and expectation.
@@ -216,7 +217,7 @@ def make_task(name: str | Path, seed: int = 0) -> Task:
         return {'hover': _hover_task, 'force': _force_task, 'torque': _torque_task,
                 'payload': _payload_task}[name](name)
     if name.lower().endswith('.csv') or Path(name).exists():
-        return _pose_task(name, pose_file.read_poses(name))
+        return _pose_task(name, pose_file.read_poses(name, reach))
     raise TaskError(f"task '{name}': expected a CSV file of poses, randomN or one of "
                     f"{', '.join(NAMES)}")
 

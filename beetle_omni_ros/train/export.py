@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.control import policy_checksum
+from beetle_omni_ros.control import onnx_runtime, policy_checksum
 from beetle_omni_ros.control.policy_file import INPUT, OUTPUT, PolicyContract
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import flatten
@@ -89,9 +89,7 @@ def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
 
 def compare(mean: Callable[[torch.Tensor], torch.Tensor], path: Path, size: int) -> float:
     """Largest difference of torch and onnxruntime on random observations, relative."""
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(str(path), providers=['CPUExecutionProvider'])
+    session = onnx_runtime.load().InferenceSession(str(path), providers=['CPUExecutionProvider'])
     generator = torch.Generator().manual_seed(0)
     probes = torch.randn(PROBES, size, generator=generator)
     with torch.no_grad():

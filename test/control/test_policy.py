@@ -1,11 +1,14 @@
 """The policy as a controller: what it loads, what it refuses, what it does with bad numbers."""
 
 from dataclasses import replace
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
-from beetle_omni_ros.control import policy_checksum
+from beetle_omni_ros.control import onnx_runtime, policy_checksum
 from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
 from beetle_omni_ros.control.observation import observation
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
@@ -287,3 +290,13 @@ def test_a_wound_robot_that_stays_off_its_pose_is_flown_through_level_but_not_of
     assert up[0] == pytest.approx(-1.0) and max(up) == pytest.approx(1.0)
     assert policy.diagnostics()['unwound'] == 1
     assert seen(trajectory) == pytest.approx([-1.0] * 200)
+
+
+def test_a_policy_leaves_nothing_in_the_temporary_folder(tmp_path):
+    script = ('from beetle_omni_ros.control.policy import PolicyController\n'
+              'from beetle_omni_ros.robot.parameters import RobotParameters\n'
+              'PolicyController(RobotParameters.load())')
+    environment = {name: value for name, value in os.environ.items() if name != onnx_runtime.OFF}
+    subprocess.run([sys.executable, '-c', script], check=True, timeout=60,
+                   env={**environment, 'TMPDIR': str(tmp_path)})
+    assert not list(tmp_path.iterdir())

@@ -51,6 +51,42 @@ def test_every_node_that_is_started_alone_or_composed_is_confined(ros_domain, un
     assert done.stderr.strip() == 'probe_node: error: SUBNET'
 
 
+def test_one_argument_of_a_node_opens_it(ros_domain, unset):
+    def start(*arguments):
+        code = f'{PROBE}runner.main(ProbeNode, ["probe", *{list(arguments)!r}])'
+        return subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                              check=False, timeout=60).stderr.strip()
+
+    assert start('--discovery', 'SUBNET') == 'probe_node: error: SUBNET'
+    assert start('--discovery=off', '--ros-args', '-p', 'a:=1') == 'probe_node: error: OFF'
+    for bad in (('--discovery', 'world'), ('--discovery',)):
+        assert start(*bad).startswith('probe_node: error: --discovery: expected one of LOCALHOST')
+
+
+def test_what_a_node_composition_was_told_is_none_of_its_nodes(ros_domain, unset):
+    done = subprocess.run(
+        [sys.executable, '-m', 'beetle_omni_ros.nodes.composed', '--discovery', 'subnet',
+         'no_node'], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2 and "unknown node 'no_node'" in done.stderr
+
+
+@pytest.mark.parametrize('command', ['fly', 'check'])
+def test_commands_that_join_the_graph_have_the_argument(command):
+    done = subprocess.run([sys.executable, '-m', 'beetle_omni_ros.cli', command, '--help'],
+                          capture_output=True, text=True, check=False, timeout=60)
+    assert '--discovery' in done.stdout
+
+
+def test_an_argument_of_fly_holds_for_the_processes_that_it_starts(tmp_path, unset, monkeypatch):
+    monkeypatch.setenv(discovery.RANGE, 'LOCALHOST')        # put back afterwards
+    monkeypatch.setenv(discovery.OWN, '')
+    given = {}
+    monkeypatch.setattr(subprocess, 'Popen', lambda *_, env, **__: given.update(env))
+    discovery.confine(asked='subnet')
+    Graph({'ekf_node': {}}, tmp_path, 7).start_process('composed')
+    assert given['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SUBNET'
+
+
 def test_a_graph_is_confined(tmp_path, unset, monkeypatch):
     given = {}
     monkeypatch.setattr(subprocess, 'Popen', lambda *_, env, **__: given.update(env))

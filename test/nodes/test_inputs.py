@@ -132,6 +132,22 @@ def test_a_target_from_a_clock_ahead_does_not_block_later_ones(bench):
     assert bench.wait(lambda: node._target.position[2] == 1.5)
 
 
+def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
+    node = bench.add(StillNode())
+    monkeypatch.setattr(node, 'simulated', True)
+    now = time.time()
+    for time_now, stamp, good in (
+            (now, 1.5, False), (now, now + 1e5, False), (now, now - 60, True),
+            (100.0, 1.5, True), (0.0, now, True), (100.0, now, False)):
+        monkeypatch.setattr(node, 'now', lambda told=time_now: told)
+        target = targets.pose_target(pose(stamp=stamp))
+        if good:
+            node._check_target(target, now)
+        else:
+            with pytest.raises(convert.MessageError, match='the stamp is .* expected at most'):
+                node._check_target(target, now)
+
+
 def test_a_latched_target_stays_good_for_a_node_that_starts_later(bench, monkeypatch):
     node = bench.add(StillNode())
     late = time.time() + 60
@@ -139,6 +155,23 @@ def test_a_latched_target_stays_good_for_a_node_that_starts_later(bench, monkeyp
     latched = bench.user.create_publisher(PoseStamped, 'target_pose', qos.LATCHED)
     latched.publish(pose(1.2, time.time()))
     assert bench.wait(lambda: node._target is not None)
+
+
+def test_a_target_beyond_the_reach_of_who_flies_is_refused_and_not_taken_over(bench):
+    node = bench.add(StillNode())
+    node._controller.reach = 6.5
+    node._position = np.array([0.0, 0.0, 1.0])
+    poses = bench.publisher(PoseStamped, 'target_pose')
+    poses.publish(pose(x=12.0))
+    assert bench.wait(lambda: node._target is not None)     # on standby: another may get there
+    node._on_mode(String(data='flying:nmpc'))
+    assert node._target is None and 'the present pose is held' in node.said[-1]
+    poses.publish(pose(x=3.0))
+    assert bench.wait(lambda: node._target is not None)
+    near, heard = node._target, len(node.said)
+    poses.publish(pose(x=12.0))
+    assert bench.wait(lambda: len(node.said) > heard)
+    assert node._target is near and '12 m from the robot, expected at most 6.5 m' in node.said[-1]
 
 
 def trajectory(heights, stamp):
@@ -243,8 +276,9 @@ def test_what_is_read_only_cannot_be_set_in_flight(ros_domain, tmp_path, kind):
             for answer in (node.set_parameters([new])[0],
                            node.set_parameters_atomically([new])):
                 assert not answer.successful and '\n' not in answer.reason
-                assert "parameter 'use_sim_time' is read-only" in answer.reason
+                assert 'read-only parameter: use_sim_time' in answer.reason
         assert node.now() > before and not node.get_parameter('use_sim_time').value
+        assert node.describe_parameter('use_sim_time').read_only
         for name in node._parameters:
             if node.describe_parameter(name).read_only:
                 answer = node.set_parameters([Parameter(name, value=node.get_parameter(

@@ -160,6 +160,8 @@ def test_a_launch_is_found_on_this_computer_alone(bringup, monkeypatch):
     monkeypatch.setenv(discovery.OWN, 'SUBNET')
     bringup.generate_launch_description()
     assert os.environ[discovery.RANGE] == 'SUBNET'
+    bringup.start(composed='false', discovery='OFF')
+    assert os.environ[discovery.RANGE] == 'OFF'
 
 
 def test_the_ports_of_a_launch_lie_in_the_users_own_folder(bringup):

@@ -80,8 +80,44 @@ def test_a_pipe_in_place_of_a_lock_is_refused_at_once(temporary):
 
 def test_a_lock_is_not_emptied_before_it_is_held(temporary):
     (private.folder() / 'x.lock').write_text('4711')
-    with private.lock_file('x.lock') as file:
+    with private.open_lock('x.lock') as file:
         assert file.read() == '4711'
+
+
+def test_a_lock_names_its_holder_and_leaves_nothing_behind(temporary, name):
+    lock = private.Lock('x.lock')
+    with pytest.raises(private.HeldError, match=str(os.getpid())):
+        private.Lock('x.lock')
+    lock.close()
+    lock.close()
+    assert not list(temporary.iterdir())
+    private.Lock('x.lock').close()
+
+
+def test_a_lock_that_its_holder_removes_meanwhile_is_taken_anew(temporary, monkeypatch):
+    first, opened = private.Lock('x.lock'), private.open_lock
+
+    def late(name):
+        file = opened(name)
+        first.close()       # between the opening and the lock
+        return file
+
+    monkeypatch.setattr(private, 'open_lock', late)
+    second = private.Lock('x.lock')
+    monkeypatch.setattr(private, 'open_lock', opened)
+    assert (private.folder() / 'x.lock').read_text() == str(os.getpid())
+    with pytest.raises(private.HeldError):
+        private.Lock('x.lock')
+    second.close()
+
+
+def test_a_domain_leaves_nothing_behind_but_the_locks_of_who_lives(temporary):
+    with domain.reserved() as number:
+        alive = private.Lock(f'{number}.ekf_node.lock')
+        (private.folder() / f'{number}.sim_node.lock').write_text('999999999')   # was killed
+    assert [path.name for path in private.folder().iterdir()] == [f'{number}.ekf_node.lock']
+    alive.close()
+    assert not list(temporary.iterdir())
 
 
 def test_a_node_leaves_the_file_behind_a_link_alone(temporary):

@@ -72,6 +72,27 @@ def test_a_fast_one_tries_and_a_failed_flight_says_what_the_simulator_lost():
         flown(Nodes(lost=0.1), may_be_slow=False)
 
 
+def test_a_fault_that_keeps_it_on_the_ground_ends_the_attempt_at_once():
+    class Jammed(Nodes):
+        states, waited = [], 0
+
+        def call(self, name):
+            return True, ''
+
+        def spin(self, seconds):
+            super().spin(seconds)
+            self.waited += 1
+            self.states.append('disarmed:joint1_jammed')
+
+        def countdown(self, seconds):
+            yield from range(100)
+
+    nodes = Jammed()
+    with pytest.raises(FlightError, match='no take-off in 3 attempts'):
+        flown(nodes)
+    assert nodes.waited < 20
+
+
 @pytest.fixture
 def attempts(monkeypatch):
     """Graphs that `fly` started; the first in real time is too slow."""

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import tracemalloc
 
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -346,3 +347,28 @@ def test_closing_twice_and_writing_after_the_end_are_harmless(tmp_path):
     writer.flush()
     with pytest.raises(BagError, match='closed'):
         writer.write_imu(time.time(), (0, 0, 9.8), (0, 0, 0))
+
+
+def test_a_long_recording_takes_no_memory_and_its_index_is_complete(tmp_path):
+    def record(count, begin):
+        for k in range(count):
+            for name in ('state', 'battery'):
+                (writer.write_state(begin + k, 'flying:nmpc') if name == 'state' else
+                 writer.write_battery(begin + k, 24.0, -9.0))
+            writer.flush()
+
+    with BagWriter(tmp_path / 'bag') as writer:
+        record(200, 0)
+        tracemalloc.start()
+        before = tracemalloc.get_traced_memory()[0]
+        record(2000, 200)
+        grown = tracemalloc.get_traced_memory()[0] - before
+        tracemalloc.stop()
+    assert grown < 60_000       # 30 bytes a chunk; the records have 250
+    assert {path.suffix for path in (tmp_path / 'bag').iterdir()} == {'.mcap', '.yaml'}
+    with next((tmp_path / 'bag').glob('*.mcap')).open('rb') as file:
+        summary = make_reader(file).get_summary()
+        assert len(summary.chunk_indexes) == summary.statistics.chunk_count >= 2200
+        assert sum(1 for _ in make_reader(file).iter_messages()) == 4400
+    with AnyReader([tmp_path / 'bag']) as reader:
+        assert sum(1 for _ in reader.messages()) == 4400

@@ -78,3 +78,27 @@ def test_flights_with_and_without_targets_stand_on_one_page(tmp_path):
             record(tmp_path / 'one', task='hover', targets=2)]
     run_report(bags, tmp_path / 'page.html', console=Console(file=io.StringIO()))
     assert (tmp_path / 'page.html').stat().st_size > 10_000
+
+
+def test_a_fault_that_the_supervisor_named_stands_in_the_page(tmp_path):
+    with BagWriter(tmp_path / 'bag', {'task': 'hover', 'seed': 0}) as writer:
+        for k in range(80):
+            t = 10 + 0.05 * k
+            writer.write_truth(t, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
+            writer.write_state(t, 'flying:nmpc' if k < 30 else 'fallback:joint1_astray' if k < 40
+                               else 'landing:rotor2_lost' if k < 70 else 'disarmed:<b>')
+        writer.write_diagnostic(13.0, 'supervisor_node: supervisor', {
+            'fault.joint3_slipped': '12.5', 'nmpc.refused.stale stamp': '7'}, 1, 'landing')
+    log = read_bag(tmp_path / 'bag')
+    assert log.controllers() == ['nmpc']        # a fallback counts for the one that it replaced
+    assert [name for _, name in log.active_controller()] == ['nmpc', None]
+    assert list(log.named_faults().items()) == [
+        ('joint1_astray', 11.5), ('rotor2_lost', 12.0), ('joint3_slipped', 13.0),
+        ('<b>', 13.5)]
+    page = tmp_path / 'page.html'
+    run_report([tmp_path / 'bag'], page, console=Console(file=io.StringIO()))
+    text = page.read_text()
+    for told in ('fault: rotor2_lost at', '<td>landing</td><td>rotor2_lost</td>',
+                 'fault: joint3_slipped at', 'nmpc.refused.stale stamp'):
+        assert told in text, told
+    assert '<b>' not in text and text.count('<td>rotor2_lost</td>') == 1

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
+from beetle_omni_ros.control.reach import reach_of_name
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.pose_file import read_poses, TaskError
-from beetle_omni_ros.runs.target_checks import TargetChecks
+from beetle_omni_ros.runs.pose_file import COLUMNS, read_poses, TaskError
+from beetle_omni_ros.runs.target_checks import out_of_reach, TargetChecks
 
 CHECKS = TargetChecks(RobotParameters.load())
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -67,3 +68,38 @@ def test_a_row_that_cannot_be_flown_is_named(tmp_path):
     file.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,0\n0,0,0.05,180,0,0\n')
     with pytest.raises(TaskError, match=r'task.csv: row 3: z = 0.05 m, expected at least'):
         read_poses(file)
+
+
+def test_points_that_lie_too_far_apart_for_their_times_are_refused():
+    def path(x, turn=0.0):
+        return TrajectoryTarget(
+            np.array([0.0, 0.1]), np.array([[0, 0, 1.0], [x, 0, 1.0]]),
+            np.array([LEVEL, rotations.from_rpy(0, 0, turn)]), np.zeros((2, 3)), np.zeros((2, 3)))
+
+    assert CHECKS.why_not(path(1.0, 1.9)) == ''
+    assert 'point 2: 8 m from the one before within 0.1 s' in CHECKS.why_not(path(8.0))
+    assert CHECKS.why_not(path(0.0, 3.1)) == ''     # 34.6 rad/s about a diagonal
+
+
+@pytest.mark.parametrize('reach, row', [(6.5, 4), (2.0, 3), (0.4, 2)])
+def test_a_row_beyond_the_reach_of_the_controller_is_named(tmp_path, reach, row):
+    file = tmp_path / 'far.csv'
+    file.write_text(f'{",".join(COLUMNS)}\n0.5,0,1,0,0,0\n3,0,1,0,0,0\n17.9,0,1,0,0,0\n')
+    assert len(read_poses(file)) == 3
+    with pytest.raises(TaskError, match=rf'row {row}: .* m from .*expected at most {reach:g} m'):
+        read_poses(file, reach)
+
+
+def test_what_is_in_reach_is_judged_from_the_robot():
+    here = np.array([10.0, 0, 1])
+    near, far = (PoseTarget(np.array([x, 0, 1.0]), LEVEL) for x in (16.0, 17.0))
+    assert out_of_reach(near, here, 6.5, 0.0) == ''
+    assert out_of_reach(far, here, 6.5, 0.0).startswith('7 m from the robot, expected at most 6.5')
+    track = TrajectoryTarget(np.array([0.0, 10.0]), np.array([[0, 0, 1.0], [10.0, 0, 1]]),
+                             np.array([LEVEL, LEVEL]), np.zeros((2, 3)), np.zeros((2, 3)))
+    assert out_of_reach(track, here, 6.5, 0.0) and not out_of_reach(track, here, 6.5, 5.0)
+
+
+def test_every_step_of_the_shipped_tasks_is_in_reach_of_every_controller():
+    for name in ('rl', 'rl_memory', 'nmpc', 'nmpc_published'):
+        assert reach_of_name(name) > np.linalg.norm([4.0, 4.0, 1.4])

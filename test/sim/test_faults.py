@@ -288,7 +288,8 @@ def test_a_fault_that_is_none_is_refused(arguments, named):
 @pytest.mark.parametrize(('numbers', 'named'), [
     ({'rotor': 5}, '1 to 4'), ({'rotor': 1.5}, 'whole'), ({'rotor': True}, 'whole'),
     ({'rotor': 'x'}, 'whole'), ({'rotor': 1, 'servo': 1}, "'servo' is unknown"),
-    ({'rotor': 10 ** 400}, '1 to 4'), ({'rotor': float('nan')}, 'whole')])
+    ({'rotor': 10 ** 400}, '1 to 4'), ({'rotor': float('nan')}, 'whole'),
+    ({'rotor': 16 ** 9000}, 'an integer of 36001 bits'), ({'x' * 9000: 1}, 'xxx... is unknown')])
 def test_numbers_are_checked_by_name(numbers, named):
     with pytest.raises(ParameterError, match=named):
         Fault('rotor_stops', **numbers)
@@ -319,7 +320,7 @@ def test_files_of_one_flight(tmp_path):
 
 @pytest.mark.parametrize(('text', 'named'), [
     ('faults: 3', "key 'faults'"), ('fault: []', "key 'fault'"), ('faults: [3]', 'fault 1'),
-    ('faults: [{what: rotor_stop}]', 'known names: rotor_1_stops'),
+    ('faults: [{what: rotor_stop}]', 'near: rotor_stops'),
     ('faults: [{what: rotor_stops}]', "'rotor' is missing"),
     ('faults: [{what: rotor_weak, rotor: 1}]', "'share' is missing"),
     ('faults: [{what: rotor_blinks, share: 1}]', "key 'share'"),

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.yaml_file import quoted
 
 LARGEST = 1e9       # of any number; what is beyond is a slip of the pen
 KINDS: dict[str, type[Effect]] = {}
@@ -44,9 +45,9 @@ class Number:
                 or not -inf < value < inf or (self.whole and value != int(value)):
             kind = 'a whole number' if self.whole else 'a number'
             raise ParameterError(f"{at}: expected {kind}{f' [{self.unit}]' if unit else ''}, "
-                                 f'found {str(value)[:60]!r}')
+                                 f'found {quoted(value)}')
         if not max(self.low, -LARGEST) <= value <= min(self.high, LARGEST):
-            raise ParameterError(f'{at}: {str(value)[:60]} is outside {self.low:g} to '
+            raise ParameterError(f'{at}: {quoted(value)} is outside {self.low:g} to '
                                  f'{self.high:g}{unit}')
         return float(value)
 
@@ -78,12 +79,14 @@ class Fault:
 
         """
         if kind not in KINDS:
-            raise ParameterError(f"fault '{kind}' is unknown; known: {', '.join(sorted(KINDS))}")
+            raise ParameterError(f'fault {quoted(kind)} is unknown; known: '
+                                 f"{', '.join(sorted(KINDS))}")
         declared = KINDS[kind].numbers
         for key in numbers:
             if key not in declared:
                 known = ', '.join(('at', 'duration', *declared))
-                raise ParameterError(f"fault '{kind}': key '{key}' is unknown; known: {known}")
+                raise ParameterError(f"fault '{kind}': key {quoted(key)} is unknown; "
+                                     f'known: {known}')
         values = {}
         for key, number in declared.items():
             value = numbers.get(key, number.default)

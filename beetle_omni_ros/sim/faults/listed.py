@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter, ParameterError
+from beetle_omni_ros.robot.yaml_file import quoted, shortened
 from beetle_omni_ros.sim.faults.base import Fault, KINDS
 
 GROUPS = ('limits', 'flight', 'healthy')
@@ -134,13 +136,13 @@ class FaultList:
 def _cases(faults) -> dict[str, Case]:
     cases = {}
     for name, entry in faults.items():
-        at = f"key 'faults.{name}'"
+        at = f"key 'faults.{shortened(name) if isinstance(name, str) else quoted(name)}'"
         if not isinstance(name, str) or not isinstance(entry, dict) \
                 or set(entry) != {'expected', 'what', 'strike'}:
             raise ParameterError(f'{at}: expected the keys expected, what and strike')
         if entry['expected'] not in OUTCOMES:
             raise ParameterError(f"{at}: expected: one of {', '.join(OUTCOMES)}, "
-                                 f"found {str(entry['expected'])[:60]!r}")
+                                 f"found {quoted(entry['expected'])}")
         if not isinstance(entry['what'], str):
             raise ParameterError(f'{at}: what: expected text')
         if not isinstance(entry['strike'], list) or not entry['strike']:
@@ -174,7 +176,7 @@ def load_faults(path: str | Path) -> list[Fault]:
     given = schema.load_yaml(path)
     unknown = set(map(str, given)) - {'faults'}
     if unknown:
-        raise ParameterError(f"{path}: key '{min(unknown)}': unknown key; known: faults")
+        raise ParameterError(f'{path}: key {quoted(min(unknown))}: unknown key; known: faults')
     if not isinstance(given.get('faults'), list):
         raise ParameterError(f"{path}: key 'faults': expected a list")
     named = FaultList.load().cases
@@ -192,11 +194,14 @@ def _placed(entry, at, named):
             raise ParameterError(f"{at}: key 'kind': give the kind as 'what'")
         return [_fault({'kind': what, **numbers}, at)]
     if what not in named:
-        raise ParameterError(f"{at}: key 'what': '{what[:60]}' is unknown; known kinds: "
-                             f"{', '.join(sorted(KINDS))}; known names: {', '.join(named)}")
+        near = get_close_matches(what[:60], [*KINDS, *named], 8, 0.4)
+        raise ParameterError(f"{at}: key 'what': {quoted(what)} is unknown, a kind or a name of "
+                             'params/faults.yaml is expected' + (
+                                 f"; near: {', '.join(dict.fromkeys(near))}" if near else ''))
     for key in numbers:
         if key not in ('at', 'duration'):
-            raise ParameterError(f"{at}: key '{key}': a fault of the list takes at and duration")
+            raise ParameterError(f'{at}: key {quoted(key)}: a fault of the list takes at and '
+                                 'duration')
     return [_fault({'kind': fault.kind, **fault.numbers, 'duration': fault.duration, **numbers},
                    at) for fault in named[what].strike]
 
@@ -216,6 +221,7 @@ def parse_faults(text: str) -> list[Fault]:
             numbers = {key: float(value) for key, _, value in (one.partition('=')
                                                                for one in given)}
         except ValueError:
-            raise ParameterError(f"faults: '{part}': expected KIND NAME=NUMBER ...") from None
+            raise ParameterError(f'faults: {quoted(part)}: expected KIND NAME=NUMBER '
+                                 '...') from None
         faults.append(_fault({'kind': kind, **numbers}, 'faults'))
     return faults

@@ -1,0 +1,285 @@
+"""
+Does any packet or message break a reader? ``python benchmarks/fuzz_packets.py --count 1000000``.
+
+Frames of the motor board, packets of the servos and ROS messages are mutated, or hold hostile
+numbers behind a good checksum. Drivers and emulated devices must take them without an exception,
+and ROS messages must be read or refused by ``MessageError``, in one bounded line.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+import sys
+import time
+import traceback
+
+import numpy as np
+from sensor_msgs.msg import Imu
+
+from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.drivers.mavlink_receiver import MavlinkReceiver
+from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
+from beetle_omni_ros.drivers.motor_board_watch import BoardWatch, restarted
+from beetle_omni_ros.drivers.servo_link import ServoLink
+from beetle_omni_ros.drivers.servo_port import ServoPort
+from beetle_omni_ros.nodes import convert, targets
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.target_checks import TargetChecks
+from beetle_omni_ros.sim.emulated import mavlink
+from beetle_omni_ros.sim.emulated.dynamixel import fast_status, packet, Receiver, status
+
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
+NUMBERS = (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-320, 0.0, -5.0, 1e6)
+TEXTS = ('', 'world', 'map', 'x' * 100_000, 'gimbal1', 'a\0b', '\N{SNOWMAN}')
+SERVOS, DATA = [1, 2, 3, 4], 10
+LONGEST_TEXT = 500
+PLACES = 20         # different findings that are printed
+
+
+def mutated(rng: np.random.Generator, data: bytes) -> bytes:
+    """Flip, cut, repeat or replace some bytes."""
+    data = bytearray(data)
+    for _ in range(rng.integers(1, 4)):
+        at, length = int(rng.integers(len(data) + 1)), int(rng.integers(1, 12))
+        match rng.integers(5):
+            case 0 if at < len(data):
+                data[at] ^= 1 << int(rng.integers(8))
+            case 1:
+                del data[at:at + length]
+            case 2:
+                data[at:at] = data[at:at + length]
+            case 3:
+                data[at:at + length] = rng.bytes(length)
+            case 4:
+                del data[at:]
+    return bytes(data)
+
+
+class Board:
+    """Frames to the driver's receiver and watch, and to the emulated board's parser."""
+
+    def __init__(self):
+        self._receiver = MavlinkReceiver(1, 1, restarted)
+        self._parser = mavlink.Parser()
+        self._watch = BoardWatch(MotorBoardParameters.load(), RobotParameters.load(), time.time)
+        self._sequence, self._asked = count(), 0
+
+    def __call__(self, rng):
+        """Feed one frame."""
+        number = list(mavlink.MESSAGES)[rng.integers(len(mavlink.MESSAGES))]
+        _, layout = mavlink.MESSAGES[number]
+        values = layout.unpack(rng.bytes(layout.size))      # nan and inf among them
+        if number == mavlink.TIMESYNC:      # an answer to a question, with any time
+            values = values[0], self._asked
+        frame = mavlink.pack(number, values, next(self._sequence) % 256, 1, 1)
+        if rng.random() < 0.5:
+            frame = mutated(rng, frame)
+        now = time.monotonic()
+        for message in self._receiver.feed(frame):
+            self._watch.message(message, now)
+        self._parser.feed(frame)
+        self._watch.tick(now, True)
+        if rng.random() < 0.1:
+            self._asked = self._watch.time_question().ts1
+            self._watch.take()
+
+
+class Wire(ServoPort):
+    """A port that plays back answers; where none is left, its time is over at once."""
+
+    def __init__(self):
+        super().__init__('wire', 1_000_000, 0.001)
+        self.waiting, self._late = b'', 0.0
+        self.tx_time_per_byte = 0.01
+
+    def clearPort(self):
+        """Nothing is kept."""
+
+    def writePort(self, data):
+        """All is written."""
+        return len(data)
+
+    def readPort(self, length):
+        """Give what is left."""
+        taken, self.waiting = self.waiting[:length], self.waiting[length:]
+        if not taken:
+            self._late += 100.0
+        return taken
+
+    def getCurrentTime(self):
+        """Milliseconds."""
+        return self._late
+
+
+class Servos:
+    """Answers to the servo driver's reads, and packets to an emulated servo's receiver."""
+
+    def __init__(self):
+        self._link = ServoLink('wire', 1_000_000, 0.001)
+        self._link._port = self._wire = Wire()
+        self._receiver = Receiver()
+
+    def __call__(self, rng):
+        """Feed the answers to one read, and one packet to the device."""
+        link = self._link
+        link.fast = bool(rng.integers(2))
+        parts = [(one, int(rng.integers(256)), rng.bytes(DATA)) for one in SERVOS]
+        answer = b''.join(fast_status(parts, (DATA + 4) * len(parts)) if link.fast else
+                          [status(*part) for part in parts])
+        self._wire.waiting = mutated(rng, answer) if rng.random() < 0.7 else answer
+        for error, data in link.sync_read(132, DATA, SERVOS).values():
+            if len(data) != DATA or not 0 <= error < 128:
+                raise AssertionError(f'an answer of {len(data)} bytes, error {error}')
+        sent = packet(int(rng.integers(1, 253)), int(rng.integers(1, 160)), rng.bytes(8))
+        for _ in self._receiver.feed(mutated(rng, sent)):
+            pass
+
+
+class Messages:
+    """Hostile fields in every message that a node reads."""
+
+    def __init__(self):
+        zero = np.zeros(3)
+        self._checks = TargetChecks(RobotParameters.load())
+        track = targets.target_message(TrajectoryTarget(
+            np.arange(3.0), np.ones((3, 3)), np.tile(LEVEL, (3, 1)), np.zeros((3, 3)),
+            np.zeros((3, 3))))
+        self._kinds: list[tuple[Callable, Callable]] = [
+            (lambda: convert.pose_message(1.0, zero, LEVEL), convert.pose_sample),
+            (lambda: convert.pose_message(1.0, zero + 1, LEVEL), self._target),
+            (lambda: track, self._track),
+            (lambda: convert.odometry_message(1.0, zero, zero, LEVEL, zero), convert.odom),
+            (lambda: convert.command_message(Command(1.0, np.zeros(4), np.ones(4))),
+             convert.command),
+            (lambda: convert.joint_message(1.0, np.zeros(4), np.zeros(4)), convert.joints),
+            (lambda: convert.joint_message(1.0, np.zeros(4), np.zeros(4)), convert.known_joints),
+            (lambda: convert.rotor_message(1.0, np.ones(4)), convert.rotors),
+            (lambda: convert.battery_message(1.0, 24.0, -9.0, 6), convert.battery),
+            (lambda: convert.wrench_message(1.0, zero, zero), convert.wrench),
+            (Imu, convert.imu_sample)]
+
+    def _target(self, message):
+        target: PoseTarget = targets.pose_target(message)
+        self._judge(target)
+
+    def _track(self, message):
+        self._judge(targets.trajectory_target(message))
+
+    def _judge(self, target):
+        if not self._checks.why_not(target, 5.0):
+            positions = np.atleast_2d(getattr(target, 'positions', getattr(
+                target, 'position', None)))
+            if not (np.isfinite(positions).all() and positions[:, 2].min() > 0
+                    and np.abs(positions).max() <= 18):
+                raise AssertionError(f'a target at {positions.tolist()} is taken')
+
+    def __call__(self, rng):
+        """Read one message."""
+        make, read = self._kinds[rng.integers(len(self._kinds))]
+        message = copied(make())
+        for _ in range(rng.integers(1, 4)):
+            spoil(rng, message)
+        try:
+            read(message)
+        except convert.MessageError as error:
+            if '\n' in str(error) or len(str(error)) > LONGEST_TEXT:
+                raise AssertionError(f'a refusal of {len(str(error))} characters') from None
+
+
+def copied(message):
+    """A message that can be changed."""
+    made = type(message)()
+    for field in message.get_fields_and_field_types():
+        value = getattr(message, field)
+        if hasattr(value, 'get_fields_and_field_types'):
+            value = copied(value)
+        elif isinstance(value, list):
+            value = [copied(one) if hasattr(one, 'get_fields_and_field_types') else one
+                     for one in value]
+        setattr(made, field, value)
+    return made
+
+
+def spoil(rng: np.random.Generator, message) -> None:
+    """Change one field at random, of the message or of what it holds."""
+    fields = list(message.get_fields_and_field_types())
+    field = fields[rng.integers(len(fields))]
+    value = getattr(message, field)
+    if hasattr(value, 'get_fields_and_field_types'):
+        spoil(rng, value)
+    elif isinstance(value, bool):
+        setattr(message, field, not value)
+    elif isinstance(value, int):
+        low = -2**31 if field == 'sec' else 0
+        setattr(message, field, int(rng.choice([0, 1, 255 if low == 0 else low, 200])))
+    elif isinstance(value, float):
+        number = NUMBERS[rng.integers(len(NUMBERS))]
+        if message.get_fields_and_field_types()[field] == 'float':      # of 32 bits
+            with np.errstate(over='ignore'):
+                number = np.float32(number)
+        setattr(message, field, float(number))
+    elif isinstance(value, str):
+        setattr(message, field, TEXTS[rng.integers(len(TEXTS))])
+    else:
+        spoil_sequence(rng, message, field, list(value))
+
+
+def spoil_sequence(rng, message, field, values) -> None:
+    """Change, drop or repeat an entry; of fixed arrays only change one."""
+    at = int(rng.integers(len(values))) if values else 0
+    if values and hasattr(values[at], 'get_fields_and_field_types') and rng.random() < 0.7:
+        spoil(rng, values[at])
+    elif values and isinstance(values[at], float) and rng.random() < 0.7:
+        small = message.get_fields_and_field_types()[field].startswith('sequence<float')
+        values[at] = float(NUMBERS[rng.integers(3 if small else len(NUMBERS))])
+    elif values and isinstance(values[at], str) and rng.random() < 0.7:
+        values[at] = TEXTS[rng.integers(len(TEXTS))]
+    elif type(getattr(message, field)) is not np.ndarray and values:
+        values = values[:at] if rng.random() < 0.5 else values * int(rng.integers(2, 30))
+    setattr(message, field, values)
+
+
+KINDS = {'board': Board, 'servos': Servos, 'messages': Messages}
+
+
+def fuzz(kind: Callable, number: int, seed: int) -> Counter:
+    """Feed so many; what went wrong, and how often."""
+    feed, findings = kind(), Counter()
+    rng = np.random.default_rng(seed)
+    with np.errstate(all='ignore'):
+        for _ in range(number):
+            try:
+                feed(rng)
+            except Exception as error:      # whatever it is, it is a finding
+                place = traceback.extract_tb(error.__traceback__)[-1]
+                findings[f'{type(error).__name__} in {Path(place.filename).name}:{place.lineno}: '
+                         f'{str(error)[:150]}'] += 1
+    return findings
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Fuzz all kinds, or those that were asked for; status 1 where one found something."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().split('\n\n')[0])
+    parser.add_argument('--count', type=int, default=1_000_000, help='in all')
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--kinds', default=','.join(KINDS), help='separated by commas')
+    given = parser.parse_args(arguments)
+    names = given.kinds.split(',')
+    failed = False
+    for name in names:
+        number, begin = -(-given.count // len(names)), time.perf_counter()
+        findings = fuzz(KINDS[name], number, given.seed)
+        print(f'{name}: {number}, {findings.total()} findings, '
+              f'{time.perf_counter() - begin:.0f} s', flush=True)
+        for text, times in findings.most_common(PLACES):
+            print(f'  {times} x {text}')
+        failed |= bool(findings)
+    return int(failed)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,231 @@
+"""
+Does anything grow in a long flight? ``python benchmarks/soak.py [--minutes 60]``.
+
+Flies the whole ROS graph, with recorder and both buses, and reads every 10 s from /proc how much
+memory, how many threads and how many open files each of its processes has. After a warm-up a line
+is fitted through the memory. Exit status 1 where one grows by more than 5 MB an hour, has more
+threads or files at the end than after the warm-up, died, or the flight ended early.
+
+The pack is made so large that it lasts; the bag is thrown away.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+import json
+import os
+from pathlib import Path
+import shutil
+import sys
+import tempfile
+import time
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+import yaml
+
+from beetle_omni_ros.nodes import domain
+from beetle_omni_ros.nodes.actuators import bridged, BRIDGES
+from beetle_omni_ros.nodes.discovery import confine
+from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes.operator import Operator
+from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.runs.pose_file import COLUMNS
+from beetle_omni_ros.runs.tasks import POSE_DURATION, WAYPOINTS
+
+PERIOD = 10.0           # s between two samples
+WARM_UP = 0.2           # share of the flight before the fit, at least:
+WARM_UP_LEAST = 180.0   # s; buffers and caches fill in the first minutes
+LIMIT = 5.0             # MB an hour
+CAPACITY = 1000.0       # Ah
+READY, TAKE_OFF, LANDING = 300.0, 30.0, 30.0    # s
+MEGA = 1 / 1024         # of a kB of /proc
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What one process has at one time."""
+
+    t: float            # s since the take-off
+    memory: float       # MB, resident
+    threads: int
+    files: int
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What became of one process after the warm-up."""
+
+    process: str
+    memory_start_MB: float
+    memory_end_MB: float
+    memory_MB_per_hour: float
+    threads_start: int
+    threads_end: int
+    files_start: int
+    files_end: int
+    samples: int
+
+    @property
+    def grows(self) -> bool:
+        """Whether it has more than it may."""
+        return not self.memory_MB_per_hour <= LIMIT or self.threads_end > self.threads_start \
+            or self.files_end > self.files_start
+
+
+def read_sample(pid: int, t: float) -> Sample | None:
+    """Read what a process has; None where it is gone."""
+    place = Path(f'/proc/{pid}')
+    try:
+        status = dict(line.split(':', 1) for line in
+                      (place / 'status').read_text().splitlines() if ':' in line)
+        return Sample(t, float(status['VmRSS'].split()[0]) * MEGA, int(status['Threads']),
+                      len(os.listdir(place / 'fd')))
+    except (OSError, KeyError):
+        return None
+
+
+def growth(process: str, samples: list[Sample], warm_up: float) -> Growth | None:
+    """Fit the samples after ``warm_up`` [s]; None where there are fewer than three."""
+    kept = [sample for sample in samples if sample.t >= warm_up]
+    if len(kept) < 3:
+        return None
+    t, memory = np.array([[sample.t, sample.memory] for sample in kept]).T
+    slope, start = np.polyfit(t - t[0], memory, 1)
+    return Growth(process, float(start), float(start + slope * (t[-1] - t[0])),
+                  float(3600 * slope), kept[0].threads, kept[-1].threads,
+                  kept[0].files, kept[-1].files, len(kept))
+
+
+def make_graph(folder: Path, number: int, given) -> Graph:
+    """Make the graph of ``fly`` in ``folder``, with a pack that lasts."""
+    simulator = yaml.safe_load(share_path('params/simulator.yaml').read_text())
+    simulator['/**/sim_node']['ros__parameters']['battery']['capacity'] = CAPACITY
+    (folder / 'simulator.yaml').write_text(yaml.safe_dump(simulator))
+    count = int(60 * given.minutes / POSE_DURATION) + 2
+    rows = [','.join(f'{v:g}' for v in WAYPOINTS[k % len(WAYPOINTS)]) for k in range(count)]
+    (folder / 'poses.csv').write_text('\n'.join([','.join(COLUMNS), *rows]) + '\n')
+    parameters = {
+        'recorder_node': {'bag': str(folder / 'bag')},
+        'sim_node': {'simulator_file': str(folder / 'simulator.yaml')},
+        'ekf_node': {}, 'nmpc_node': {}, 'rl_node': {}, 'supervisor_node': {},
+        'reference_node': {'task': str(folder / 'poses.csv')}}
+    if given.actuators == 'emulated':
+        for node, values in bridged(folder, {}).items():
+            parameters[node] = {**parameters.get(node, {}), **values}
+    return Graph(parameters, folder, number, composed=not given.separate,
+                 simulated=given.clock == 'simulated')
+
+
+def take_off(operator: Operator, bridges: list[str]) -> None:
+    """Arm and wait for the task's begin; ends the program where that fails."""
+    if not operator.wait(lambda: operator.ready and not operator.waits_for(bridges), READY):
+        sys.exit(f'the graph is not ready: {operator.waits_for(bridges) or operator.state}')
+    operator.spin(2.0)
+    for _ in range(3):
+        answer = operator.call('arm')
+        if answer[0] and operator.wait(lambda: operator.state.startswith('flying'), TAKE_OFF):
+            return
+    sys.exit(f'no take-off: {answer[1]}')
+
+
+def watch(graph: Graph, operator: Operator, seconds: float, say: Callable[[str], None]
+          ) -> tuple[dict[str, list[Sample]], str]:
+    """Sample every process until the time is over; samples, and why it ended early or ''."""
+    samples: dict[str, list[Sample]] = {name: [] for name in graph.processes}
+    begin = time.monotonic()
+    due = begin
+    while (now := time.monotonic()) < begin + seconds:
+        if now >= due:
+            due += PERIOD
+            for name, process in graph.processes.items():
+                sample = read_sample(process.pid, now - begin)
+                if sample:
+                    samples[name].append(sample)
+            say(f'{(now - begin) / 60:.1f} min: ' + ', '.join(
+                f'{name} {taken[-1].memory:.1f} MB' for name, taken in samples.items() if taken))
+        operator.spin(0.2)
+        if graph.dead():
+            return samples, '; '.join(f'{name} died ({how})' for name, how in
+                                      graph.dead().items())
+        if not operator.state.startswith(('flying', 'fallback')):
+            return samples, f"the supervisor was in '{operator.states[-1]}' after " \
+                            f'{now - begin:.0f} s'
+    return samples, ''
+
+
+def soak(given, console: Console) -> dict:
+    """Fly, watch, land, stop; the numbers."""
+    confine()
+    folder = Path(tempfile.mkdtemp(prefix='soak_'))
+    operator, graph, ended = None, None, 'no take-off'
+    samples: dict[str, list[Sample]] = {}
+    try:
+        with domain.reserved() as number:
+            try:
+                graph = make_graph(folder, number, given)
+                graph.start()
+                operator = Operator(number)
+                take_off(operator, [node for node in graph.nodes if node in BRIDGES])
+                samples, ended = watch(graph, operator, 60 * given.minutes, console.log)
+                operator.call('land')
+                operator.wait(lambda: operator.state in ('disarmed', 'emergency_stop'), LANDING)
+            finally:
+                stubborn = graph.stop() if graph else []
+                if operator:
+                    operator.close()
+        bag_mb = sum(file.stat().st_size for file in (folder / 'bag').glob('*')) / 1e6
+        for line in graph.warnings()[:20]:
+            console.print(line, markup=False, highlight=False, style='yellow')
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    warm_up = max(WARM_UP * 60 * given.minutes, WARM_UP_LEAST)
+    found = [growth(name, taken, warm_up) for name, taken in samples.items()]
+    return {'minutes': given.minutes, 'warm_up_s': warm_up, 'limit_MB_per_hour': LIMIT,
+            'ended_early': ended, 'killed': stubborn, 'bag_MB': bag_mb,
+            'processes': [{**asdict(one), 'grows': one.grows} for one in found if one],
+            'samples': {name: [asdict(one) for one in taken] for name, taken in samples.items()}}
+
+
+def print_table(result: dict, console: Console) -> None:
+    """Print a row for each process."""
+    table = Table('process', 'memory [MB]', 'slope [MB/h]', 'threads', 'files', 'grows')
+    for one in result['processes']:
+        table.add_row(
+            one['process'], f"{one['memory_start_MB']:.1f} to {one['memory_end_MB']:.1f}",
+            f"{one['memory_MB_per_hour']:+.2f}",
+            f"{one['threads_start']} to {one['threads_end']}",
+            f"{one['files_start']} to {one['files_end']}", 'yes' if one['grows'] else 'no')
+    console.print(table)
+    console.print(f"after {result['warm_up_s']:.0f} s of warm-up; bag {result['bag_MB']:.0f} MB")
+    if result['ended_early']:
+        console.print(f"ended early: {result['ended_early']}", style='red')
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Fly so long, print what grew; status 1 where something did."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--minutes', type=float, default=60.0, help='of flight')
+    parser.add_argument('--actuators', choices=('emulated', 'direct'), default='emulated')
+    parser.add_argument('--clock', choices=('system', 'simulated'), default='system',
+                        help='simulated needs --actuators direct; minutes are of real time')
+    parser.add_argument('--separate', action='store_true', help='a process for each node')
+    parser.add_argument('--json', type=Path, help='file for the numbers')
+    given = parser.parse_args(arguments)
+    if given.clock == 'simulated' and given.actuators == 'emulated':
+        parser.error('serial devices keep real time; expected --actuators direct')
+    console = Console()
+    result = soak(given, console)
+    print_table(result, console)
+    if given.json:
+        given.json.write_text(json.dumps(result, indent=1) + '\n')
+    failed = result['ended_early'] or result['killed'] or not result['processes'] or any(
+        one['grows'] for one in result['processes'])
+    return int(bool(failed))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
