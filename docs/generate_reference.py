@@ -81,8 +81,10 @@ MEANINGS = {
     'supervisor/identity': 'identity of the supervisor; actuators obey its commands alone',
     'supervisor/target': 'what controllers fly to in place of the target of the operator; '
                          'nothing where it has no points',
-    'supervisor/actuators': '`gimbal1..4` and `rotor1..4`: `position` holds the angles of stuck '
-                            'joints (NaN: the joint moves), `effort` 1 or 0 for each rotor',
+    'supervisor/actuators': '`gimbal1..4`, `rotor1..4`, `gimbal1_zero..4_zero`: `position` holds '
+                            'true angles of stuck joints (NaN: the joint moves) and the zeros of '
+                            'encoders that jumped, reading minus true tilt; `effort` is NaN for '
+                            'a rotor that obeys, 0 for a lost one, else the thrust that it holds',
     'reference/state': '`waiting`, `flying 3/15`, `done`, `done: control lost at level 60`, or '
                        '`aborted` when the flight ended before the task',
     'joint_bridge/state': '`ready`, `waiting: WHY` or `lost: WHY`',

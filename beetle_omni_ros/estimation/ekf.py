@@ -180,7 +180,9 @@ class ErrorStateEkf:
             return False
         before, from_position, from_quaternion = self._good_pose
         limits, dt = self._parameters.doubt, stamp - before
-        if not 0 < dt <= self._parameters.imu.gap_limit:
+        repeats = np.array_equal(position, from_position) \
+            and np.array_equal(quaternion, from_quaternion)
+        if repeats or not 0 < dt <= self._parameters.imu.gap_limit:
             return False
         node = self._track.at(stamp)
         step = position - from_position - dt * node.velocity

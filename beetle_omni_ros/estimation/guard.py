@@ -6,7 +6,7 @@ from math import inf, isfinite, sqrt
 import numpy as np
 
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.estimation.spikes import SpikeFilter
+from beetle_omni_ros.robot.spikes import SpikeFilter
 
 
 class InputGuard:

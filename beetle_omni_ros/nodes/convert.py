@@ -292,9 +292,10 @@ def actuator_health(message: JointState) -> ToldHealth:
     if any(abs(angle) > np.pi * 2 for angle in stuck) or not all(map(isfinite, zeros)):
         raise MessageError('expected angles within one turn and finite zeros')
     return ToldHealth(seconds(message.header.stamp), ActuatorHealth(
-        tuple(effort != 0 for effort in efforts),
-        tuple(None if isnan(a) else float(a) for a in stuck),
-        tuple(None if isnan(f) or f == 0 else float(f) for f in efforts), tuple(map(float, zeros))))
+        rotors=tuple(effort != 0 for effort in efforts),
+        stuck=tuple(None if isnan(a) else float(a) for a in stuck),
+        held=tuple(None if isnan(f) or f == 0 else float(f) for f in efforts),
+        zeros=tuple(map(float, zeros))))
 
 
 def battery(message: BatteryState) -> Battery:

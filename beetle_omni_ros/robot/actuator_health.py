@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-
 NO_ZEROS = (0.0,) * 4
 
 

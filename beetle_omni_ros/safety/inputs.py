@@ -7,9 +7,9 @@ from math import isfinite
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, corrected, State
-from beetle_omni_ros.estimation.spikes import SpikeFilter
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.spikes import SpikeFilter
 from beetle_omni_ros.safety.actuators import Actuators
 from beetle_omni_ros.safety.events import EventLog, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -79,12 +79,14 @@ class Inputs:
         """Take raw joint feedback (4,), nan where unknown, beside what comes with the state."""
         good = not self._ahead(stamp) and self.vehicle.on_joints(
             stamp, self.watch.health.true(position), velocity)
-        if good and np.isfinite(position).all():
+        if good:
             self._watch_joints(stamp, np.asarray(position, dtype=float))
         return good
 
     def _watch_joints(self, stamp, reading):
         """Let the detectors look at a reading (4,); a zero that it moves counts for it, too."""
+        if not (isfinite(stamp) and np.isfinite(reading).all()):
+            return
         zeros = self.watch.health.zeros
         self.watch.on_joints(stamp, reading, self.airborne)
         if self.watch.health.zeros != zeros:

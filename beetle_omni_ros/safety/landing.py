@@ -115,9 +115,10 @@ class Landing:
         self._blind_for = self._blind_for + dt if no_mocap and no_imu else 0.0
         if self._blind_for > self._blind_limit:
             self.given_up = 'no estimator, no MoCap, no IMU'
+        tilt = vehicle.seen(in_force).tilt
         vehicle.backup.predict(
             now, self._ramp.at(now).velocity if no_mocap else None,
-            self._gauge.motion(vehicle.seen(in_force).tilt, self._robot.inertia) if no_imu else None)
+            self._gauge.motion(tilt, self._robot.inertia) if no_imu else None)
         return no_mocap
 
     def set_out(self, now: float, in_force: Command | None) -> None:

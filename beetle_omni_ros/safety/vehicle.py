@@ -105,7 +105,7 @@ class Vehicle:
         return True
 
     def seen(self, in_force: Command | None, state: State | None = None) -> State:
-        """A state for the hover controller; silent joints that may follow are where a model says."""
+        """A state for the hover controller; silent joints that may follow are as modelled."""
         state = self.state if state is None else state
         if self.joints.silent and in_force is not None and not self.stuck:
             tilt = in_force.tilt if self.modelled_tilt is None else self.modelled_tilt

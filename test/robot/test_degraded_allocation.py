@@ -83,7 +83,7 @@ def test_beyond_the_limits_it_comes_nearer_than_clipping(health):
         if not got.saturated.any():
             continue
         wrench = np.concatenate([force, torque])
-        columns, inverse = ours.choices[0]
+        columns, inverse, _ = ours.choices[0]
         pairs = (inverse @ wrench).reshape(4, 2)
         if any(pairs[i, 0] < 0 for i in ours.stuck):
             continue
@@ -119,7 +119,17 @@ def test_near_a_solution_it_stays_there():
     np.testing.assert_allclose(got.thrust, aim.thrust, atol=1e-5)
 
 
+def test_a_rotor_that_holds_a_thrust_gives_it_and_the_others_meet_the_wrench():
+    ours = DegradedAllocator(ROBOT, ActuatorHealth(held=(None, 9.0, None, None)))
+    for force, torque, present in draws(50, 5):
+        got = ours.allocate(force, torque, present)
+        assert got.thrust[1] == pytest.approx(9.0)
+        if not got.saturated.any():
+            np.testing.assert_allclose(np.concatenate(ours.wrench(got.tilt, got.thrust)),
+                                       np.concatenate([force, torque]), atol=1e-6)
+
+
 def test_health_refuses_what_is_not_four():
-    with pytest.raises(ValueError, match='four rotors'):
+    with pytest.raises(ValueError, match='rotors: expected four, found 3'):
         ActuatorHealth(rotors=(True,) * 3)
     assert ALL_WELL.healthy and not lost(1).healthy and not stuck(0, 0.0).healthy

@@ -78,7 +78,9 @@ def switching(puppet, far):
     def talk():
         puppet.alive.discard('rl')
         original()
-        puppet.supervisor.on_command('rl', replace(far, stamp=puppet.now), puppet.now)
+        lively = far.thrust + 1e-9 * np.sin(1e3 * puppet.now)
+        puppet.supervisor.on_command('rl', replace(far, stamp=puppet.now, thrust=lively),
+                                     puppet.now)
 
     puppet._talk = talk
     puppet.run(1.0)

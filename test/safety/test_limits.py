@@ -20,6 +20,12 @@ def command(stamp=NOW, tilt=(0.1, 0.2, 0.3, 0.4), thrust=(7.0, 7.5, 8.0, 8.5)):
     return Command(stamp, np.array(tilt), np.array(thrust))
 
 
+def lively(stamp, *numbers):
+    """As a controller that answers measurements: never the same to the last digit."""
+    given = command(stamp, *numbers)
+    return Command(stamp, given.tilt + 1e-9 * np.sin(1e3 * stamp), given.thrust)
+
+
 def stream():
     return CommandStream(LIMITS, ROBOT)
 
@@ -77,7 +83,7 @@ def test_a_step_to_a_new_target_does_not_cost_the_right_to_be_selected():
     for k in range(200):
         checked.tick(0.01)
         now = NOW + 0.01 * k
-        checked.offer(command(now, near.tilt if k < 100 else far), now)
+        checked.offer(lively(now, near.tilt if k < 100 else far), now)
         assert checked.good == (k >= 50)
     assert checked.refused == {limits.JUMP: 1}
 
@@ -89,6 +95,14 @@ def test_one_that_jumps_all_the_time_is_silent_and_not_good():
         now += 0.01
         checked.offer(command(now, (3.0 * (-1) ** k, 0, 0, 0)), now)
     assert checked.silence.silent and not checked.good
+
+
+def test_one_that_repeats_its_numbers_is_refused_until_they_change():
+    checked = stream()
+    reasons = [checked.offer(command(NOW + 0.01 * k), NOW + 0.01 * k) for k in range(20)]
+    assert reasons[:limits.SAME] == [''] * limits.SAME
+    assert set(reasons[limits.SAME + 1:]) == {limits.FROZEN}
+    assert checked.offer(lively(NOW + 0.2), NOW + 0.2) == ''
 
 
 def test_accepted_command_does_not_change_with_the_callers_arrays():
@@ -107,7 +121,7 @@ def test_good_means_half_a_second_without_gap_or_refusal():
         for _ in range(round(duration / 0.01)):
             now += 0.01
             checked.tick(0.01)
-            checked.offer(command(now, thrust=(np.nan,) * 4) if spoil else command(now), now)
+            checked.offer(command(now, thrust=(np.nan,) * 4) if spoil else lively(now), now)
 
     now = NOW
     run(0.4)

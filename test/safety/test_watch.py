@@ -154,7 +154,8 @@ def test_a_rotor_that_turns_too_slowly_is_named_by_its_esc():
         t, works = 0.02 * n, np.ones(4)
         if t > 3.0:
             works[1] = np.exp(-(t - 3.0) / LAG)
-        watch.on_speeds(t, k * np.sqrt(thrust * works), thrust)
+        watch.on_command(t, thrust)
+        watch.on_speeds(t, k * np.sqrt(thrust * works))
         if watch.lost is not None and named is None:
             named = t - 3.0, watch.lost
     assert named[1] == 1 and named[0] < 0.2
@@ -163,8 +164,41 @@ def test_a_rotor_that_turns_too_slowly_is_named_by_its_esc():
 def test_an_esc_without_telemetry_is_no_lost_rotor():
     watch = SpeedWatch(P.rotor, ROBOT)
     for n in range(300):
-        watch.on_speeds(0.02 * n, np.array([800.0, np.nan, 800.0, 800.0]), np.full(4, 7.0))
+        watch.on_command(0.02 * n, np.full(4, 7.0))
+        watch.on_speeds(0.02 * n, np.array([800.0, np.nan, 800.0, 800.0]))
     assert watch.lost is None
+
+
+@pytest.mark.parametrize(('answer', 'deaf'), [
+    (lambda lagged, t: lagged, False), (lambda lagged, t: 0.7 * lagged, False),
+    (lambda lagged, t: np.full(4, 7.0), True)], ids=['healthy', 'weak', 'holds its thrust'])
+def test_a_rotor_that_does_not_follow_its_commands_is_told_by_the_slope(answer, deaf):
+    watch, thrust, noise = SpeedWatch(P.rotor, ROBOT), np.full(4, 7.0), np.random.default_rng(0)
+    told = False
+    for n in range(1200):
+        t = 0.005 * n
+        asked = 7.0 + 3.0 * np.sin(6.0 * t + np.arange(4))
+        thrust = thrust - np.expm1(-0.005 / LAG) * (asked - thrust)
+        watch.on_command(t, asked)
+        if n % 4 == 0:
+            given = np.where(np.arange(4) == 2, answer(thrust, t) if t > 2 else thrust, thrust)
+            watch.on_speeds(t, 300.0 * np.sqrt(given) * noise.normal(1.0, 0.01, 4))
+            told |= watch.deaf == 2
+            assert watch.deaf in (None, 2)
+    assert told == deaf
+
+
+def test_the_zero_of_an_encoder_that_jumps_moves_and_the_joint_is_not_stuck():
+    watch = FaultWatch(P, ROBOT, Allocator(ROBOT))
+    for n in range(200):
+        t = 0.005 * n
+        true = np.full(4, 0.3 * np.sin(3 * t))
+        zero = np.array([0, 0, 1.5, 0]) if n > 100 else np.zeros(4)
+        watch.on_command(Command(t, watch.health.read(true), np.full(4, 7.0)))
+        watch.on_joints(t, true + zero, True)
+    assert set(watch.faults) == {'joint3_encoder_jump'}
+    assert watch.health.healthy
+    np.testing.assert_allclose(watch.health.zeros, [0, 0, 1.5, 0], atol=0.01)
 
 
 def poses(watch, attitude, at, estimate=lambda t: None):

@@ -21,9 +21,9 @@ class SpeedWatch:
     """
     Thrust goes with the square of the speed; the factor of each rotor is learnt in flight.
 
-    A rotor that no longer answers is told by the slope of the measured over the modelled thrust, a
-    regression over the last half second. It is 1 for a healthy rotor, its share for a weak one, and
-    0 for one that holds its thrust. It is judged where the modelled thrust has varied enough.
+    A rotor that no longer answers is told by the slope of the measured over the modelled thrust,
+    a regression over the last half second. It is 1 for a healthy rotor, its share for a weak one,
+    and 0 for one that holds its thrust. It is judged where the modelled thrust has varied enough.
 
     Args:
         limits: thresholds.
