@@ -13,7 +13,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from beetle_omni_ros.control.base import Controller, PoseTarget, State, Target, tell_health
+from beetle_omni_ros.control.base import (
+    checked,
+    Controller,
+    PoseTarget,
+    State,
+    Target,
+    tell_health,
+)
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
@@ -257,7 +264,8 @@ class FlightLoop:
         for name, controller in self._controllers.items():
             if self._ticks % self._every[name]:
                 continue
-            command = self._timers[name].call(controller.step, state, self._wanted())
+            command = checked(name, self._timers[name].call(controller.step, state,
+                                                            self._wanted()))
             if name == self._supervisor.active:
                 for passed in self._processes.requests(command, now):
                     self._request(name, passed, now)

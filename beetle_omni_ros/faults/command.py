@@ -14,12 +14,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.evaluation.command import CONTROLLERS
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.faults import campaign, page
 from beetle_omni_ros.faults.flight import STARTS
 from beetle_omni_ros.faults.healthy import CONDITIONS, fly_healthy, HealthyTrial
 from beetle_omni_ros.faults.landings import fly_landing, LandingTrial
 from beetle_omni_ros.faults.trial import fly_trial, Trial
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import check_writable, write_json
 from beetle_omni_ros.sim.faults.listed import FaultList
@@ -27,7 +28,8 @@ from beetle_omni_ros.sim.faults.listed import FaultList
 
 def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
                starts: list[str] | None = None, seeds: int = 1, conditions: str = 'nominal',
-               controller: str = 'nmpc', jobs: int | None = None, output: Path | None = None,
+               controller: str = registry.DEFAULT, jobs: int | None = None,
+               output: Path | None = None,
                json_path: Path | None = None, docs: Path | None = None, bags: bool = False,
                landings: int = 0, without_mocap: bool = False, healthy: float = 0.0,
                console: Console | None = None) -> dict:
@@ -62,6 +64,7 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     listed = FaultList.load(faults)
     cases = listed.chosen(only)
     _check(starts, controller, output, json_path, docs, bags)
+    controller = registry.find(controller).reference
     meta = {'command': _described(faults, only, starts, seeds, conditions, controller, landings,
                                   without_mocap, healthy), 'version': __version__}
     fly = _Flyer(console, jobs, output)
@@ -94,9 +97,7 @@ def _check(starts, controller, output, json_path, docs, bags):
     for start in starts or ():
         if start not in STARTS:
             raise ParameterError(f"--from '{start}': expected {', '.join(STARTS)}")
-    if controller not in CONTROLLERS:
-        raise ParameterError(f"controller '{controller}': expected one of "
-                             f"{', '.join(CONTROLLERS)}")
+    registry.make(controller, RobotParameters.load())       # or says what is wrong with it
     if bags and output is None:
         raise ParameterError('--bags: expected --output DIR to record to')
     if json_path:

@@ -37,7 +37,7 @@ class Operator:
 
     """
 
-    def __init__(self, domain: int, controller: str = 'nmpc'):
+    def __init__(self, domain: int, controller: str):
         """Join ``domain`` and watch the flight of ``controller``."""
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context, domain_id=domain,
