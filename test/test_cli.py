@@ -121,10 +121,10 @@ def test_compare_refuses_unusable_input_before_anything_flies(
     assert not list(tmp_path.rglob('*.html')) and not list(tmp_path.rglob('*.npz'))
 
 
-def test_fly_refuses_a_controller_without_a_node(capsys, tmp_path):
+def test_fly_refuses_a_controller_that_nobody_registered(capsys, tmp_path):
     pytest.importorskip('rclpy')
-    line = refused(capsys, 'fly', '--controller', 'nmpc_published', '--bag', tmp_path / 'bag')
-    assert "controller 'nmpc_published': no node for it; expected nmpc" in line
+    line = refused(capsys, 'fly', '--controller', 'nmpc_publish', '--bag', tmp_path / 'bag')
+    assert "controller 'nmpc_publish': expected one of nmpc, rl, rl_memory" in line
 
 
 def test_report_takes_a_folder_of_bags(capsys, bag, tmp_path):

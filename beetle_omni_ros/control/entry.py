@@ -11,13 +11,15 @@ from pathlib import Path
 import re
 import sys
 import traceback
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from beetle_omni_ros.control.base import Controller
 from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
+
+if TYPE_CHECKING:       # which imports CasADi, and a list of names needs none
+    from beetle_omni_ros.robot.parameters import RobotParameters
 
 PERIOD = 0.01               # [s] of a controller whose class does not say
 LONGEST_PERIOD = 1.0        # [s]

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import metadata
+from typing import TYPE_CHECKING
 
 from beetle_omni_ros.control import shipped
 from beetle_omni_ros.control.base import Controller
@@ -22,8 +23,10 @@ from beetle_omni_ros.control.entry import (
     entry_of,
     loaded,
 )
-from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
+
+if TYPE_CHECKING:       # which imports CasADi, and a list of names needs none
+    from beetle_omni_ros.robot.parameters import RobotParameters
 
 GROUP = 'beetle_omni_ros.controllers'
 SHIPPED: Mapping[str, ControllerEntry] = {
