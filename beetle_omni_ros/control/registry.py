@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import metadata
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from beetle_omni_ros.control import shipped
 from beetle_omni_ros.control.base import Controller
@@ -41,9 +41,29 @@ def _points() -> dict[str, metadata.EntryPoint]:
             if point.name not in SHIPPED}
 
 
+_ADDED: dict[str, ControllerEntry] = {}     # of this process alone
+
+
 def names() -> list[str]:
     """Every registered name, the shipped ones first."""
-    return [*SHIPPED, *_points()]
+    return list(dict.fromkeys((*SHIPPED, *_points(), *_ADDED)))
+
+
+def add(found: Any) -> ControllerEntry:
+    """
+    Register a class, or a function that builds a controller, in this process under its name.
+
+    One of the same name that was added before is replaced, as when a notebook's cell runs again.
+
+    Raises:
+        ParameterError: it cannot be one, or its name is that of another package's controller.
+
+    """
+    entry = entry_of(found, '')
+    if entry.name in SHIPPED or entry.name in _points():
+        raise ParameterError(_taken(entry.name, entry.name))
+    _ADDED[entry.name] = entry
+    return entry
 
 
 def find(reference: str) -> ControllerEntry:
@@ -61,6 +81,8 @@ def find(reference: str) -> ControllerEntry:
         return SHIPPED[reference]
     if ':' in reference:
         return _named(absolute(reference))
+    if reference in _ADDED:
+        return _ADDED[reference]
     if reference in _points():
         return _registered(reference)
     raise ParameterError(f"controller '{reference}': expected one of {', '.join(names())}, or "
@@ -89,10 +111,14 @@ def find_all(references: Iterable[str]) -> list[ControllerEntry]:
 @cache
 def _named(spec: str) -> ControllerEntry:
     entry = entry_of(loaded(spec, spec), spec)
-    if entry.name in names():
-        raise ParameterError(f"controller '{spec}': '{entry.name}' is a registered controller's "
-                             "name; expected another one (the class's attribute 'name')")
+    if entry.name in SHIPPED or entry.name in _points():
+        raise ParameterError(_taken(spec, entry.name))
     return entry
+
+
+def _taken(reference, name):
+    return f"controller '{reference}': '{name}' is a registered controller's name; expected " \
+           "another one (the class's attribute 'name')"
 
 
 @cache
@@ -138,5 +164,5 @@ def owner(option: str) -> str:
     return next(name for name, entry in SHIPPED.items() if entry.option == option)
 
 
-__all__ = ['compared', 'ControllerEntry', 'ControllerOptions', 'DEFAULT', 'find', 'find_all',
-           'GROUP', 'make', 'names', 'owner', 'pilot', 'SHIPPED', 'standing_by']
+__all__ = ['add', 'compared', 'ControllerEntry', 'ControllerOptions', 'DEFAULT', 'find',
+           'find_all', 'GROUP', 'make', 'names', 'owner', 'pilot', 'SHIPPED', 'standing_by']

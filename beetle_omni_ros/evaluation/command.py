@@ -81,7 +81,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
     return memory.log()
 
 
-def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nominal',
+def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 'nominal',
                  robot: Path | None = None, plant: Path | None = None, seed: int = 0,
                  bag: Path | None = None, json_path: Path | None = None,
                  options: Mapping[str, ControllerOptions] = MappingProxyType({}),
@@ -91,7 +91,7 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
 
     Args:
         controllers: names, or where their classes are, see :func:`control.registry.find`.
-        task: name or pose file.
+        task: name or pose file, or one that was made.
         conditions: 'nominal' or 'published'.
         robot: file that estimator and controllers believe; default the shipped one.
         plant: file that is true in the simulation; default ``robot``.
@@ -112,7 +112,8 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
     console = console or Console()
     believed = RobotParameters.load(robot)
     true = RobotParameters.load(plant) if plant else believed
-    flown = make_task(task, seed)
+    flown = task if isinstance(task, Task) else make_task(task, seed)
+    task = flown.name
     entries = registry.find_all(controllers)
     options = {registry.find(name).reference: given for name, given in options.items()}
     for entry in entries:
