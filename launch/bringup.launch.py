@@ -30,8 +30,9 @@ ARGUMENTS = {
     'motor_board_file': ('', None, 'parameters of rotor_bridge_node; empty: the shipped ones'),
     'controller': ('nmpc', None, 'the active controller: a registered name, or '
                                  'package.module:Class'),
-    'standby': ('true', ['true', 'false'], 'nmpc and rl run too, to be selected in flight; the '
-                                           'policy only if it fits the robot'),
+    'standby': ('true', ['true', 'false'], 'the controllers that stand by run too, to be '
+                                           'selected in flight; a policy only if it fits '
+                                           'the robot'),
     'policy': ('', None, 'policy (ONNX) for rl_node; empty: the shipped one'),
     'task': ('', None, 'task for reference_node; empty: targets come from elsewhere'),
     'record': ('', None, 'folder for a bag; empty: no recording'),

@@ -14,6 +14,7 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.guidance.guidance import Charge, Guidance, GuidanceParameters
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.control.observation import disturbed, observed
+from beetle_omni_ros.control.policy_file import kind
 from beetle_omni_ros.control.policy_network import PolicyNetwork
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import schema
@@ -85,7 +86,7 @@ class PolicyController:
         p = self._parameters = parameters or PolicyParameters.load()
         self.network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
         self.contract = contract = self.network.contract
-        self.name = 'rl_memory' if contract.memory else 'rl'
+        self.name = kind(contract.memory)
         self.period = 1 / contract.rate_hz
         self._scale, self._offset = contract.action_scale.tolist(), contract.action_offset.tolist()
         tilt, rotors = robot.joints.position_limit, robot.rotors

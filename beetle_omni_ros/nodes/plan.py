@@ -8,6 +8,7 @@ No ROS is needed to read it.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -114,7 +115,9 @@ def plan(wanted: Wanted) -> Plan:
         ('reference_node', wanted.task, {'task': wanted.task, 'seed': wanted.seed}),
         ('viewer_node', wanted.viewer, believed),
         *((name, bridges, bridges.get(name)) for name in BRIDGES))
-    return Plan({name: dict(values) for name, is_there, values in table if is_there}, left_out)
+    # Copies: ROS reads no parameter file in which two nodes share a list.
+    return Plan({name: deepcopy(values) for name, is_there, values in table if is_there},
+                left_out)
 
 
 def _bridges(wanted, believed):
