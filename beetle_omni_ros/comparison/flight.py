@@ -60,8 +60,8 @@ def fly_flight(flight: Flight, task: Task, code: str | None = None) -> dict:
             warnings.simplefilter('ignore', RuntimeWarning)
             log = fly(flight.reference, task, robot=robot, plant=robot,
                       conditions=flight.conditions, seed=flight.seed,
-                      options=ControllerOptions(
-                          policy=Path(flight.policy) if flight.policy else None),
+                      options={flight.reference: ControllerOptions(
+                          policy=Path(flight.policy) if flight.policy else None)},
                       meta={'task': flight.task, 'conditions': flight.conditions,
                             'seed': flight.seed})
             result['metrics'] = judged = metrics(log, task)

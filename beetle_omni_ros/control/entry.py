@@ -155,7 +155,7 @@ class ControllerEntry:
         mapping = schema.load_yaml(file) if file else {}
         parameters = schema.bind(kind, self.completed(mapping, bool(options.parameters)),
                                  str(file or ''))
-        if not self.policy_file:
+        if not (self.policy_file and hasattr(parameters, 'policy')):
             return parameters
         return replace(parameters, policy=str(options.policy or self.policy_file),
                        allow_other_robot=parameters.allow_other_robot
@@ -191,7 +191,7 @@ class ControllerEntry:
         except (ParameterError, FileNotFoundError, ImportError):
             raise
         except Exception as error:
-            if not self.spec:
+            if isinstance(self.controller, str):    # ours: a fault of the package
                 raise
             raise ParameterError(f"controller '{self.reference}': building it raised "
                                  f'{_told(error)}') from error

@@ -39,24 +39,22 @@ from beetle_omni_ros.sim.simulator import Simulator
 
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,
         conditions: str = 'nominal', seed: int = 0,
-        options: ControllerOptions = ControllerOptions(),
+        options: Mapping[str, ControllerOptions] = MappingProxyType({}),
         bag: Path | None = None, meta: dict | None = None, faults: Sequence[Fault] = (),
         progress=lambda part: None) -> FlightLog:
     """
     Fly one task with one controller; see :func:`run_evaluate` for the arguments.
 
-    ``options`` are those of this controller.
-
     Returns:
         the flight, also when the robot crashed (``meta['crashed']``).
 
     """
-    name = registry.find(controller).name
     # With a lost actuator the pilot lands the robot, whoever flew it.
-    flying = registry.make(controller, robot, options)
-    aboard = {name: flying}
-    if faults and registry.pilot() != name:
-        aboard[registry.pilot()] = registry.make(registry.pilot(), robot)
+    entries = map(registry.find, dict.fromkeys(
+        [controller, registry.pilot()] if faults else [controller]))
+    aboard = {entry.name: entry.make(robot, options.get(entry.reference, ControllerOptions()))
+              for entry in entries}
+    name, flying = next(iter(aboard.items()))
     meta = dict(meta or {}, controller=name, guidance=guidance_of(flying))
     memory = LogRecorder(meta)
     with ExitStack() as stack:
@@ -139,8 +137,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             bar = bars.add_task(f'{name}: {task}, {conditions}', total=1.0)
             folder = bag / name if bag and len(controllers) > 1 else bag
             log = fly(entry.reference, flown, robot=believed, plant=true, conditions=conditions,
-                      seed=seed, options=options.get(entry.reference, ControllerOptions()),
-                      bag=folder, meta=meta, faults=struck,
+                      seed=seed, options=options, bag=folder, meta=meta, faults=struck,
                       progress=lambda part, bar=bar: bars.update(bar, completed=part))
             results[name] = metrics_of_runs.metrics(log, flown)
             if log.meta['ended']:

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.faults import campaign, page
 from beetle_omni_ros.faults.flight import STARTS
 from beetle_omni_ros.faults.healthy import CONDITIONS, fly_healthy, HealthyTrial
@@ -63,10 +64,13 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     console = console or Console()
     listed = FaultList.load(faults)
     cases = listed.chosen(only)
-    _check(starts, controller, output, json_path, docs, bags)
-    controller = registry.find(controller).reference
+    entry = registry.find(controller)
+    controller = entry.reference
+    _check(starts, output, json_path, docs, bags)
+    guidance = guidance_of(entry.make(RobotParameters.load()))      # or what is wrong with it
     meta = {'command': _described(faults, only, starts, seeds, conditions, controller, landings,
-                                  without_mocap, healthy), 'version': __version__}
+                                  without_mocap, healthy), 'version': __version__,
+            'guidance': guidance}
     fly = _Flyer(console, jobs, output)
     results: dict = {'meta': meta}
     if landings:
@@ -93,11 +97,10 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     return results
 
 
-def _check(starts, controller, output, json_path, docs, bags):
+def _check(starts, output, json_path, docs, bags):
     for start in starts or ():
         if start not in STARTS:
             raise ParameterError(f"--from '{start}': expected {', '.join(STARTS)}")
-    registry.make(controller, RobotParameters.load())       # or says what is wrong with it
     if bags and output is None:
         raise ParameterError('--bags: expected --output DIR to record to')
     if json_path:

@@ -4,6 +4,7 @@ import ast
 from importlib import metadata
 from pathlib import Path
 import re
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -221,6 +222,19 @@ def test_entry_points_of_other_packages_are_names(module, monkeypatch):
     entry = registry.find('theirs')
     assert (entry.name, entry.reference) == ('theirs', 'theirs')
     assert registry.find('nmpc') is registry.SHIPPED['nmpc']    # stays the package's own
+
+
+def test_an_installed_package_brings_its_controllers(module, tmp_path):
+    info = tmp_path / 'theirs-0.1.dist-info'
+    info.mkdir()
+    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: theirs\nVersion: 0.1\n')
+    (info / 'entry_points.txt').write_text(
+        f'[{registry.GROUP}]\ntheirs = {module}:MyController\nbroken = {module}:None\n')
+    code = ('from beetle_omni_ros.control import registry\n'
+            'print(registry.names()[-2:], registry.find("theirs").description)\n')
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          env={'PYTHONPATH': f'{tmp_path}:{ROOT}'}, check=False)
+    assert done.stdout == "['broken', 'theirs'] Holds still.\n", done.stderr
 
 
 def test_the_shipped_ones_are_entry_points_as_well():

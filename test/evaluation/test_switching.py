@@ -132,7 +132,7 @@ def fly_poses(tmp_path, policy, *heights):
     path = tmp_path / 'poses.csv'
     path.write_text(HEADER + ''.join(f'0,0,{z},0,0,0\n' for z in heights))
     return command.fly('rl', make_task(path), robot=ROBOT, plant=ROBOT,
-                       options=ControllerOptions(policy=policy))
+                       options={'rl': ControllerOptions(policy=policy)})
 
 
 def test_answers_that_are_no_numbers_end_in_hover_and_good_ones_fly_again(tmp_path):
