@@ -12,14 +12,22 @@ import re
 from setuptools import find_packages, setup
 
 PACKAGE = 'beetle_omni_ros'
-NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'joint_bridge_node',
-         'rotor_bridge_node', 'reference_node', 'recorder_node', 'viewer_node')
+NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'controller_node', 'supervisor_node',
+         'joint_bridge_node', 'rotor_bridge_node', 'reference_node', 'recorder_node',
+         'viewer_node')
 
 
 def version():
     """Read the version from the package without importing it."""
     text = Path(PACKAGE, '__init__.py').read_text(encoding='utf-8')
     return re.search(r"^__version__ = '([^']+)'", text, re.MULTILINE).group(1)
+
+
+def controllers():
+    """List the entry points of the controllers that the package ships."""
+    text = Path(PACKAGE, 'control', 'shipped.py').read_text(encoding='utf-8')
+    return [f'{name} = {PACKAGE}.control.shipped:{name}'
+            for name in re.findall(r'^(\w+) = ControllerEntry\(', text, re.MULTILINE)]
 
 
 def shared(*folders):
@@ -139,5 +147,6 @@ setup(
             f'beetle_omni = {PACKAGE}.cli:main',
             *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in NODES),
         ],
+        'beetle_omni_ros.controllers': controllers(),
     },
 )

@@ -1,3 +1,176 @@
-"""Flight stack and controller comparison for an overactuated tiltable quadrotor."""
+"""
+Flight stack and controller comparison for an overactuated tiltable quadrotor.
+
+What a notebook needs is here, and imports nothing before it is called::
+
+    import beetle_omni_ros as bo
+
+    robot = bo.robot()                                    # parameters, from a file or shipped
+    log = bo.simulate('nmpc', [[0, 0, 1, 90, 0, 0]])      # a flight as numpy arrays
+    table = bo.evaluate([MyController, 'rl'], 'waypoints')      # metrics, and a table in print
+    log = bo.read_run('runs_out/flight')                  # a recorded bag as numpy arrays
+    found = bo.find_gap(['flight1', 'flight2'])           # where model and measurement disagree
+
+Examples of one screen each stand in examples/.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from beetle_omni_ros import robot
+
+if TYPE_CHECKING:
+    from beetle_omni_ros.robot.parameters import RobotParameters
+    from beetle_omni_ros.runs.log import FlightLog
 
 __version__ = '0.1.0'
+__all__ = ['evaluate', 'find_gap', 'read_run', 'robot', 'simulate', 'trajectory']
+
+
+def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
+             robot: RobotParameters | str | Path | None = None,
+             plant: RobotParameters | str | Path | None = None, conditions: str = 'nominal',
+             seed: int = 0, bag: str | Path | None = None) -> FlightLog:
+    """
+    Fly a task in this process, as `beetle_omni evaluate` does.
+
+    Args:
+        controller: a registered name, 'package.module:Class', or a class
+            (docs/how-to/own_controller.md).
+        task: a name as on the command line, a pose file, poses (N, 6) of x, y, z [m], roll,
+            pitch, yaw [deg], or what :func:`trajectory` returns.
+        robot: what estimator and controller believe: parameters or a file; None: the shipped one.
+        plant: what is true in the simulation; None: as ``robot``.
+        conditions: 'nominal' or 'published'.
+        seed: of everything random.
+        bag: new folder to record a bag in.
+
+    Returns:
+        The flight; ``log.meta['crashed']`` says whether the robot touched the ground.
+
+    Raises:
+        ParameterError, TaskError, BagError, FlightError: in one line.
+
+    """
+    from beetle_omni_ros.evaluation.command import fly
+    believed, flown = _robot(robot), _task(task, seed)
+    return fly(_reference(controller), flown, robot=believed,
+               plant=believed if plant is None else _robot(plant), conditions=conditions,
+               seed=seed, bag=None if bag is None else Path(bag), meta={
+                   'task': flown.name, 'conditions': conditions, 'seed': seed,
+                   'robot': str(robot) if isinstance(robot, (str, Path)) else 'params/robot.yaml',
+                   'version': __version__})
+
+
+def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any = 'waypoints', *,
+             robot: str | Path | None = None, plant: str | Path | None = None,
+             conditions: str = 'nominal', seed: int = 0, bag: str | Path | None = None,
+             quiet: bool = False) -> dict:
+    """
+    Fly a task with each controller and judge the flights, as `beetle_omni evaluate` does.
+
+    Args:
+        controllers: one or several, each as in :func:`simulate`.
+        task: as in :func:`simulate`.
+        robot: file of what estimator and controllers believe; None: the shipped one.
+        plant: file of what is true in the simulation; None: as ``robot``.
+        conditions: 'nominal' or 'published'.
+        seed: of everything random.
+        bag: new folder; with several controllers it holds a bag for each.
+        quiet: print no table.
+
+    Returns:
+        What `evaluate --json` writes: ``meta``, and a key for each controller's name.
+
+    """
+    from rich.console import Console
+
+    from beetle_omni_ros.evaluation.command import run_evaluate
+    several = [controllers] if isinstance(controllers, str) or callable(controllers) \
+        else controllers
+    return run_evaluate(
+        controllers=[_reference(one) for one in several], task=_task(task, seed),
+        conditions=conditions, seed=seed, bag=None if bag is None else Path(bag),
+        robot=None if robot is None else Path(robot),
+        plant=None if plant is None else Path(plant), console=Console(quiet=quiet))
+
+
+def read_run(path: str | Path) -> FlightLog:
+    """
+    Read a recorded bag into numpy arrays.
+
+    Args:
+        path: rosbag2 folder, or one of its files.
+
+    Returns:
+        The flight; what was missing or wrong stands in its ``warnings``.
+
+    Raises:
+        BagError: it cannot be read; one line.
+
+    """
+    from beetle_omni_ros.runs.bag_reader import read_bag
+    return read_bag(path)
+
+
+def find_gap(runs: Sequence[str | Path], holdout: Sequence[str | Path] = (), *,
+             robot: str | Path | None = None, apply: str | Path | None = None,
+             report: str | Path | None = None, quiet: bool = False) -> dict:
+    """
+    Find where model and measurement disagree, as `beetle_omni gap` does.
+
+    Args:
+        runs: bags that are fitted.
+        holdout: bags that judge; by default the last run, where there are three or more.
+        robot: file that is believed.
+        apply: robot file to write, with the named effects.
+        report: HTML page to write.
+        quiet: print nothing.
+
+    Returns:
+        What `gap --json` writes: ``verdict``, ``effects``, ``closure`` and the rest.
+
+    """
+    from rich.console import Console
+
+    from beetle_omni_ros.identify.gap.command import gap_results
+    robot, apply, report = (None if path is None else Path(path)
+                            for path in (robot, apply, report))
+    return gap_results(list(map(Path, runs)), list(map(Path, holdout)), robot, apply, None, report,
+                       Console(quiet=quiet))
+
+
+def trajectory(times, positions, quaternions, name: str = 'own trajectory'):
+    """
+    Make a task of a trajectory: 8 s at its first pose, then the whole of it.
+
+    Args:
+        times: (N,) increasing, from 0 [s].
+        positions: (N, 3) in world [m].
+        quaternions: (N, 4) body to world (x, y, z, w).
+        name: in result tables.
+
+    """
+    from beetle_omni_ros.runs.tasks import trajectory_task
+    return trajectory_task(name, times, positions, quaternions)
+
+
+def _reference(controller):
+    from beetle_omni_ros.control import registry
+    return controller if isinstance(controller, str) else registry.add(controller).name
+
+
+def _robot(given):
+    from beetle_omni_ros.robot.parameters import RobotParameters
+    return given if isinstance(given, RobotParameters) else RobotParameters.load(given)
+
+
+def _task(given, seed):
+    from beetle_omni_ros.runs.tasks import make_task, poses_task, Task
+    if isinstance(given, Task):
+        return given
+    return make_task(given, seed) if isinstance(given, (str, Path)) else \
+        poses_task('own poses', given)

@@ -16,10 +16,9 @@ import json
 
 import numpy as np
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, PoseTarget, State
 from beetle_omni_ros.control.feasible import feasible_target
-from beetle_omni_ros.control.hover import HoverController
-from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.holding import Holding
@@ -39,6 +38,7 @@ POSITION, ATTITUDE = 0.03, np.radians(2)    # what counts as held
 SINK = 0.3              # [m/s]
 ABOVE = 1.0             # [m] above its first pose a flight begins, falling while rotors start
 POWERED = (True,) * 4
+CONTROLLERS = [name for name, entry in registry.SHIPPED.items() if entry.flies_degraded]
 
 
 class Robot:
@@ -105,7 +105,7 @@ class Flight:
         self.robot, self.case = robot, case
         self.body = Robot(robot, arguments.conditions, seed, case.first.position + [0, 0, ABOVE],
                           case.first.quaternion)
-        self.controllers, self.flying = controllers, controllers['nmpc']
+        self.controllers, self.flying = controllers, controllers[registry.pilot()]
         self.after = controllers[arguments.controller]
         self.told_after = arguments.told_after
         self.told = ALL_WELL
@@ -217,7 +217,7 @@ def main():
     parser.add_argument('--what', choices=('rotor', 'servo'), default='rotor')
     parser.add_argument('--from', dest='start', choices=('hover', 'random'), default='hover')
     parser.add_argument('--stuck-at', choices=('random', 'here'), default='random')
-    parser.add_argument('--controller', choices=('nmpc', 'hover'), default='nmpc')
+    parser.add_argument('--controller', choices=CONTROLLERS, default=registry.DEFAULT)
     parser.add_argument('--told-after', type=float, default=0.1,
                         help='from the loss until the controller knows [s]')
     parser.add_argument('--conditions', choices=('nominal', 'published'), default='nominal')
@@ -226,7 +226,7 @@ def main():
     parser.add_argument('--json', help='write all rows into this file')
     arguments = parser.parse_args()
     robot = RobotParameters.load()
-    controllers = {'nmpc': NmpcController(robot), 'hover': HoverController(robot)}
+    controllers = {name: registry.make(name, robot) for name in CONTROLLERS}
     rows = []
     print('case alive held    m    deg  upright height  turn margin lowest touchdown')
     for number in arguments.only or range(arguments.first,

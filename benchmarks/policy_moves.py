@@ -31,7 +31,7 @@ import torch
 
 from beetle_omni_ros.control import onnx_runtime
 from beetle_omni_ros.control.base import Command, PoseTarget, State
-from beetle_omni_ros.control.guidance import Guidance
+from beetle_omni_ros.control.guidance.guidance import Guidance
 from beetle_omni_ros.control.policy import PolicyParameters
 from beetle_omni_ros.control.policy_network import find, PolicyNetwork
 from beetle_omni_ros.robot import dynamics as model

@@ -28,9 +28,11 @@ ARGUMENTS = {
                   'else configure'),
     'servo_bus_file': ('', None, 'parameters of joint_bridge_node; empty: the shipped ones'),
     'motor_board_file': ('', None, 'parameters of rotor_bridge_node; empty: the shipped ones'),
-    'controller': ('nmpc', ['nmpc', 'rl'], 'the active controller'),
-    'standby': ('true', ['true', 'false'], 'the other controller runs too, to be selected in '
-                                           'flight; the policy only if it fits the robot'),
+    'controller': ('nmpc', None, 'the active controller: a registered name, or '
+                                 'package.module:Class'),
+    'standby': ('true', ['true', 'false'], 'the controllers that stand by run too, to be '
+                                           'selected in flight; a policy only if it fits '
+                                           'the robot'),
     'policy': ('', None, 'policy (ONNX) for rl_node; empty: the shipped one'),
     'task': ('', None, 'task for reference_node; empty: targets come from elsewhere'),
     'record': ('', None, 'folder for a bag; empty: no recording'),
@@ -56,98 +58,64 @@ def has_ros2_bag():
                           check=False).returncode == 0
 
 
-def node_parameters(given):
-    """Node name -> parameters, for the nodes that the arguments ask for."""
-    from beetle_omni_ros.nodes.standby import controller_nodes
-    robot = {'robot_file': given['robot_file']} if given['robot_file'] else {}
-    seed = int(given['seed'])
-    nodes = {}
-    if given['backend'] == 'sim':
-        nodes['sim_node'] = {'conditions': given['conditions'], 'seed': seed}
-        if given['plant_file'] or given['robot_file']:
-            nodes['sim_node']['robot_file'] = given['plant_file'] or given['robot_file']
-    nodes['ekf_node'] = robot
-    for node, values in bridges(given, robot).items():
-        nodes[node] = {**nodes.get(node, {}), **values}
-    controllers, left_out = controller_nodes(
-        given['controller'], robot_file=given['robot_file'], policy=given['policy'],
-        allow_other_robot=given['allow_other_robot'] == 'true',
-        standby=given['standby'] == 'true')
-    if left_out:
-        print(f'rl does not stand by: {left_out}', file=sys.stderr)
-    nodes.update(controllers)
-    nodes['supervisor_node'] = {**robot, 'controller': given['controller']}
-    if given['task']:
-        nodes['reference_node'] = {'task': given['task'], 'seed': seed}
-    if given['viewer'] == 'true':
-        nodes['viewer_node'] = robot
-    return nodes
-
-
-def bridges(given, robot):
-    """Node name -> parameters that the actuators ask for."""
-    from beetle_omni_ros.nodes.actuators import bridged, BRIDGES
+def wanted(given):
+    """Put the arguments into the terms of the graph's plan."""
+    from beetle_omni_ros.nodes.plan import Wanted
     from beetle_omni_ros.nodes.private import scratch
-    if given['actuators'] != 'bridges':
-        return {}
-    if given['backend'] == 'sim':
-        # in a folder of its own: ports of two simulations must not meet
-        nodes = bridged(scratch('ports'), robot)
-    else:
-        nodes = {node: dict(robot) for node in BRIDGES}
-    nodes['joint_bridge_node']['autostart'] = given['autostart'] or (
-        'activate' if given['backend'] == 'sim' else 'configure')
-    for node, key in zip(BRIDGES, ('servo_bus_file', 'motor_board_file')):
-        if given[key]:
-            nodes[node][key] = given[key]
-    return nodes
+    simulated = given['backend'] == 'sim'
+    emulated = simulated and given['actuators'] == 'bridges'
+    # in a folder of its own: ports of two simulations must not meet
+    return Wanted(
+        simulated=simulated, ports=str(scratch('ports')) if emulated else '',
+        bag=given['record'] if given['record'] and not has_ros2_bag() else '',
+        seed=int(given['seed']),
+        **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
+        **{key: given[key] for key in (
+            'actuators', 'autostart', 'conditions', 'controller', 'motor_board_file',
+            'plant_file', 'policy', 'robot_file', 'servo_bus_file', 'task')})
 
 
-def recorded_topics(namespace):
-    """Absolute names of the topics of INTERFACES."""
+def recorded_topics(namespace, controllers):
+    """Absolute names of the topics of INTERFACES, and of these controllers."""
     from beetle_omni_ros.nodes.recorder_node import OWN_TOPICS
-    from beetle_omni_ros.runs.topics import TOPICS
+    from beetle_omni_ros.runs.topics import topics_with
     prefix = f"/{namespace.strip('/')}/" if namespace.strip('/') else '/'
-    return [prefix + topic for topic in (*TOPICS, *OWN_TOPICS)]
+    return [prefix + topic for topic in (*topics_with(controllers), *OWN_TOPICS)]
 
 
-def grouped(nodes):
-    """Nodes by process: the bridges, which wait for their ports, have one of their own."""
-    from beetle_omni_ros.nodes.actuators import BRIDGES
-    groups = ({name: nodes[name] for name in nodes if (name in BRIDGES) == apart}
-              for apart in (False, True))
-    return [group for group in groups if group]
-
-
-def composed(nodes, namespace):
+def composed(arguments, nodes, namespace):
     """One process that runs ``nodes``."""
     overrides = [argument for node, values in nodes.items() for key, value in values.items()
                  for argument in ('-p', f'{node}:{key}:={value}')]
     if namespace:
         overrides += ['-r', f'__ns:=/{namespace}']
-    return ExecuteProcess(cmd=[sys.executable, '-m', f'{PACKAGE}.nodes.composed', *nodes,
+    return ExecuteProcess(cmd=[sys.executable, '-m', f'{PACKAGE}.nodes.composed', *arguments,
                                '--ros-args', *overrides], output='screen')
 
 
 def actions(context):
     """Turn the arguments into processes."""
+    from beetle_omni_ros.nodes import plan
     from beetle_omni_ros.nodes.discovery import confine
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     confine(asked=given['discovery'])
-    nodes = node_parameters(given)
+    planned = plan.plan(wanted(given))
+    nodes = planned.nodes
+    for name, reason in planned.left_out.items():
+        print(f'{name} does not stand by: {reason}', file=sys.stderr)
     processes = []
-    if given['record']:
-        if has_ros2_bag():
-            processes.append(ExecuteProcess(
-                cmd=['ros2', 'bag', 'record', '-s', 'mcap', '-o', given['record'],
-                     *recorded_topics(given['namespace'])], output='screen'))
-        else:
-            nodes['recorder_node'] = {'bag': given['record']}
+    if given['record'] and 'recorder_node' not in nodes:
+        controllers = nodes['supervisor_node'].get('controllers', ())
+        processes.append(ExecuteProcess(
+            cmd=['ros2', 'bag', 'record', '-s', 'mcap', '-o', given['record'],
+                 *recorded_topics(given['namespace'], controllers)], output='screen'))
     if given['composed'] == 'true':
-        processes += [composed(group, given['namespace'].strip('/')) for group in grouped(nodes)]
+        processes += [composed(plan.arguments(nodes, names), {name: nodes[name] for name in names},
+                               given['namespace'].strip('/'))
+                      for names in plan.processes(nodes).values()]
     else:
-        processes += [Node(package=PACKAGE, executable=name, name=name, parameters=[values],
-                           namespace=given['namespace'], output='screen')
+        processes += [Node(package=PACKAGE, executable=plan.executable(name), name=name,
+                           parameters=[values], namespace=given['namespace'], output='screen')
                       for name, values in nodes.items()]
     return processes
 

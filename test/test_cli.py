@@ -36,7 +36,7 @@ def refused(capsys, *arguments):
 
 @pytest.mark.parametrize('command', [
     [], ['fly'], ['evaluate'], ['compare'], ['faults'], ['report'], ['train'], ['identify'],
-    ['check']])
+    ['check'], ['controllers']])
 def test_every_command_has_help(capsys, command):
     assert cli.main([*command, '--help']) == 0
     assert 'Usage' in capsys.readouterr().out
@@ -49,6 +49,15 @@ def test_help_needs_neither_ros_nor_any_heavy_module():
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
                           env={**os.environ, 'PYTHONPATH': str(ROOT)}, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_controllers_are_listed_with_what_is_known_of_them(capsys, tmp_path):
+    file = tmp_path / 'controllers.json'
+    assert cli.main(['controllers', '--json', str(file)]) == 0
+    listed = json.loads(file.read_text())
+    assert list(listed)[:2] == ['nmpc', 'rl'] and 'rl_memory' in capsys.readouterr().out
+    assert listed['rl']['policy_file'] == 'policies/rl.onnx' and listed['rl']['rate_hz'] == 100
+    assert listed['nmpc']['guidance'] == 'none' and listed['nmpc']['flies_degraded']
 
 
 def test_version(capsys):
@@ -121,10 +130,10 @@ def test_compare_refuses_unusable_input_before_anything_flies(
     assert not list(tmp_path.rglob('*.html')) and not list(tmp_path.rglob('*.npz'))
 
 
-def test_fly_refuses_a_controller_without_a_node(capsys, tmp_path):
+def test_fly_refuses_a_controller_that_nobody_registered(capsys, tmp_path):
     pytest.importorskip('rclpy')
-    line = refused(capsys, 'fly', '--controller', 'nmpc_published', '--bag', tmp_path / 'bag')
-    assert "controller 'nmpc_published': no node for it; expected nmpc" in line
+    line = refused(capsys, 'fly', '--controller', 'nmpc_publish', '--bag', tmp_path / 'bag')
+    assert "controller 'nmpc_publish': expected one of nmpc, rl, rl_memory" in line
 
 
 def test_report_takes_a_folder_of_bags(capsys, bag, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -11,10 +12,12 @@ from beetle_omni_ros.cli.options import (
     check_flight,
     CONDITIONS,
     ConditionsOption,
+    ControllerOption,
     DiscoveryOption,
     fail,
     FAILED,
     JsonOption,
+    KNOWN,
     OtherRobotOption,
     PlantOption,
     PolicyOption,
@@ -22,13 +25,13 @@ from beetle_omni_ros.cli.options import (
     SeedOption,
     TaskOption,
 )
+from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, owner
 from beetle_omni_ros.robot.schema import ParameterError
 
 
 def fly(bag: Annotated[Path, typer.Option(
             '--bag', metavar='DIR', help='New folder for the recorded bag.')],
-        controller: Annotated[str, typer.Option(
-            '--controller', metavar='nmpc|rl', help='The active controller.')] = 'nmpc',
+        controller: ControllerOption = DEFAULT,
         task: TaskOption = 'waypoints',
         conditions: ConditionsOption = 'nominal',
         seed: SeedOption = 0,
@@ -77,9 +80,8 @@ def fly(bag: Annotated[Path, typer.Option(
 
 def evaluate(controllers: Annotated[str, typer.Option(
                  '--controllers', metavar='NAME,...',
-                 help='Controllers to fly one after the other: nmpc, rl, rl_memory, '
-                      'nmpc_published, hover.')]
-             = 'nmpc',
+                 help=f'Controllers to fly one after the other: {KNOWN}.')]
+             = DEFAULT,
              task: TaskOption = 'random100',
              conditions: ConditionsOption = 'nominal',
              seed: SeedOption = 0,
@@ -87,7 +89,7 @@ def evaluate(controllers: Annotated[str, typer.Option(
              plant: PlantOption = None,
              nmpc_file: Annotated[Optional[Path], typer.Option(
                  '--nmpc', metavar='FILE',
-                 help="Other parameters for the controller 'nmpc'.")] = None,
+                 help=f"Other parameters for the controller '{owner('--nmpc')}'.")] = None,
              policy: PolicyOption = None,
              allow_other_robot: OtherRobotOption = False,
              bag: Annotated[Optional[Path], typer.Option(
@@ -107,26 +109,30 @@ def evaluate(controllers: Annotated[str, typer.Option(
     if not names or len(set(names)) != len(names):
         raise ParameterError(f"--controllers '{controllers}': expected different names, "
                              'separated by commas')
-    for option, file, name in (('--nmpc', nmpc_file, 'nmpc'), ('--policy', policy, 'rl')):
+    options = {name: ControllerOptions(allow_other_robot=allow_other_robot) for name in names}
+    for option, file, key in (('--nmpc', nmpc_file, 'parameters'), ('--policy', policy, 'policy')):
+        name = owner(option)
         if file and name not in names:
             raise ParameterError(f"{option} {file}: for the controller '{name}', which is not "
                                  f"among {', '.join(names)}")
+        if file:
+            options[name] = replace(options[name], **{key: file})
     check_flight(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
                  files=(robot, plant, nmpc_file, policy, faults))
-    from beetle_omni_ros.evaluation.command import ControllerFiles, run_evaluate
+    from beetle_omni_ros.evaluation.command import run_evaluate
     from beetle_omni_ros.evaluation.loop import FlightError
     try:
         run_evaluate(controllers=names, task=task, conditions=conditions, robot=robot,
                      plant=plant, seed=seed, bag=bag, json_path=json_path, faults=faults,
-                     files=ControllerFiles(nmpc=nmpc_file, policy=policy,
-                                           allow_other_robot=allow_other_robot))
+                     options=options)
     except FlightError as error:
         raise typer.Exit(fail(error, FAILED)) from None
 
 
 def compare(controllers: Annotated[Optional[str], typer.Option(
                 '--controllers', metavar='NAME,...',
-                help='Default: rl, rl_memory, nmpc and nmpc_published, as far as there.')] = None,
+                help=f'Of {KNOWN}. Default: the policies and NMPCs that are shipped, as far as '
+                     'there.')] = None,
             tasks: Annotated[Optional[str], typer.Option(
                 '--tasks', metavar='TASK,...', help='Names or pose files; default: all.')] = None,
             conditions: Annotated[str, typer.Option(
@@ -188,8 +194,7 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
            seeds: Annotated[int, typer.Option(
                '--seeds', metavar='N', min=1, help='Flights of each fault from each start.')] = 1,
            conditions: ConditionsOption = 'nominal',
-           controller: Annotated[str, typer.Option(
-               '--controller', metavar='nmpc|rl', help='The active controller.')] = 'nmpc',
+           controller: ControllerOption = DEFAULT,
            landings: Annotated[int, typer.Option(
                '--landings', metavar='N', min=0, help='Fly N landings from random attitudes in '
                                                       'place of the list.')] = 0,

@@ -8,11 +8,17 @@ from typing import Annotated, Optional
 
 import typer
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.schema import ParameterError
 
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130
 CONDITIONS = ('nominal', 'published')
 
+# Not those of other packages: --help looks for no installed package.
+KNOWN = f"{', '.join(registry.SHIPPED)}, any registered one, or package.module:Class"
+
+ControllerOption = Annotated[str, typer.Option(
+    '--controller', metavar='NAME', help=f'The active controller: {KNOWN}.')]
 TaskOption = Annotated[str, typer.Option(
     '--task', help='CSV file of poses, or waypoints, randomN (random100), lemniscate, hover, '
                    'force, torque or payload.', metavar='TASK')]
@@ -28,7 +34,8 @@ RobotOption = Annotated[Optional[Path], typer.Option(
 PlantOption = Annotated[Optional[Path], typer.Option(
     '--plant', metavar='FILE', help='What is true in the simulation. Default: as --robot.')]
 PolicyOption = Annotated[Optional[Path], typer.Option(
-    '--policy', metavar='FILE', help="Another policy (ONNX) for the controller 'rl'.")]
+    '--policy', metavar='FILE',
+    help=f"Another policy (ONNX) for the controller '{registry.owner('--policy')}'.")]
 OtherRobotOption = Annotated[bool, typer.Option(
     '--allow-other-robot', help='Fly a policy although it was trained for other robot '
                                 'parameters.')]

@@ -23,12 +23,14 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.comparison import grids_other, page
 from beetle_omni_ros.comparison.fingerprint import commit, file_digest, policy_file, versions
 from beetle_omni_ros.comparison.grid import Grid, Number
-from beetle_omni_ros.comparison.plan import CONDITIONS, CONTROLLERS, Flight, plan, TASKS
+from beetle_omni_ros.comparison.plan import CONDITIONS, Flight, plan, TASKS
 from beetle_omni_ros.comparison.store import Store
 from beetle_omni_ros.comparison.style import look
 from beetle_omni_ros.comparison.summary import summarise
 from beetle_omni_ros.comparison.sweep import check_backend, sweep
-from beetle_omni_ros.evaluation.command import ControllerFiles, make_controller
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import guidance_of
+from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import write_json
@@ -49,7 +51,8 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
 
     Args:
         output: folder for ``comparison.html``, ``comparison.json``, ``README.md`` and pictures.
-        controllers: names; None takes all that are there, and says which are not.
+        controllers: names, or where their classes are; None takes the shipped ones that are
+            there, and says which are not.
         tasks: names or pose files; None is all.
         conditions: 'nominal', 'published'; None is both.
         seeds: None is 0 and 1, and 0 alone for long tasks.
@@ -58,7 +61,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
         address: of a Ray cluster; None starts Ray on this computer.
         cache: folder of finished flights; None is in the output.
         fresh: fly again what is kept.
-        policy: another policy for 'rl'.
+        policy: another policy for the controller that `--policy` is for.
         json_path: a second place for the numbers.
         console: where to print.
 
@@ -70,14 +73,14 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
 
     """
     console = console or Console()
-    wanted = controllers or list(CONTROLLERS)
+    wanted = controllers or registry.compared()
     arguments = (wanted, tasks or TASKS, conditions or CONDITIONS, seeds)
     check_backend(backend)
     plan(*arguments)  # refuses unusable input before anything is made
     there, skipped = _available(wanted, policy, refuse=controllers is not None)
     for name, reason in skipped.items():
         print(f'beetle_omni: {name} is left out: {reason}', file=sys.stderr)
-    flights = plan(there, *arguments[1:], policy=policy)
+    flights = plan([entry.reference for entry in there], *arguments[1:], policy=policy)
     output = Path(output)
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -91,7 +94,8 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
         print(f'beetle_omni: finished flights are kept in {store.folder}; the same command goes '
               'on from there', file=sys.stderr)
         raise
-    results = _results(flown, arguments, there, skipped, policy)
+    results = _results(flown, arguments, [entry.name for entry in there], skipped, policy)
+    results['meta']['guidance'] = {entry.name: text for entry, text in there.items()}
     _write(results, flown, output, console)
     if json_path:
         write_json(json_path, results)
@@ -102,20 +106,22 @@ def _available(wanted, policy, refuse):
     """
     Build each controller once, which also compiles what the workers would all compile.
 
-    Returns the names that can fly and the reason for each other one; with ``refuse`` the
-    first of these is raised instead.
+    Returns the entries of those that can fly with their guidance in words, and the reason for
+    each other one; with ``refuse`` the first of these is raised instead.
     """
-    robot, there, skipped = RobotParameters.load(), [], {}
-    for name in wanted:
+    robot, there, skipped = RobotParameters.load(), {}, {}
+    learnt = registry.owner('--policy')
+    for entry in registry.find_all(wanted):
         try:
-            make_controller(name, robot, ControllerFiles(policy=policy))
-            there.append(name)
+            there[entry] = guidance_of(entry.make(robot, ControllerOptions(
+                policy=policy if entry.name == learnt else None)))
         except (ParameterError, FileNotFoundError) as error:
             if refuse:
                 raise ParameterError(str(error)) from None
-            skipped[name] = ' '.join(str(error).split())
-    if policy and 'rl' not in there:
-        raise ParameterError(f"--policy {policy}: for the controller 'rl', which does not fly")
+            skipped[entry.name] = ' '.join(str(error).split())
+    if policy and learnt not in {entry.name for entry in there}:
+        raise ParameterError(f"--policy {policy}: for the controller '{learnt}', which does not "
+                             'fly')
     return there, skipped
 
 
@@ -162,14 +168,17 @@ def _results(flown, arguments, there, skipped, policy):
     order = {name: k for k, name in enumerate((*tasks, *conditions, *there))}
     flights = sorted(flown, key=lambda flight: (
         order[flight.task], order[flight.conditions], order[flight.controller], flight.seed))
-    files = {name: policy_file(name, policy) for name in there}
-    command = (f"beetle_omni compare --controllers {','.join(there)} --tasks {','.join(tasks)} "
-               f"--conditions {','.join(conditions)}"
+    specs = {flight.controller: flight.spec for flight in flights if flight.spec}
+    references = [specs.get(name, name) for name in there]
+    files = {name: policy_file(reference, policy)
+             for name, reference in zip(there, references, strict=True)}
+    command = (f"beetle_omni compare --controllers {','.join(references)} "
+               f"--tasks {','.join(tasks)} --conditions {','.join(conditions)}"
                + (f" --seeds {','.join(map(str, seeds))}" if seeds else '')
                + (f' --policy {policy}' if policy else ''))
     return {
         'meta': {'version': __version__, 'commit': commit(), 'command': command,
-                 'controllers': there, 'skipped': skipped, 'tasks': list(tasks),
+                 'controllers': there, 'specs': specs, 'skipped': skipped, 'tasks': list(tasks),
                  'conditions': list(conditions),
                  'seeds': sorted({flight.seed for flight in flights}),
                  'policy_file': str(policy) if policy else None,

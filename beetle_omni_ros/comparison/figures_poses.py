@@ -8,6 +8,7 @@ import numpy as np
 
 from beetle_omni_ros.comparison.plan import Flight
 from beetle_omni_ros.comparison.style import FAINT, INK, look
+from beetle_omni_ros.comparison.summary import PUBLISHED
 from beetle_omni_ros.runs import published
 from beetle_omni_ros.runs.body import roll_pitch_yaw
 from beetle_omni_ros.runs.figures import panels
@@ -93,7 +94,7 @@ def _points(results):
 def _published_points(panel, task):
     if not task.startswith('random'):
         return
-    for name, column in (('RL', 'published_rl'), ('NMPC', 'published_nmpc')):
+    for column, name in PUBLISHED.items():
         numbers = published.RANDOM_POSES[name]
         x, y = (numbers['mean'][key] for key in ('U_position_m', 'U_orientation_deg'))
         spans = [[[value - numbers['min'][key]], [numbers['max'][key] - value]]

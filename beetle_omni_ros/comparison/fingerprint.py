@@ -5,18 +5,20 @@ from __future__ import annotations
 from functools import cache
 import hashlib
 from importlib import metadata
+import inspect
 from pathlib import Path
 import platform
 import subprocess
 
 from beetle_omni_ros.comparison.plan import Flight
-from beetle_omni_ros.evaluation.command import POLICIES
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 
 ROOMS = ('control', 'estimation', 'evaluation', 'robot', 'runs', 'safety', 'sim')
 LIBRARIES = ('casadi', 'filterpy', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
-OF_POLICIES = ('observation.py', 'policy.py', 'policy_file.py', 'policy_network.py',
-               'turning.py', 'unwinding.py', 'rl.yaml')  # no other controller reads these
+# What no other shipped controller reads: folders and files of the package, parameters.
+OF_POLICIES = ('control/guidance', 'control/observation.py', 'control/policy.py',
+               'control/policy_file.py', 'control/policy_network.py', 'params/rl.yaml')
 NOT_FLOWN = ('gap.yaml', 'train.yaml')  # parameters that no flight reads
 LENGTH = 16  # hexadecimal digits kept
 
@@ -27,7 +29,8 @@ def code_fingerprint(policy: bool = True) -> str:
     Digest of the code that flies and judges, its parameters and its libraries.
 
     Args:
-        policy: whether a policy flies; else without what only policies are flown with.
+        policy: whether a policy flies, or a controller of which that is not known; else without
+            what only policies are flown with.
 
     """
     package = Path(__file__).resolve().parents[1]
@@ -36,7 +39,7 @@ def code_fingerprint(policy: bool = True) -> str:
     files += [package / 'comparison' / 'flight.py']
     files += [path for path in share_path('params').glob('*.yaml') if path.name not in NOT_FLOWN]
     if not policy:
-        files = [path for path in files if path.name not in OF_POLICIES]
+        files = [path for path in files if not is_of_policies(path)]
     digest = hashlib.sha256()
     for path in sorted(files, key=lambda path: (path.parent.name, path.name)):
         digest.update(f'{path.parent.name}/{path.name}'.encode())
@@ -45,6 +48,12 @@ def code_fingerprint(policy: bool = True) -> str:
         digest.update(f'{library} {_version(library)}'.encode())
     digest.update(f'{platform.machine()} {platform.python_version()}'.encode())
     return digest.hexdigest()[:LENGTH]
+
+
+def is_of_policies(path: Path) -> bool:
+    """Whether only policies read a file."""
+    there = f"/{'/'.join(path.parts[-3:])}"
+    return any(there.endswith(f'/{part}') or f'/{part}/' in there for part in OF_POLICIES)
 
 
 def _version(library):
@@ -67,28 +76,44 @@ def policy_file(controller: str, other: str | Path | None = None) -> Path | None
     Locate a controller's policy.
 
     Args:
-        controller: name.
-        other: file in place of the shipped policy of 'rl'.
+        controller: by which the registry finds it.
+        other: file in place of the shipped policy of the controller that `--policy` is for.
 
     Returns:
         None for a controller that needs none, or whose file is absent.
 
     """
-    if controller == 'rl' and other:
+    if controller == registry.owner('--policy') and other:
         return Path(other)
+    shipped = registry.find(controller).policy_file
     try:
-        return share_path(POLICIES[controller]) if controller in POLICIES else None
+        return share_path(shipped) if shipped else None
     except FileNotFoundError:
         return None
 
 
+def own_code(controller: str) -> str:
+    """Digest of the code of a controller that is not the package's own; '' for one that is."""
+    if controller in registry.SHIPPED:
+        return ''
+    file = Path(inspect.getfile(registry.find(controller).builder()))
+    top = file.parent
+    while (top / '__init__.py').is_file():
+        top = top.parent
+    files = [file] if top == file.parent else sorted(
+        (top / file.relative_to(top).parts[0]).rglob('*.py'))
+    return ' '.join(file_digest(path) for path in files)
+
+
 def flight_key(flight: Flight) -> str:
     """Digest of all that determines a flight's numbers."""
-    parts = [code_fingerprint(flight.controller in POLICIES), flight.controller,
+    entry, own = registry.find(flight.reference), own_code(flight.reference)
+    parts = [code_fingerprint(bool(entry.policy_file or own)), flight.reference,
              flight.conditions, str(flight.seed)]
+    parts += [own] if own else []
     is_file = Path(flight.task).is_file()
     parts.append(file_digest(flight.task) if is_file else flight.task)
-    if policy := policy_file(flight.controller, flight.policy):
+    if policy := policy_file(flight.reference, flight.policy):
         parts.append(file_digest(policy))
     return hashlib.sha256('\n'.join(parts).encode()).hexdigest()[:LENGTH]
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from beetle_omni_ros.comparison.fingerprint import code_fingerprint
 from beetle_omni_ros.comparison.plan import Flight
-from beetle_omni_ros.evaluation.command import ControllerFiles, fly
+from beetle_omni_ros.control.registry import ControllerOptions
+from beetle_omni_ros.evaluation.command import fly
 from beetle_omni_ros.evaluation.loop import FlightError
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -57,9 +58,10 @@ def fly_flight(flight: Flight, task: Task, code: str | None = None) -> dict:
         with warnings.catch_warnings():
             # A flight that goes wrong may overflow; it is judged by what came of it.
             warnings.simplefilter('ignore', RuntimeWarning)
-            log = fly(flight.controller, task, robot=robot, plant=robot,
+            log = fly(flight.reference, task, robot=robot, plant=robot,
                       conditions=flight.conditions, seed=flight.seed,
-                      files=ControllerFiles(policy=Path(flight.policy) if flight.policy else None),
+                      options={flight.reference: ControllerOptions(
+                          policy=Path(flight.policy) if flight.policy else None)},
                       meta={'task': flight.task, 'conditions': flight.conditions,
                             'seed': flight.seed})
             result['metrics'] = judged = metrics(log, task)

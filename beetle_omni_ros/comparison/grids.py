@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from beetle_omni_ros.comparison.grid import Cell, Column, GAZEBO, Grid, Number, OURS, REAL
 from beetle_omni_ros.comparison.style import task_title
+from beetle_omni_ros.comparison.summary import PUBLISHED
+from beetle_omni_ros.control import registry
 
-PAPER = ('published_rl', 'published_nmpc')
+PAPER = tuple(PUBLISHED)
 GROUP = {'random': GAZEBO, 'force': GAZEBO, 'torque': GAZEBO, 'waypoints': REAL,
          'lemniscate': REAL}
 SINGLE = {'U_position_m': 4, 'U_orientation_deg': 2, 'L_position_m': 3, 'L_orientation_deg': 2}
@@ -97,8 +99,10 @@ class Task:
         """Shell lines that fly what the table shows."""
         seeds = sorted({seed for name in self.ours for seed in
                         self.numbers[self.conditions][name]['seeds']})
-        policy = self.results['meta']['policy_file'] if 'rl' in self.ours else None
-        return [f"beetle_omni evaluate --controllers {','.join(self.ours)} --task {self.task} "
+        meta = self.results['meta']
+        policy = meta['policy_file'] if registry.owner('--policy') in self.ours else None
+        ours = [meta.get('specs', {}).get(name, name) for name in self.ours]
+        return [f"beetle_omni evaluate --controllers {','.join(ours)} --task {self.task} "
                 f'--conditions {self.conditions} --seed {seed}'
                 + (f' --policy {policy}' if policy else '') for seed in seeds]
 

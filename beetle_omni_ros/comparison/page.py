@@ -132,7 +132,12 @@ def png(figure: Figure) -> bytes:
 def legend(results: dict) -> list[tuple[str, str]]:
     """Term and meaning, of controllers and conditions that the page shows."""
     meta = results['meta']
-    made = [(look(name).label, look(name).text) for name in meta['controllers']]
+    made = []
+    for name in meta['controllers']:
+        text = [look(name).text or meta.get('specs', {}).get(name, '')]
+        if moved := meta.get('guidance', {}).get(name):
+            text.append(f'guidance: {moved}')
+        made.append((look(name).label, '; '.join(filter(None, text))))
     made += [(f'{name} conditions', CONDITIONS[name]) for name in meta['conditions']]
     made += [(f'{name}: not flown', reason) for name, reason in meta['skipped'].items()]
     return made

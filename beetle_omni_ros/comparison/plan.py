@@ -14,18 +14,15 @@ from itertools import product
 from pathlib import Path
 import re
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.tasks import make_task, Task
 
-CONTROLLERS = ('rl', 'rl_memory', 'nmpc', 'nmpc_published')
 TASKS = ('random100', 'waypoints', 'lemniscate', 'force', 'torque', 'payload', 'hover')
 CONDITIONS = ('nominal', 'published')
 SEEDS = (0, 1)  # unless others are asked for; a long task is flown with the first alone
 LONG = 50.0  # [s]
 
-# Core seconds for a simulated second, measured on one x86 core. They decide the order of the
-# flights and the remaining time shown, no result.
-COST = {'rl': 0.07, 'rl_memory': 0.08, 'nmpc': 0.1, 'nmpc_published': 0.13, 'hover': 0.05}
 START_COST = 2.0  # core seconds to build simulator and controller
 
 
@@ -37,9 +34,10 @@ class Flight:
     Attributes:
         task: name, or path of a pose file.
         conditions: 'nominal' or 'published'.
-        controller: name.
+        controller: name, under which its results stand.
         seed: of the task's poses and of everything random in the simulation.
-        policy: file in place of the shipped policy of 'rl', '' for none.
+        policy: file in place of its shipped policy, '' for none.
+        spec: where its class is, '' for a registered one.
 
     """
 
@@ -48,6 +46,7 @@ class Flight:
     controller: str
     seed: int
     policy: str = ''
+    spec: str = ''
 
     @property
     def name(self) -> str:
@@ -62,7 +61,12 @@ class Flight:
     @cached_property
     def cost(self) -> float:
         """Rough time that the flight takes [core seconds]."""
-        return START_COST + COST.get(self.controller, 0.1) * self.make_task().duration
+        return START_COST + registry.find(self.reference).cost * self.make_task().duration
+
+    @property
+    def reference(self) -> str:
+        """By which the registry finds the controller."""
+        return self.spec or self.controller
 
     def make_task(self) -> Task:
         """Make the task that is flown."""
@@ -76,11 +80,11 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
     List all flights, the longest first, so that no long one is left over at the end.
 
     Args:
-        controllers: names.
+        controllers: names, or where their classes are.
         tasks: names, or paths of pose files.
         conditions: 'nominal', 'published'.
         seeds: numbers from 0; None takes 0 and 1, and 0 alone for tasks of more than 50 s.
-        policy: file in place of the shipped policy of 'rl'.
+        policy: file in place of the shipped policy of the controller that `--policy` is for.
 
     Raises:
         ParameterError: an entry that stands there twice, or none; unknown conditions or task.
@@ -99,10 +103,11 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
     chosen = {task: seeds_of(task) for task in tasks}  # which refuses unknown tasks
     if seeds is not None:
         chosen = dict.fromkeys(tasks, seeds)
-    other = {'rl': str(policy)} if policy else {}
-    flights = [Flight(task, condition, controller, seed, other.get(controller, ''))
-               for task in tasks for condition, controller, seed
-               in product(conditions, controllers, chosen[task])]
+    other = {registry.owner('--policy'): str(policy)} if policy else {}
+    entries = registry.find_all(controllers)
+    flights = [Flight(task, condition, entry.name, seed, other.get(entry.name, ''), entry.spec)
+               for task in tasks for condition, entry, seed
+               in product(conditions, entries, chosen[task])]
     return sorted(flights, key=lambda flight: -flight.cost)
 
 

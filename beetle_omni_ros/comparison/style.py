@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from zlib import crc32
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.runs.figures import FAINT, INK
 
 
@@ -19,20 +21,9 @@ class Look:
     marker: str = 'o'
 
 
-# Blue for RL and red for NMPC as in the publication; the variants are lighter and dashed, so that
-# all four differ in brightness and in line, too, for those who cannot tell the colours.
-LOOKS = {
-    'rl': Look('RL', 'the learned policy, 33 observations', '#1b5fb4', '-', 'o'),
-    'rl_memory': Look('RL, memory', 'the learned policy that also sees the estimated disturbance',
-                      '#58b4e8', (0, (5, 1.6)), 's'),
-    'nmpc': Look('NMPC', 'offset-free, params/nmpc.yaml', '#c8281e', '-', '^'),
-    'nmpc_published': Look('NMPC, published settings', 'params/nmpc_published.yaml', '#e8960c',
-                           (0, (3, 1.2, 1, 1.2)), 'v'),
-    'hover': Look('hover PD', "PD with allocation, the supervisor's fallback", '#5b6770',
-                  (0, (1, 1.2)), 'D'),
-    'published_rl': Look('RL', 'the publication', '#1b5fb4', ':', '*'),
-    'published_nmpc': Look('NMPC', 'the publication', '#c8281e', ':', '*'),
-}
+PUBLISHED = 'published_'    # before the name of the controller that a published one is
+# Of controllers that are not the package's own, one of these by their name.
+SPARE = ('#2a9d4b', '#7b4fb0', '#008c95', '#a0522d', '#6b7f1e')
 
 CONDITIONS = {
     'nominal': 'simulator as measured: multibody plant, second-order servos, rotor lag, sensor '
@@ -41,12 +32,19 @@ CONDITIONS = {
                  'inertia, centre of mass, sensor biases, more noise, latencies',
 }
 
-__all__ = ['CONDITIONS', 'FAINT', 'INK', 'Look', 'look', 'LOOKS']
+__all__ = ['CONDITIONS', 'FAINT', 'INK', 'Look', 'look', 'PUBLISHED']
 
 
 def look(controller: str) -> Look:
-    """Look of a controller; a grey one for a name without."""
-    return LOOKS.get(controller, Look(controller, '', FAINT))
+    """Look of a controller, or of the one that the publication flew in its place."""
+    name = controller.removeprefix(PUBLISHED)
+    entry = registry.SHIPPED.get(name)
+    if entry is None:
+        return Look(name, '', SPARE[crc32(name.encode()) % len(SPARE)], (0, (4, 1, 1, 1)), 'X')
+    line = entry.line
+    if name != controller:
+        return Look(entry.label, 'the publication', line.colour, ':', '*')
+    return Look(entry.label, entry.description, line.colour, line.dashes, line.marker)
 
 
 def task_title(task: str) -> str:

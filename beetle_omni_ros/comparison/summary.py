@@ -11,12 +11,15 @@ from math import isfinite
 
 import numpy as np
 
+from beetle_omni_ros.comparison import style
 from beetle_omni_ros.comparison.plan import Flight
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.runs import published
 from beetle_omni_ros.runs.metrics import POSE_KEYS
 
-# Published columns of each task: key -> (label, in simulation or on the robot).
-PUBLISHED = {'published_rl': 'RL', 'published_nmpc': 'NMPC'}
+# Column of the publication's numbers -> what it is called there.
+PUBLISHED = {f'{style.PUBLISHED}{name}': entry.label for name, entry in reversed(
+    registry.SHIPPED.items()) if entry.label in published.RANDOM_POSES}
 EFFORT = {'hover_speed_m_s': ('hover_speed_mean_m_s', 'hover_speed_std_m_s'),
           'hover_angular_speed_rad_s': ('hover_angular_speed_mean_rad_s',
                                         'hover_angular_speed_std_rad_s'),

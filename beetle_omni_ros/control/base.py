@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, NO_ZEROS
+from beetle_omni_ros.robot.schema import ParameterError
 
 ROTORS = 4
 
@@ -159,16 +160,20 @@ class Controller(Protocol):
     """
     A function of state and target; whatever differs between controllers is inside.
 
-    ``step`` is called once every ``period`` with a fresh state and must not raise on
+    ``step`` is called once every ``period`` [s] with a fresh state and must not raise on
     finite input. A standby controller is stepped as well, so that it can take over
     without a jump; the command in force stands in ``state.command``.
 
-    A controller that flies only to targets near enough says so in ``reach`` [m].
-    A controller that can fly with fewer actuators also has ``set_health(health)``, see
-    :func:`tell_health`; another one is not asked to.
+    A controller may have, and needs none of:
+
+    - ``diagnostics() -> dict``: health of the last step and since reset, for operators and logs;
+    - ``set_health(health)``, if it can fly with fewer actuators, see :func:`tell_health`;
+    - ``reach``: farthest target that it flies to [m], see :mod:`control.reach`;
+    - ``guidance``: text, what moves the targets that it is given; result tables show it.
+
+    :mod:`control.registry` says how one is built from a class, and what it is called.
     """
 
-    name: str
     period: float
 
     def reset(self) -> None:
@@ -176,9 +181,6 @@ class Controller(Protocol):
 
     def step(self, state: State, target: Target) -> Command:
         """One command for one state."""
-
-    def diagnostics(self) -> dict[str, float | int | str]:
-        """Health of the last step and since reset, for operators and logs."""
 
 
 def corrected(state: State, health: ActuatorHealth) -> State:
@@ -196,3 +198,30 @@ def tell_health(controller: Controller, health: ActuatorHealth) -> None:
     told = getattr(controller, 'set_health', None)
     if told is not None:
         told(health)
+
+
+def guidance_of(controller: Controller) -> str:
+    """What moves the targets that a controller is given, in words; 'none' for nothing."""
+    text = getattr(controller, 'guidance', '')
+    return text if text and isinstance(text, str) else 'none'
+
+
+def checked(name: str, command: object) -> Command:
+    """
+    Return what a controller's ``step`` gave, if it is a command.
+
+    Raises:
+        ParameterError: what else it is, in one line.
+
+    """
+    if not isinstance(command, Command):
+        raise ParameterError(f"controller '{name}': step returned {type(command).__name__}, "
+                             'expected control.base.Command')
+    for part in ('tilt', 'thrust'):
+        shape = getattr(getattr(command, part), 'shape', None)
+        if shape != (ROTORS,):
+            raise ParameterError(
+                f"controller '{name}': step returned a command whose {part} is "
+                f"{f'of shape {shape}' if shape is not None else 'no array'}, expected a numpy "
+                f'array of {ROTORS}')
+    return command

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -12,14 +11,11 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, PoseTarget, Reference, State, Target
 from beetle_omni_ros.control.call import FunctionCall
 from beetle_omni_ros.control.disturbance import DisturbanceEstimator
-from beetle_omni_ros.control.guidance import Guidance
+from beetle_omni_ros.control.guidance.guidance import Charge, Guidance, GuidanceParameters
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.control.observation import disturbed, observed
+from beetle_omni_ros.control.policy_file import kind
 from beetle_omni_ros.control.policy_network import PolicyNetwork
-from beetle_omni_ros.control.routing import RoutingParameters
-from beetle_omni_ros.control.trimming import TrimmingParameters
-from beetle_omni_ros.control.turning import TurningParameters
-from beetle_omni_ros.control.unwinding import UnwindingParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -27,7 +23,6 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
 
 DEFAULT = 'policies/rl.onnx'
-LATEST = 10     # steps within which a command comes back as the one in force
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +34,7 @@ class EstimateParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolicyParameters:
+class PolicyParameters(GuidanceParameters):
     """Which policy, and what stands around it; params/rl.yaml says why."""
 
     policy: str = parameter(DEFAULT, doc="ONNX file, in the package's share or any path",
@@ -57,14 +52,6 @@ class PolicyParameters:
     model: EstimateParameters = group(EstimateParameters, 'for the estimate')
     disturbance: DisturbanceParameters = group(
         DisturbanceParameters, 'what a policy with memory sees')
-    unwinding: UnwindingParameters = group(
-        UnwindingParameters, 'through a level attitude where joints end at their stops')
-    routing: RoutingParameters = group(
-        RoutingParameters, 'round where the shortest turn ends at joint stops')
-    turning: TurningParameters = group(
-        TurningParameters, 'where targets are shown while there is far to turn')
-    trimming: TrimmingParameters = group(
-        TrimmingParameters, 'the steady error at a target is taken off')
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> PolicyParameters:
@@ -79,8 +66,8 @@ class PolicyController:
     Its previous action is the command in force, whoever gave it, so that it takes over where
     another controller leaves off. Targets are cut to the limits of the actuators, as they were
     in training; an output that is not finite or absurdly large goes out as it is, for the
-    supervisor to refuse. Pose targets are shown as :mod:`control.guidance` moves them: a way round
-    where the joints would wind to their stops, without dives, without steady errors.
+    supervisor to refuse. Pose targets are shown as :mod:`control.guidance.guidance`
+    moves them.
 
     Args:
         robot: what the controller believes about the robot.
@@ -90,6 +77,7 @@ class PolicyController:
         network: what the policy's file computes.
         contract: what the policy's file says about itself.
         reach: farthest target [m].
+        guidance: the parts of it that are on.
 
     Raises:
         ParameterError: the file is missing, broken, or does not fit; one line.
@@ -101,7 +89,7 @@ class PolicyController:
         p = self._parameters = parameters or PolicyParameters.load()
         self.network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
         self.contract = contract = self.network.contract
-        self.name = 'rl_memory' if contract.memory else 'rl'
+        self.name = kind(contract.memory)
         self.period, self.reach = 1 / contract.rate_hz, p.reach
         self._scale, self._offset = contract.action_scale.tolist(), contract.action_offset.tolist()
         tilt, rotors = robot.joints.position_limit, robot.rotors
@@ -109,7 +97,8 @@ class PolicyController:
         self._hover = [robot.hover_thrust] * 4
         self._estimator = DisturbanceEstimator(
             robot, p, FunctionCall(model.integrator(robot), None)) if contract.memory else None
-        self._guidance = Guidance(p, robot.tilt_axes)
+        self._guidance, self._charge = Guidance(p, robot.tilt_axes), Charge()
+        self.guidance = self._guidance.text
         self.reset()
 
     def reset(self) -> None:
@@ -117,7 +106,7 @@ class PolicyController:
         self._command: Command | None = None
         self._steps = self._rejected = self._faults = self._cut = 0
         self._guidance.reset()
-        self._latest: deque[list[float]] = deque(maxlen=LATEST)
+        self._charge.reset()
         if self._estimator:
             self._estimator.reset()
 
@@ -129,7 +118,7 @@ class PolicyController:
             self._rejected += 1
             return self._repeated(state)
         self._command = Command(state.stamp, np.array(values[:4]), np.array(values[4:]))
-        self._latest.appendleft(values)
+        self._charge.gave(values)
         return self._command
 
     def infer(self, state: State, reference: Reference) -> list[float] | None:
@@ -163,7 +152,7 @@ class PolicyController:
     def _reference(self, state, target):
         """What the policy is to follow from this state on."""
         if isinstance(target, PoseTarget):
-            return self._guidance.target(state, target, self._in_charge(state)).at(state.stamp)
+            return self._guidance.target(state, target, self._charge.holds(state)).at(state.stamp)
         return target.at(state.stamp + self._parameters.trajectory_lookahead)
 
     def _observe(self, state, reference):
@@ -179,12 +168,6 @@ class PolicyController:
                 self._estimator.reset()
             observation += disturbed(state, self._estimator.disturbance)
         return observation
-
-    def _in_charge(self, state):
-        """Whether the command in force is one of this controller's latest."""
-        command = state.command
-        return command is not None and command.tilt.tolist() + command.thrust.tolist() \
-            in self._latest
 
     def _previous_action(self, state):
         """The command in force, before the first the measured tilts and hover thrust."""

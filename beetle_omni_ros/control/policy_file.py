@@ -29,6 +29,11 @@ LARGEST = 1e12                         # of a scale or an offset
 TOLERANCE = 1e-6                       # of scales and offsets, which travel as text
 
 
+def kind(memory: bool) -> str:
+    """Name of a policy that sees the estimated disturbance, or does not."""
+    return 'rl' + ('_memory' if memory else '')
+
+
 @dataclass(frozen=True, kw_only=True)
 class PolicyContract:
     """
@@ -71,7 +76,7 @@ class PolicyContract:
         return cls(observations=blocks(memory), robot=robot.name, robot_hash=robot.hash(),
                    action_scale=np.repeat([TILT_SCALE, THRUST_SCALE], 4),
                    action_offset=np.repeat([0.0, robot.hover_thrust], 4),
-                   name='rl_memory' if memory else 'rl')
+                   name=kind(memory))
 
     @property
     def memory(self) -> bool:

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.control.base import Controller
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.hover import HoverController
-from beetle_omni_ros.control.nmpc import NmpcController
-from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
-from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
-from beetle_omni_ros.control.reach import reach_of_name
+from beetle_omni_ros.control.reach import reach_of
+from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import metrics as metrics_of_runs
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import BagWriter
@@ -32,66 +30,18 @@ from beetle_omni_ros.runs.pose_file import check_steps
 from beetle_omni_ros.runs.recorder import LogRecorder, Tee
 from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.runs.tasks import make_task, Task
+from beetle_omni_ros.runs.topics import topics_with
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.supervisor import PILOT, Supervisor
+from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.faults.listed import load_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
-CONTROLLERS = ('nmpc', 'rl', 'rl_memory', 'nmpc_published', 'hover')
-POLICIES = {'rl': 'policies/rl.onnx', 'rl_memory': 'policies/rl_memory.onnx'}
-
-
-@dataclass(frozen=True, kw_only=True)
-class ControllerFiles:
-    """
-    Files in place of the shipped ones.
-
-    Attributes:
-        nmpc: parameters of 'nmpc'.
-        policy: network of 'rl'.
-        allow_other_robot: fly policies that were trained for other robot parameters.
-
-    """
-
-    nmpc: Path | None = None
-    policy: Path | None = None
-    allow_other_robot: bool = False
-
-
-def make_controller(name: str, robot: RobotParameters,
-                    files: ControllerFiles = ControllerFiles()) -> Controller:
-    """
-    Build a controller by name.
-
-    Args:
-        name: 'nmpc', 'nmpc_published' (the publication's settings), 'rl', 'rl_memory' (with
-            the estimated disturbance) or 'hover'.
-        robot: what it believes about the robot.
-        files: in place of the shipped ones.
-
-    Raises:
-        ParameterError: unknown name, or an unusable file.
-
-    """
-    if name == 'nmpc':
-        return NmpcController(robot, NmpcParameters.load(files.nmpc))
-    if name == 'nmpc_published':
-        return NmpcController(robot, NmpcParameters.load(share_path('params/nmpc_published.yaml')))
-    if name in POLICIES:
-        policy = files.policy if name == 'rl' and files.policy else POLICIES[name]
-        parameters = PolicyParameters.load()
-        return PolicyController(robot, replace(
-            parameters, policy=str(policy),
-            allow_other_robot=parameters.allow_other_robot or files.allow_other_robot))
-    if name == 'hover':
-        return HoverController(robot)
-    raise ParameterError(f"controller '{name}': expected one of {', '.join(CONTROLLERS)}")
-
 
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,
-        conditions: str = 'nominal', seed: int = 0, files: ControllerFiles = ControllerFiles(),
+        conditions: str = 'nominal', seed: int = 0,
+        options: Mapping[str, ControllerOptions] = MappingProxyType({}),
         bag: Path | None = None, meta: dict | None = None, faults: Sequence[Fault] = (),
         progress=lambda part: None) -> FlightLog:
     """
@@ -104,28 +54,30 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         TaskError: a pose of the task is beyond the controller's reach.
 
     """
+    # With a lost actuator the pilot lands the robot, whoever flew it.
+    entries = map(registry.find, dict.fromkeys(
+        [controller, registry.pilot()] if faults else [controller]))
+    aboard = {entry.name: entry.make(robot, options.get(entry.reference, ControllerOptions()))
+              for entry in entries}
+    name, flying = next(iter(aboard.items()))
     if task.kind == 'poses':
-        check_steps(task.poses, reach_of_name(controller, files.nmpc),
-                    lambda k: f"task '{task.name}': pose {k + 1}")
-    meta = dict(meta or {}, controller=controller)
+        check_steps(task.poses, reach_of(flying), lambda k: f"task '{task.name}': pose {k + 1}")
+    meta = dict(meta or {}, controller=name, guidance=guidance_of(flying))
     memory = LogRecorder(meta)
     with ExitStack() as stack:
         recorder = memory
         if bag is not None:
-            writer = stack.enter_context(BagWriter(bag, meta=meta))
+            writer = stack.enter_context(BagWriter(bag, meta=meta, topics=tuple(
+                topics_with([name]))))
             recorder = Tee(memory, writer)
         estimator = EkfParameters.load()
         supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
-                                CONTROLLERS)
+                                tuple(dict.fromkeys((*registry.names(), name))))
         simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed)
-        # With a lost actuator the NMPC lands the robot, whoever flew it.
-        aboard = dict.fromkeys([controller, PILOT] if faults else [controller])
         loop = FlightLoop(
-            simulator,
-            ErrorStateEkf(estimator, robot.gravity),
-            {name: make_controller(name, robot, files) for name in aboard}, supervisor, recorder,
+            simulator, ErrorStateEkf(estimator, robot.gravity), aboard, supervisor, recorder,
             estimator.imu.gyroscope_noise, faults, TargetChecks(robot).why_not)
-        supervisor.select(controller)
+        supervisor.select(name)
         stayed = loop.fly(task, progress)
         recorder.write_meta({'crashed': not stayed, 'ended': loop.ending,
                              'broken': simulator.broken})
@@ -134,24 +86,24 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
     return memory.log()
 
 
-def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nominal',
+def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 'nominal',
                  robot: Path | None = None, plant: Path | None = None, seed: int = 0,
                  bag: Path | None = None, json_path: Path | None = None,
-                 files: ControllerFiles = ControllerFiles(), faults: Path | None = None,
-                 console: Console | None = None) -> dict:
+                 options: Mapping[str, ControllerOptions] = MappingProxyType({}),
+                 faults: Path | None = None, console: Console | None = None) -> dict:
     """
     Fly a task with each controller and report.
 
     Args:
-        controllers: names, see :func:`make_controller`.
-        task: name or pose file.
+        controllers: names, or where their classes are, see :func:`control.registry.find`.
+        task: name or pose file, or one that was made.
         conditions: 'nominal' or 'published'.
         robot: file that estimator and controllers believe; default the shipped one.
         plant: file that is true in the simulation; default ``robot``.
         seed: of the task's poses and of everything random in the simulation.
         bag: folder for a bag; with several controllers, one bag for each inside it.
         json_path: file for the results.
-        files: of controllers, in place of the shipped ones.
+        options: controller -> files in place of its own.
         faults: file of what fails, when since the task's start and how long; by default nothing.
         console: where to print.
 
@@ -165,15 +117,20 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
     console = console or Console()
     believed = RobotParameters.load(robot)
     true = RobotParameters.load(plant) if plant else believed
-    flown = make_task(task, seed, min(reach_of_name(name, files.nmpc) for name in controllers))
-    for name in controllers:
-        if name not in CONTROLLERS or name in POLICIES:     # refused before anything flies
-            make_controller(name, believed, files)
+    entries = registry.find_all(controllers)
+    options = {registry.find(name).reference: given for name, given in options.items()}
+    reaches = [_reach(entry, believed, options.get(entry.reference, ControllerOptions()))
+               for entry in entries]
+    flown = task if isinstance(task, Task) else make_task(task, seed, min(reaches))
+    task = flown.name
     meta = {'task': task, 'conditions': conditions, 'seed': seed,
             'robot': str(robot) if robot else 'params/robot.yaml',
             'plant': str(plant) if plant else None, 'version': __version__}
-    if files.policy:
-        meta['policy'] = str(files.policy)
+    for given in options.values():
+        if given.policy:
+            meta['policy'] = str(given.policy)
+    if others := {entry.name: entry.spec for entry in entries if entry.spec}:
+        meta['controllers'] = others
     struck = load_faults(faults) if faults else []
     if struck:
         meta['faults'] = [str(fault) for fault in struck]
@@ -181,11 +138,12 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
     columns = (TextColumn('{task.description}'), BarColumn(),
                TextColumn('{task.percentage:>3.0f} %'), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as bars:
-        for name in controllers:
+        for entry in entries:
+            name = entry.name
             bar = bars.add_task(f'{name}: {task}, {conditions}', total=1.0)
             folder = bag / name if bag and len(controllers) > 1 else bag
-            log = fly(name, flown, robot=believed, plant=true, conditions=conditions, seed=seed,
-                      files=files, bag=folder, meta=meta, faults=struck,
+            log = fly(entry.reference, flown, robot=believed, plant=true, conditions=conditions,
+                      seed=seed, options=options, bag=folder, meta=meta, faults=struck,
                       progress=lambda part, bar=bar: bars.update(bar, completed=part))
             results[name] = metrics_of_runs.metrics(log, flown)
             if log.meta['ended']:
@@ -196,3 +154,10 @@ def run_evaluate(*, controllers: list[str], task: str, conditions: str = 'nomina
     if json_path:
         write_json(json_path, results)
     return results
+
+
+def _reach(entry, robot, options):
+    """Reach of a controller [m]; what may be unusable is built, and so refused before a flight."""
+    if entry.policy_file or entry.spec:
+        return reach_of(entry.make(robot, options))
+    return entry.reach(robot, options)

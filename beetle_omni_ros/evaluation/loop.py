@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from beetle_omni_ros.control.base import (
+    checked,
     Controller,
     corrected,
     PoseTarget,
@@ -268,7 +269,8 @@ class FlightLoop:
         for name, controller in self._controllers.items():
             if self._ticks % self._every[name]:
                 continue
-            command = self._timers[name].call(controller.step, state, self._wanted())
+            command = checked(name, self._timers[name].call(controller.step, state,
+                                                            self._wanted()))
             if name == self._supervisor.active:
                 for passed in self._processes.requests(command, now):
                     self._request(name, passed, now)

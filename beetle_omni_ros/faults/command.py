@@ -14,13 +14,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.evaluation.command import CONTROLLERS
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.faults import campaign, page
 from beetle_omni_ros.faults.flight import STARTS
 from beetle_omni_ros.faults.healthy import CONDITIONS, fly_healthy, HealthyTrial
 from beetle_omni_ros.faults.landings import fly_landing, LandingTrial
 from beetle_omni_ros.faults.trial import fly_trial, Trial
 from beetle_omni_ros.faults.watch import as_expected
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import check_writable, write_json
 from beetle_omni_ros.sim.faults.listed import FaultList
@@ -28,7 +30,8 @@ from beetle_omni_ros.sim.faults.listed import FaultList
 
 def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
                starts: list[str] | None = None, seeds: int = 1, conditions: str = 'nominal',
-               controller: str = 'nmpc', jobs: int | None = None, output: Path | None = None,
+               controller: str = registry.DEFAULT, jobs: int | None = None,
+               output: Path | None = None,
                json_path: Path | None = None, docs: Path | None = None, bags: bool = False,
                landings: int = 0, without_mocap: bool = False, healthy: float = 0.0,
                through_ros: Callable[[FaultList], Iterator[dict]] | None = None,
@@ -64,10 +67,13 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     console = console or Console()
     listed = FaultList.load(faults)
     cases = listed.chosen(None if through_ros else only)
-    _check(starts, controller, output, json_path, docs, bags)
+    entry = registry.find(controller)
+    controller = entry.reference
+    _check(starts, output, json_path, docs, bags)
+    guidance = guidance_of(entry.make(RobotParameters.load()))      # or what is wrong with it
     meta = {'command': _described(faults, only, starts, seeds, conditions, controller, landings,
                                   without_mocap, healthy, bool(through_ros)),
-            'version': __version__}
+            'version': __version__, 'guidance': guidance}
     fly = _Flyer(console, jobs, output)
     results: dict = {'meta': meta}
     if landings:
@@ -102,13 +108,10 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     return results
 
 
-def _check(starts, controller, output, json_path, docs, bags):
+def _check(starts, output, json_path, docs, bags):
     for start in starts or ():
         if start not in STARTS:
             raise ParameterError(f"--from '{start}': expected {', '.join(STARTS)}")
-    if controller not in CONTROLLERS:
-        raise ParameterError(f"controller '{controller}': expected one of "
-                             f"{', '.join(CONTROLLERS)}")
     if bags and output is None:
         raise ParameterError('--bags: expected --output DIR to record to')
     if json_path:

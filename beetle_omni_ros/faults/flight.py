@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.evaluation.command import CONTROLLERS, make_controller
 from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.faults.watch import FlightWatch
 from beetle_omni_ros.robot import rotations
@@ -19,7 +19,7 @@ from beetle_omni_ros.runs.recorder import Tee
 from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.supervisor import PILOT, Supervisor
+from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.faults.listed import FaultList, FlightPlan
 from beetle_omni_ros.sim.parameters import SimulatorParameters
@@ -56,16 +56,18 @@ class Flight:
         """
         believed = RobotParameters.load()
         estimator, safety = EkfParameters.load(), SupervisorParameters.load()
-        self.supervisor = Supervisor(safety, believed, HoverController(believed), CONTROLLERS)
+        aboard = {entry.name: entry.make(believed) for entry in map(
+            registry.find, dict.fromkeys([controller, registry.pilot()]))}
+        name = next(iter(aboard))
+        self.supervisor = Supervisor(safety, believed, HoverController(believed),
+                                     tuple(dict.fromkeys((*registry.names(), name))))
         self.simulator = Simulator(true_robot or believed, SimulatorParameters.load(),
                                    conditions=conditions, seed=seed)
         self.loop = FlightLoop(
-            self.simulator, ErrorStateEkf(estimator, believed.gravity),
-            {name: make_controller(name, believed) for name in dict.fromkeys([controller, PILOT])},
-            self.supervisor,
+            self.simulator, ErrorStateEkf(estimator, believed.gravity), aboard, self.supervisor,
             Tee() if recorder is None else recorder, estimator.imu.gyroscope_noise, strike,
             TargetChecks(believed).why_not)
-        self.supervisor.select(controller)
+        self.supervisor.select(name)
         self.random = np.random.default_rng(seed)
         self._fence = safety.envelope.half_width, safety.envelope.height
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.evaluation.compute import collector_off
 from beetle_omni_ros.faults.flight import Flight, told_faults
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -28,7 +29,7 @@ class HealthyTrial:
 
     seed: int
     conditions: str = 'nominal'
-    controller: str = 'nmpc'
+    controller: str = registry.DEFAULT
 
 
 def fly_healthy(trial: HealthyTrial, listed: FaultList) -> dict:

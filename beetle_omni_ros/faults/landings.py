@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.evaluation.compute import collector_off
 from beetle_omni_ros.faults.flight import Flight
 from beetle_omni_ros.faults.trial import told
@@ -29,7 +30,7 @@ class LandingTrial:
 
     seed: int
     conditions: str = 'nominal'
-    controller: str = 'nmpc'
+    controller: str = registry.DEFAULT
     without_mocap: bool = False
 
 

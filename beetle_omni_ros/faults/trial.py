@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.evaluation.compute import collector_off
 from beetle_omni_ros.faults.flight import Flight, OFF, STARTS, Watcher
 from beetle_omni_ros.faults.watch import as_expected
@@ -37,11 +38,12 @@ class Trial:
     start: str = 'hover'
     seed: int = 0
     conditions: str = 'nominal'
-    controller: str = 'nmpc'
+    controller: str = registry.DEFAULT
 
     def __str__(self) -> str:
         """A name for its bag."""
-        return f'{self.case}_{self.start}_{self.conditions}_{self.controller}_{self.seed}'
+        controller = registry.find(self.controller).name
+        return f'{self.case}_{self.start}_{self.conditions}_{controller}_{self.seed}'
 
 
 def fly_trial(trial: Trial, listed: FaultList, bags: Path | None = None) -> dict:

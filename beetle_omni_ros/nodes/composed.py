@@ -1,46 +1,70 @@
-"""Any set of nodes in one process: ``python -m beetle_omni_ros.nodes.composed NODE...``."""
+"""
+Any set of nodes in one process: ``python -m beetle_omni_ros.nodes.composed NODE...``.
+
+A NODE is an executable, or a controller: a registered name, or ``package.module:Class``.
+"""
 
 from __future__ import annotations
 
 from importlib import import_module
 import sys
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.nodes import runner
+from beetle_omni_ros.nodes.plan import class_name, GENERIC, NODES
+from beetle_omni_ros.robot.schema import ParameterError
 
-NODES = {'sim_node': 'SimNode', 'ekf_node': 'EkfNode', 'nmpc_node': 'NmpcNode',
-         'rl_node': 'RlNode', 'supervisor_node': 'SupervisorNode',
-         'rotor_bridge_node': 'RotorBridgeNode',
-         'reference_node': 'ReferenceNode', 'recorder_node': 'RecorderNode',
-         'viewer_node': 'ViewerNode', 'joint_bridge_node': 'JointBridgeNode'}
+COMMAND = 'composed'
 
 
 def main(args=None):
     """Run the named nodes on one events executor, as one process."""
     argv = list(sys.argv if args is None else args)
-    names = runner.own_arguments(argv, 'composed')
+    names = runner.own_arguments(argv, COMMAND)
     usage = ('usage: composed NODE... [--discovery RANGE] [--ros-args -p NODE:KEY:=VALUE ...]; '
-             f"NODE: {', '.join(NODES)}")
+             f"NODE: {', '.join(NODES)}, a controller's name, or package.module:Class")
     if names and names[0] in ('-h', '--help'):
         print(usage)
         sys.exit(runner.OK)
-    unknown = [name for name in names if name not in NODES]
+    unknown = [name for name in names if name not in NODES and ':' not in name
+               and name not in registry.names()]
     if unknown or not names or len(set(names)) < len(names):
         problem = f"unknown node '{unknown[0]}'" if unknown else 'each node once, at least one'
-        print(f'composed: error: {problem}; {usage}', file=sys.stderr)
-        sys.exit(runner.UNUSABLE)
-    classes = [_class(name) for name in names]
+        _end(f'{problem}; {usage}')
+    classes = [_class(name) if name in NODES else _controller_class(name) for name in names]
     program = argv[:1]
     ros_arguments = [a for a in argv[1:] if a not in names]
-    sys.exit(runner.run(classes, program + ros_arguments, 'composed'))
+    sys.exit(runner.run(classes, program + ros_arguments, COMMAND))
+
+
+def _end(text):
+    print(f'{COMMAND}: error: {text}', file=sys.stderr)
+    sys.exit(runner.UNUSABLE)
 
 
 def _class(name):
     try:
-        return getattr(import_module(f'{__package__}.{name}'), NODES[name])
+        return getattr(import_module(f'{__package__}.{name}'), class_name(name))
     except ModuleNotFoundError as error:
-        print(f"composed: error: {name} needs the Python package '{error.name}'; what bridges "
-              "need installs the extra 'hardware' of beetle_omni_ros", file=sys.stderr)
-        sys.exit(runner.UNUSABLE)
+        _end(f"{name} needs the Python package '{error.name}'; what bridges need installs the "
+             "extra 'hardware' of beetle_omni_ros")
+
+
+def _controller_class(reference):
+    """Class of the node of one controller."""
+    base = _class(GENERIC)
+    try:
+        entry = registry.find(reference)
+    except ParameterError as error:
+        _end(error)
+
+    class Named(base):
+        executable = f'{entry.name}_node'
+
+        def __init__(self):
+            super().__init__(entry)
+
+    return Named
 
 
 if __name__ == '__main__':

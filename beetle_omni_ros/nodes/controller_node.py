@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, make_dataclass, replace
 import math
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from beetle_omni_ros.control.base import Controller, corrected, PoseTarget, tell_health
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import checked, corrected, guidance_of, PoseTarget, tell_health
 from beetle_omni_ros.control.reach import reach_of
-from beetle_omni_ros.nodes import convert, health, qos, targets
+from beetle_omni_ros.control.registry import ControllerEntry
+from beetle_omni_ros.nodes import convert, health, qos, runner, targets
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.actuator_health import ALL_WELL
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.target_checks import out_of_reach, TargetChecks
 
 ODOM_AGE = 0.05         # s, an older estimate is not worth a command
@@ -25,6 +29,7 @@ JOINT_AGE = 0.1         # s
 OTHER_CLOCK = 3600.0    # s between a target's stamp and simulated time
 # A step is due when the stamps say so, within half of the smallest estimate interval.
 STEP_TOLERANCE = 0.0025
+NAME = 'controller_node'    # of the executable, before it knows its controller
 
 
 class ControllerNode(FlightNode):
@@ -37,26 +42,31 @@ class ControllerNode(FlightNode):
 
     real_time = True
 
-    def __init__(self, controller_name: str, parameter_class: type, file: str, file_key: str):
+    def __init__(self, controller: ControllerEntry | str = ''):
         """
-        Subscribe the controller's inputs.
+        Build the controller and subscribe its inputs.
 
         Args:
-            controller_name: 'nmpc' or 'rl'; commands go to '<controller_name>/command'.
-            parameter_class: of the node; ``self.make_controller(parameters)`` builds from it.
-            file: shipped parameter file of the controller.
-            file_key: parameter that names another one.
+            controller: its entry, or by what the registry finds it; '' asks the node's parameter
+                ``controller``. Commands go to '<its name>/command'.
 
         """
-        super().__init__(f'{controller_name}_node', parameter_class, file, file_key)
-        self._controller: Controller = self.make_controller(self.parameters)
+        entry = controller if isinstance(controller, ControllerEntry) else \
+            registry.find(controller or _asked())
+        is_own = isinstance(controller, str) and controller     # of an executable for it alone
+        super().__init__(f'{entry.name}_node', node_parameters(entry, not is_own),
+                         entry.parameters_file, entry.file_key, completed=entry.completed)
+        self._entry = entry
+        self._controller = entry.make(
+            RobotParameters.load(self.parameters.robot_file or None),
+            parameters=self.parameters if entry.parameters else None)
         self._target = self._joints = self._command = None
         self._hold = self._wish = self._position = None
         self._actuators = ALL_WELL
         self._checks = TargetChecks(RobotParameters.load(self.parameters.robot_file or None))
-        self._mode, self._own_mode = '', f'flying:{controller_name}'
+        self._mode, self._own_mode = '', f'flying:{entry.name}'
         self._last_step = 0.0
-        self._publisher = self.create_publisher(JointState, f'{controller_name}/command',
+        self._publisher = self.create_publisher(JointState, f'{entry.name}/command',
                                                 qos.COMMAND)
         self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.ESTIMATE,
                     max_age=ODOM_AGE)
@@ -78,10 +88,6 @@ class ControllerNode(FlightNode):
                     self._on_actuators, qos.LATCHED, stale_after=None)
         self.health.track_compute(self._controller.period)
         self.health.report('controller', self._controller_status)
-
-    def make_controller(self, parameters) -> Controller:
-        """Build the controller; each node says how."""
-        raise NotImplementedError
 
     def _on_joints(self, joints):
         self._joints = joints
@@ -155,7 +161,7 @@ class ControllerNode(FlightNode):
                 self._hold = PoseTarget(odom.position, odom.quaternion, odom.stamp)
         target = self._wish or self._target or self._hold
         command = self.timed(self._controller.step, state, target)
-        self._publisher.publish(convert.command_message(command))
+        self._publisher.publish(convert.command_message(checked(self._entry.name, command)))
 
     def _is_due(self, stamp):
         period = self._controller.period
@@ -177,4 +183,55 @@ class ControllerNode(FlightNode):
         return not 0.25 < part < 0.75
 
     def _controller_status(self):
-        return health.OK, self._controller.name, dict(self._controller.diagnostics())
+        controller = self._controller
+        told = getattr(controller, 'diagnostics', dict)()
+        return health.OK, getattr(controller, 'name', self._entry.name), {
+            **told, 'guidance': guidance_of(controller)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoParameters:
+    """Of a controller without parameters."""
+
+
+def node_parameters(entry: ControllerEntry, chosen: bool) -> type:
+    """
+    Parameters of a controller's node: its own, the robot, and the file to start from.
+
+    Args:
+        entry: of the controller.
+        chosen: whether the node was told which controller it runs.
+
+    """
+    base = entry.parameter_class or NoParameters
+    more = {'robot_file': ('', 'robot file that the controller believes; empty: the shipped one'),
+            entry.file_key: ('', f"controller file; empty: {entry.parameters_file or 'none'}")}
+    if chosen:
+        more['controller'] = (entry.reference, 'which controller this node runs')
+    return make_dataclass(
+        f'{entry.name}_parameters',
+        [(name, str, parameter(default, doc=doc, read_only=True))
+         for name, (default, doc) in more.items()],
+        bases=(base,), frozen=base.__dataclass_params__.frozen, kw_only=True)
+
+
+def _asked() -> str:
+    """Value of the parameter ``controller`` of the node that is about to be."""
+    probe = Node(NAME, start_parameter_services=False, enable_rosout=False)
+    given, name = probe._parameter_overrides.get('controller'), probe.get_name()
+    probe.destroy_node()
+    if given is not None:
+        return str(given.value)
+    if name != NAME:
+        return name.removesuffix('_node')
+    raise ParameterError("key 'controller': missing; expected a registered controller "
+                         f"({', '.join(registry.names())}) or package.module:Class")
+
+
+def main(args=None):
+    """Run the node."""
+    runner.main(ControllerNode, args)
+
+
+if __name__ == '__main__':
+    main()

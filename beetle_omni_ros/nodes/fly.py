@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 import shutil
 import sys
@@ -12,15 +13,15 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.control.reach import reach_of_name
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.nodes import domain, runner
-from beetle_omni_ros.nodes.actuators import ACTUATORS, bridged
+from beetle_omni_ros.nodes.actuators import ACTUATORS
 from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.flight import Flight, FlightError, TooSlowError
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.interrupts import terminable, undisturbed
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.standby import controller_nodes
+from beetle_omni_ros.nodes.plan import plan, Wanted
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table
@@ -33,8 +34,9 @@ INTERRUPTED = 130
 CLOCKS = {'auto': ('system', 'simulated'), 'system': ('system',), 'simulated': ('simulated',)}
 
 
-def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | None = None,
-            seed: int = 0, conditions: str = 'nominal', actuators: str | None = None,
+def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
+            bag: Path | None = None, seed: int = 0, conditions: str = 'nominal',
+            actuators: str | None = None,
             clock: str = 'auto', robot: Path | None = None, plant: Path | None = None,
             policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
             composed: bool = True, json_path: Path | None = None,
@@ -44,7 +46,7 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
     Fly a task through the ROS graph and print what the bag says.
 
     Args:
-        controller: the active controller, 'nmpc' or 'rl'.
+        controller: the active one: a name, or where its class is.
         task: name or pose file.
         bag: folder to create; None: the bag is thrown away.
         seed: of the task and the simulation.
@@ -56,9 +58,9 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
             are asked to be emulated.
         robot: file that estimator and controller believe; default the shipped one.
         plant: file that is true in the simulation; default ``robot``.
-        policy: file for 'rl'; default the shipped one.
+        policy: file for the controller that `--policy` is for; default the shipped one.
         allow_other_robot: fly a policy that was trained for other robot parameters.
-        standby: run the other controller too, so that it can be selected in flight.
+        standby: run those that stand by too, so that they can be selected in flight.
         composed: all nodes in one process, or one process for each.
         json_path: file for the results.
         domain_id: ROS domain; default a free one.
@@ -79,25 +81,28 @@ def run_fly(*, controller: str = 'nmpc', task: str = 'waypoints', bag: Path | No
             check_new(bag)
             if json_path:
                 check_writable(json_path)
-            flown = make_task(task, seed, reach_of_name(controller))
+            flown = make_task(task, seed, registry.find(controller).reach(
+                RobotParameters.load(robot)))
             RobotParameters.load(plant or robot)
             clocks = _clocks(clock, actuators)
-            controllers, left_out = controller_nodes(
-                controller, robot_file=str(Path(robot).absolute()) if robot else '',
-                policy=str(policy or ''), allow_other_robot=allow_other_robot, standby=standby)
-            if left_out:
-                _tell(console, f'rl does not stand by: {left_out}')
+            wanted = Wanted(
+                controller=controller, policy=str(policy or ''), standby=standby,
+                allow_other_robot=allow_other_robot, robot_file=_absolute(robot),
+                plant_file=_absolute(plant), conditions=conditions, seed=int(seed),
+                task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
+                actuators='direct', ports=str(folder))
+            for name, reason in plan(wanted).left_out.items():
+                _tell(console, f'{name} does not stand by: {reason}')
+            controller = registry.find(controller).name
             number = stack.enter_context(domain.reserved()) if domain_id is None else domain_id
             meta = {'task': task, 'conditions': conditions, 'seed': seed,
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
                     'controller': controller, 'composed': composed}
-            parameters = _parameters(controllers, task, bag, seed, conditions, robot, plant)
-            parameters['supervisor_node']['controller'] = controller
             for kind in clocks:
                 meta |= {'clock': kind, 'actuators': actuators or (
                     'direct' if kind == 'simulated' else 'emulated')}
-                graph = _make_graph(parameters, meta, folder, number)
+                graph = _make_graph(wanted, meta, folder, number)
                 try:
                     status = _fly(graph, controller, flown, meta, console,
                                   may_be_slow=kind == clocks[-1])
@@ -130,12 +135,12 @@ def _clocks(clock, actuators):
     return CLOCKS['system' if actuators == 'emulated' else clock]
 
 
-def _make_graph(parameters, meta, folder, number):
+def _make_graph(wanted, meta, folder, number):
     """The graph for the clock and the actuators of ``meta``."""
-    parameters = dict(parameters)
     if meta['actuators'] == 'emulated':
-        _join(parameters, bridged(folder, parameters['ekf_node']))
-    return Graph(parameters, folder, number, meta['composed'], meta['clock'] == 'simulated')
+        wanted = replace(wanted, actuators='bridges')
+    return Graph(plan(wanted).nodes, folder, number, meta['composed'],
+                 meta['clock'] == 'simulated')
 
 
 def _clear(bag, folder, error, console):
@@ -161,22 +166,8 @@ def _tell(console, text):
     console.print(text, markup=False, emoji=False, highlight=False)
 
 
-def _parameters(controllers, task, bag, seed, conditions, robot, plant):
-    """Node name -> parameters of the graph."""
-    believed = {'robot_file': str(Path(robot).absolute())} if robot else {}
-    true = {'robot_file': str(Path(plant).absolute())} if plant else believed
-    task_file = str(Path(task).absolute()) if Path(task).is_file() else str(task)
-    return {'recorder_node': {'bag': str(bag)},
-            'sim_node': {**true, 'conditions': conditions, 'seed': int(seed)},
-            'ekf_node': believed,
-            **controllers,
-            'supervisor_node': dict(believed),
-            'reference_node': {'task': task_file, 'seed': int(seed)}}
-
-
-def _join(parameters, more):
-    for node, values in more.items():
-        parameters[node] = {**parameters.get(node, {}), **values}
+def _absolute(path):
+    return str(Path(path).absolute()) if path else ''
 
 
 def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console,

@@ -12,10 +12,11 @@ import time
 import yaml
 
 import beetle_omni_ros
+from beetle_omni_ros.nodes import plan
 from beetle_omni_ros.nodes.actuators import BRIDGES
 from beetle_omni_ros.nodes.discovery import confine
+from beetle_omni_ros.nodes.plan import BRIDGES_COMPOSED, COMPOSED
 
-COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'
 PORT_TIMEOUT = 30.0     # s for the simulator to make its serial ports
 STOP_TIMEOUT = 8.0      # s for a process to stop by itself before it is killed
 
@@ -51,12 +52,12 @@ class Graph:
             {f'/**/{node}': {'ros__parameters': values}
              for node, values in parameters.items() if values}) if any(parameters.values())
             else '/**: {ros__parameters: {}}\n')
-        self._commands = {node: [node] for node in self.nodes}
         if composed:
-            bridges = [node for node in self.nodes if node in BRIDGES]
-            others = [node for node in self.nodes if node not in BRIDGES]
-            self._commands = {name: [COMPOSED, *nodes] for name, nodes in
-                              ((COMPOSED, others), (BRIDGES_COMPOSED, bridges)) if nodes}
+            self._commands = {name: [COMPOSED, *plan.arguments(parameters, nodes), '--ros-args']
+                              for name, nodes in plan.processes(parameters).items()}
+        else:
+            self._commands = {node: [plan.executable(node), '--ros-args', *(
+                () if node in plan.NODES else ('-r', f'__node:={node}'))] for node in self.nodes}
         self.processes: dict[str, subprocess.Popen] = {}
 
     def start(self) -> None:
@@ -87,7 +88,7 @@ class Graph:
         module, *arguments = self._commands[name]
         with open(self.log(name), 'a') as log:
             self.processes[name] = subprocess.Popen(
-                [sys.executable, '-m', f'{__package__}.{module}', *arguments, '--ros-args',
+                [sys.executable, '-m', f'{__package__}.{module}', *arguments,
                  '--params-file', str(self._file)],
                 env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                 start_new_session=True)     # Ctrl-C is for the one that stops all in order

@@ -32,7 +32,8 @@ class FlightNode(Node):
 
     def __init__(self, name: str, parameter_class: type, file: str | None = None,
                  file_key: str | None = None, on_change: Callable | None = None,
-                 changeable: tuple[str, ...] | None = None):
+                 changeable: tuple[str, ...] | None = None,
+                 completed: Callable[[dict, bool], dict] | None = None):
         """
         Claim the name, read the parameters, start diagnostics.
 
@@ -43,6 +44,7 @@ class FlightNode(Node):
             file_key: parameter that names another one.
             on_change: takes a changed instance.
             changeable: names that may be set in flight.
+            completed: adds to what a file says.
 
         Raises:
             ParameterError, StartError: with one line for the operator.
@@ -55,7 +57,7 @@ class FlightNode(Node):
         self.simulated = bool(self.get_parameter(parameters.CLOCK).value)
         self.flight_clock = self.get_clock() if self.simulated else self.steady_clock
         self.parameters = parameters.declare(self, parameter_class, file, file_key,
-                                             on_change, changeable)
+                                             on_change, changeable, completed)
         parameters.lock_clock(self)
         self.health = Health(self)
         self.get_logger().debug('started')      # the first call is slow: not in flight

@@ -13,6 +13,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.nodes import convert, qos, runner
 from beetle_omni_ros.nodes.actuators import READY, STATES
 from beetle_omni_ros.nodes.discovery import confine
@@ -38,7 +39,7 @@ class Operator:
 
     """
 
-    def __init__(self, domain: int, controller: str = 'nmpc'):
+    def __init__(self, domain: int, controller: str = registry.DEFAULT):
         """Join ``domain`` and watch the flight of ``controller``."""
         confine()
         self._context = rclpy.Context()

@@ -23,7 +23,7 @@ from rclpy.node import Node
 
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.schema import NAMES, ParameterError
 
 # ROS itself puts these into the overrides of a node.
 CLOCK = 'use_sim_time'
@@ -33,7 +33,8 @@ UNBOUNDED = 1e300       # FloatingPointRange needs both ends
 
 
 def declare(node: Node, cls: type, file: str | None = None, file_key: str | None = None,
-            on_change: Callable | None = None, changeable: tuple[str, ...] | None = None):
+            on_change: Callable | None = None, changeable: tuple[str, ...] | None = None,
+            completed: Callable[[dict, bool], dict] | None = None):
     """
     Declare every leaf of the parameter dataclass ``cls`` on ``node``.
 
@@ -48,6 +49,7 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
         on_change: called with the new instance when parameters were set in flight; may
             raise ParameterError to refuse. Without it every parameter is read-only.
         changeable: names that may be set in flight; None: all that are not read-only.
+        completed: (values of the file, whether a user named it) -> values to start from.
 
     Returns:
         The validated instance of ``cls``.
@@ -58,14 +60,17 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
     """
     overrides = {name: value.value for name, value in node._parameter_overrides.items()
                  if name not in ROS_OWN and not name.startswith(ROS_OWN_PREFIX)}
-    start_from = overrides.get(file_key) or (share_path(file) if file else None)
+    own_file = overrides.get(file_key)
+    start_from = own_file or (share_path(file) if file else None)
     mapping = schema.load_yaml(start_from) if start_from else {}
+    if completed is not None:
+        mapping = completed(mapping, bool(own_file))
     leaves = _leaves(cls)
     for name, value in overrides.items():
         _put(mapping, name, _shaped(leaves.get(name), value))
     instance = schema.bind(cls, mapping)
     for name, entry, hint, value in schema.flatten(instance):
-        if isinstance(value, (dict, tuple)):
+        if isinstance(value, (dict, tuple)) and hint != NAMES:
             continue    # structured values live in files only
         fixed = on_change is None or changeable is not None and name not in changeable
         node.declare_parameter(name, _plain(value, hint), _descriptor(entry, hint, fixed),
@@ -108,6 +113,8 @@ def _put(mapping, name, value):
 def _plain(value, hint):
     if isinstance(value, np.ndarray):
         return [float(v) for v in value.ravel()]
+    if hint == NAMES:
+        return list(value)
     if value is None:       # an optional value that nobody set
         return '' if _kind(hint) is str else float('nan')
     return _kind(hint)(value) if _kind(hint) in (int, float, bool, str) else value
@@ -125,7 +132,7 @@ def _descriptor(entry, hint, fixed) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
         description=meta.get('doc', '') + unit,
         # ROS takes an empty list for one of another type, and [2] is none of floats.
-        dynamic_typing=hint is np.ndarray and meta.get('shape') is None,
+        dynamic_typing=hint is np.ndarray and meta.get('shape') is None or hint == NAMES,
         read_only=fixed or bool(meta.get('read_only')),
         additional_constraints=f"one of {', '.join(meta['choices'])}" if meta.get('choices')
         else '')

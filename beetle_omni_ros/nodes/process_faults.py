@@ -18,10 +18,11 @@ from sensor_msgs.msg import JointState
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.nodes import convert, domain, qos
-from beetle_omni_ros.nodes.actuators import bridged, BRIDGES
+from beetle_omni_ros.nodes.actuators import BRIDGES
 from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
+from beetle_omni_ros.nodes.plan import plan, Wanted
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.sim.faults.listed import FaultList, OutcomeLimits
@@ -232,13 +233,9 @@ def fly_through_ros(name: str, listed: FaultList) -> dict:
 
 
 def _graph(folder, number, bridges):
-    parameters: dict[str, dict] = {
-        'recorder_node': {'bag': str(folder / 'bag')}, 'sim_node': {}, 'ekf_node': {},
-        'nmpc_node': {}, 'supervisor_node': {}}
-    if bridges:
-        for node, values in bridged(folder, {}).items():
-            parameters[node] = {**parameters.get(node, {}), **values}
-    return Graph(parameters, folder, number, composed=False)
+    wanted = Wanted(standby=False, actuators='bridges' if bridges else 'direct',
+                    ports=str(folder), bag=str(folder / 'bag'))
+    return Graph(plan(wanted).nodes, folder, number, composed=False)
 
 
 def _start(graph, observer):
@@ -259,16 +256,16 @@ def _start(graph, observer):
 
 def _watch(graph, observer, fault, listed):
     """Strike, watch, land; what was seen."""
-    plan = listed.flight
+    flight = listed.flight
     observer.begin()
     refused = fault.strike(graph, observer)
-    observer.wait(lambda: observer.state in OFF or observer.touched is not None, plan.watch_time)
+    observer.wait(lambda: observer.state in OFF or observer.touched is not None, flight.watch_time)
     asked = observer.state.partition(':')[0] in ('flying', 'fallback') and observer.touched is None
     if asked:
         observer.call('land')
-    observer.wait(lambda: observer.state in OFF, plan.landing_time if observer.touched is None
+    observer.wait(lambda: observer.state in OFF, flight.landing_time if observer.touched is None
                   else 2.0)
-    observer.spin(plan.end_time + 1.0)      # a diagnostic of the simulator is among it
+    observer.spin(flight.end_time + 1.0)      # a diagnostic of the simulator is among it
     return _judged(observer, asked, refused, listed.limits)
 
 

@@ -9,13 +9,14 @@ import sys
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rosbags.interfaces import QosDurability
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.nodes import health, qos, runner
 from beetle_omni_ros.nodes.node import FlightNode
-from beetle_omni_ros.robot.schema import parameter, ParameterError
+from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.runs.bag import BagError, BagWriter
 from beetle_omni_ros.runs.topics import LATCHED as LATCHED_TOPIC
 from beetle_omni_ros.runs.topics import SENSOR as SENSOR_TOPIC
-from beetle_omni_ros.runs.topics import Topic, TOPICS
+from beetle_omni_ros.runs.topics import Topic, topics_with
 
 FLUSH_PERIOD = 0.4      # s; a crash loses at most what came after the last flush
 STATE = Topic('std_msgs/msg/String', LATCHED_TOPIC)
@@ -32,6 +33,9 @@ class RecorderNodeParameters:
     """Parameters of recorder_node."""
 
     bag: str = parameter(doc='folder to create for the bag', read_only=True)
+    controllers: NAMES = parameter(
+        tuple(registry.standing_by()), read_only=True,
+        doc='whose requests are recorded beside the rest: registered names')
 
 
 class RecorderNode(FlightNode):
@@ -42,14 +46,16 @@ class RecorderNode(FlightNode):
     def __init__(self):
         """Create the bag, then listen."""
         super().__init__('recorder_node', RecorderNodeParameters)
+        topics = topics_with(self.parameters.controllers)
         try:
-            self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace())
+            self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
+                                  topics=tuple(topics))
         except BagError as error:
             raise ParameterError(f"key 'bag': {error}") from None
         self._written = self._lost = 0
         self._failure = None
         prefix = self.get_namespace().rstrip('/') + '/'
-        for name, topic in {**TOPICS, **OWN_TOPICS}.items():
+        for name, topic in {**topics, **OWN_TOPICS}.items():
             latched = topic.qos.durability == QosDurability.TRANSIENT_LOCAL
             self.create_subscription(
                 _message_class(topic.type), name, self._writer(prefix + name, topic.type),

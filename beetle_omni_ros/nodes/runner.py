@@ -118,8 +118,9 @@ def own_arguments(argv: Sequence[str], name: str) -> list[str]:
 
 
 def executable(node_class: type) -> str:
-    """Name of a node's executable: EkfNode -> ekf_node."""
-    return re.sub(r'(?<=[a-z])(?=[A-Z])', '_', node_class.__name__).lower()
+    """Name of a node's executable, its own or of its class: EkfNode -> ekf_node."""
+    return getattr(node_class, 'executable', '') \
+        or re.sub(r'(?<=[a-z])(?=[A-Z])', '_', node_class.__name__).lower()
 
 
 def make_executor(context=None):

@@ -12,6 +12,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.nodes import convert, health, qos, runner, targets
@@ -19,12 +20,11 @@ from beetle_omni_ros.nodes.command_source import new_identity, TOPIC
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.actuator_health import ALL_WELL
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import parameter, ParameterError
+from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.safety.events import ERROR, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import DISARMED, FALLBACK, FLYING, STOPPED, Supervisor
 
-CONTROLLERS = ('nmpc', 'rl')
 WATCH_PERIOD = 0.01     # s between looks at what is silent
 SENSOR_AGE = 0.2        # s, the descent without estimator uses nothing older
 LEVELS = {FALLBACK: health.WARN, STOPPED: health.ERROR}
@@ -34,6 +34,9 @@ LEVELS = {FALLBACK: health.WARN, STOPPED: health.ERROR}
 class SupervisorNodeParameters(SupervisorParameters):
     """Parameters of supervisor_node: the supervisor's own and the robot."""
 
+    controllers: NAMES = parameter(
+        tuple(registry.standing_by()), read_only=True,
+        doc='those that may be active: registered names, or package.module:Class')
     robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
     supervisor_file: str = parameter(
         '', doc='file to start from; empty: the shipped params/supervisor.yaml', read_only=True)
@@ -54,7 +57,14 @@ class SupervisorNode(FlightNode):
         super().__init__('supervisor_node', SupervisorNodeParameters, 'params/supervisor.yaml',
                          'supervisor_file', self._changed, changeable=('controller',))
         robot = RobotParameters.load(self.parameters.robot_file or None)
-        self._supervisor = Supervisor(self.parameters, robot, HoverController(robot), CONTROLLERS)
+        self._controllers = [registry.find(name).name if ':' in name else name
+                             for name in self.parameters.controllers]
+        if self.parameters.controller not in self._controllers:
+            raise ParameterError(f"key 'controller': expected one of "
+                                 f"{', '.join(self._controllers)}, found "
+                                 f"'{self.parameters.controller}'")
+        self._supervisor = Supervisor(self.parameters, robot, HoverController(robot),
+                                      self._controllers)
         self._joints = None
         self._sent = (None, '')     # stamp and source of the last command
         self._state = ''
@@ -87,7 +97,7 @@ class SupervisorNode(FlightNode):
                     lambda told: supervisor.on_rotors(told.stamp, told.speed), stale_after=None)
         self.listen(BatteryState, 'battery_state', convert.battery,
                     lambda b: supervisor.on_battery(b.voltage))
-        for name in CONTROLLERS:
+        for name in self._controllers:
             self.listen(JointState, f'{name}/command', convert.command, self._on_command(name),
                         qos.COMMAND, stale_after=None)
         for name in ('joint', 'rotor'):

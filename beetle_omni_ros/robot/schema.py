@@ -17,6 +17,7 @@ from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, shortened, YamlEr
 
 # Parameters that hold more than numbers, from lists and mappings of a file.
 STRUCTURED = {tuple: ((list, tuple), 'a list'), dict: ((dict, type(None)), 'a mapping')}
+NAMES = tuple[str, ...]     # type of a parameter that is a list of names
 FILE_NAME, KEY, WHOLE = 500, 80, 1000    # characters of them in a message
 
 
@@ -165,6 +166,10 @@ def check(entry, hint: type, value: Any, at: str) -> Any:
             raise ParameterError(f"{at}: expected one of {', '.join(meta['choices'])}, "
                                  f'found {quoted(value)}')
         return value
+    if hint == NAMES:
+        if not isinstance(value, (list, tuple)) or not all(isinstance(v, str) for v in value):
+            raise ParameterError(f'{at}: expected a list of names, found {quoted(value)}')
+        return tuple(value)
     if hint in STRUCTURED:
         kinds, what = STRUCTURED[hint]
         if not isinstance(value, kinds):
@@ -260,4 +265,4 @@ def nest(flat: dict[str, Any]) -> dict:
 
 
 __all__ = ['ParameterError', 'bind', 'check', 'flatten', 'group', 'load', 'load_yaml',
-           'nest', 'parameter']
+           'NAMES', 'nest', 'parameter']

@@ -17,7 +17,7 @@ from beetle_omni_ros.runs import messages
 from beetle_omni_ros.runs.bag_reader import BagError, META_KEY, read_bag, read_messages
 from beetle_omni_ros.runs.chunk_index import ChunkIndex
 from beetle_omni_ros.runs.log import COMPUTE_KEYS
-from beetle_omni_ros.runs.topics import EVENT, Topic, TOPICS
+from beetle_omni_ros.runs.topics import EVENT, Topic, topic_of, TOPICS
 
 BAG_VERSION = 9  # of metadata.yaml, as Jazzy writes it
 
@@ -42,7 +42,7 @@ class BagWriter:
             path: folder to create; it must not exist.
             meta: what is known of the flight: task, conditions, seed, robot, version.
             namespace: of the topics, '' or e.g. '/robot1'.
-            topics: names in ``TOPICS`` to declare.
+            topics: names to declare, see :func:`~beetle_omni_ros.runs.topics.topic_of`.
 
         Raises:
             BagError: the folder exists or cannot be made.
@@ -55,7 +55,7 @@ class BagWriter:
         self._writer = _open(self.path)
         self._index = self._writer.storage.chunks = ChunkIndex(self.path)
         for name in topics:
-            self._declare(self._prefix + name, TOPICS[name])
+            self._declare(self._prefix + name, topic_of(name))
         self._last_t = 0.0
         if meta:
             self.write_meta(meta)
@@ -86,13 +86,16 @@ class BagWriter:
         Write one message of rosbags' type store.
 
         Args:
-            name: in ``TOPICS``, without namespace.
+            name: without namespace, see :func:`~beetle_omni_ros.runs.topics.topic_of`.
             message: see :mod:`~beetle_omni_ros.runs.messages`.
             t: time of recording [s].
 
         """
-        self.write_raw(self._prefix + name, TOPICS[name].type,
-                       messages.TYPESTORE.serialize_cdr(message, TOPICS[name].type), t)
+        topic, entry = self._prefix + name, topic_of(name)
+        if topic not in self._connections and self._writer is not None:
+            self._declare(topic, entry)
+        self.write_raw(topic, entry.type, messages.TYPESTORE.serialize_cdr(message, entry.type),
+                       t)
 
     def write_raw(self, topic: str, msgtype: str, data: bytes | memoryview, t: float) -> None:
         """
@@ -190,10 +193,9 @@ class BagWriter:
                    t if received is None else received)
 
     def write_request(self, controller: str, t, tilt, thrust, received=None) -> None:
-        """What one controller asked for; kept for those that have a command topic."""
-        if f'{controller}/command' in TOPICS:
-            self.write(f'{controller}/command', messages.command(t, tilt, thrust),
-                       t if received is None else received)
+        """What one controller asked for, before the supervisor."""
+        self.write(f'{controller}/command', messages.command(t, tilt, thrust),
+                   t if received is None else received)
 
     def write_wrench(self, t, force_world, torque_body) -> None:
         """External wrench from ``t`` until the next."""

@@ -15,12 +15,12 @@ from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, YamlError
 from beetle_omni_ros.runs import decode, messages
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.recorder import LogRecorder
-from beetle_omni_ros.runs.topics import split_topic, TOPICS
+from beetle_omni_ros.runs.topics import is_ambiguous, split_topic, topic_of, TOPICS
 
 META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
 
 # Entries of it by which a flight is judged, and how long they may be.
-META_TEXTS = ('task', 'conditions', 'robot', 'plant', 'controller', 'version')
+META_TEXTS = ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version')
 LONGEST_TEXT = 250
 
 
@@ -158,13 +158,15 @@ class _Reading:
 
     def take(self, message):
         if message.topic not in self._split:
+            if self._namespace is None and is_ambiguous(message.topic):
+                return      # until another topic shows in which namespace the robot is
             self._split[message.topic] = self._recognise(message.topic)
         name = self._split[message.topic]
         if name is None:
             return
         try:
-            if message.type != TOPICS[name].type:
-                raise decode.LayoutError(f'type is {message.type}, not {TOPICS[name].type}')
+            if message.type != topic_of(name).type:
+                raise decode.LayoutError(f'type is {message.type}, not {topic_of(name).type}')
             decoded = messages.TYPESTORE.deserialize_cdr(message.data, message.type)
             decode.record(self.recorder, name, decoded, message.received)
             self._counts[name] += 1
@@ -173,7 +175,7 @@ class _Reading:
             self._reason.setdefault(name, str(error) or type(error).__name__)
 
     def _recognise(self, topic):
-        split = split_topic(topic)
+        split = split_topic(topic, () if self._namespace is None else (self._namespace,))
         if split is None:
             return None
         namespace, name = split

@@ -9,6 +9,7 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
 from beetle_omni_ros.runs.log import COMPUTE_KEYS
 from beetle_omni_ros.runs.messages import COMMAND_NAMES, COMPUTE_STATUS, NAN4, RUN_STATUS
+from beetle_omni_ros.runs.topics import requester
 
 
 class LayoutError(ValueError):
@@ -27,7 +28,7 @@ def record(recorder, topic: str, message, received: float) -> None:
 
     Args:
         recorder: takes ``write_*`` calls, see :class:`~beetle_omni_ros.runs.recorder.LogRecorder`.
-        topic: name in ``TOPICS``.
+        topic: name in ``TOPICS``, or '<controller>/command'.
         message: decoded by ``TYPESTORE``.
         received: time of recording [s].
 
@@ -35,7 +36,9 @@ def record(recorder, topic: str, message, received: float) -> None:
         LayoutError: the message lacks names or values that the topic needs.
 
     """
-    _READERS[topic](recorder, message, received)
+    controller = requester(topic)
+    read = _read_command(controller) if controller else _READERS[topic]
+    read(recorder, message, received)
 
 
 def _read_body(write):
@@ -135,7 +138,6 @@ _READERS = {
     'battery_state': _read_battery, 'odom': _read_body('write_odom'),
     'ground_truth/odom': _read_body('write_truth'), 'target_pose': _read_pose_target,
     'target_trajectory': _read_trajectory, 'command': _read_command(None),
-    'nmpc/command': _read_command('nmpc'), 'rl/command': _read_command('rl'),
     'disturbance': _read_wrench, 'supervisor/state': _read_state,
     'diagnostics': _read_diagnostics}
 

@@ -147,6 +147,7 @@ def _judge(log, task, flown, expected):
         result[name] = {key: _reduced(reduce, [pose[key] for pose in poses]) for key in POSE_KEYS}
     result['success_rate'] = float(np.mean([p['reached'] for p in poses])) if poses else None
     result['crashed'] = _crashed(log, body, flown)
+    result['guidance'] = _guidance(log, flown.name)
     result['lowest'] = _lowest(log, body, flown)
     compute = log.compute.get(flown.name, {})
     result['compute_ms'] = {key: compute.get(key)
@@ -160,6 +161,16 @@ def _judge(log, task, flown, expected):
     if task:
         result.update(task_metrics.extras(log, body, task, U_WINDOW))
     return result
+
+
+def _guidance(log, controller):
+    """What moved the controller's targets, in its own words; None where nobody said."""
+    told = [entry.values['guidance'] for entry in log.diagnostics
+            if entry.name.rpartition('/')[2] == f'{controller}_node: controller'
+            and 'guidance' in entry.values]
+    if not told and log.meta.get('controller') == controller:
+        return log.meta.get('guidance')
+    return told[-1] if told else None
 
 
 def _pose(body: Motion, target, task):

@@ -112,6 +112,8 @@ def _summary(judged, task):
              ['lowest point [m]', *(_lowest(column) for column in columns)]]
     rows += [[text, *(_number(_at(column, path), digits) for column in columns)]
              for text, path, digits in EFFORT_ROWS]
+    if any(column.get('guidance') for column in columns):
+        rows.append(['guidance', *(column.get('guidance') or ABSENT for column in columns)])
     if any('stamp_to_command_ms' in column for column in columns):
         rows.append(['stamp to command, 99 % [ms]', *(
             _number(_at(column, 'stamp_to_command_ms.p99'), 2) for column in columns)])

@@ -9,7 +9,7 @@ import re
 
 import numpy as np
 
-from beetle_omni_ros.control.base import PoseTarget, Target
+from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs import lemniscate, pose_file
 from beetle_omni_ros.runs.pose_file import TaskError
@@ -287,5 +287,52 @@ def _lemniscate_task(name):
     return Task(name, 'trajectory', (hold, track), pose[None], rounds)
 
 
-__all__ = ['control_lost', 'make_task', 'Moment', 'NAMES', 'pose_target', 'random_poses',
-           'Segment', 'Task', 'TaskError', 'TaskPlayer']
+def trajectory_task(name: str, times: np.ndarray, positions: np.ndarray,
+                    quaternions: np.ndarray) -> Task:
+    """
+    Make a task of a trajectory: 8 s at its first pose, then the whole of it.
+
+    Args:
+        name: of the task.
+        times: (N,) increasing, from 0 [s].
+        positions: (N, 3) in world [m].
+        quaternions: (N, 4) body to world (x, y, z, w).
+
+    Raises:
+        TaskError: shapes that do not fit together, or too few samples.
+
+    """
+    times, positions, quaternions = (np.asarray(array, dtype=float)
+                                     for array in (times, positions, quaternions))
+    count = len(times)
+    if count < 3 or positions.shape != (count, 3) or quaternions.shape != (count, 4):
+        raise TaskError(f"task '{name}': expected times (N,), positions (N, 3) and quaternions "
+                        f'(N, 4) of at least 3 samples, found {times.shape}, {positions.shape} '
+                        f'and {quaternions.shape}')
+    quaternions = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    steps = [rotations.log(rotations.multiply(rotations.conjugate(a), b))
+             for a, b in zip(quaternions, quaternions[1:])]
+    between = np.array(steps) / np.diff(times)[:, None]
+    rates = np.vstack([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
+    velocities = np.gradient(positions, times, axis=0)
+    hold = np.concatenate([positions[0], np.degrees(rotations.to_rpy(quaternions[0]))])
+
+    def target(start):
+        return TrajectoryTarget(start + times, positions, quaternions, velocities, rates, start)
+
+    duration = float(times[-1])
+    return Task(name, 'trajectory',
+                (Segment(POSE_DURATION, _builder(hold)), Segment(duration, target)), hold[None],
+                ((POSE_DURATION, POSE_DURATION + duration),))
+
+
+def poses_task(name: str, poses: np.ndarray) -> Task:
+    """Make a task of (N, 6) poses: x, y, z [m], roll, pitch, yaw [deg], 8 s each."""
+    poses = np.atleast_2d(np.asarray(poses, dtype=float))
+    if poses.ndim != 2 or poses.shape[1] != 6 or not np.isfinite(poses).all():
+        raise TaskError(f"task '{name}': expected finite poses (N, 6), found shape {poses.shape}")
+    return _pose_task(name, poses)
+
+
+__all__ = ['control_lost', 'make_task', 'Moment', 'NAMES', 'pose_target', 'poses_task',
+           'random_poses', 'Segment', 'Task', 'TaskError', 'TaskPlayer', 'trajectory_task']

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 
 from rosbags.interfaces import (
@@ -12,6 +13,8 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
+
+from beetle_omni_ros.control import registry
 
 
 def _qos(depth, reliability=QosReliability.RELIABLE, durability=QosDurability.VOLATILE):
@@ -44,6 +47,9 @@ class Topic:
     required: bool = False
 
 
+REQUEST = Topic('sensor_msgs/msg/JointState', COMMAND)     # `<controller>/command`
+
+# Those of the controllers that stand by; topic_of() knows any controller's.
 TOPICS: dict[str, Topic] = {
     'mocap/pose': Topic('geometry_msgs/msg/PoseStamped', SENSOR, True),
     'imu/data_raw': Topic('sensor_msgs/msg/Imu', SENSOR, True),
@@ -52,8 +58,7 @@ TOPICS: dict[str, Topic] = {
     'odom': Topic('nav_msgs/msg/Odometry', COMMAND, True),
     'target_pose': Topic('geometry_msgs/msg/PoseStamped', LATCHED, True),
     'target_trajectory': Topic('trajectory_msgs/msg/MultiDOFJointTrajectory', LATCHED),
-    'nmpc/command': Topic('sensor_msgs/msg/JointState', COMMAND),
-    'rl/command': Topic('sensor_msgs/msg/JointState', COMMAND),
+    **{f'{name}/command': REQUEST for name in registry.standing_by()},
     'command': Topic('sensor_msgs/msg/JointState', COMMAND, True),
     'ground_truth/odom': Topic('nav_msgs/msg/Odometry', COMMAND),
     'disturbance': Topic('geometry_msgs/msg/WrenchStamped', EVENT),
@@ -62,15 +67,55 @@ TOPICS: dict[str, Topic] = {
 }
 
 
-def split_topic(topic: str) -> tuple[str, str] | None:
+def topics_with(controllers: Iterable[str]) -> dict[str, Topic]:
+    """Name -> topic of a graph with these controllers, by their names."""
+    return {**TOPICS, **{f'{name}/command': REQUEST for name in controllers}}
+
+
+def requester(name: str) -> str:
+    """Controller of a topic '<controller>/command'; '' for any other name."""
+    controller, _, rest = name.partition('/')
+    return controller if rest == 'command' else ''
+
+
+def topic_of(name: str) -> Topic:
+    """
+    Topic of a name without namespace.
+
+    Raises:
+        KeyError: it is none of ours.
+
+    """
+    return REQUEST if requester(name) else TOPICS[name]
+
+
+def is_ambiguous(topic: str) -> bool:
+    """Whether '/name/command' may be a controller's or a robot's, as nobody knows ``name``."""
+    _, _, name = topic.removesuffix('/command').rpartition('/')
+    return topic.endswith('/command') and bool(name) and name not in registry.names()
+
+
+def split_topic(topic: str, namespaces: Container[str] = ()) -> tuple[str, str] | None:
     """
     Take a bag's topic apart.
 
+    Args:
+        topic: full name.
+        namespaces: of the robots that are known to be in the bag, as '' or '/robot1'. Without,
+            '/name/command' is a controller's where one of that name is registered, else the
+            command of a robot in '/name'.
+
     Returns:
-        (namespace, name in ``TOPICS``): '/robot1/nmpc/command' -> ('/robot1', 'nmpc/command');
+        (namespace, name): '/robot1/nmpc/command' -> ('/robot1', 'nmpc/command');
         None for a topic that is not one of ours. ``diagnostics`` may also be the global one.
 
     """
+    space, _, last = topic.rpartition('/')
+    if last == 'command':
+        above, _, controller = space.rpartition('/')
+        is_one = above in namespaces and space not in namespaces or controller in registry.names()
+        if controller and is_one:
+            return above, f'{controller}/command'
     for name in sorted(TOPICS, key=len, reverse=True):
         if topic == name or topic == '/' + name:
             return '', name

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
@@ -184,8 +185,7 @@ class Envelope:
 class SupervisorParameters:
     """Everything the supervisor can be told."""
 
-    controller: str = parameter('nmpc', doc='the active controller, also in flight',
-                                choices=('nmpc', 'rl'))
+    controller: str = parameter(registry.DEFAULT, doc='the active controller, also in flight')
     commands: CommandLimits = group(CommandLimits)
     handover: HandoverParameters = group(HandoverParameters)
     state: StateLimits = group(StateLimits)

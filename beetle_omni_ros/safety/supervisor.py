@@ -7,10 +7,12 @@ in-process evaluation run the same code and get the same answer. See docs/safety
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, Controller, PoseTarget, Target
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL, NO_ZEROS
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -27,7 +29,6 @@ from beetle_omni_ros.safety.watch.faults import CRASH, DISPLACED
 
 DISARMED, TAKEOFF, FLYING = 'disarmed', 'takeoff', 'flying'
 FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
-PILOT = 'nmpc'      # flies with actuators missing, where it is good; else the hover law
 RESUMING = 0.1      # [s] after a pause until every source has spoken again
 IN_FLIGHT = (TAKEOFF, FLYING, FALLBACK, LANDING)
 
@@ -40,7 +41,9 @@ class Supervisor(Inputs):
         parameters: thresholds.
         robot: the robot as it is believed to be.
         fallback: flies takeoff, fallback and landing; HoverController or alike.
-        controllers: names of the controllers that may be active.
+        controllers: names of the controllers that may be active; None: those that stand by.
+        pilot: who lands with actuators missing, where it is good, else the hover law; None: the
+            registry's choice among ``controllers``.
 
     Attributes:
         state: 'disarmed', 'takeoff', 'flying', 'fallback', 'landing' or 'emergency_stop'.
@@ -50,8 +53,11 @@ class Supervisor(Inputs):
     """
 
     def __init__(self, parameters: SupervisorParameters, robot: RobotParameters,
-                 fallback: Controller, controllers: tuple[str, ...] = ('nmpc', 'rl')):
+                 fallback: Controller, controllers: Sequence[str] | None = None,
+                 pilot: str | None = None):
+        controllers = tuple(registry.standing_by() if controllers is None else controllers)
         super().__init__(parameters, robot, controllers)
+        self._pilot = registry.pilot(controllers) if pilot is None else pilot
         self._hover = fallback
         self._gauge = SupportGauge(self._allocator, robot.gravity, robot.rotors.time_constant)
         self._handover = Handover(parameters.handover)
@@ -391,9 +397,9 @@ class Supervisor(Inputs):
         if self._landing.given_up:
             self.emergency_stop(now, self._landing.given_up)
             return self._stand(now, dt)
-        pilot = self._selection.good(PILOT) if self._landing_way is not None else None
+        pilot = self._selection.good(self._pilot) if self._landing_way is not None else None
         if pilot is not None and not self.vehicle.backup.running:
-            self.source = PILOT
+            self.source = self._pilot
             command = self._handover.limit(pilot, self._in_force)
         if self._landing.grounded:
             self._motors_off(DISARMED, now, INFO, 'on the ground: motors off, disarmed')

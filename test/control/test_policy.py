@@ -10,10 +10,10 @@ import pytest
 
 from beetle_omni_ros.control import onnx_runtime, policy_checksum
 from beetle_omni_ros.control.base import Command, PoseTarget, State, TrajectoryTarget
+from beetle_omni_ros.control.guidance.routing import RoutingParameters
 from beetle_omni_ros.control.observation import observation
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
 from beetle_omni_ros.control.policy_file import PolicyContract
-from beetle_omni_ros.control.routing import RoutingParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import PoseTarget, State
-from beetle_omni_ros.control.routing import Routing, RoutingParameters, spread_attitudes
+from beetle_omni_ros.control.guidance.routing import Routing, RoutingParameters, spread_attitudes
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 

@@ -9,8 +9,8 @@ from plant import Plant
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, State
+from beetle_omni_ros.control.guidance.trimming import Trimming, TrimmingParameters
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
-from beetle_omni_ros.control.trimming import Trimming, TrimmingParameters
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import PoseTarget, State
+from beetle_omni_ros.control.guidance.turning import Turning, TurningParameters
 from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
-from beetle_omni_ros.control.turning import Turning, TurningParameters
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 

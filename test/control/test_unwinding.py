@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import PoseTarget, State
-from beetle_omni_ros.control.turns import tilts_at_end, turning_cost
-from beetle_omni_ros.control.unwinding import (
+from beetle_omni_ros.control.guidance.turns import tilts_at_end, turning_cost
+from beetle_omni_ros.control.guidance.unwinding import (
     level_between,
     levelled,
     Unwinding,

@@ -5,13 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.hover import HoverController
+from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation import command
 from beetle_omni_ros.evaluation.loop import FlightError, FlightLoop
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.recorder import LogRecorder
 from beetle_omni_ros.runs.tasks import make_task
@@ -67,8 +70,8 @@ def fly_switching(policy, seed):
     supervisor = Supervisor(SupervisorParameters.load(), ROBOT, HoverController(ROBOT))
     times = np.sort(np.random.default_rng(seed).uniform(4.0, 4.0 + 8 * POSES, SWITCHES))
     recorder = Switching(supervisor, times)
-    controllers = {name: command.make_controller(name, ROBOT,
-                                                 command.ControllerFiles(policy=policy))
+    controllers = {name: registry.make(name, ROBOT, ControllerOptions(policy=policy)
+                                       if name == 'rl' else ControllerOptions())
                    for name in ('nmpc', 'rl')}
     loop = FlightLoop(Simulator(ROBOT), ErrorStateEkf(estimator, ROBOT.gravity),
                       controllers, supervisor, recorder, estimator.imu.gyroscope_noise)
@@ -129,7 +132,7 @@ def fly_poses(tmp_path, policy, *heights):
     path = tmp_path / 'poses.csv'
     path.write_text(HEADER + ''.join(f'0,0,{z},0,0,0\n' for z in heights))
     return command.fly('rl', make_task(path), robot=ROBOT, plant=ROBOT,
-                       files=command.ControllerFiles(policy=policy))
+                       options={'rl': ControllerOptions(policy=policy)})
 
 
 def test_answers_that_are_no_numbers_end_in_hover_and_good_ones_fly_again(tmp_path):
@@ -161,8 +164,8 @@ def test_absurd_answers_never_get_control(tmp_path):
 def test_another_robot_flies_where_that_is_allowed(tmp_path):
     pytest.importorskip('onnx')
     from hover_policy import write_hover_policy
-    files = command.ControllerFiles(policy=write_hover_policy(tmp_path / 'p.onnx'))
+    options = ControllerOptions(policy=write_hover_policy(tmp_path / 'p.onnx'))
     other = replace(ROBOT, mass=3.1)
-    with pytest.raises(command.ParameterError, match='robot_hash'):
-        command.make_controller('rl', other, files)
-    command.make_controller('rl', other, replace(files, allow_other_robot=True))
+    with pytest.raises(ParameterError, match='robot_hash'):
+        registry.make('rl', other, options)
+    registry.make('rl', other, replace(options, allow_other_robot=True))

@@ -8,9 +8,10 @@ import rclpy
 from rclpy.parameter import Parameter
 
 from beetle_omni_ros.control.base import Command, PoseTarget
+from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.nodes import convert, targets
 from beetle_omni_ros.nodes.controller_node import ControllerNode
-from beetle_omni_ros.nodes.ekf_node import EkfNode, EkfNodeParameters
+from beetle_omni_ros.nodes.ekf_node import EkfNode
 from beetle_omni_ros.nodes.reference_node import ReferenceNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
@@ -64,12 +65,9 @@ class FollowerNode(ControllerNode):
     """The controller node with a controller that needs no solver."""
 
     def __init__(self):
-        super().__init__('nmpc', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')
+        super().__init__(ControllerEntry(name='nmpc', controller=Follower))
         self._publisher = Sent()
-
-    def make_controller(self, parameters):
-        self.follower = Follower()
-        return self.follower
+        self.follower = self._controller
 
 
 def odom_at(stamp, height=1.0):

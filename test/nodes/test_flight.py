@@ -247,7 +247,7 @@ def test_an_interrupt_stops_every_process(tmp_path, arrangement):
     ('task', 'somersault', 'somersault'),
     ('robot', '/nowhere.yaml', '/nowhere.yaml'),
     ('json_path', '/nowhere/result.json', '/nowhere/result.json'),
-    ('controller', 'hover', "controller 'hover': no node for it; expected nmpc or rl"),
+    ('controller', 'hoover', "controller 'hoover': expected one of nmpc, rl, rl_memory"),
     ('clock', 'sundial', "clock 'sundial': expected auto or system or simulated"),
     ('actuators', 'strings', "actuators 'strings': expected emulated or direct"),
 ])

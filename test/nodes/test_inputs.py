@@ -20,9 +20,10 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from beetle_omni_ros.control.base import Command, TrajectoryTarget
+from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.nodes import command_source, convert, qos, targets
 from beetle_omni_ros.nodes.controller_node import ControllerNode
-from beetle_omni_ros.nodes.ekf_node import EkfNode, EkfNodeParameters
+from beetle_omni_ros.nodes.ekf_node import EkfNode
 from beetle_omni_ros.nodes.joint_bridge_node import JointBridgeNode
 from beetle_omni_ros.nodes.recorder_node import RecorderNode
 from beetle_omni_ros.nodes.reference_node import ReferenceNode
@@ -39,11 +40,9 @@ class StillNode(ControllerNode):
     """The controller node around nothing."""
 
     def __init__(self):
-        super().__init__('nmpc', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')
-
-    def make_controller(self, parameters):
-        return SimpleNamespace(period=0.01, name='none', diagnostics=dict,
-                               set_health=lambda health: None)
+        super().__init__(ControllerEntry(name='nmpc', controller=lambda: SimpleNamespace(
+            period=0.01, step=lambda state, target: None, reset=lambda: None,
+            set_health=lambda health: None)))
 
 
 class Bench:

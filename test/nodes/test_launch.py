@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from beetle_omni_ros.nodes import composed, discovery, private, standby
+from beetle_omni_ros.nodes import discovery, plan, private
 from beetle_omni_ros.nodes.actuators import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -35,7 +35,7 @@ def bringup(monkeypatch):
             setattr(module, member, type(member, (Recorded,), {}))
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.setenv(discovery.RANGE, 'LOCALHOST')        # put back afterwards
-    monkeypatch.setattr(standby, 'unfit', lambda *_: '')    # a policy that fits is there
+    monkeypatch.setattr(plan, 'unfit', lambda *_: '')    # a policy that fits is there
     spec = spec_from_file_location('bringup', share_path('launch/bringup.launch.py'))
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -68,7 +68,7 @@ def test_composed_is_one_process_and_one_for_the_bridges(bringup):
     command = process.kwargs['cmd']
     nodes = command[3:command.index('--ros-args')]
     assert nodes == ['sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node']
-    assert {*nodes, *BRIDGES} <= set(composed.NODES)
+    assert {*nodes, *BRIDGES} <= set(plan.NODES)
     assert 'sim_node:seed:=7' in command
     assert command[-2:] == ['-r', '__ns:=/robot1']
 
@@ -130,7 +130,7 @@ def test_either_controller_is_active_and_the_other_stands_by(bringup, capsys, mo
     process, _ = bringup.start(allow_other_robot='true')
     assert 'rl_node:allow_other_robot:=True' in process.kwargs['cmd']
     assert not capsys.readouterr().err
-    monkeypatch.setattr(standby, 'unfit', lambda *_: 'robot_hash: another robot')
+    monkeypatch.setattr(plan, 'unfit', lambda *_: 'robot_hash: another robot')
     assert controllers() == ('nmpc', {'nmpc_node': {}})
     assert 'rl does not stand by: robot_hash' in capsys.readouterr().err
     with pytest.raises(ParameterError, match='robot_hash'):

@@ -17,10 +17,10 @@ from sensor_msgs.msg import JointState
 from witness import HEADER, READY, Witness
 
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.control.policy import PolicyController, PolicyParameters
+from beetle_omni_ros.control.policy import DEFAULT, PolicyController, PolicyParameters
 from beetle_omni_ros.nodes import convert, qos
 from beetle_omni_ros.nodes.graph import Graph
-from beetle_omni_ros.nodes.standby import controller_nodes, unfit
+from beetle_omni_ros.nodes.plan import controller_nodes, unfit
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
@@ -127,15 +127,15 @@ def test_a_policy_that_cannot_fly_does_not_stand_by(tmp_path):
     assert list(controller_nodes('nmpc', policy=policy)[0]) == ['nmpc_node', 'rl_node']
     assert list(controller_nodes('rl', policy=policy)[0]) == ['rl_node', 'nmpc_node']
     nodes, reason = controller_nodes('nmpc', policy=policy, robot_file=other)
-    assert list(nodes) == ['nmpc_node'] and 'robot_hash' in reason
+    assert list(nodes) == ['nmpc_node'] and 'robot_hash' in reason['rl']
     nodes, reason = controller_nodes('nmpc', policy=policy, robot_file=other,
                                      allow_other_robot=True)
     assert nodes['rl_node'] == {'robot_file': other, 'policy': policy, 'allow_other_robot': True}
     assert unfit(policy, other) and not unfit(policy, other, True)
     with pytest.raises(ParameterError, match='no such file'):
         controller_nodes('rl', policy=str(tmp_path / 'none.onnx'))
-    with pytest.raises(ParameterError, match="'hover': no node"):
-        controller_nodes('hover')
+    with pytest.raises(ParameterError, match="'hoover': expected one of nmpc, rl"):
+        controller_nodes('hoover')
 
 
 class Pilot(Witness):
@@ -180,8 +180,8 @@ def flight(request, ros_domain, tmp_path):
     """The composed graph with both controllers in the air, on its way through random poses."""
     if request.param == 'written':
         policy = str(write_hover_policy(tmp_path / 'hover.onnx', memory=True))
-    elif unfit():
-        pytest.skip(unfit())
+    elif reason := unfit(DEFAULT):
+        pytest.skip(reason)
     else:
         policy = ''
     controllers, reason = controller_nodes('nmpc', policy=policy)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
-from beetle_omni_ros.control.reach import reach_of_name
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.pose_file import COLUMNS, read_poses, TaskError
@@ -101,5 +101,7 @@ def test_what_is_in_reach_is_judged_from_the_robot():
 
 
 def test_every_step_of_the_shipped_tasks_is_in_reach_of_every_controller():
-    for name in ('rl', 'rl_memory', 'nmpc', 'nmpc_published'):
-        assert reach_of_name(name) > np.linalg.norm([4.0, 4.0, 1.4])
+    robot = RobotParameters.load()
+    reaches = {name: entry.reach(robot) for name, entry in registry.SHIPPED.items()}
+    assert min(reaches.values()) > np.linalg.norm([4.0, 4.0, 1.4])
+    assert reaches['rl'] == reaches['rl_memory'] == 6.5 and reaches['hover'] == np.inf

@@ -11,7 +11,7 @@ import numpy as np
 
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.runs.bag_reader import BagError, read_messages
-from beetle_omni_ros.runs.topics import split_topic, TOPICS
+from beetle_omni_ros.runs.topics import is_ambiguous, split_topic, TOPICS
 
 NEEDED = {'imu/data_raw': 6, 'mocap/pose': 7, 'joint_states': 4, 'command': 8}
 OPTIONAL = {'battery_state': 1}
@@ -60,7 +60,9 @@ def read_recording(path: str | Path) -> Recording:
     namespaces = set()
     for message in read_messages(path, warnings):
         if message.topic not in known:
-            split = split_topic(message.topic)
+            if not namespaces and is_ambiguous(message.topic):
+                continue
+            split = split_topic(message.topic, namespaces)
             known[message.topic] = split[1] if split else None
             if split and split[1] in NEEDED:
                 namespaces.add(split[0])

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import PoseTarget, State
-from beetle_omni_ros.control.turns import tilts_along, turned
+from beetle_omni_ros.control.guidance.turns import tilts_along, turned
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import parameter
 

@@ -31,7 +31,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import PoseTarget, State
-from beetle_omni_ros.control.turns import STRAIGHT_UP, tilts_at_end, turning_cost
+from beetle_omni_ros.control.guidance.turns import STRAIGHT_UP, tilts_at_end, turning_cost
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import parameter
 

@@ -1,0 +1,166 @@
+"""
+Guidance: the pose targets that a controller is shown, one way of moving them after the other.
+
+A controller that acts on the present state alone, as a policy does, needs it for wound joints,
+for dives in large turns and for steady errors. It is no part of any controller: one that wants
+it holds a :class:`Guidance`, or is flown inside a :class:`Guided`; another one leaves it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.control.base import (
+    Command,
+    Controller,
+    PoseTarget,
+    State,
+    Target,
+    tell_health,
+)
+from beetle_omni_ros.control.guidance.routing import Routing, RoutingParameters
+from beetle_omni_ros.control.guidance.trimming import Trimming, TrimmingParameters
+from beetle_omni_ros.control.guidance.turning import Turning, TurningParameters
+from beetle_omni_ros.control.guidance.unwinding import Unwinding, UnwindingParameters
+from beetle_omni_ros.control.reach import reach_of
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.schema import group
+
+LATEST = 10     # steps within which a command comes back as the one in force
+NONE = 'none'   # guidance of a controller that flies without
+ALWAYS = 100.0  # [rad] as a limit of the routing: the shortest turn is always flown
+
+
+@dataclass(frozen=True, kw_only=True)
+class GuidanceParameters:
+    """What the guidance does; params/rl.yaml says why."""
+
+    unwinding: UnwindingParameters = group(
+        UnwindingParameters, 'through a level attitude where joints end at their stops')
+    routing: RoutingParameters = group(
+        RoutingParameters, 'round where the shortest turn ends at joint stops')
+    turning: TurningParameters = group(
+        TurningParameters, 'where targets are shown while there is far to turn')
+    trimming: TrimmingParameters = group(
+        TrimmingParameters, 'the steady error at a target is taken off')
+
+    @property
+    def text(self) -> str:
+        """The parts that are on, for result tables."""
+        parts = {'unwinding': self.unwinding.attempts > 0,
+                 'routing': self.routing.tilt < ALWAYS, 'turning': True,
+                 'trimming': self.trimming.rate > 0}
+        return ', '.join(name for name, is_on in parts.items() if is_on)
+
+
+class Guidance:
+    """
+    Through level for who is stuck, else round joint stops; without dives; without steady errors.
+
+    Args:
+        parameters: of each.
+        axes: (4, 3) unit tilt axes in base_link.
+
+    Attributes:
+        text: the parts that are on.
+
+    """
+
+    def __init__(self, parameters: GuidanceParameters, axes: np.ndarray):
+        self.text = parameters.text
+        self._unwinding = Unwinding(parameters.unwinding, axes)
+        self._routing = Routing(parameters.routing, axes)
+        self._turning = Turning(parameters.turning)
+        self._trimming = Trimming(parameters.trimming)
+
+    def reset(self) -> None:
+        """Forget the target and all that was found on the way to it."""
+        for part in (self._unwinding, self._routing, self._turning, self._trimming):
+            part.reset()
+
+    def target(self, state: State, given: PoseTarget, in_charge: bool = True) -> PoseTarget:
+        """
+        The pose target that the controller is to see.
+
+        Args:
+            state: of the robot.
+            given: the target.
+            in_charge: whether the robot is flying by this controller.
+
+        """
+        aim = self._unwinding.target(state, given)
+        if aim is given:
+            aim = self._routing.target(state, given)
+        shown = self._turning.target(state, given, aim)
+        if shown is given:
+            return self._trimming.target(state, given, in_charge)
+        self._trimming.reset()      # on its way elsewhere; joints may come back wound otherwise
+        return shown
+
+    def diagnostics(self) -> dict[str, int]:
+        """Counts since the last reset."""
+        return {'unwound': self._unwinding.attempts, 'routed': self._routing.routed}
+
+
+class Charge:
+    """Whether the robot flies by the commands of one controller."""
+
+    def __init__(self):
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the commands."""
+        self._latest: deque[list[float]] = deque(maxlen=LATEST)
+
+    def gave(self, values: list[float]) -> None:
+        """Keep a command: tilts [rad], then thrusts [N]."""
+        self._latest.appendleft(values)
+
+    def holds(self, state: State) -> bool:
+        """Whether the command in force is one of the latest."""
+        command = state.command
+        return command is not None and command.tilt.tolist() + command.thrust.tolist() \
+            in self._latest
+
+
+class Guided:
+    """
+    A controller with guidance around it: again a :class:`control.base.Controller`.
+
+    Args:
+        controller: any.
+        guidance: which moves its pose targets; trajectories pass as they are.
+
+    """
+
+    def __init__(self, controller: Controller, guidance: Guidance):
+        self._controller, self._guidance = controller, guidance
+        self._charge = Charge()
+        self.period, self.reach = controller.period, reach_of(controller)
+        self.guidance = guidance.text
+
+    def reset(self) -> None:
+        """Forget what controller and guidance remember."""
+        self._charge.reset()
+        self._guidance.reset()
+        self._controller.reset()
+
+    def step(self, state: State, target: Target) -> Command:
+        """One command for one state."""
+        if isinstance(target, PoseTarget):
+            target = self._guidance.target(state, target, self._charge.holds(state))
+        command = self._controller.step(state, target)
+        self._charge.gave(command.tilt.tolist() + command.thrust.tolist())
+        return command
+
+    def set_health(self, health: ActuatorHealth) -> None:
+        """Tell the controller, where it can make use of that."""
+        tell_health(self._controller, health)
+
+    def diagnostics(self) -> dict[str, float | int | str]:
+        """What the controller tells, and the counts of the guidance."""
+        told = getattr(self._controller, 'diagnostics', dict)
+        return {**told(), **self._guidance.diagnostics()}

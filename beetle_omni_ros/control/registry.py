@@ -1,0 +1,168 @@
+"""
+The controllers that can be flown: one table for everything that takes a controller's name.
+
+A name is looked for among the entry points of the group ``beetle_omni_ros.controllers``, to which
+any installed package may add; ``package.module:Class`` and ``path/to/file.py:Class`` lead to a
+class that is registered nowhere. The entry points of this package are read from
+:mod:`control.shipped`, so that a checkout needs no installation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import cache
+from importlib import metadata
+from typing import Any, TYPE_CHECKING
+
+from beetle_omni_ros.control import shipped
+from beetle_omni_ros.control.base import Controller
+from beetle_omni_ros.control.entry import (
+    absolute,
+    ControllerEntry,
+    ControllerOptions,
+    entry_of,
+    loaded,
+)
+from beetle_omni_ros.robot.schema import ParameterError
+
+if TYPE_CHECKING:       # which imports CasADi, and a list of names needs none
+    from beetle_omni_ros.robot.parameters import RobotParameters
+
+GROUP = 'beetle_omni_ros.controllers'
+SHIPPED: Mapping[str, ControllerEntry] = {
+    name: entry for name, entry in vars(shipped).items() if isinstance(entry, ControllerEntry)}
+DEFAULT = next(iter(SHIPPED))       # who flies when nobody says who
+
+
+@cache
+def _points() -> dict[str, metadata.EntryPoint]:
+    """Entry points of other packages by name; the shipped names stay the package's own."""
+    return {point.name: point for point in sorted(metadata.entry_points(group=GROUP))
+            if point.name not in SHIPPED}
+
+
+_ADDED: dict[str, ControllerEntry] = {}     # of this process alone
+
+
+def names() -> list[str]:
+    """Every registered name, the shipped ones first."""
+    return list(dict.fromkeys((*SHIPPED, *_points(), *_ADDED)))
+
+
+def add(found: Any) -> ControllerEntry:
+    """
+    Register a class, or a function that builds a controller, in this process under its name.
+
+    One of the same name that was added before is replaced, as when a notebook's cell runs again.
+
+    Raises:
+        ParameterError: it cannot be one, or its name is that of another package's controller.
+
+    """
+    entry = entry_of(found, '')
+    if entry.name in SHIPPED or entry.name in _points():
+        raise ParameterError(_taken(entry.name, entry.name))
+    _ADDED[entry.name] = entry
+    return entry
+
+
+def find(reference: str) -> ControllerEntry:
+    """
+    Look a controller up.
+
+    Args:
+        reference: a registered name, ``package.module:Class`` or ``path/to/file.py:Class``.
+
+    Raises:
+        ParameterError: there is none, or it cannot be loaded; one line.
+
+    """
+    if reference in SHIPPED:
+        return SHIPPED[reference]
+    if ':' in reference:
+        return _named(absolute(reference))
+    if reference in _ADDED:
+        return _ADDED[reference]
+    if reference in _points():
+        return _registered(reference)
+    raise ParameterError(f"controller '{reference}': expected one of {', '.join(names())}, or "
+                         'package.module:Class')
+
+
+def find_all(references: Iterable[str]) -> list[ControllerEntry]:
+    """
+    Look several controllers up; no two of them may have one name.
+
+    Raises:
+        ParameterError: as :func:`find`, or a name twice.
+
+    """
+    entries: dict[str, ControllerEntry] = {}
+    for reference in references:
+        entry = find(reference)
+        if entry.name in entries:
+            raise ParameterError(f"controllers '{entries[entry.name].reference}' and "
+                                 f"'{entry.reference}': both are called {entry.name}; expected "
+                                 "different names (a class's attribute 'name')")
+        entries[entry.name] = entry
+    return list(entries.values())
+
+
+@cache
+def _named(spec: str) -> ControllerEntry:
+    entry = entry_of(loaded(spec, spec), spec)
+    if entry.name in SHIPPED or entry.name in _points():
+        raise ParameterError(_taken(spec, entry.name))
+    return entry
+
+
+def _taken(reference, name):
+    return f"controller '{reference}': '{name}' is a registered controller's name; expected " \
+           "another one (the class's attribute 'name')"
+
+
+@cache
+def _registered(name: str) -> ControllerEntry:
+    return entry_of(loaded(_points()[name].value.replace(' ', ''), name), '', name)
+
+
+def make(reference: str, robot: RobotParameters,
+         options: ControllerOptions = ControllerOptions()) -> Controller:
+    """Build a controller, see :func:`find` and :meth:`ControllerEntry.make`."""
+    return find(reference).make(robot, options)
+
+
+def pilot(among: Iterable[str] | None = None) -> str:
+    """
+    Name of the controller that lands the robot when actuators are lost, whoever flew it.
+
+    Args:
+        among: names that are there; None: all that are registered.
+
+    Returns:
+        The first shipped one that can; '' where none of them is there.
+
+    """
+    there = set(SHIPPED if among is None else among)
+    return next((name for name, entry in SHIPPED.items()
+                 if entry.flies_degraded and name in there), '')
+
+
+def standing_by() -> list[str]:
+    """Names that are in the ROS graph beside another one that flies."""
+    return [name for name, entry in SHIPPED.items() if entry.stands_by]
+
+
+def compared() -> list[str]:
+    """Names that are compared when nobody says what; policies first."""
+    return sorted((name for name, entry in SHIPPED.items() if entry.compared),
+                  key=lambda name: not SHIPPED[name].policy_file)
+
+
+def owner(option: str) -> str:
+    """Name of the controller whose file an option of the command line replaces."""
+    return next(name for name, entry in SHIPPED.items() if entry.option == option)
+
+
+__all__ = ['add', 'compared', 'ControllerEntry', 'ControllerOptions', 'DEFAULT', 'find',
+           'find_all', 'GROUP', 'make', 'names', 'owner', 'pilot', 'SHIPPED', 'standing_by']

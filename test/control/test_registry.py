@@ -1,0 +1,301 @@
+"""One list of controllers: how names and classes become controllers, and what is refused."""
+
+import ast
+from importlib import metadata
+from pathlib import Path
+import re
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import checked, Command, Controller
+from beetle_omni_ros.control.entry import ControllerEntry, entry_of, RESERVED
+from beetle_omni_ros.control.registry import ControllerOptions
+from beetle_omni_ros.nodes.plan import NODES
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.resources import PACKAGE
+from beetle_omni_ros.robot.schema import ParameterError
+
+ROBOT = RobotParameters.load()
+ROOT = Path(__file__).resolve().parents[2]
+MODULE = '''
+from dataclasses import dataclass
+import numpy as np
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot.schema import parameter
+
+
+class MyController:
+    """Holds still.
+
+    For tests.
+    """
+
+    period = 0.02
+
+    def reset(self):
+        pass
+
+    def step(self, state, target):
+        return Command(state.stamp, np.zeros(4), np.full(4, 7.0))
+
+
+class Tuned(MyController):
+    """Has parameters."""
+
+    name = 'my_tuned'
+    guidance = 'a map'
+
+    @dataclass(frozen=True, kw_only=True)
+    class Parameters:
+        gain: float = parameter(2.0, doc='of the law', low=0, high=9)
+
+    parameters_file = 'tuned.yaml'
+
+    def __init__(self, robot, parameters, options):
+        self.gain, self.options = parameters.gain, options
+
+    def set_health(self, health):
+        pass
+
+
+class Needs(MyController):
+    def __init__(self, robot, gain):
+        pass
+
+
+class Narrow(MyController):
+    def step(self, state):
+        pass
+
+
+class Slow(MyController):
+    period = 5
+
+
+class Near(MyController):
+    reach = 3.0
+
+
+class Nowhere(MyController):
+    reach = 0
+
+
+class Failing(MyController):
+    def __init__(self):
+        raise ZeroDivisionError('no way')
+
+
+class NoReset:
+    period = 0.01
+
+    def step(self, state, target):
+        pass
+
+
+class Named(MyController):
+    name = 'rl'
+
+
+class Taken(MyController):
+    name = 'ekf'
+
+
+number = 3
+'''
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """Stand in a folder with a module of controllers; return its name."""
+    name = f'own_{tmp_path.name}'.replace('-', '_')
+    (tmp_path / f'{name}.py').write_text(MODULE)
+    (tmp_path / 'tuned.yaml').write_text('gain: 3.0\n')
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, 'path', list(sys.path))
+    return name
+
+
+def test_every_shipped_controller_is_built_and_keeps_the_contract():
+    for name in registry.names():
+        if name in registry.SHIPPED:
+            entry = registry.find(name)
+            controller = entry.make(ROBOT)
+            assert entry.name == name and entry.reference == name and entry.description
+            assert controller.period == pytest.approx(entry.period)
+            assert getattr(controller, 'guidance', 'none') == entry.guidance
+            assert hasattr(controller, 'set_health') == entry.flies_degraded
+
+
+def test_a_class_is_found_by_module_and_by_file_under_its_own_name(module, tmp_path):
+    for spec in (f'{module}:MyController', f'{tmp_path / module}.py:MyController',
+                 f'./{module}.py:MyController'):
+        entry = registry.find(spec)
+        assert (entry.name, entry.description, entry.period) == ('my_controller', 'Holds still.',
+                                                                 0.02)
+        assert entry.make(ROBOT).step(SimpleNamespace(stamp=1.0), None).stamp == 1.0
+        # what another process is told leads there from any folder
+        assert registry.find(entry.reference).name == 'my_controller'
+    assert Path(registry.find(f'./{module}.py:MyController').reference).is_absolute()
+
+
+def test_parameters_options_and_attributes_of_a_class_are_used(module, tmp_path):
+    entry = registry.find(f'{module}:Tuned')
+    assert entry.name == 'my_tuned' and entry.guidance == 'a map' and entry.flies_degraded
+    options = ControllerOptions(allow_other_robot=True)
+    made = entry.make(ROBOT, options)
+    assert made.gain == 3.0 and made.options is options
+    (tmp_path / 'other.yaml').write_text('gain: 4.0\n')
+    assert entry.make(ROBOT, ControllerOptions(parameters=tmp_path / 'other.yaml')).gain == 4.0
+    (tmp_path / 'other.yaml').write_text('gian: 4.0\n')
+    with pytest.raises(ParameterError, match="gian.*did you mean 'gain'"):
+        entry.make(ROBOT, ControllerOptions(parameters=tmp_path / 'other.yaml'))
+
+
+@pytest.mark.parametrize('spec, message', [
+    ('nmpx', 'expected one of nmpc, rl, .*package.module:Class'),
+    ('{}:', 'expected package.module:Class'),
+    ('{}:Absent', "no 'Absent' in .*its classes: .*MyController"),
+    ('{}:number', 'a int, expected a class'),
+    ('{}:Needs', r"cannot be built from \(robot, gain\).*'gain'"),
+    ('{}:Narrow', r'step\(state\), expected step\(state, target\)'),
+    ('{}:NoReset', r'no method reset\(\)'),
+    ('{}:Slow', 'period is 5, expected .* at most 1 s'),
+    ('{}:Nowhere', 'reach is 0, expected .* above 0'),
+    ('{}:Failing', 'building it raised ZeroDivisionError: no way'),
+    ('{}:Named', "'rl' is a registered controller's name"),
+    ('{}:Taken', "'ekf': not usable as a name"),
+    ('{}_absent:My', "no module '.*_absent'"),
+    ('{}_absent.py:My', 'no such file'),
+    ('absent.{}:My', "no module 'absent'")])
+def test_what_is_wrong_with_a_class_is_said_in_one_line(module, spec, message):
+    with pytest.raises(ParameterError, match=message) as caught:
+        registry.make(spec.format(module), ROBOT)
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('text, message', [
+    ('import none_such\n', "needs the module 'none_such'"), ('1 +\n', 'raised SyntaxError'),
+    ('raise ValueError("bad")\n', r'raised ValueError: bad \(broken.py, line 1\)')])
+def test_a_module_that_cannot_be_imported_says_why(tmp_path, text, message):
+    (tmp_path / 'broken.py').write_text(text)
+    with pytest.raises(ParameterError, match=message):
+        registry.find(f'{tmp_path}/broken.py:My')
+
+
+def test_the_reach_of_any_controller_is_known_and_is_endless_where_it_does_not_say(
+        module, tmp_path):
+    assert registry.find(f'{module}:Near').reach(ROBOT) == 3.0
+    assert registry.find(f'{module}:MyController').reach(ROBOT) == np.inf
+    assert registry.find('hover').reach(ROBOT) == np.inf
+    (tmp_path / 'other.yaml').write_text('reach: 2.0\n')
+    other = ControllerOptions(parameters=tmp_path / 'other.yaml')
+    for name in ('nmpc', 'rl'):
+        assert registry.find(name).reach(ROBOT, other) == 2.0
+    assert registry.find('rl').reach(ROBOT) == registry.make('rl', ROBOT).reach
+
+
+def test_a_file_of_parameters_for_a_controller_without_is_refused(module, tmp_path):
+    with pytest.raises(ParameterError, match='reads no parameter file'):
+        registry.make(f'{module}:MyController', ROBOT,
+                      ControllerOptions(parameters=tmp_path / 'tuned.yaml'))
+
+
+def test_two_of_one_name_do_not_fly_together(module, tmp_path):
+    with pytest.raises(ParameterError, match='both are called my_controller'):
+        registry.find_all(['nmpc', f'{module}:MyController', f'{module}.py:MyController'])
+
+
+def test_a_class_that_inherits_from_the_protocol_needs_no_constructor():
+    class Plain(Controller):
+        period = 0.01
+
+        def reset(self):
+            pass
+
+        def step(self, state, target):
+            return None
+
+    assert isinstance(entry_of(Plain, 'x:Plain').make(ROBOT), Plain)
+
+
+def test_what_step_gives_is_checked():
+    good = Command(0.0, np.zeros(4), np.ones(4))
+    assert checked('x', good) is good
+    for wrong, message in ((None, 'returned NoneType'), ((0, 1), 'returned tuple'),
+                           (Command(0.0, [0] * 4, np.ones(4)), 'tilt is no array'),
+                           (Command(0.0, np.zeros(4), np.ones(3)), r'thrust is of shape \(3,\)')):
+        with pytest.raises(ParameterError, match=message):
+            checked('x', wrong)
+
+
+def test_entry_points_of_other_packages_are_names(module, monkeypatch):
+    points = [metadata.EntryPoint('theirs', f'{module}:MyController', registry.GROUP),
+              metadata.EntryPoint('nmpc', f'{module}:MyController', registry.GROUP)]
+    monkeypatch.setattr(metadata, 'entry_points', lambda group: points)
+    monkeypatch.setattr(registry, '_points', registry._points.__wrapped__)
+    monkeypatch.setattr(registry, '_registered', registry._registered.__wrapped__)
+    assert 'theirs' in registry.names() and registry.names().count('nmpc') == 1
+    entry = registry.find('theirs')
+    assert (entry.name, entry.reference) == ('theirs', 'theirs')
+    assert registry.find('nmpc') is registry.SHIPPED['nmpc']    # stays the package's own
+
+
+def test_an_installed_package_brings_its_controllers(module, tmp_path):
+    info = tmp_path / 'theirs-0.1.dist-info'
+    info.mkdir()
+    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: theirs\nVersion: 0.1\n')
+    (info / 'entry_points.txt').write_text(
+        f'[{registry.GROUP}]\ntheirs = {module}:MyController\nbroken = {module}:None\n')
+    code = ('from beetle_omni_ros.control import registry\n'
+            'print(registry.names()[-2:], registry.find("theirs").description)\n')
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
+                          env={'PYTHONPATH': f'{tmp_path}:{ROOT}'}, check=False)
+    assert done.stdout == "['broken', 'theirs'] Holds still.\n", done.stderr
+
+
+def test_the_shipped_ones_are_entry_points_as_well():
+    text = (ROOT / PACKAGE / 'control' / 'shipped.py').read_text()
+    names = re.findall(r'^(\w+) = ControllerEntry\(', text, re.MULTILINE)   # as setup.py reads
+    assert names == list(registry.SHIPPED)
+    assert all(entry.name == name for name, entry in registry.SHIPPED.items())
+
+
+def test_names_of_nodes_and_controllers_do_not_meet():
+    nodes = {node.removesuffix('_node') for node in NODES}
+    assert nodes - set(registry.SHIPPED) <= set(RESERVED)
+    with pytest.raises(ParameterError, match='not usable as a name'):
+        ControllerEntry(name='My Controller', controller=object)
+
+
+def test_the_pilot_is_the_first_of_those_there_that_flies_with_actuators_missing():
+    assert registry.pilot() == 'nmpc'
+    assert registry.pilot(['rl', 'hover']) == 'hover'
+    assert registry.pilot(['rl']) == ''
+
+
+def names_together(path):
+    """Lines of a file that name several controllers, apart from docstrings."""
+    tree = ast.parse(path.read_text(encoding='utf-8'))
+    texts = {id(node.body[0].value) for node in ast.walk(tree)
+             if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and node.body
+             and isinstance(node.body[0], ast.Expr)}
+    known = set(registry.SHIPPED)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            together = set() if id(node) in texts else set(re.findall(r'\w+', node.value)) & known
+        else:
+            together = {part.value for part in ast.iter_child_nodes(node)
+                        if isinstance(part, ast.Constant) and isinstance(part.value, str)} & known
+        if len(together) > 1:
+            yield f'{path.relative_to(ROOT)}:{node.lineno}: {sorted(together)}'
+
+
+def test_no_other_list_of_controllers_is_left():
+    files = [*(ROOT / PACKAGE).rglob('*.py'), *(ROOT / 'launch').glob('*.py')]
+    found = [line for path in files for line in names_together(path)]
+    assert not found

@@ -1,0 +1,130 @@
+"""Any registered controller as a node: by name, by its class, in a whole graph."""
+
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+import rclpy
+from witness import HEADER, READY
+
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.nodes import plan
+from beetle_omni_ros.nodes.controller_node import ControllerNode
+from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.bag import read_bag
+from beetle_omni_ros.runs.topics import split_topic, topic_of, topics_with
+
+OWN = f"{Path(__file__).resolve().parents[2] / 'examples' / 'own_controller.py'}:PoseController"
+
+
+@pytest.fixture
+def make(ros_domain):
+    """Make one node of this process, with parameters."""
+    nodes = []
+
+    def build(node_class, *overrides):
+        arguments = [a for override in overrides for a in ('-p', override)]
+        rclpy.init(args=['--ros-args', *arguments], domain_id=ros_domain)
+        nodes.append(node_class())
+        return nodes[0]
+
+    yield build
+    for node in nodes:
+        node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def topics(node):
+    """Names that a node publishes."""
+    return [publisher.topic_name for publisher in node.publishers]
+
+
+def test_the_parameter_says_which_controller_a_node_runs(make):
+    node = make(ControllerNode, f'controller:={OWN}')
+    assert node.get_name() == 'pose_controller_node'
+    assert '/pose_controller/command' in topics(node)
+    assert node.get_parameter('controller').value == OWN
+    assert node._controller_status()[2] == {'guidance': 'none'}
+
+
+def test_a_shipped_one_comes_with_its_parameters_and_its_own_policy(make):
+    node = make(ControllerNode, 'controller:=rl_memory', 'unwinding.attempts:=0')
+    assert node.get_name() == 'rl_memory_node'
+    assert node.get_parameter('policy').value == registry.find('rl_memory').policy_file
+    assert node.get_parameter('unwinding.attempts').value == 0
+    assert node._controller_status()[2]['guidance'] == 'routing, turning, trimming'
+
+
+def test_the_supervisor_knows_those_that_it_is_told(make):
+    node = make(SupervisorNode, f"controllers:=['nmpc','{OWN}']", 'controller:=pose_controller')
+    assert node._supervisor.active == 'pose_controller'
+    assert node.get_parameter('controllers').value == ['nmpc', OWN]
+    refused, = node.set_parameters([rclpy.parameter.Parameter('controller', value='rl')])
+    assert not refused.successful and 'nmpc, pose_controller' in refused.reason
+
+
+def test_an_active_controller_that_the_supervisor_does_not_know_is_refused(make):
+    with pytest.raises(ParameterError, match="'controller': expected one of nmpc, rl, found 'x'"):
+        make(SupervisorNode, 'controller:=x')
+
+
+@pytest.mark.parametrize('override, message', [
+    ((), "'controller': missing"), (('-p', 'controller:=nmpx'), "'nmpx': expected one of nmpc"),
+    (('-p', 'controller:=absent.module:My'), "no module 'absent'"),
+    (('-p', f'controller:={OWN}Not'), 'its classes: PoseController')])
+def test_what_cannot_be_flown_ends_the_node_with_one_line(ros_domain, override, message):
+    done = subprocess.run(
+        [sys.executable, '-m', 'beetle_omni_ros.nodes.controller_node', '--ros-args', *override],
+        capture_output=True, text=True, timeout=60, check=False, env=dict(os.environ))
+    assert done.returncode == 2, done.stderr
+    line, = done.stderr.strip().splitlines()
+    assert line.startswith('controller_node: error: ') and message in line
+
+
+def test_the_plan_of_a_graph_with_another_controller():
+    nodes = plan.plan(plan.Wanted(controller=OWN, actuators='direct', bag='/b',
+                                  task='hover')).nodes
+    assert list(nodes) == ['recorder_node', 'sim_node', 'ekf_node', 'pose_controller_node',
+                           'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node']
+    assert nodes['pose_controller_node'] == {'controller': OWN}
+    assert nodes['supervisor_node']['controller'] == 'pose_controller'
+    known = ['pose_controller', *registry.standing_by()]
+    assert nodes['supervisor_node']['controllers'] == known
+    assert nodes['recorder_node']['controllers'] == known
+    assert plan.executable('pose_controller_node') == 'controller_node'
+    assert plan.arguments(nodes, ['ekf_node', 'pose_controller_node']) == ['ekf_node', OWN]
+    alone = plan.plan(plan.Wanted(controller=OWN, actuators='direct', standby=False)).nodes
+    assert list(alone) == ['sim_node', 'ekf_node', 'pose_controller_node', 'supervisor_node']
+
+
+def test_topics_of_any_controller_are_told_from_those_of_a_robot():
+    assert split_topic('/nmpc/command') == ('', 'nmpc/command')
+    assert split_topic('/robot1/rl/command') == ('/robot1', 'rl/command')
+    assert split_topic('/robot1/command') == ('/robot1', 'command')
+    assert split_topic('/own/command', ('',)) == ('', 'own/command')
+    assert split_topic('/robot1/own/command', ('/robot1',)) == ('/robot1', 'own/command')
+    assert split_topic('/robot1/command', ('/robot1',)) == ('/robot1', 'command')
+    assert topic_of('own/command') == topic_of('nmpc/command') == topics_with(['x'])['x/command']
+
+
+def test_a_class_of_a_file_flies_the_whole_graph_and_is_read_back(tmp_path):
+    task, bag, result = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'result.json'
+    task.write_text(HEADER + '0.3,0,1,20,0,30\n')
+    environment = dict(os.environ)
+    environment.pop('ROS_DOMAIN_ID', None)
+    done = subprocess.run(
+        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--controller', OWN, '--task', task,
+         '--clock', 'simulated', '--bag', bag, '--json', result],
+        capture_output=True, text=True, timeout=READY, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    results = json.loads(result.read_text())
+    assert results['pose_controller']['success_rate'] == 1.0
+    assert results['pose_controller']['guidance'] == 'none'
+    assert results['pose_controller']['compute_ms']['median'] > 0
+    log = read_bag(bag)
+    assert 'flying:pose_controller' in log.states and not log.warnings
+    assert set(log.requests) == {'pose_controller', *registry.standing_by()}

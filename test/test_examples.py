@@ -1,0 +1,151 @@
+"""Every example runs as its first lines say, and the public module does what it offers."""
+
+from dataclasses import replace
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import beetle_omni_ros
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.tasks import TaskError
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / 'examples'
+POSES = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0.5,0,1.2,60,0,30\n'
+SCREEN = 60     # lines
+
+
+@pytest.fixture(scope='module')
+def poses(tmp_path_factory):
+    """A pose file of one pose."""
+    path = tmp_path_factory.mktemp('examples') / 'poses.csv'
+    path.write_text(POSES)
+    return path
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory):
+    """Two short flights in a wind that the robot file does not know."""
+    windy = replace(beetle_omni_ros.robot(), effects={'wind': {'force': (1.2, -0.8, 0.0)}})
+    flown = [[0.8, 0.4, 1.2, 40, 20, 90], [-0.6, 0.8, 0.9, -30, 35, -120]]
+    folder = tmp_path_factory.mktemp('bags')
+    for k in range(2):
+        beetle_omni_ros.simulate('hover', flown, seed=k, plant=windy, bag=folder / f'flight{k}')
+    return [folder / f'flight{k}' for k in range(2)]
+
+
+def run(name, *arguments):
+    """Run an example and return what it prints."""
+    done = subprocess.run([sys.executable, EXAMPLES / name, *map(str, arguments)], cwd=ROOT,
+                          env={'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1',
+                               'PATH': '/usr/bin:/bin', 'HOME': str(Path.home())},
+                          capture_output=True, text=True, timeout=250, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_an_own_controller_flies_beside_the_nmpc(poses):
+    printed = run('own_controller.py', poses)
+    assert re.search(r'poses reached +1 of 1 +1 of 1', printed)
+    assert 'pose_controller' in printed and 'guidance' in printed
+
+
+def test_an_own_trajectory_is_followed_by_both_controllers():
+    printed = run('own_trajectory.py', 6)
+    errors = dict(re.findall(r'^(nmpc|rl): ([\d.]+) mm', printed, re.MULTILINE))
+    assert {'nmpc', 'rl'} == set(errors) and max(map(float, errors.values())) < 100
+
+
+def test_an_own_robot_flies_known_and_unknown(poses):
+    printed = run('own_robot.py', poses)
+    assert printed.startswith('3.4 kg') and 'unknown robot' in printed
+
+
+def test_a_bag_becomes_arrays(bags):
+    printed = run('read_bag.py', bags[0])
+    assert 'IMU samples' in printed and 'hover asked for' in printed
+    assert 'warning' not in printed
+
+
+def test_two_bags_tell_what_the_model_misses(bags):
+    printed = run('gap_two_bags.py', *bags)
+    before, after = re.search(r'gap ([\d.]+) before, ([\d.]+) after', printed).groups()
+    assert 'named' in printed and 'wind' in printed and float(after) < float(before)
+
+
+def test_each_example_is_a_screen_and_is_run_here():
+    text = Path(__file__).read_text()
+    for path in EXAMPLES.glob('*.py'):
+        assert len(path.read_text().splitlines()) <= SCREEN, path.name
+        assert f"'{path.name}'" in text, path.name
+
+
+def test_the_public_names_are_there_and_import_nothing_heavy():
+    assert set(beetle_omni_ros.__all__) >= {'robot', 'simulate', 'evaluate', 'read_run',
+                                            'find_gap'}
+    assert all(getattr(beetle_omni_ros, name).__doc__ for name in beetle_omni_ros.__all__)
+    code = ('import sys, beetle_omni_ros; '
+            'sys.exit(any(m in sys.modules for m in ("numpy", "casadi", "mujoco", "rich")))')
+    assert subprocess.run([sys.executable, '-c', code], env={'PYTHONPATH': str(ROOT)},
+                          check=False).returncode == 0
+
+
+def test_robot_reads_a_file_and_stays_a_room():
+    assert beetle_omni_ros.robot().mass == pytest.approx(3.0386)
+    heavy = beetle_omni_ros.robot(ROOT / 'params' / 'robot_weak_and_heavy.yaml')
+    assert heavy.mass == pytest.approx(3.19053)
+    from beetle_omni_ros.robot import rotations
+    assert beetle_omni_ros.robot.rotations is rotations
+    with pytest.raises(ParameterError, match='none.yaml'):
+        beetle_omni_ros.robot('none.yaml')
+
+
+class Still:
+    """Holds its rotors and joints as they are at hover."""
+
+    period = 0.01
+
+    def __init__(self, robot):
+        self.thrust = np.full(4, robot.hover_thrust)
+
+    def reset(self):
+        pass
+
+    def step(self, state, target):
+        return Command(state.stamp, np.zeros(4), self.thrust)
+
+
+def test_a_class_flies_under_its_own_name_and_may_be_defined_again():
+    log = beetle_omni_ros.simulate(Still, [[0, 0, 1, 0, 0, 0]])
+    assert log.meta['controller'] == 'still' and 'still' in log.requests
+    again = type('Still', (Still,), {})
+    assert beetle_omni_ros.evaluate(again, [[0, 0, 1, 0, 0, 0]], quiet=True)['still']['poses']
+    assert registry.find('still').controller is again
+    with pytest.raises(ParameterError, match="'nmpc' is a registered"):
+        beetle_omni_ros.simulate(type('X', (Still,), {'name': 'nmpc'}))
+
+
+def test_tasks_of_wrong_shape_are_refused():
+    with pytest.raises(TaskError, match=r'\(N, 6\)'):
+        beetle_omni_ros.simulate('hover', [[0, 0, 1]])
+    with pytest.raises(TaskError, match='at least 3'):
+        beetle_omni_ros.trajectory([0, 1], np.zeros((2, 3)), np.ones((2, 4)))
+
+
+def test_velocities_of_a_trajectory_are_those_of_its_motion():
+    times = np.arange(0, 2.001, 0.01)
+    angle = 0.7 * times
+    task = beetle_omni_ros.trajectory(
+        times, np.column_stack([np.sin(angle), np.cos(angle), 1 + 0 * angle]),
+        np.column_stack([0 * angle, 0 * angle, np.sin(angle / 2), np.cos(angle / 2)]))
+    target = task.segments[1].target(5.0)
+    middle = target.at(6.0)
+    assert np.allclose(middle.velocity, [0.7 * np.cos(0.7), -0.7 * np.sin(0.7), 0], atol=1e-4)
+    assert np.allclose(middle.angular_velocity, [0, 0, 0.7], atol=1e-6)
+    assert task.duration == pytest.approx(10.0)
