@@ -107,18 +107,18 @@ def test_robot_reads_a_file_and_stays_a_room():
 
 
 class Still:
-    """Holds its rotors and joints as they are at hover."""
+    """Holds its joints, and its rotors near hover: a command that never changes is refused."""
 
     period = 0.01
 
     def __init__(self, robot):
-        self.thrust = np.full(4, robot.hover_thrust)
+        self.thrust = robot.hover_thrust
 
     def reset(self):
         pass
 
     def step(self, state, target):
-        return Command(state.stamp, np.zeros(4), self.thrust)
+        return Command(state.stamp, np.zeros(4), np.full(4, self.thrust - state.velocity[2]))
 
 
 def test_a_class_flies_under_its_own_name_and_may_be_defined_again():
