@@ -15,7 +15,7 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag_reader import read_bag
 from beetle_omni_ros.runs.metrics import metrics
-from beetle_omni_ros.runs.tasks import make_task
+from beetle_omni_ros.runs.tasks import make_task, TaskError
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 ROBOT = RobotParameters.load()
@@ -153,3 +153,22 @@ def test_faults_of_a_file_strike_and_are_told(poses, tmp_path):
     assert 'fallback' in log.states
     assert log.meta['broken'] == results['hover']['crashed']
     assert not log.meta['broken'] or log.meta['impact']['speed'] > 1.0
+
+
+@pytest.mark.parametrize('reach', ['3.0', None])
+def test_a_task_beyond_the_reach_of_any_controller_is_refused_where_it_says_one(
+        tmp_path, monkeypatch, reach):
+    far, own = tmp_path / 'far.csv', tmp_path / 'own.py'
+    far.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,0\n4,0,1,0,0,0\n')
+    own.write_text('from beetle_omni_ros.control.hover import HoverController\n'
+                   'class Own(HoverController):\n'
+                   f'    name = "own"\n    {f"reach = {reach}" if reach else "pass"}\n')
+    task = make_task(str(far))
+    monkeypatch.setattr(loop.FlightLoop, 'fly', lambda *_: False)   # what is flown is no matter
+    if not reach:
+        assert command.fly(f'{own}:Own', task, robot=ROBOT, plant=ROBOT).meta['crashed']
+        return
+    with pytest.raises(TaskError, match='row 3: 4 m from the pose before, expected at most 3 m'):
+        evaluate(far, [f'{own}:Own'])
+    with pytest.raises(TaskError, match='pose 2: 4 m from the pose before, expected at most 3 m'):
+        command.fly(f'{own}:Own', task, robot=ROBOT, plant=ROBOT)

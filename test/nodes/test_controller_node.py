@@ -1,23 +1,29 @@
 """Any registered controller as a node: by name, by its class, in a whole graph."""
 
 import json
+import math
 import os
 from pathlib import Path
 import subprocess
 import sys
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import rclpy
 from witness import HEADER, READY
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.nodes import plan
+from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.nodes import convert, plan
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.topics import split_topic, topic_of, topics_with
 
+LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 OWN = f"{Path(__file__).resolve().parents[2] / 'examples' / 'own_controller.py'}:PoseController"
 
 
@@ -57,6 +63,26 @@ def test_a_shipped_one_comes_with_its_parameters_and_its_own_policy(make):
     assert node.get_parameter('policy').value == registry.find('rl_memory').policy_file
     assert node.get_parameter('unwinding.attempts').value == 0
     assert node._controller_status()[2]['guidance'] == 'routing, turning, trimming'
+
+
+def test_any_controller_sees_true_tilts_and_no_target_beyond_its_reach(make, monkeypatch):
+    node, seen = make(ControllerNode, f'controller:={OWN}'), []
+    controller = node._controller
+    step = controller.step
+    monkeypatch.setattr(controller, 'step', lambda state, target: seen.append(state) or step(
+        state, target))
+    health = ActuatorHealth(zeros=(0.1, 0.0, 0.0, -0.2))
+    node._on_actuators(SimpleNamespace(health=health))
+    node._on_joints(convert.Joints(1.0, np.zeros(4), np.zeros(4)))
+    node._on_odom(convert.Odom(1.0, np.array([0.0, 0.0, 1.0]), np.zeros(3), LEVEL,
+                               np.zeros(3)))
+    assert seen[0].tilt == pytest.approx(health.true(np.zeros(4))) and seen[0].tilt.any()
+    far = PoseTarget(np.array([9.0, 0.0, 1.0]), LEVEL, 1.0)
+    node._mode = node._own_mode
+    node._check_target(far, math.nan)       # it does not say how far it flies
+    controller.reach = 3.0
+    with pytest.raises(convert.MessageError, match='expected at most 3 m'):
+        node._check_target(far, math.nan)
 
 
 def test_the_supervisor_knows_those_that_it_is_told(make):

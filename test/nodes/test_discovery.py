@@ -3,10 +3,11 @@
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
-from beetle_omni_ros.nodes import discovery
+from beetle_omni_ros.nodes import discovery, plan
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -92,3 +93,24 @@ def test_a_graph_is_confined(tmp_path, unset, monkeypatch):
     monkeypatch.setattr(subprocess, 'Popen', lambda *_, env, **__: given.update(env))
     Graph({'ekf_node': {}}, tmp_path, 7).start_process('composed')
     assert given['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+
+
+@pytest.mark.parametrize('composed', [True, False])
+def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, unset, monkeypatch, composed):
+    monkeypatch.setenv(discovery.RANGE, 'LOCALHOST')        # put back afterwards
+    monkeypatch.setenv(discovery.OWN, '')
+    started = {}
+
+    def start(arguments, env, **_):
+        started[arguments[2]] = env[discovery.RANGE], arguments
+        return SimpleNamespace(poll=lambda: 0, returncode=0)
+
+    monkeypatch.setattr(subprocess, 'Popen', start)
+    monkeypatch.setattr(os.path, 'exists', lambda _: True)
+    discovery.confine(asked='subnet')
+    nodes = plan.plan(plan.Wanted(controller='hover', ports=str(tmp_path), task='hover',
+                                  bag=str(tmp_path / 'bag'))).nodes
+    graph = Graph(nodes, tmp_path, 7, composed)
+    graph.start()
+    assert len(graph.processes) == (2 if composed else len(nodes))
+    assert {told for told, _ in started.values()} == {'SUBNET'}
