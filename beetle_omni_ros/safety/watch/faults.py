@@ -10,6 +10,7 @@ from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.safety.watch.joints import JointWatch
 from beetle_omni_ros.safety.watch.mocap import MocapWatch
 from beetle_omni_ros.safety.watch.parameters import Detection
@@ -42,7 +43,8 @@ class FaultWatch:
     def __init__(self, parameters: Detection, robot: RobotParameters, allocator: Allocator):
         """See the class."""
         self._p, self._limit = parameters, robot.joints.position_limit
-        self._thrust_max = robot.rotors.thrust_max
+        self._thrust_max = self._limit_now = robot.rotors.thrust_max
+        self._map = ThrustMap(robot.rotors) if len(robot.rotors.map) > 1 else None
         self._wrench = WrenchWatch(parameters.rotor, parameters.contact, robot, allocator)
         self._contact = ContactWatch(parameters.contact, robot.gravity)
         self._joints = JointWatch(parameters.servo, robot)
@@ -77,6 +79,15 @@ class FaultWatch:
         news, self._new = self._new, []
         return news
 
+    def on_voltage(self, voltage: float) -> None:
+        """Take the pack's voltage [V]: a low one limits every rotor, which is no fault of one."""
+        if self._map is not None:
+            self._limit_now = self._map.thrust_limit_below(voltage)
+
+    def _possible(self, thrust):
+        """Thrusts (4,) [N] that the present voltage allows."""
+        return np.minimum(thrust, self._limit_now)
+
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                command: Command | None, height: float | None) -> None:
         """
@@ -92,7 +103,7 @@ class FaultWatch:
 
         """
         dt, self._stamp = stamp - self._stamp, stamp
-        thrust = np.zeros(ROTORS) if command is None else command.thrust
+        thrust = np.zeros(ROTORS) if command is None else self._possible(command.thrust)
         self._wrench.on_imu(stamp, force, rate, tilt, thrust, self.health)
         self._contact.update(min(max(dt, 0.0), 0.05), height, self._wrench)
         if height is not None and height < self._p.contact.near_ground:
@@ -112,7 +123,7 @@ class FaultWatch:
     def on_command(self, command: Command) -> None:
         """Take what goes out."""
         self._joints.on_command(command.stamp, command.tilt)
-        self._speeds.on_command(command.stamp, command.thrust)
+        self._speeds.on_command(command.stamp, self._possible(command.thrust))
 
     def on_joints(self, stamp: float, tilt: np.ndarray, trusted: bool) -> None:
         """
