@@ -158,6 +158,8 @@ class Inputs:
         if self.airborne and not self._agrees(stamp, position, quaternion):
             return False
         good = vehicle.backup.on_mocap(stamp, position, quaternion)
+        if good and self.airborne and vehicle.imu.silent:
+            self.watch.without_imu(stamp, position, self._height)
         if good:
             vehicle.mocap.heard()
         return good

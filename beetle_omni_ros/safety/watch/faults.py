@@ -19,6 +19,7 @@ from beetle_omni_ros.safety.watch.wrench import ContactWatch, WrenchWatch
 
 CRASH, DISPLACED = 'crash', 'mocap_jumped'
 BUILD_UP = 0.5          # [s] five time constants of a rotor
+RACES = 2.0             # [-] of the largest thrust: the speed of a motor without propeller
 NOTICEABLE = 0.3        # [N] by which the thrust of a rotor that obeys nobody may drift untold
 
 
@@ -104,6 +105,7 @@ class FaultWatch:
         """
         dt, self._stamp = stamp - self._stamp, stamp
         thrust = np.zeros(ROTORS) if command is None else self._possible(command.thrust)
+        self._wrench.supported = self._speeds.slow
         self._wrench.on_imu(stamp, force, rate, tilt, thrust, self.health)
         self._contact.update(min(max(dt, 0.0), 0.05), height, self._wrench)
         if height is not None and height < self._p.contact.near_ground:
@@ -162,6 +164,10 @@ class FaultWatch:
         model = self._joints.model
         return None if model is None else self.health.true(model)
 
+    def without_imu(self, stamp: float, position: np.ndarray, height: float | None) -> None:
+        """Look for a crash in a MoCap position (3,) [m], see :meth:`ContactWatch.on_pose`."""
+        self._contact.on_pose(stamp, np.asarray(position, dtype=float), height)
+
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                  attitude: np.ndarray | None, rate: np.ndarray | None,
                  place: np.ndarray | None = None, velocity: np.ndarray | None = None) -> bool:
@@ -194,6 +200,8 @@ class FaultWatch:
             return self._speeds.forget()
         if self._speeds.lost is not None:
             self._lose_rotor(self._speeds.lost, stamp, 'its ESC')
+        for rotor in np.flatnonzero(self._speeds.thrust > RACES * self._thrust_max):
+            self._lose_rotor(int(rotor), stamp, 'the speed at which it races')
         deaf = self._speeds.deaf
         if deaf is not None and self.health.rotors[deaf] \
                 and self._name(f'rotor{deaf + 1}_deaf', stamp, f'rotor {deaf + 1} does not follow '

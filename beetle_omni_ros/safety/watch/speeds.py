@@ -33,6 +33,7 @@ class SpeedWatch:
         lost: the rotor (0 to 3) that turns too slowly, or None.
         deaf: the rotor (0 to 3) whose speed does not follow its commands, or None.
         thrust: (4,) by the speeds [N], nan where unknown.
+        slow: (4,) bool, rotors that turn noticeably too slowly at the last report.
 
     """
 
@@ -53,6 +54,7 @@ class SpeedWatch:
         self.lost: int | None = None
         self.deaf: int | None = None
         self.thrust = np.full(ROTORS, np.nan)
+        self.slow = np.zeros(ROTORS, dtype=bool)
 
     def on_command(self, stamp: float, thrust: np.ndarray) -> None:
         """Take what the rotors were asked at ``stamp`` [s], (4,) [N]."""
@@ -97,6 +99,7 @@ class SpeedWatch:
         judged = np.isfinite(square) & (self._thrust > self._p.least_thrust)
         known = judged & (self._learnt_for >= LEARNT)
         slow = known & (self._factor * square < (1 - self._p.share) * self._thrust)
+        self.slow = known & (self._factor * square < (1 - self._p.noticed) * self._thrust)
         self._for = np.where(slow, self._for + dt, 0.0)
         self.lost = int(np.argmax(self._for)) if self._for.max() >= self._p.speed_time else None
         self.thrust = np.where(known, self._factor * square, np.nan)
@@ -122,4 +125,4 @@ class SpeedWatch:
             & (slope_times < self._p.least_slope * variance)
         self._deaf_for = np.where(deaf, self._deaf_for + dt, 0.0)
         self.deaf = int(np.argmax(self._deaf_for)) \
-            if self._deaf_for.max() >= self._p.speed_time else None
+            if self._deaf_for.max() >= self._p.deaf_time else None
