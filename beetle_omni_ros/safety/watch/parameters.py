@@ -59,6 +59,9 @@ class RotorLimits:
     least_variation: float = parameter(
         1.0, doc='standard deviation of the commanded thrust from which it is judged', unit='N',
         low=0.05, high=10)
+    excess: float = parameter(
+        3.0, doc='thrust beyond the commanded one, and beyond it by `share`, of a rotor that does '
+        'not follow', unit='N', low=0.1, high=20)
     deaf_time: float = parameter(0.3, doc='for this long', unit='s', low=0.005, high=5)
     least_slope: float = parameter(
         0.4, doc='slope below which a rotor does not follow its commands', low=0, high=1)
