@@ -83,7 +83,7 @@ class FlightLoop:
                        for name, c in controllers.items()}
         self._target: Target | None = None
         self._hold: Target | None = None
-        self._joints = self._battery = self._command = None
+        self._joints = self._battery = self._command = self._estimated = None
         self._ticks = 0
         self._state_name = self._told = ''
         self._health = ALL_WELL
@@ -191,7 +191,9 @@ class FlightLoop:
         now = frame.time
         self._sense(frame)
         estimate = self._estimator.estimate
-        if estimate is not None and self._joints is not None:
+        new = estimate is not None and estimate.stamp != self._estimated
+        if new and self._joints is not None:
+            self._estimated = estimate.stamp    # the estimator tells each estimate once
             state = processes.estimate(self._state(estimate))
             if state is not None:
                 self._answer(state, estimate, now)

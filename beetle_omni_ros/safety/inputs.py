@@ -158,6 +158,8 @@ class Inputs:
         if self.airborne and not self._agrees(stamp, position, quaternion):
             return False
         good = vehicle.backup.on_mocap(stamp, position, quaternion)
+        if good and self.airborne and vehicle.imu.silent:
+            self.watch.without_imu(stamp, position, self._height)
         if good:
             vehicle.mocap.heard()
         return good
@@ -179,6 +181,7 @@ class Inputs:
         if not (isfinite(voltage) and voltage >= 0):
             return False
         self.vehicle.voltage = float(voltage)
+        self.watch.on_voltage(self.vehicle.voltage)
         return True
 
     def on_actuators(self, name: str, text: str, now: float) -> bool:

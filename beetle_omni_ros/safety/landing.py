@@ -20,6 +20,7 @@ from beetle_omni_ros.safety.ramp import inclination, Ramp
 from beetle_omni_ros.safety.support import SupportGauge
 from beetle_omni_ros.safety.vehicle import Vehicle
 
+STILL = 1.0     # [s] without IMU: it should sink and does not
 AHEAD, BETWEEN = 20.0, 0.1      # [s] how far ahead, and how densely, a way is told
 
 
@@ -50,7 +51,7 @@ class Landing:
         self._allocator, self._floor = allocator, floor
         self._hover, self._gauge, self._vehicle, self._events = hover, gauge, vehicle, events
         self.grounded, self.given_up = False, ''
-        self._standing_for, self._blind_for = 0.0, 0.0
+        self._standing_for, self._still_for, self._blind_for = 0.0, 0.0, 0.0
         self._blind = False
         self._robot, self._health = robot, ALL_WELL
 
@@ -205,7 +206,8 @@ class Landing:
         sinking = reference.velocity[2] < -0.5 * p.speed
         stands = sinking and carried and (still or specific_force_up is not None)
         self._standing_for = self._standing_for + dt if stands else 0.0
-        self.grounded = self._standing_for >= p.ground_time - 1e-9
+        self._still_for = self._still_for + dt if blind and sinking and still else 0.0
+        self.grounded = self._standing_for >= p.ground_time - 1e-9 or self._still_for >= STILL
 
 
 class _Now:

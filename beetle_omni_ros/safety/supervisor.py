@@ -281,7 +281,8 @@ class Supervisor(Inputs):
         if self._beyond_limits(now) or self.state == LANDING:
             return
         if no_rotors:
-            self._land(now, ERROR, f'{no_rotors}: landing while it may follow')
+            self._land(now, ERROR, f'{no_rotors}: landing while it may follow',
+                       'rotor_bridge_lost')
             return
         if 'estimator_wrong' in self.faults and not vehicle.backup.running:
             self._land(now, ERROR, 'the estimate contradicts MoCap: controlled descent on raw '
@@ -289,22 +290,25 @@ class Supervisor(Inputs):
         elif vehicle.estimate.silent:
             why = f' (last refused: {vehicle.last_refusal})' if vehicle.last_refusal else ''
             self._land(now, ERROR, f'ekf_node {vehicle.estimate.text}{why}: controlled descent '
-                                   'on raw sensors')
+                                   'on raw sensors', 'estimator_lost')
         elif DISPLACED in self.faults:
             self._land(now, ERROR, 'the position of MoCap jumped: landing')
         elif vehicle.mocap_lost and vehicle.mocap.elapsed > self._parameters.state.mocap_patience:
-            self._land(now, ERROR, f'MoCap {vehicle.mocap.text}: landing by dead reckoning')
+            self._land(now, ERROR, f'MoCap {vehicle.mocap.text}: landing by dead reckoning',
+                       'mocap_lost')
         elif no_joints:
-            self._land(now, ERROR, f'{no_joints}: landing with the joints as they are')
+            self._land(now, ERROR, f'{no_joints}: landing with the joints as they are',
+                       'joint_bridge_lost')
         elif vehicle.joints.silent:
             self._land(now, ERROR, f'joint_bridge_node {vehicle.joints.text}: landing with the '
-                                   'joints assumed where they were commanded')
+                                   'joints assumed where they were commanded', 'joints_lost')
         elif vehicle.battery_empty:
-            self._land(now, ERROR, f'battery empty ({vehicle.voltage:.1f} V): landing')
+            self._land(now, ERROR, f'battery empty ({vehicle.voltage:.1f} V): landing',
+                       'battery_empty')
         elif vehicle.outside_fence and envelope.fence_reaction != 'none':
-            self._react(envelope.fence_reaction, now, 'left the fence')
+            self._react(envelope.fence_reaction, now, 'left the fence', 'fence_left')
         elif vehicle.lost and envelope.lost_reaction != 'none':
-            self._react(envelope.lost_reaction, now, 'tumbling or falling')
+            self._react(envelope.lost_reaction, now, 'tumbling or falling', 'control_lost')
 
     def _beyond_limits(self, now):
         """Limits that hold while landing and in fallback, too; whether one was passed."""
@@ -322,7 +326,7 @@ class Supervisor(Inputs):
             return True
         if self.state == FALLBACK and self._fallback_for > envelope.fallback_time:
             self._land(now, ERROR, f'{self.active}_node not good for '
-                                   f'{envelope.fallback_time:g} s: landing')
+                                   f'{envelope.fallback_time:g} s: landing', 'controller_lost')
             return True
         return False
 
@@ -330,9 +334,11 @@ class Supervisor(Inputs):
         if self._on_ground:
             self._motors_off(DISARMED, now, ERROR, f'{why}; still on the ground: motors off')
         else:
+            self.watch.name('rotor_bridge_lost', now, '')
             self.emergency_stop(now, why)
 
-    def _react(self, reaction, now, why):
+    def _react(self, reaction, now, why, name):
+        self.watch.name(name, now, '')
         if reaction == 'emergency_stop':
             self.emergency_stop(now, why)
         elif reaction == 'landing':
@@ -377,6 +383,7 @@ class Supervisor(Inputs):
             estimate = self.vehicle.estimate
             cause = f' (ekf_node {estimate.text} too)' if estimate.elapsed > 0.5 * estimate.limit \
                 else ''
+            self.watch.name('controller_silent', now, '')
             self._fall_back(now, ERROR, f'{self.active}_node {stream.complaint}{cause}: '
                                         'fallback to hover')
             return self._hold(now, dt)
@@ -415,7 +422,9 @@ class Supervisor(Inputs):
                                   state.quaternion, now)
         self._enter(FALLBACK, now, severity, text)
 
-    def _land(self, now, severity, text):
+    def _land(self, now, severity, text, name=''):
+        if name:
+            self.watch.name(name, now, '')
         if self._on_ground:
             return self._motors_off(DISARMED, now, severity, f'{text}; still on the ground: '
                                                              'motors off')

@@ -10,6 +10,7 @@ from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.safety.watch.joints import JointWatch
 from beetle_omni_ros.safety.watch.mocap import MocapWatch
 from beetle_omni_ros.safety.watch.parameters import Detection
@@ -18,6 +19,7 @@ from beetle_omni_ros.safety.watch.wrench import ContactWatch, WrenchWatch
 
 CRASH, DISPLACED = 'crash', 'mocap_jumped'
 BUILD_UP = 0.5          # [s] five time constants of a rotor
+RACES = 2.0             # [-] of the largest thrust: the speed of a motor without propeller
 NOTICEABLE = 0.3        # [N] by which the thrust of a rotor that obeys nobody may drift untold
 
 
@@ -42,7 +44,8 @@ class FaultWatch:
     def __init__(self, parameters: Detection, robot: RobotParameters, allocator: Allocator):
         """See the class."""
         self._p, self._limit = parameters, robot.joints.position_limit
-        self._thrust_max = robot.rotors.thrust_max
+        self._thrust_max = self._limit_now = robot.rotors.thrust_max
+        self._map = ThrustMap(robot.rotors) if len(robot.rotors.map) > 1 else None
         self._wrench = WrenchWatch(parameters.rotor, parameters.contact, robot, allocator)
         self._contact = ContactWatch(parameters.contact, robot.gravity)
         self._joints = JointWatch(parameters.servo, robot)
@@ -77,6 +80,15 @@ class FaultWatch:
         news, self._new = self._new, []
         return news
 
+    def on_voltage(self, voltage: float) -> None:
+        """Take the pack's voltage [V]: a low one limits every rotor, which is no fault of one."""
+        if self._map is not None:
+            self._limit_now = self._map.thrust_limit_below(voltage)
+
+    def _possible(self, thrust):
+        """Thrusts (4,) [N] that the present voltage allows."""
+        return np.minimum(thrust, self._limit_now)
+
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                command: Command | None, height: float | None) -> None:
         """
@@ -92,7 +104,8 @@ class FaultWatch:
 
         """
         dt, self._stamp = stamp - self._stamp, stamp
-        thrust = np.zeros(ROTORS) if command is None else command.thrust
+        thrust = np.zeros(ROTORS) if command is None else self._possible(command.thrust)
+        self._wrench.supported = self._speeds.slow
         self._wrench.on_imu(stamp, force, rate, tilt, thrust, self.health)
         self._contact.update(min(max(dt, 0.0), 0.05), height, self._wrench)
         if height is not None and height < self._p.contact.near_ground:
@@ -112,7 +125,7 @@ class FaultWatch:
     def on_command(self, command: Command) -> None:
         """Take what goes out."""
         self._joints.on_command(command.stamp, command.tilt)
-        self._speeds.on_command(command.stamp, command.thrust)
+        self._speeds.on_command(command.stamp, self._possible(command.thrust))
 
     def on_joints(self, stamp: float, tilt: np.ndarray, trusted: bool) -> None:
         """
@@ -151,6 +164,10 @@ class FaultWatch:
         model = self._joints.model
         return None if model is None else self.health.true(model)
 
+    def without_imu(self, stamp: float, position: np.ndarray, height: float | None) -> None:
+        """Look for a crash in a MoCap position (3,) [m], see :meth:`ContactWatch.on_pose`."""
+        self._contact.on_pose(stamp, np.asarray(position, dtype=float), height)
+
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                  attitude: np.ndarray | None, rate: np.ndarray | None,
                  place: np.ndarray | None = None, velocity: np.ndarray | None = None) -> bool:
@@ -183,6 +200,8 @@ class FaultWatch:
             return self._speeds.forget()
         if self._speeds.lost is not None:
             self._lose_rotor(self._speeds.lost, stamp, 'its ESC')
+        for rotor in np.flatnonzero(self._speeds.thrust > RACES * self._thrust_max):
+            self._lose_rotor(int(rotor), stamp, 'the speed at which it races')
         deaf = self._speeds.deaf
         if deaf is not None and self.health.rotors[deaf] \
                 and self._name(f'rotor{deaf + 1}_deaf', stamp, f'rotor {deaf + 1} does not follow '

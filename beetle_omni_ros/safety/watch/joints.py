@@ -58,6 +58,7 @@ class JointWatch:
         """Take a complete reading (4,) [rad] of the time ``stamp`` [s]."""
         dt = stamp - self._stamp
         if dt <= 0:
+            self.jump = np.zeros(ROTORS)
             return
         before, self._stamp = getattr(self, '_tilt', tilt), stamp
         self._tilt = tilt

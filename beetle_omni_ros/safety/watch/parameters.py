@@ -20,6 +20,9 @@ class ContactLimits:
     support: float = parameter(
         0.35, doc='force that the rotors do not explain, in weights: something carries it',
         low=0.05, high=2)
+    bump: float = parameter(
+        1.2, doc='change of the velocity by six MoCap poses, without an IMU', unit='m/s', low=0.1,
+        high=20)
     time: float = parameter(0.15, doc='for this long', unit='s', low=0.01, high=2)
     filter: float = parameter(0.03, doc='time constant of forces', unit='s', low=0.005, high=1)
 
@@ -39,10 +42,15 @@ class RotorLimits:
                                     high=100)
     least_evidence: float = parameter(
         3.0, doc='residual in standard deviations from which it is judged', low=1, high=1000)
-    time: float = parameter(0.05, doc='for this long', unit='s', low=0.005, high=1)
+    time: float = parameter(0.05, doc='for this long, where the ESC says so, too', unit='s',
+                            low=0.005, high=1)
+    time_alone: float = parameter(0.3, doc='for this long, by the wrench alone', unit='s',
+                                  low=0.005, high=2)
+    noticed: float = parameter(0.25, doc='part of the thrust missing by the ESC that supports it',
+                               low=0.05, high=1)
     slip: float = parameter(0.4, doc="angle between the true thrust and the encoder's",
                             unit='rad', low=0.05, high=3)
-    slip_time: float = parameter(0.1, doc='for this long', unit='s', low=0.005, high=1)
+    slip_time: float = parameter(0.3, doc='for this long', unit='s', low=0.005, high=1)
     speed_time: float = parameter(0.06, doc='for this long, by the ESC speed', unit='s', low=0.005,
                                   high=1)
     slope_window: float = parameter(
@@ -51,6 +59,10 @@ class RotorLimits:
     least_variation: float = parameter(
         1.0, doc='standard deviation of the commanded thrust from which it is judged', unit='N',
         low=0.05, high=10)
+    excess: float = parameter(
+        3.0, doc='thrust beyond the commanded one, and beyond it by `share`, of a rotor that does '
+        'not follow', unit='N', low=0.1, high=20)
+    deaf_time: float = parameter(0.3, doc='for this long', unit='s', low=0.005, high=5)
     least_slope: float = parameter(
         0.4, doc='slope below which a rotor does not follow its commands', low=0, high=1)
 

@@ -24,6 +24,7 @@ class SpeedWatch:
     A rotor that no longer answers is told by the slope of the measured over the modelled thrust,
     a regression over the last half second. It is 1 for a healthy rotor, its share for a weak one,
     and 0 for one that holds its thrust. It is judged where the modelled thrust has varied enough.
+    A rotor that gives clearly more than asked is told at once: neither lag nor weakness does that.
 
     Args:
         limits: thresholds.
@@ -33,6 +34,7 @@ class SpeedWatch:
         lost: the rotor (0 to 3) that turns too slowly, or None.
         deaf: the rotor (0 to 3) whose speed does not follow its commands, or None.
         thrust: (4,) by the speeds [N], nan where unknown.
+        slow: (4,) bool, rotors that turn noticeably too slowly at the last report.
 
     """
 
@@ -48,11 +50,12 @@ class SpeedWatch:
         self._thrust = np.zeros(ROTORS)
         self._factor = np.zeros(ROTORS)     # [N s^2/rad^2]
         self._learnt_for = np.zeros(ROTORS)
-        self._for, self._deaf_for = np.zeros(ROTORS), np.zeros(ROTORS)
+        self._for, self._deaf_for, self._more_for = np.zeros((3, ROTORS))
         self._sums = np.zeros((5, ROTORS))      # moments of modelled and measured thrust
         self.lost: int | None = None
         self.deaf: int | None = None
         self.thrust = np.full(ROTORS, np.nan)
+        self.slow = np.zeros(ROTORS, dtype=bool)
 
     def on_command(self, stamp: float, thrust: np.ndarray) -> None:
         """Take what the rotors were asked at ``stamp`` [s], (4,) [N]."""
@@ -60,7 +63,7 @@ class SpeedWatch:
 
     def forget(self) -> None:
         """Suspect no rotor."""
-        self._for, self._deaf_for = np.zeros(ROTORS), np.zeros(ROTORS)
+        self._for, self._deaf_for, self._more_for = np.zeros((3, ROTORS))
         self._sums[:] = 0.0
         self.lost = self.deaf = None
 
@@ -97,6 +100,7 @@ class SpeedWatch:
         judged = np.isfinite(square) & (self._thrust > self._p.least_thrust)
         known = judged & (self._learnt_for >= LEARNT)
         slow = known & (self._factor * square < (1 - self._p.share) * self._thrust)
+        self.slow = known & (self._factor * square < (1 - self._p.noticed) * self._thrust)
         self._for = np.where(slow, self._for + dt, 0.0)
         self.lost = int(np.argmax(self._for)) if self._for.max() >= self._p.speed_time else None
         self.thrust = np.where(known, self._factor * square, np.nan)
@@ -118,8 +122,10 @@ class SpeedWatch:
         count = np.where(full, weight, 1.0)
         variance = sum_xx / count - (sum_x / count) ** 2
         slope_times = sum_xy / count - sum_x * sum_y / count**2
+        more = known & (y > (1 + self._p.share) * x) & (y - x > self._p.excess)
+        self._more_for = np.where(more, self._more_for + dt, 0.0)
         deaf = full & (variance > self._p.least_variation**2) \
             & (slope_times < self._p.least_slope * variance)
         self._deaf_for = np.where(deaf, self._deaf_for + dt, 0.0)
-        self.deaf = int(np.argmax(self._deaf_for)) \
-            if self._deaf_for.max() >= self._p.speed_time else None
+        told = (self._deaf_for >= self._p.deaf_time) | (self._more_for >= self._p.speed_time)
+        self.deaf = int(np.argmax(told)) if told.any() else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from math import exp
 
 import numpy as np
@@ -12,6 +13,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.watch.parameters import ContactLimits, RotorLimits
 
 LONGEST = 0.05          # [s] between two IMU samples; a longer gap starts the filters anew
+AFTER_HIT = 1.0         # [s] after an impact in which a push is contact at any height
+SPAN, LONGEST_TRACK = 3, 0.12   # poses of either velocity; [s] of both
 USUAL = 1.0             # [s] over which a push that was there in the air is learnt
 
 
@@ -35,6 +38,7 @@ class WrenchWatch:
         lost: the rotor (0 to 3) that is missing, or None.
         slipped: (joint 0 to 3, true tilt less encoder [rad]) of a tilt that differs, or None.
         impact: largest specific force of the last sample beyond the rotors' reach [m/s^2], or 0.
+        supported: (4,) bool, rotors that their ESC says are slow, too; set by the caller.
         unexplained: (3,) filtered force that neither the rotors nor another vector of one of them
             explain, in base_link [m/s^2].
 
@@ -57,6 +61,7 @@ class WrenchWatch:
         """Begin anew, with rotors that stand still."""
         self._thrust = np.zeros(ROTORS)
         self._stamp = None
+        self.supported = np.zeros(ROTORS, dtype=bool)
         self._lost_for, self._slipped_for = np.zeros(ROTORS), np.zeros(ROTORS)
         self._filtered, self._vectors = np.zeros(6), np.zeros((ROTORS, 2))
         self.lost: int | None = None
@@ -133,7 +138,7 @@ class WrenchWatch:
                 self.unexplained = left[i][:3] / self._weights[:3]
         self._lost_for = self._counted(self._lost_for, lost, dt)
         self._slipped_for = self._counted(self._slipped_for, slipped, dt)
-        self.lost = self._first(self._lost_for >= p.time)
+        self.lost = self._first(self._lost_for >= np.where(self.supported, p.time, p.time_alone))
         joint = self._first(self._slipped_for >= p.slip_time)
         self.slipped = None if joint is None or not slipped[joint] else (joint, angle)
 
@@ -166,11 +171,15 @@ class ContactWatch:
 
     def reset(self) -> None:
         """Begin anew."""
-        self._for, self.reason, self._usual = 0.0, '', 0.0
+        self._for, self.reason, self._usual, self._since_hit = 0.0, '', 0.0, np.inf
+        self._track: deque = deque(maxlen=2 * SPAN + 1)
 
     def update(self, dt: float, height: float | None, wrench: WrenchWatch) -> None:
         """
         Take one IMU sample's verdict.
+
+        Near the ground an impact is enough, or a push. Elsewhere, where the height may be wrong,
+        it takes both: what hits something in the air and flies on is not pushed afterwards.
 
         Args:
             dt: since the one before [s].
@@ -179,13 +188,36 @@ class ContactWatch:
 
         """
         push = float(np.linalg.norm(wrench.unexplained)) / self._gravity
-        if height is not None and height > self._limits.near_ground:
+        near = height is None or height <= self._limits.near_ground
+        self._since_hit = 0.0 if wrench.impact else self._since_hit + dt
+        hit = self._since_hit < AFTER_HIT
+        if not near and not hit:
             self._for = 0.0
             self._usual += min(1.0, dt / USUAL) * (push - self._usual)
             return
-        if wrench.impact:
+        if wrench.impact and near:
             self.reason = f'impact of {wrench.impact:.0f} m/s^2'
-        carried = height is not None and push > self._limits.support + self._usual
+        carried = (height is not None or hit) and push > self._limits.support + self._usual
         self._for = self._for + dt if carried else 0.0
         if self._for >= self._limits.time and not self.reason:
             self.reason = f'{push:.1f} of the weight are carried by something else'
+
+    def on_pose(self, stamp: float, position: np.ndarray, height: float | None) -> None:
+        """
+        Look for a bump in MoCap alone, for want of an IMU.
+
+        Args:
+            stamp: [s].
+            position: (3,) in world [m].
+            height: as in :meth:`update`.
+
+        """
+        track = self._track
+        track.append((stamp, position))
+        if len(track) < track.maxlen or track[-1][0] - track[0][0] > LONGEST_TRACK:
+            return
+        (t, a), (u, b), (v, c) = track[0], track[SPAN], track[-1]
+        change = float(np.linalg.norm((c - b) / (v - u) - (b - a) / (u - t)))
+        if height is not None and height <= self._limits.near_ground \
+                and change > self._limits.bump:
+            self.reason = f'velocity changed by {change:.1f} m/s at once'
