@@ -73,6 +73,9 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
     """
     console = console or Console()
     try:
+        if (discovery or '').strip().upper() == 'OFF':
+            raise ParameterError('--discovery OFF: the nodes of a flight would not find each '
+                                 'other; expected LOCALHOST, SUBNET or SYSTEM_DEFAULT')
         confine(asked=discovery)
         with ExitStack() as stack:
             stack.enter_context(terminable())

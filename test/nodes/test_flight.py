@@ -250,6 +250,7 @@ def test_an_interrupt_stops_every_process(tmp_path, arrangement):
     ('controller', 'hoover', "controller 'hoover': expected one of nmpc, rl, rl_memory"),
     ('clock', 'sundial', "clock 'sundial': expected auto or system or simulated"),
     ('actuators', 'strings', "actuators 'strings': expected emulated or direct"),
+    ('discovery', 'off', '--discovery OFF: the nodes of a flight would not find each other'),
 ])
 def test_unusable_input_is_refused_before_anything_starts(capsys, argument, value, named):
     from beetle_omni_ros.nodes.fly import run_fly
