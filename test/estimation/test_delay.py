@@ -71,7 +71,8 @@ def test_latency_hidden_in_the_stamps_of_the_imu_is_found_and_bridged(age):
     assert np.linalg.norm(ekf.estimate.position - truth['position'][0]) < 0.004
     assert np.linalg.norm(error[:3]) > 0.5 * age * np.linalg.norm(truth['velocity'][0])
 
-    trusting = replace(parameters, initial=replace(parameters.initial, time_offset_std=0.0))
+    trusting = replace(parameters, initial=replace(parameters.initial, time_offset_std=0.0),
+                       doubt=replace(parameters.doubt, poses=1000))    # it follows the poses else
     blind = run(ErrorStateEkf(trusting, GRAVITY), flight)
     assert (np.linalg.norm(blind.estimate.position - truth['position'][0])
             > 3 * np.linalg.norm(ekf.estimate.position - truth['position'][0]))

@@ -150,7 +150,7 @@ def test_faults_of_a_file_strike_and_are_told(poses, tmp_path):
     assert results['meta']['faults'] == told
     log = read_bag(tmp_path / 'bag')
     assert log.meta['faults'] == told
-    assert 'fallback' in log.states
+    assert 'fallback:controller_silent' in log.states
     assert log.meta['broken'] == results['hover']['crashed']
     assert not log.meta['broken'] or log.meta['impact']['speed'] > 1.0
 

@@ -88,7 +88,8 @@ def test_twenty_switches_at_random_moments_of_random_poses(flights):
     assert [name for _, name in flown] == ['flying:nmpc'] + [
         f'flying:{name}' for _, name in recorder.switched]
     assert np.allclose([t for t, _ in flown[1:]], [t for t, _ in recorder.switched], atol=0.011)
-    assert not {'fallback', 'landing', 'emergency_stop'} & set(log.states)
+    assert not {'fallback', 'landing', 'emergency_stop'} & {
+        state.partition(':')[0] for state in log.states}
     assert all(pose['reached'] for pose in metrics(log, task)['poses'])
     # What is executed is what the selected controller asked for, once it has caught up: the time
     # of a hand-over counts in stamps and ends with the command that crosses it.
@@ -142,9 +143,9 @@ def test_answers_that_are_no_numbers_end_in_hover_and_good_ones_fly_again(tmp_pa
     log = fly_poses(tmp_path, broken, 1.0, 1.6, 1.1)
     assert not log.meta['crashed']
     assert [name for name in log.states if name not in ('disarmed', 'takeoff')] == [
-        'flying:rl', 'fallback', 'flying:rl']
+        'flying:rl', 'fallback:controller_silent', 'flying:rl']
     begin, fell = log.state_t[log.states.index('flying:rl')], \
-        log.state_t[log.states.index('fallback')]
+        log.state_t[log.states.index('fallback:controller_silent')]
     up = log.truth_t > begin
     assert log.truth_position[up, 2].min() > 0.8
     # within the supervisor's patience of the first refusal, and on the second target
