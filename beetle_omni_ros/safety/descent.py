@@ -136,6 +136,11 @@ class BackupEstimator:
                 self._use(stamp, force, rate)
 
     @property
+    def last_position(self) -> np.ndarray | None:
+        """(3,) of the latest MoCap pose in world [m], None before the first."""
+        return self._poses[-1][1] if self._poses else None
+
+    @property
     def velocity_by_poses(self) -> np.ndarray | None:
         """(3,) in world by the poses of the last 0.1 s alone [m/s], None where there are none."""
         if not self._poses:

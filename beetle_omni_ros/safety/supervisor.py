@@ -256,8 +256,12 @@ class Supervisor(Inputs):
     def _look_down(self, now, dt):
         """Whether it lies on the floor; what waited in the queues during a pause is older."""
         self._resuming -= dt
-        height = self._height
-        if height is not None and height < self._parameters.detection.contact.near_ground:
+        # The estimate may have lost its way in a fall; MoCap has not.
+        heights = [self._height]
+        if not self.vehicle.mocap.silent and self.vehicle.backup.last_position is not None:
+            heights.append(float(self.vehicle.backup.last_position[2]) - self._floor)
+        near = self._parameters.detection.contact.near_ground
+        if any(height is not None and height < near for height in heights):
             self._resuming = 0.0
             self._crash(now, 'on the floor after the pause')
 
