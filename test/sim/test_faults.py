@@ -315,7 +315,7 @@ def test_files_of_one_flight(tmp_path):
     assert faults[0] == Fault('rotor_stops', 3.0, 2.0, rotor=2)
     assert [(fault.kind, fault.at) for fault in faults[1:3]] == [
         ('servo_bus_lost', 4.0), ('servo_limp', 4.0)]
-    assert faults[-1] == Fault('rotor_stops', 1.0, 0.1, rotor=1)
+    assert faults[-1] == Fault('rotor_stops', 1.0, 0.03, rotor=1)
 
 
 @pytest.mark.parametrize(('text', 'named'), [
