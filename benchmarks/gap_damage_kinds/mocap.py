@@ -36,6 +36,15 @@ def mocap_centimetres(bag, random, other):
     bag.put(MOCAP, bag.values(MOCAP) * [1e2, 1e2, 1e2, 1, 1, 1, 1])
 
 
+@damage('MoCap positions with 30 mm of white noise', MOCAP,
+        causes=['noise|nois|scatter'])
+def mocap_noisy(bag, random, other):
+    """Every position."""
+    pose = bag.values(MOCAP).copy()
+    pose[:, :3] += random.normal(0.0, 0.03, (len(pose), 3))
+    bag.put(MOCAP, pose)
+
+
 @damage('MoCap repeats its last pose, with new stamps, for a seventh of the flight', MOCAP,
         causes=['freez|froze|stuck|repeat|constant|stale|not change|unchang|same|stands? still'],
         scope=FIRST)

@@ -70,6 +70,13 @@ def stale(made):
     return made
 
 
+def noisy(made, topic, columns, deviation):
+    made.values[topic] = made.values[topic].copy()
+    made.values[topic][:, :columns] += np.random.default_rng(0).normal(
+        0, deviation, (len(made.values[topic]), columns))
+    return made
+
+
 def reordered(made):
     order = np.arange(len(made.times[POSE]))
     for k in range(10, len(order) - 10, 20):
@@ -213,6 +220,8 @@ KINDS = {
     'joints in counts': (lambda m: columns(m, JOINTS, 0, 4, lambda v: 2048 + v * 4096
                                            / (2 * np.pi)), JOINTS, ['counts'], None),
     'one joint frozen': (lambda m: frozen(m, JOINTS, 8.5, 24, 1), JOINTS, ['frozen'], 8.5),
+    'MoCap noisy': (lambda m: noisy(m, POSE, 3, 0.03), POSE, ['scatters'], None),
+    'encoders noisy': (lambda m: noisy(m, JOINTS, 4, 0.1), JOINTS, ['scatters'], None),
     'tilts commanded in degrees': (lambda m: columns(m, COMMAND, 0, 4, np.rad2deg), COMMAND,
                                    ['degrees'], None),
     'thrusts in millinewtons': (lambda m: columns(m, COMMAND, 4, 8, lambda v: 1e3 * v), COMMAND,

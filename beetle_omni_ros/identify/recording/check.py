@@ -8,7 +8,7 @@ from beetle_omni_ros.identify.recording.conventions import convention_damages
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.identify.recording.lags import lag_damages
 from beetle_omni_ros.identify.recording.limits import RecordingLimits, shipped
-from beetle_omni_ros.identify.recording.readings import reading_damages
+from beetle_omni_ros.identify.recording.readings import noise_damages, reading_damages
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 MOST_REPAIRS = 6        # one after the other, each of which can uncover the next
@@ -35,7 +35,7 @@ def damages(recording: Recording, robot: RobotParameters,
     found = clock_damages(recording, limits)
     found += reading_damages(recording, limits, {damage.topic for damage in found})
     return found or lag_damages(recording, limits) \
-        or convention_damages(recording, robot, limits)
+        or convention_damages(recording, robot, limits) or noise_damages(recording, limits)
 
 
 def repaired(recording: Recording, robot: RobotParameters,

@@ -75,6 +75,9 @@ class RecordingLimits:
         low=0, unit='m', doc='Largest distance between two MoCap readings.')
     unit_length: float = parameter(
         low=0, unit='1', doc='Largest deviation of a quaternion norm from 1.')
+    scatter: np.ndarray = parameter(shape=(5,), unit='',
+        doc='Largest white noise of specific force [m/s^2], rate [rad/s], MoCap position [m] and '
+        'orientation [rad], and encoders [rad].')
     edge: float = parameter(
         low=0, unit='Hz', doc='Low-pass edge of what two sensors are compared by.')
     least_motion: np.ndarray = parameter(shape=(3,), unit='',

@@ -17,6 +17,7 @@ AXES = {'imu/data_raw': [f'linear_acceleration.{a}' for a in 'xyz']
         'mocap/pose': [f'position.{a}' for a in 'xyz'] + [f'orientation.{a}' for a in 'xyzw'],
         'joint_states': [f'position of gimbal{k}' for k in range(1, 5)]}
 LEAST_CLIPPED = 10      # readings
+DIFFERENCED = 20**0.5   # deviation of the third difference of white noise: 1 + 9 + 9 + 1
 MOST_REPAIRED = 0.02    # of a topic's readings: more outliers are no few bad readings
 
 
@@ -46,6 +47,40 @@ def reading_damages(recording: Recording, limits: RecordingLimits,
                 found[topic] = damage
                 break
     return list(found.values())
+
+
+def noise_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
+    """
+    Sensors that scatter more than any of their kind, at most one fault a topic.
+
+    The third difference of even readings removes smooth motion. Of white noise it has 20 times the
+    variance; its median does not care for single steps.
+
+    Args:
+        recording: whose units and axes are right: in millimetres every sensor is noisy.
+        limits: of a sound recording.
+
+    """
+    force, rate, place, turn, tilt = limits.scatter
+    found = []
+    for topic, most, units in (
+            ('imu/data_raw', [force] * 3 + [rate] * 3, ['m/s^2'] * 3 + ['rad/s'] * 3),
+            ('mocap/pose', [place] * 3 + [turn] * 4, ['m'] * 3 + ['rad'] * 4),
+            ('joint_states', [tilt] * 4, ['rad'] * 4)):
+        series = _Series(recording, topic)
+        values = series.values.copy()
+        if topic == 'mocap/pose':
+            values[:, 3:] = 2 * _aligned(values[:, 3:])     # [rad] of small turns
+        if len(values) < 20:
+            continue
+        scatter = NORMAL * np.median(np.abs(np.diff(values, 3, axis=0)), axis=0) / DIFFERENCED
+        k = int(np.argmax(scatter / most))
+        if scatter[k] > most[k]:
+            found.append(series.damage(
+                f'{AXES[topic][k]} scatters by {scatter[k]:.2g} {units[k]}, and such a sensor by '
+                f'{most[k]:.2g} at most: a noisy sensor, a wrong calibration, or a bad view of '
+                'the markers'))
+    return found
 
 
 class _Series:
