@@ -11,7 +11,8 @@ from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.spikes import SpikeFilter
 from beetle_omni_ros.safety.actuators import Actuators
-from beetle_omni_ros.safety.events import EventLog, WARNING
+from beetle_omni_ros.safety.events import EventLog, INFO, WARNING
+from beetle_omni_ros.safety.limits import JUMP
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.selection import Selection
 from beetle_omni_ros.safety.vehicle import Vehicle
@@ -71,8 +72,9 @@ class Inputs:
         """Check one command of one controller; False when it is refused (and counted)."""
         reason = self._selection.offer(controller, command, now)
         if reason:
-            self._say(now, WARNING, f'{controller}_node: command refused: {reason}',
-                      f'{controller}: {reason}')
+            # A step to a new target jumps once; one that goes on jumping is silent: an error.
+            self._say(now, INFO if reason == JUMP else WARNING,
+                      f'{controller}_node: command refused: {reason}', f'{controller}: {reason}')
         return not reason
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
