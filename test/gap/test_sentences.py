@@ -7,6 +7,7 @@ import pytest
 
 from beetle_omni_ros.identify.gap.results import grids, headline, parameters
 from beetle_omni_ros.identify.gap.sentence import summary
+from beetle_omni_ros.robot.effects import CATALOGUE
 
 
 def effect(names, value, interval, file, unit='N s/m', **member):
@@ -73,3 +74,16 @@ def test_no_interval_holds_what_cannot_be(name, deviation, expected):
     entry, parameter = name.split('.')
     found = parameters(a, entry, (name,), {name: deviation}, ROBOT)[parameter]
     assert found['interval'] == pytest.approx(expected) and found['file'] == 0.0
+
+
+@pytest.mark.parametrize('name', CATALOGUE)
+def test_every_entry_states_each_of_its_parameters(name):
+    own = {key.name: key for key in KEYS.values() if key.effect == name}
+    member = 1 if CATALOGUE[name].each else None
+    free = tuple(key for key in own if member is None or key.endswith(f'[{member - 1}]')) or \
+        tuple(own)
+    a = SimpleNamespace(keys=KEYS, widths=dict.fromkeys(own, 0.1))
+    stated = parameters(a, name, free, dict.fromkeys(own, 0.0), ROBOT)
+    assert list(stated) == list(CATALOGUE[name].parameters)
+    for entry in stated.values():
+        assert set(entry) == {'value', 'unit', 'file', 'interval'}

@@ -101,9 +101,9 @@ def parameters(a: Analysis, name: str, free: tuple[str, ...], theta: dict[str, f
         keys = [key for key in own if key.parameter == parameter
                 and (not member or key.name in free)]
         values = [key.value(theta.get(key.name, 0.0)) for key in keys]
-        own = [key.base for key in keys]
+        bases = [key.base for key in keys]
         entry = {'value': values if len(values) > 1 else values[0], 'unit': spec.unit,
-                 'file': own if len(own) > 1 else own[0]}
+                 'file': bases if len(bases) > 1 else bases[0]}
         if with_intervals:
             widths = [key.width(theta.get(key.name, 0.0), a.widths.get(key.name, 0.0))
                       if key.name in free else 0.0 for key in keys]
