@@ -45,9 +45,12 @@ def test_a_second_signal_does_not_cut_the_clean_up_short():
 
 
 def test_a_signal_while_a_flight_that_is_over_is_cleaned_up_waits():
+    cleaned = False
     with terminable(), undisturbed():
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.01)
+        cleaned = True
+    assert cleaned
 
 
 @pytest.mark.parametrize('moment', ['start', 'flight'])
