@@ -75,11 +75,10 @@ class ControllerNode(FlightNode):
         self.listen(JointState, 'command', CommandSource(self).read, self._on_command, qos.COMMAND,
                     stale_after=None)
         # Latched by those who follow INTERFACES, volatile from a quick tool: both are heard.
-        for profile in (qos.LATCHED, qos.EVENT):
-            self.listen(PoseStamped, 'target_pose', targets.pose_target, self._on_target,
-                        profile, stale_after=None, published=True, check=self._check_target)
+        self.listen(PoseStamped, 'target_pose', targets.pose_target, self._on_target,
+                    None, stale_after=None, published=True, check=self._check_target)
         self.listen(MultiDOFJointTrajectory, 'target_trajectory', targets.trajectory_target,
-                    self._on_target, qos.EVENT, stale_after=None, published=True,
+                    self._on_target, None, stale_after=None, published=True,
                     check=self._check_target)
         self.create_subscription(String, 'supervisor/state', self._on_mode, qos.LATCHED)
         self.listen(MultiDOFJointTrajectory, 'supervisor/target', targets.wished_target,

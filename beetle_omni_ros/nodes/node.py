@@ -10,6 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from beetle_omni_ros.nodes import arrival, convert, instance, parameters, qos
+from beetle_omni_ros.nodes.every_offer import EveryOffer
 from beetle_omni_ros.nodes.health import Health
 
 # A stamp this far ahead of the clock comes from another clock.
@@ -73,7 +74,7 @@ class FlightNode(Node):
         return self.now() if self.simulated else time.monotonic()
 
     def listen(self, message_type: type, topic: str, read: Callable, handle: Callable,
-               profile: QoSProfile = qos.SENSOR, max_age: float | None = None,
+               profile: QoSProfile | None = qos.SENSOR, max_age: float | None = None,
                stale_after: float | None = 0.5, published: bool = False,
                check: Callable | None = None) -> None:
         """
@@ -84,7 +85,8 @@ class FlightNode(Node):
             topic: relative name.
             read: message -> dataclass with a ``stamp``; raises MessageError.
             handle: called with the dataclass.
-            profile: quality of service.
+            profile: quality of service; None: whatever publishers offer, see
+                :class:`~beetle_omni_ros.nodes.every_offer.EveryOffer`.
             max_age: refuse stamps older than this, or ahead of the clock [s]; None: any.
             stale_after: silence that is an error, once the topic came [s]; None: none.
             published: pass the time of publication [s, system time, or nan] to ``check`` and
@@ -108,6 +110,10 @@ class FlightNode(Node):
             health.received(topic, age)
             handle(value, *publication)
 
+        if profile is None:
+            EveryOffer(self, message_type, topic, callback if published else
+                       lambda message, _: callback(message))
+            return
         taken = arrival.with_publication(callback) if published else callback
         self.create_subscription(message_type, topic, taken, profile)
 

@@ -11,6 +11,7 @@ from rosbags.interfaces import QosDurability
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.nodes import health, qos, runner
+from beetle_omni_ros.nodes.every_offer import EveryOffer
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.runs.bag import BagError, BagWriter
@@ -26,6 +27,8 @@ OWN_TOPICS = {'reference/state': STATE, 'joint_bridge/state': STATE, 'rotor_brid
               'supervisor/actuators': Topic('sensor_msgs/msg/JointState', LATCHED_TOPIC),
               'supervisor/target': Topic('trajectory_msgs/msg/MultiDOFJointTrajectory',
                                          LATCHED_TOPIC)}
+
+TARGETS = 'target_pose', 'target_trajectory'    # of anybody, however they are published
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,16 +59,19 @@ class RecorderNode(FlightNode):
         self._failure = None
         prefix = self.get_namespace().rstrip('/') + '/'
         for name, topic in {**topics, **OWN_TOPICS}.items():
+            kind, write = _message_class(topic.type), self._writer(prefix + name, topic.type)
+            if name in TARGETS:
+                EveryOffer(self, kind, name, write, depth=50, raw=True, on_lost=self._on_lost)
+                continue
             latched = topic.qos.durability == QosDurability.TRANSIENT_LOCAL
             self.create_subscription(
-                _message_class(topic.type), name, self._writer(prefix + name, topic.type),
-                qos.LATCHED_LOG if latched else qos.LOG, raw=True,
+                kind, name, write, qos.LATCHED_LOG if latched else qos.LOG, raw=True,
                 event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
         self.health.report('bag', self._bag_status)
         self.create_timer(FLUSH_PERIOD, self._flush, clock=self.steady_clock)
 
     def _writer(self, topic, message_type):
-        def write(data):
+        def write(data, _=None):
             if self._failure:
                 return
             try:

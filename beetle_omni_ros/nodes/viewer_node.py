@@ -58,7 +58,7 @@ class ViewerNode(FlightNode):
         self.listen(JointState, 'command', convert.command, self._keep('_command'), qos.SENSOR,
                     stale_after=None)
         self.listen(PoseStamped, 'target_pose', targets.pose_target, self._keep('_target'),
-                    qos.LATCHED, stale_after=None)
+                    None, stale_after=None)
         self.create_timer(1 / given.rate, self._draw, clock=self.steady_clock)
 
     def _changed(self, new):

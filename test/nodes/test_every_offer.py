@@ -1,0 +1,91 @@
+"""Targets are heard once, however they are published, and nobody warns of their offers."""
+
+import time
+
+from geometry_msgs.msg import PoseStamped
+import pytest
+import rclpy
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from beetle_omni_ros.nodes import qos, runner
+from beetle_omni_ros.nodes.recorder_node import RecorderNode
+from beetle_omni_ros.runs.bag import read_bag
+
+BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+SOON = 10       # s
+
+
+class Bench:
+    """A recorder, and a user who publishes targets to it."""
+
+    def __init__(self, domain, bag):
+        rclpy.init(args=['--ros-args', '-p', f'bag:={bag}'], domain_id=domain)
+        self.recorder, self.user = RecorderNode(), rclpy.create_node('user')
+        self.executor = runner.make_executor()
+        self.executor.add_node(self.recorder)
+        self.executor.add_node(self.user)
+        self.incompatible = []
+
+    def spin(self, seconds):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def publisher(self, profile):
+        return self.user.create_publisher(
+            PoseStamped, 'target_pose', profile, event_callbacks=PublisherEventCallbacks(
+                incompatible_qos=self.incompatible.append))
+
+    def written(self):
+        return self.recorder._bag.counts['/target_pose']
+
+    def publish(self, publisher, height):
+        """Publish when somebody listens; wait until it is written."""
+        before, end = self.written(), time.monotonic() + SOON
+        message = PoseStamped()
+        message.pose.position.z, message.pose.orientation.w = height, 1.0
+        while not publisher.get_subscription_count() and time.monotonic() < end:
+            self.spin(0.05)
+        publisher.publish(message)
+        while self.written() == before and time.monotonic() < end:
+            self.spin(0.05)
+        return self.written() - before
+
+
+@pytest.fixture
+def bench(ros_domain, tmp_path):
+    made = Bench(ros_domain, tmp_path / 'bag')
+    yield made
+    made.recorder.destroy_node()
+    made.user.destroy_node()
+    rclpy.try_shutdown()
+
+
+def test_a_volatile_target_is_recorded_without_an_incompatible_offer(bench, tmp_path):
+    assert bench.publish(bench.publisher(qos.EVENT), 1.25) == 1
+    bench.spin(1.2)     # two looks at what is offered
+    assert not bench.incompatible
+    bench.recorder.close()
+    log = read_bag(tmp_path / 'bag')
+    assert [target.position[2] for target in log.targets] == [1.25]
+    assert log.targets[0].stamp == pytest.approx(time.time(), abs=60)   # unstamped: as it came
+
+
+def test_a_latched_target_of_before_is_recorded(bench):
+    publisher = bench.publisher(qos.LATCHED)
+    publisher.publish(PoseStamped())        # nobody can listen yet
+    end = time.monotonic() + SOON
+    while not bench.written() and time.monotonic() < end:
+        bench.spin(0.05)
+    bench.spin(0.5)
+    assert bench.written() == 1 and not bench.incompatible
+
+
+@pytest.mark.parametrize('profile', [qos.EVENT, qos.LATCHED, BEST_EFFORT])
+def test_each_target_is_recorded_once_whatever_is_offered(bench, profile):
+    publisher = bench.publisher(profile)
+    bench.spin(1.2)     # the subscriptions that it needs are there
+    assert [bench.publish(publisher, height) for height in (1.0, 1.1, 1.2)] == [1, 1, 1]
+    bench.spin(0.3)
+    assert bench.written() == 3
