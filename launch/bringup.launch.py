@@ -36,6 +36,7 @@ ARGUMENTS = {
     'policy': ('', None, 'policy (ONNX) for rl_node; empty: the shipped one'),
     'task': ('', None, 'task for reference_node; empty: targets come from elsewhere'),
     'record': ('', None, 'folder for a bag; empty: no recording'),
+    'compression': ('none', ['none', 'zstd'], 'of the chunks in the bag'),
     'allow_other_robot': ('false', ['true', 'false'],
                           'fly a policy that was trained for other robot parameters'),
     'namespace': ('', None, 'namespace of every node and topic'),
@@ -71,8 +72,8 @@ def wanted(given):
         seed=int(given['seed']),
         **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
         **{key: given[key] for key in (
-            'actuators', 'autostart', 'conditions', 'controller', 'motor_board_file',
-            'plant_file', 'policy', 'robot_file', 'servo_bus_file', 'task')})
+            'actuators', 'autostart', 'compression', 'conditions', 'controller',
+            'motor_board_file', 'plant_file', 'policy', 'robot_file', 'servo_bus_file', 'task')})
 
 
 def recorded_topics(namespace, controllers):
@@ -107,7 +108,9 @@ def actions(context):
     if given['record'] and 'recorder_node' not in nodes:
         controllers = nodes['supervisor_node'].get('controllers', ())
         processes.append(ExecuteProcess(
-            cmd=['ros2', 'bag', 'record', '-s', 'mcap', '-o', given['record'],
+            cmd=['ros2', 'bag', 'record', '-s', 'mcap', '-o', given['record'], *(
+                     ['--storage-preset-profile', 'zstd_fast']
+                     if given['compression'] == 'zstd' else []),
                  *recorded_topics(given['namespace'], controllers)], output='screen'))
     if given['composed'] == 'true':
         processes += [composed(plan.arguments(nodes, names), {name: nodes[name] for name in names},

@@ -10,6 +10,7 @@ import typer
 
 from beetle_omni_ros.cli.options import (
     check_flight,
+    CompressionOption,
     CONDITIONS,
     ConditionsOption,
     ControllerOption,
@@ -31,6 +32,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 def fly(bag: Annotated[Path, typer.Option(
             '--bag', metavar='DIR', help='New folder for the recorded bag.')],
+        compression: CompressionOption = 'none',
         controller: ControllerOption = DEFAULT,
         task: TaskOption = 'waypoints',
         conditions: ConditionsOption = 'nominal',
@@ -64,15 +66,16 @@ def fly(bag: Annotated[Path, typer.Option(
     Takes off, flies the task, lands, records a bag and prints the result table.
     Example: beetle_omni fly --controller nmpc --task waypoints --bag my_flight
     """
-    check_flight(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
-                 files=(robot, plant, policy))
+    check_flight(task=task, seed=seed, conditions=conditions, bag=bag, compression=compression,
+                 json_path=json_path, files=(robot, plant, policy))
     from beetle_omni_ros.nodes.fly import FlightError, run_fly
     try:
-        code = run_fly(controller=controller, task=task, bag=bag, seed=seed,
-                       conditions=conditions, actuators=actuators, clock=clock, robot=robot,
-                       plant=plant, policy=policy, allow_other_robot=allow_other_robot,
-                       standby=standby, composed=composed, json_path=json_path,
-                       domain_id=domain_id, discovery=discovery)
+        code = run_fly(controller=controller, task=task, bag=bag, compression=compression,
+                       seed=seed, conditions=conditions, actuators=actuators, clock=clock,
+                       robot=robot, plant=plant, policy=policy,
+                       allow_other_robot=allow_other_robot, standby=standby,
+                       composed=composed, json_path=json_path, domain_id=domain_id,
+                       discovery=discovery)
     except FlightError as error:
         raise typer.Exit(fail(error, FAILED)) from None
     raise typer.Exit(code if isinstance(code, int) else 0)
@@ -95,6 +98,7 @@ def evaluate(controllers: Annotated[str, typer.Option(
              bag: Annotated[Optional[Path], typer.Option(
                  '--bag', metavar='DIR', help='New folder for the bag; with several controllers '
                                               'it holds one bag for each.')] = None,
+             compression: CompressionOption = 'none',
              faults: Annotated[Optional[Path], typer.Option(
                  '--faults', metavar='FILE', help='What fails, when and for how long (YAML, see '
                                                   'docs/faults.md).')] = None,
@@ -117,14 +121,14 @@ def evaluate(controllers: Annotated[str, typer.Option(
                                  f"among {', '.join(names)}")
         if file:
             options[name] = replace(options[name], **{key: file})
-    check_flight(task=task, seed=seed, conditions=conditions, bag=bag, json_path=json_path,
-                 files=(robot, plant, nmpc_file, policy, faults))
+    check_flight(task=task, seed=seed, conditions=conditions, bag=bag, compression=compression,
+                 json_path=json_path, files=(robot, plant, nmpc_file, policy, faults))
     from beetle_omni_ros.evaluation.command import run_evaluate
     from beetle_omni_ros.evaluation.loop import FlightError
     try:
         run_evaluate(controllers=names, task=task, conditions=conditions, robot=robot,
-                     plant=plant, seed=seed, bag=bag, json_path=json_path, faults=faults,
-                     options=options)
+                     plant=plant, seed=seed, bag=bag, compression=compression, json_path=json_path,
+                     faults=faults, options=options)
     except FlightError as error:
         raise typer.Exit(fail(error, FAILED)) from None
 

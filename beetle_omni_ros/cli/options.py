@@ -42,6 +42,8 @@ OtherRobotOption = Annotated[bool, typer.Option(
 DiscoveryOption = Annotated[Optional[str], typer.Option(
     '--discovery', metavar='LOCALHOST|SUBNET|OFF|SYSTEM_DEFAULT',
     help='Who can find the nodes. Default: programs of this computer alone.')]
+CompressionOption = Annotated[str, typer.Option(
+    '--compression', metavar='none|zstd', help='Of the chunks in the bag.')]
 JsonOption = Annotated[Optional[Path], typer.Option(
     '--json', metavar='FILE', help='Write the results there as JSON.')]
 
@@ -52,7 +54,7 @@ def fail(error: Exception | str, status: int) -> int:
     return status
 
 
-def check_flight(*, task, seed, conditions, bag, json_path, files):
+def check_flight(*, task, seed, conditions, bag, compression, json_path, files):
     """Refuse unusable input before anything long starts."""
     from beetle_omni_ros.runs.json_file import check_writable
     from beetle_omni_ros.runs.tasks import make_task
@@ -66,4 +68,4 @@ def check_flight(*, task, seed, conditions, bag, json_path, files):
         check_writable(json_path)
     if bag:
         from beetle_omni_ros.runs.bag import check_new
-        check_new(bag)
+        check_new(bag, compression)

@@ -42,8 +42,8 @@ from beetle_omni_ros.sim.simulator import Simulator
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,
         conditions: str = 'nominal', seed: int = 0,
         options: Mapping[str, ControllerOptions] = MappingProxyType({}),
-        bag: Path | None = None, meta: dict | None = None, faults: Sequence[Fault] = (),
-        progress=lambda part: None) -> FlightLog:
+        bag: Path | None = None, compression: str = 'none', meta: dict | None = None,
+        faults: Sequence[Fault] = (), progress=lambda part: None) -> FlightLog:
     """
     Fly one task with one controller; see :func:`run_evaluate` for the arguments.
 
@@ -67,8 +67,8 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
     with ExitStack() as stack:
         recorder = memory
         if bag is not None:
-            writer = stack.enter_context(BagWriter(bag, meta=meta, topics=tuple(
-                topics_with([name]))))
+            writer = stack.enter_context(BagWriter(
+                bag, meta=meta, topics=tuple(topics_with([name])), compression=compression))
             recorder = Tee(memory, writer)
         estimator = EkfParameters.load()
         supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
@@ -89,6 +89,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
 def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 'nominal',
                  robot: Path | None = None, plant: Path | None = None, seed: int = 0,
                  bag: Path | None = None, json_path: Path | None = None,
+                 compression: str = 'none',
                  options: Mapping[str, ControllerOptions] = MappingProxyType({}),
                  faults: Path | None = None, console: Console | None = None) -> dict:
     """
@@ -102,6 +103,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
         plant: file that is true in the simulation; default ``robot``.
         seed: of the task's poses and of everything random in the simulation.
         bag: folder for a bag; with several controllers, one bag for each inside it.
+        compression: of the bags, 'none' or 'zstd'.
         json_path: file for the results.
         options: controller -> files in place of its own.
         faults: file of what fails, when since the task's start and how long; by default nothing.
@@ -143,7 +145,8 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             bar = bars.add_task(f'{name}: {task}, {conditions}', total=1.0)
             folder = bag / name if bag and len(controllers) > 1 else bag
             log = fly(entry.reference, flown, robot=believed, plant=true, conditions=conditions,
-                      seed=seed, options=options, bag=folder, meta=meta, faults=struck,
+                      seed=seed, options=options, bag=folder, compression=compression,
+                      meta=meta, faults=struck,
                       progress=lambda part, bar=bar: bars.update(bar, completed=part))
             results[name] = metrics_of_runs.metrics(log, flown)
             if log.meta['ended']:

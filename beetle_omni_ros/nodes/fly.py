@@ -35,7 +35,8 @@ CLOCKS = {'auto': ('system', 'simulated'), 'system': ('system',), 'simulated': (
 
 
 def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
-            bag: Path | None = None, seed: int = 0, conditions: str = 'nominal',
+            bag: Path | None = None, compression: str = 'none',
+            seed: int = 0, conditions: str = 'nominal',
             actuators: str | None = None,
             clock: str = 'auto', robot: Path | None = None, plant: Path | None = None,
             policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
@@ -49,6 +50,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         controller: the active one: a name, or where its class is.
         task: name or pose file.
         bag: folder to create; None: the bag is thrown away.
+        compression: of the bag, 'none' or 'zstd'.
         seed: of the task and the simulation.
         conditions: 'nominal' or 'published'.
         actuators: 'emulated': through drivers, serial ports and emulated devices; 'direct':
@@ -93,7 +95,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                 allow_other_robot=allow_other_robot, robot_file=_absolute(robot),
                 plant_file=_absolute(plant), conditions=conditions, seed=int(seed),
                 task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
-                actuators='direct', ports=str(folder))
+                compression=compression, actuators='direct', ports=str(folder))
             for name, reason in plan(wanted).left_out.items():
                 _tell(console, f'{name} does not stand by: {reason}')
             controller = registry.find(controller).name

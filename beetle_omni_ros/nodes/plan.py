@@ -48,6 +48,7 @@ class Wanted:
         conditions, seed: of the simulation.
         task: for reference_node; '' for targets from elsewhere.
         bag: folder for recorder_node; '' for no recording.
+        compression: of the bag, 'none' or 'zstd'.
         viewer: whether viewer_node runs.
 
     """
@@ -68,6 +69,7 @@ class Wanted:
     seed: int = 0
     task: str = ''
     bag: str = ''
+    compression: str = 'none'
     viewer: bool = False
 
 
@@ -105,7 +107,8 @@ def plan(wanted: Wanted) -> Plan:
         'controllers': [active, *registry.standing_by()]}
     bridges = _bridges(wanted, believed)
     table = (
-        ('recorder_node', wanted.bag, {'bag': wanted.bag, **others}),
+        ('recorder_node', wanted.bag, {'bag': wanted.bag, 'compression': wanted.compression,
+                                       **others}),
         ('sim_node', wanted.simulated, {
             **true, 'conditions': wanted.conditions, 'seed': wanted.seed,
             **bridges.get('sim_node', {})}),

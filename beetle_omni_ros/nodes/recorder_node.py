@@ -15,6 +15,7 @@ from beetle_omni_ros.nodes.every_offer import EveryOffer
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.runs.bag import BagError, BagWriter
+from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS
 from beetle_omni_ros.runs.topics import LATCHED as LATCHED_TOPIC
 from beetle_omni_ros.runs.topics import SENSOR as SENSOR_TOPIC
 from beetle_omni_ros.runs.topics import Topic, topics_with
@@ -39,6 +40,8 @@ class RecorderNodeParameters:
     controllers: NAMES = parameter(
         tuple(registry.standing_by()), read_only=True,
         doc='whose requests are recorded beside the rest: registered names')
+    compression: str = parameter('none', choices=COMPRESSIONS, read_only=True,
+                                 doc='of the chunks in the MCAP file')
 
 
 class RecorderNode(FlightNode):
@@ -52,7 +55,8 @@ class RecorderNode(FlightNode):
         topics = topics_with(self.parameters.controllers)
         try:
             self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
-                                  topics=tuple(topics))
+                                  topics=tuple(topics),
+                                  compression=self.parameters.compression)
         except BagError as error:
             raise ParameterError(f"key 'bag': {error}") from None
         self._written = self._lost = 0

@@ -8,18 +8,16 @@ import os
 from pathlib import Path
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import WriterError
 import yaml
 
 from beetle_omni_ros.control.base import Target
 from beetle_omni_ros.robot.yaml_file import read_yaml
 from beetle_omni_ros.runs import messages
 from beetle_omni_ros.runs.bag_reader import BagError, META_KEY, read_bag, read_messages
-from beetle_omni_ros.runs.chunk_index import ChunkIndex
 from beetle_omni_ros.runs.log import COMPUTE_KEYS
+from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS, JazzyWriter
 from beetle_omni_ros.runs.topics import EVENT, Topic, topic_of, TOPICS
-
-BAG_VERSION = 9  # of metadata.yaml, as Jazzy writes it
 
 
 class BagWriter:
@@ -34,7 +32,7 @@ class BagWriter:
     keeps_covariances = True
 
     def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
-                 topics: Sequence[str] = tuple(TOPICS)):
+                 topics: Sequence[str] = tuple(TOPICS), compression: str = 'none'):
         """
         Create the folder and the bag in it.
 
@@ -43,20 +41,20 @@ class BagWriter:
             meta: what is known of the flight: task, conditions, seed, robot, version.
             namespace: of the topics, '' or e.g. '/robot1'.
             topics: names to declare, see :func:`~beetle_omni_ros.runs.topics.topic_of`.
+            compression: of the chunks in the file, 'none' or 'zstd'.
 
         Raises:
-            BagError: the folder exists or cannot be made.
+            BagError: the folder exists or cannot be made; unknown compression.
 
         """
         self.path = Path(path)
         self.meta: dict = {}
         self._connections: dict[str, Connection] = {}
         self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
-        self._writer = _open(self.path)
-        self._index = self._writer.storage.chunks = ChunkIndex(self.path)
+        self._writer = _open(self.path, compression)
         for name in topics:
             self._declare(self._prefix + name, topic_of(name))
-        self._last_t = 0.0
+        self._last_t = None      # [s] of the newest message
         if meta:
             self.write_meta(meta)
 
@@ -118,7 +116,9 @@ class BagWriter:
             if msgtype not in messages.TYPESTORE.types:
                 raise BagError(f'{self.path}: topic {topic} has the unknown type {msgtype}')
             connection = self._declare(topic, Topic(msgtype, EVENT))
-        self._last_t = t
+        first, self._last_t = self._last_t is None, t
+        if first and self.meta:     # with a time of the flight
+            self._tell_meta()
         try:
             self._writer.write(connection, max(0, messages.nanoseconds(t)), data)
         except OSError as error:
@@ -150,12 +150,14 @@ class BagWriter:
             writer.close()
         except OSError as error:
             raise BagError(f'{self.path}: {error.strerror}') from error
-        finally:
-            self._index.close()
 
     def write_meta(self, meta: dict) -> None:
         """Add to what is known of the flight; also in the bag itself, for a cut-off one."""
         self.meta.update(meta)
+        if self._last_t is not None:
+            self._tell_meta()
+
+    def _tell_meta(self):
         self.write_diagnostic(self._last_t, f'recorder_node: {messages.RUN_STATUS}', self.meta)
 
     def write_truth(self, t, position, quaternion, velocity, angular_velocity) -> None:
@@ -221,14 +223,17 @@ class BagWriter:
         self.write('diagnostics', messages.diagnostic(t, name, values, level, message), t)
 
 
-def check_new(path: str | Path) -> None:
+def check_new(path: str | Path, compression: str = 'none') -> None:
     """
-    Refuse a folder into which a bag cannot be written, before the flight.
+    Refuse a bag that cannot be written, before the flight.
 
     Raises:
-        BagError: it exists, or its nearest existing parent is no writable folder.
+        BagError: the folder exists, or its nearest existing parent is no writable folder;
+            unknown compression.
 
     """
+    if compression not in COMPRESSIONS:
+        raise BagError(f"compression '{compression}': expected {' or '.join(COMPRESSIONS)}")
     path = Path(path)
     if path.exists() or path.is_symlink():
         raise BagError(f'{path}: exists already; a bag needs a new folder')
@@ -239,10 +244,10 @@ def check_new(path: str | Path) -> None:
         raise BagError(f'{path}: no permission to write in {parent}')
 
 
-def _open(path):
-    check_new(path)
+def _open(path, compression):
+    check_new(path, compression)
     try:
-        writer = Writer(path, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP)
+        writer = JazzyWriter(path, compression)
         writer.open()
     except (OSError, WriterError) as error:
         reason = getattr(error, 'strerror', None) or error

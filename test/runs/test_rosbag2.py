@@ -1,0 +1,159 @@
+"""Bags are what ``ros2 bag record`` of Jazzy writes: metadata, type hashes, compression."""
+
+from importlib.util import find_spec
+import json
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+from synthetic_flights import fly
+import yaml
+
+from beetle_omni_ros import cli
+from beetle_omni_ros.runs.bag import BagError, BagWriter, read_bag
+from beetle_omni_ros.runs.tasks import make_task
+
+INTERFACES = Path(sys.prefix) / 'share'     # of the message packages, where ROS is of PyPI
+# RIHS01 of std_msgs/msg/String in Jazzy, as every one of its installations has it.
+STRING = 'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'
+
+
+def record(folder, compression='none'):
+    with BagWriter(folder, {'task': 'hover'}, compression=compression) as writer:
+        fly(writer, make_task('hover'), duration=2.0, start=1.7e9)
+    return folder
+
+
+@pytest.fixture(scope='module')
+def plain(tmp_path_factory):
+    return record(tmp_path_factory.mktemp('plain') / 'flight')
+
+
+@pytest.fixture(scope='module')
+def packed(tmp_path_factory):
+    return record(tmp_path_factory.mktemp('packed') / 'flight', 'zstd')
+
+
+def information(bag):
+    return yaml.safe_load((bag / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+
+
+def test_metadata_has_the_fields_of_version_9_and_names_jazzy(plain):
+    found = information(plain)
+    assert set(found) == {
+        'version', 'storage_identifier', 'duration', 'starting_time', 'message_count',
+        'topics_with_message_count', 'compression_format', 'compression_mode',
+        'relative_file_paths', 'files', 'custom_data', 'ros_distro'}
+    assert (found['version'], found['storage_identifier'], found['ros_distro']) \
+        == (9, 'mcap', 'jazzy')
+    assert set(found['files'][0]) == {'path', 'starting_time', 'duration', 'message_count'}
+    assert found['files'][0]['path'] == found['relative_file_paths'][0]
+    assert (plain / found['relative_file_paths'][0]).is_file()
+    assert found['starting_time']['nanoseconds_since_epoch'] >= 1_699_999_999 * 10**9
+    topics = {entry['topic_metadata']['name']: entry['topic_metadata']
+              for entry in found['topics_with_message_count']}
+    state = topics['/supervisor/state']
+    assert set(state) == {'name', 'type', 'serialization_format', 'offered_qos_profiles',
+                          'type_description_hash'}
+    forever = {'sec': 9223372036, 'nsec': 854775807}
+    assert state['offered_qos_profiles'] == [{
+        'history': 'keep_last', 'depth': 1, 'reliability': 'reliable',
+        'durability': 'transient_local', 'deadline': forever, 'lifespan': forever,
+        'liveliness': 'automatic', 'liveliness_lease_duration': forever,
+        'avoid_ros_namespace_conventions': False}]
+    assert state['type_description_hash'] == STRING
+    assert topics['/imu/data_raw']['offered_qos_profiles'][0]['reliability'] == 'best_effort'
+
+
+def test_the_file_alone_carries_the_same_metadata_and_hashes(plain):
+    with next(plain.glob('*.mcap')).open('rb') as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().profile == 'ros2'
+        channels = {c.topic: c.metadata for c in reader.get_summary().channels.values()}
+        record, = (r for r in reader.iter_metadata() if r.name == 'rosbag2')
+    inside = yaml.safe_load(record.metadata['serialized_metadata'])
+    outside = information(plain)
+    assert inside == outside
+    for entry in outside['topics_with_message_count']:
+        topic = entry['topic_metadata']
+        own = channels[topic['name']]
+        assert own['topic_type_hash'] == topic['type_description_hash']
+        assert yaml.safe_load(own['offered_qos_profiles']) == topic['offered_qos_profiles']
+
+
+@pytest.mark.skipif(not (INTERFACES / 'std_msgs/msg/String.json').is_file(),
+                    reason='no message packages in this environment')
+def test_type_hashes_are_those_of_the_installed_message_packages(plain):
+    for entry in information(plain)['topics_with_message_count']:
+        topic = entry['topic_metadata']
+        described = json.loads((INTERFACES / f"{topic['type']}.json").read_text())
+        hashes = {one['type_name']: one['hash_string'] for one in described['type_hashes']}
+        assert topic['type_description_hash'] == hashes[topic['type']], topic['type']
+
+
+@pytest.mark.parametrize('kind', ['plain', 'packed'])
+def test_rosbags_and_mcap_read_every_message(kind, request):
+    bag = request.getfixturevalue(kind)
+    counts = {entry['topic_metadata']['name']: entry['message_count']
+              for entry in information(bag)['topics_with_message_count']}
+    with Reader(bag) as reader:
+        assert {c.topic: c.msgcount for c in reader.connections} == counts
+    with AnyReader([bag]) as reader:
+        decoded = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages()]
+    assert len(decoded) == sum(counts.values())
+    with next(bag.glob('*.mcap')).open('rb') as stream:
+        found = list(make_reader(stream, decoder_factories=[DecoderFactory()])
+                     .iter_decoded_messages())
+    assert len(found) == sum(counts.values())
+
+
+def test_compressed_bags_hold_the_same_in_half_the_space(plain, packed):
+    size = {bag: next(bag.glob('*.mcap')).stat().st_size for bag in (plain, packed)}
+    assert size[packed] < 0.5 * size[plain]
+    with next(packed.glob('*.mcap')).open('rb') as stream:
+        assert {c.compression for c in make_reader(stream).get_summary().chunk_indexes} == {'zstd'}
+    # rosbag2 names the compression of whole files and of messages here, not that of chunks.
+    assert information(packed)['compression_format'] == ''
+    assert information(packed)['compression_mode'] == ''
+    mine, theirs = read_bag(plain), read_bag(packed)
+    assert mine.odom_position.tobytes() == theirs.odom_position.tobytes()
+    assert mine.imu_t.tobytes() == theirs.imu_t.tobytes()
+
+
+def test_an_unknown_compression_is_refused_before_the_flight(tmp_path, capsys):
+    with pytest.raises(BagError, match=r"compression 'lz5': expected none or zstd"):
+        BagWriter(tmp_path / 'bag', compression='lz5')
+    assert cli.main(['evaluate', '--bag', str(tmp_path / 'bag'), '--compression', 'gzip']) == 2
+    assert "compression 'gzip': expected none or zstd" in capsys.readouterr().err
+    assert not (tmp_path / 'bag').exists()
+
+
+@pytest.mark.parametrize('kind', ['plain', 'packed'])
+@pytest.mark.skipif(find_spec('rosbag2_py') is None, reason='no rosbag2_py in this environment')
+def test_rosbag2_itself_reads_every_message(kind, request):
+    import rosbag2_py
+    bag = request.getfixturevalue(kind)
+    reader = rosbag2_py.SequentialReader()
+    reader.open(rosbag2_py.StorageOptions(uri=str(bag), storage_id='mcap'),
+                rosbag2_py.ConverterOptions('', ''))
+    count = 0
+    while reader.has_next():
+        reader.read_next()
+        count += 1
+    assert count == information(bag)['message_count']
+
+
+@pytest.mark.skipif(not shutil.which('ros2') or find_spec('ros2bag') is None,
+                    reason='no `ros2 bag` in this environment')
+def test_ros2_bag_tells_and_plays(packed):
+    told = subprocess.run(['ros2', 'bag', 'info', str(packed)], capture_output=True, text=True,
+                          timeout=60, check=True).stdout
+    assert '/imu/data_raw' in told and 'mcap' in told
+    subprocess.run(['ros2', 'bag', 'play', '--rate', '10', str(packed)], capture_output=True,
+                   timeout=60, check=True)
