@@ -30,8 +30,9 @@ fly: setup  ## fly the waypoints in real time through ROS nodes; the bag lands i
 test: setup-train  ## the whole test suite
 	@.ci/test $(ARGS)
 
-lint: setup  ## style of every Python file
+lint: setup  ## style of every Python file, types of the core
 	@.venv/bin/ruff check .
+	@.venv/bin/python -m mypy
 
 docs: setup  ## reference pages from the code, then the site with all links checked; to build/site/
 	@.venv/bin/python -c 'import material' 2>/dev/null || \
@@ -62,5 +63,5 @@ report: setup  ## one HTML page about the runs in runs_out/ (or RUNS='DIR...')
 	mkdir -p runs_out; $(TOOL) report $$runs --output runs_out/report.html $(ARGS)
 
 clean:  ## remove the environment and what builds and tools leave; keeps runs_out/
-	rm -rf .venv build install log dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv build install log dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

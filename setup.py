@@ -112,6 +112,7 @@ DOCS = [
 DEVELOPMENT = [
     *TEST,
     'colcon-common-extensions>=0.3',
+    'mypy>=1.15,<3',
     'ruff>=0.9',
 ]
 

@@ -1,4 +1,4 @@
-"""Every Python file keeps the style of pyproject.toml."""
+"""Every Python file keeps the style of pyproject.toml, and the core its types."""
 
 import importlib.util
 import os
@@ -22,4 +22,12 @@ def test_ruff_has_nothing_to_say():
     done = subprocess.run([*ruff, 'check', '--no-cache', '--output-format', 'concise', str(ROOT)],
                           cwd=ROOT, capture_output=True, text=True, check=False, timeout=60,
                           env={**os.environ, 'NO_COLOR': '1'})
+    assert done.returncode == 0, f'{done.stdout}\n{done.stderr}'
+
+
+def test_mypy_has_nothing_to_say():
+    if not importlib.util.find_spec('mypy'):
+        pytest.skip('mypy is not installed')
+    done = subprocess.run([sys.executable, '-m', 'mypy', '--no-color-output'], cwd=ROOT,
+                          capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 0, f'{done.stdout}\n{done.stderr}'

@@ -27,8 +27,8 @@ class FunctionCall:
         if library is None:
             self._buffer, self._evaluate = function.buffer()
             for i, array in enumerate(self._arguments):
-                self._buffer.set_arg(i, memoryview(array))
-            self._buffer.set_res(0, memoryview(self._result))
+                self._buffer.set_arg(i, array.data)
+            self._buffer.set_res(0, self._result.data)
             return
         count = len(self._arguments)
         self._pointers = (_POINTERS * count)(*[a.ctypes.data_as(_POINTERS)

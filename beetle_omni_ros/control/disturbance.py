@@ -17,7 +17,7 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.control.call import FunctionCall
-from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -34,7 +34,8 @@ class DisturbanceEstimator:
 
     Args:
         robot: what the controller believes.
-        parameters: of the controller.
+        parameters: bandwidths and limits.
+        command_delay: from a command to the actuators [s].
         advance: :func:`dynamics.integrator` of the robot.
 
     Attributes:
@@ -42,11 +43,12 @@ class DisturbanceEstimator:
 
     """
 
-    def __init__(self, robot: RobotParameters, parameters: NmpcParameters, advance: FunctionCall):
+    def __init__(self, robot: RobotParameters, parameters: DisturbanceParameters,
+                 command_delay: float, advance: FunctionCall):
         """See the class."""
         self._robot, self._advance = robot, advance
-        self._delay = parameters.model.command_delay
-        p = parameters.disturbance
+        self._delay = command_delay
+        p = parameters
         self._limit = np.r_[np.full(3, p.force_limit), np.full(3, p.torque_limit),
                             np.full(4, p.tilt_limit)]
         # bandwidth times inertia: turns a velocity error of one step into a change of force

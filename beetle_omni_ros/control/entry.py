@@ -283,10 +283,10 @@ def entry_of(found: Any, spec: str, name: str = '') -> ControllerEntry:
     named = own.get('name', '')
     period = getattr(found, 'period', PERIOD)
     file = getattr(found, 'parameters_file', '')
-    beside = Path(sys.modules[found.__module__].__file__).parent / file \
-        if file and getattr(sys.modules.get(found.__module__), '__file__', None) else None
+    module = getattr(sys.modules.get(found.__module__), '__file__', None)
+    beside = Path(module).parent / file if file and module else None
     parameters = getattr(found, 'Parameters', None)
-    if parameters is not None and not is_dataclass(parameters):
+    if parameters is not None and not (isinstance(parameters, type) and is_dataclass(parameters)):
         raise ParameterError(f"controller '{spec or name}': its Parameters are no dataclass of "
                              'robot.schema.parameter fields')
     return ControllerEntry(
@@ -352,6 +352,8 @@ def _module(place, spec):
         if not place.endswith('.py'):
             return import_module(name)
         file = spec_from_file_location(name, path)
+        if file is None or file.loader is None:
+            raise ParameterError(f"controller '{spec}': {path}: no Python module")
         module = sys.modules[name] = module_from_spec(file)
         try:
             file.loader.exec_module(module)

@@ -20,7 +20,7 @@ direction helps.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp
+from math import exp, inf
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, State, Target
 from beetle_omni_ros.robot import rotations, schema
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
-from beetle_omni_ros.robot.degraded_allocation import allocator, LocalWeights
+from beetle_omni_ros.robot.degraded_allocation import allocator, DegradedAllocator, LocalWeights
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
@@ -110,9 +110,9 @@ class HoverController:
         """Forget disturbances and the thrust model; the next step starts from state.command."""
         self._before: State | None = None
         self._disturbance = np.zeros(6)     # acceleration in world, angular in base_link
-        self._stamp = None
-        self._command = None
-        self._thrust = None          # (4,) modelled thrust [N]
+        self._stamp: float | None = None
+        self._command: Command | None = None
+        self._thrust = np.zeros(4)          # modelled [N]
         self._errors = (0.0, 0.0)
         self._saturations = 0
 
@@ -131,8 +131,9 @@ class HoverController:
         self.observe(state)
         force, torque = self._wrench(state, target)
         present = in_force.tilt if in_force is not None else state.tilt
-        wished = self._allocator.hover(state.quaternion, present, force, torque) \
-            if self._health.healthy else self._near(state, target, present, force, torque)
+        wished = self._near(self._allocator, state, target, present, force, torque) \
+            if isinstance(self._allocator, DegradedAllocator) else \
+            self._allocator.hover(state.quaternion, present, force, torque)
         self._saturations += bool(wished.saturated.any())
         self._command = Command(state.stamp, *self._targets(state, wished, present, dt))
         self._stamp = state.stamp
@@ -152,7 +153,7 @@ class HoverController:
             return
         self._before = state
         if before is None or state.stamp - before.stamp > LONGEST_STEP:
-            self._follow_thrust(state.command, self.period)
+            self._follow_thrust(state.command, inf if before is None else self.period)
             return
         dt = state.stamp - before.stamp
         self._follow_thrust(state.command, dt)
@@ -178,14 +179,14 @@ class HoverController:
                 'torque_disturbance_rad_s2': float(np.linalg.norm(self._disturbance[3:])),
                 'saturated_steps': int(self._saturations)}
 
-    def _near(self, state, target, present, force, torque):
+    def _near(self, degraded: DegradedAllocator, state, target, present, force, torque):
         """Allocation near the present tilts, on the way to what holds a nearby attitude."""
         turn = rotations.log(rotations.multiply(rotations.conjugate(state.quaternion),
                                                 target.at(state.stamp).quaternion))
         ahead = rotations.exp(_shortened(turn, self.parameters.attitude.error_limit))
-        aim = self._allocator.hover(rotations.multiply(state.quaternion, ahead), present)
-        force = (self._allocator.weight + force) @ rotations.matrix(state.quaternion)
-        return self._allocator.allocate_near(force, torque, present, aim, self.parameters.degraded)
+        aim = degraded.hover(rotations.multiply(state.quaternion, ahead), present)
+        force = (degraded.weight + force) @ rotations.matrix(state.quaternion)
+        return degraded.allocate_near(force, torque, present, aim, self.parameters.degraded)
 
     def _wrench(self, state, target):
         """Force beside the weight's support (world) and torque (base_link)."""
@@ -206,11 +207,9 @@ class HoverController:
         return self._allocator.mass * acceleration, inertia * angular + gyroscopic
 
     def _follow_thrust(self, in_force, dt):
-        """First-order model of the thrusts that the command in force has built up."""
+        """First-order model of the thrusts that a command has built up, ``dt`` from it on."""
         if in_force is None:
             self._thrust = np.zeros(4)
-        elif self._thrust is None:
-            self._thrust = np.array(in_force.thrust, dtype=float)
         else:
             keep = exp(-dt / self._robot.rotors.time_constant)
             self._thrust = in_force.thrust + keep * (self._thrust - in_force.thrust)

@@ -53,12 +53,15 @@ class NmpcController:
         problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag, p.horizon.change_time)
         intervals = p.horizon.intervals
         soft = (p.limits.slack_linear, p.limits.slack_quadratic) if p.limits.soft else None
-        options = (problem, intervals, soft, p.solver.tolerance, p.solver.max_iterations,
-                   p.limits.tilt_rate_intervals - 1)
+        options = {'ocp': problem, 'intervals': intervals, 'soft': soft,
+                   'tolerance': p.solver.tolerance, 'max_iterations': p.solver.max_iterations,
+                   'reaches': p.limits.tilt_rate_intervals - 1}
         advance = model.integrator(robot)
-        self._rti, self.compiled = self._make_solver(options, advance, p.solver.compile)
-        library = self._rti.library if self.compiled else None
-        self._estimator = DisturbanceEstimator(robot, p, FunctionCall(advance, library))
+        self._rti = self._make_solver(options, advance, p.solver.compile)
+        library = self._rti.library if isinstance(self._rti, CompiledRti) else None
+        self.compiled = library is not None
+        self._estimator = DisturbanceEstimator(robot, p.disturbance, p.model.command_delay,
+                                               FunctionCall(advance, library))
         self._planner = ReferencePlanner(robot, np.r_[0.0, np.cumsum(intervals)], p.unwind,
                                          p.model.servo_lag)
         self._state_size = problem.state_size
@@ -87,23 +90,23 @@ class NmpcController:
         self._estimator.set_health(health)
         self._planner.set_health(health)
         lower, upper = self._bounds[:8], self._bounds[8:16]
-        for i, (turns, angle) in enumerate(zip(health.rotors, health.stuck)):
+        for i, (turns, angle, held) in enumerate(zip(health.rotors, health.stuck, health.held)):
             if angle is not None:
                 lower[i], upper[i] = angle - NARROW, angle + NARROW
             if not turns:
                 lower[4 + i], upper[4 + i] = 0.0, NARROW
-            elif health.held[i] is not None:
-                lower[4 + i], upper[4 + i] = health.held[i] - NARROW, health.held[i] + NARROW
+            elif held is not None:
+                lower[4 + i], upper[4 + i] = held - NARROW, held + NARROW
         self._iterate = FIRST_ITERATIONS
 
     @staticmethod
-    def _make_solver(options, advance, compile_allowed):
+    def _make_solver(options, advance, compile_allowed) -> CompiledRti | InterpretedRti:
         if compile_allowed:
             try:
-                return CompiledRti(*options, extra=(advance,)), True
+                return CompiledRti(**options, extra=(advance,))
             except CompilerError as error:
                 log.warning('NMPC runs interpreted, about five times slower: %s', error)
-        return InterpretedRti(*options), False
+        return InterpretedRti(**options)
 
     def reset(self) -> None:
         """Forget estimates and horizon."""

@@ -96,7 +96,8 @@ class PolicyController:
         self._limits = [(-tilt, tilt)] * 4 + [(rotors.thrust_min, rotors.thrust_max)] * 4
         self._hover = [robot.hover_thrust] * 4
         self._estimator = DisturbanceEstimator(
-            robot, p, FunctionCall(model.integrator(robot), None)) if contract.memory else None
+            robot, p.disturbance, p.model.command_delay,
+            FunctionCall(model.integrator(robot), None)) if contract.memory else None
         self._guidance, self._charge = Guidance(p, robot.tilt_axes), Charge()
         self.guidance = self._guidance.text
         self.reset()
@@ -139,10 +140,10 @@ class PolicyController:
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Counts since reset, and what a policy with memory estimates."""
-        told = {'policy': self.contract.name, 'steps': self._steps,
-                'rejected_states': self._rejected, 'faulty_actions': self._faults,
-                'steps_at_a_limit': self._cut,
-                **self._guidance.diagnostics()}
+        told: dict[str, float | int | str] = {
+            'policy': self.contract.name, 'steps': self._steps,
+            'rejected_states': self._rejected, 'faulty_actions': self._faults,
+            'steps_at_a_limit': self._cut, **self._guidance.diagnostics()}
         if self._estimator:
             d = self._estimator.disturbance
             told['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))

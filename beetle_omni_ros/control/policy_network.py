@@ -82,7 +82,7 @@ class PolicyNetwork:
 
     def _warm_up(self):
         """Call as in level flight; a network that answers with anything but numbers is broken."""
-        rest = []
+        rest: list[float] = []
         for block in self.contract.observations:
             rest += LEVEL if 'attitude' in block.name else [0.0] * block.size
         try:

@@ -111,9 +111,9 @@ class InterpretedRti:
         self._outputs = [array.reshape(shape, order='F') for array, shape in zip(flat, shapes)]
         self._inputs = [np.zeros(ocp.stage.numel_in(i)) for i in range(6)]
         for i, array in enumerate(self._inputs):
-            self._buffer.set_arg(i, memoryview(array))
+            self._buffer.set_arg(i, array.data)
         for i, array in enumerate(flat):
-            self._buffer.set_res(i, memoryview(array))
+            self._buffer.set_res(i, array.data)
 
     def fill(self, x, u):
         """Store one state and one input over the whole horizon."""

@@ -152,20 +152,20 @@ class ErrorStateEkf:
         if self._noise.scale != self._noise_scale:
             self._noise_scale = self._noise.scale
             self._model.scale_noise(*self._noise_scale)
-        believed = self._believed
-        if believed:
-            if self._track.correct(stamp, position, quaternion) \
-                    or self._doubt(stamp, position, quaternion):
+        track = self._track if self._believed else None
+        if track is not None:
+            if track.correct(stamp, position, quaternion) \
+                    or self._doubt(track, stamp, position, quaternion):
                 self._candidate, self._contradictions = None, 0
                 self._good_pose = stamp, position, quaternion
                 return True
             self.rejected['outlier'] += 1
-        agrees = self._consider(stamp, position, quaternion, believed)
-        if not agrees and not believed:
+        agrees = self._consider(track, stamp, position, quaternion)
+        if not agrees and track is None:
             self.rejected['inconsistent_start'] += 1
-        return agrees and not believed
+        return agrees and track is None
 
-    def _doubt(self, stamp, position, quaternion) -> bool:
+    def _doubt(self, track: Track, stamp, position, quaternion) -> bool:
         """
         Use a refused pose, where poses contradict the IMU and not each other.
 
@@ -175,7 +175,7 @@ class ErrorStateEkf:
         before, self._residual = self._residual, self._model.whitened_residual
         lengths = float(np.linalg.norm(before) * np.linalg.norm(self._residual))
         aligned = float(before @ self._residual) > ALIGNED * lengths
-        goes_on = self._goes_on(stamp, position, quaternion)
+        goes_on = self._goes_on(track, stamp, position, quaternion)
         self._contradictions = 0 if not goes_on else self._contradictions + 1 if aligned else 1
         if not aligned:
             return False
@@ -184,9 +184,9 @@ class ErrorStateEkf:
             return False
         self._doubt_until = stamp + self._parameters.doubt.time
         self.rejected['imu_contradicts'] += 1
-        return self._track.correct(stamp, position, quaternion, doubtful=True)
+        return track.correct(stamp, position, quaternion, doubtful=True)
 
-    def _goes_on(self, stamp, position, quaternion) -> bool:
+    def _goes_on(self, track: Track, stamp, position, quaternion) -> bool:
         """Whether a pose goes on smoothly from the last good one."""
         if self._good_pose is None:
             return False
@@ -196,7 +196,7 @@ class ErrorStateEkf:
             and np.array_equal(quaternion, from_quaternion)
         if repeats or not 0 < dt <= self._parameters.imu.gap_limit:
             return False
-        node = self._track.at(stamp)
+        node = track.at(stamp)
         step = position - from_position - dt * node.velocity
         was, now = (rotations.multiply(q, self._model.marker_to_base)
                     for q in (from_quaternion, quaternion))
@@ -204,44 +204,50 @@ class ErrorStateEkf:
         return float(np.linalg.norm(step)) < limits.distance + limits.speed * dt \
             and geodesic_angle(turned, now) < limits.angle + limits.rate * dt
 
-    def _consider(self, stamp, position, quaternion, believed) -> bool:
+    def _consider(self, believed: Track | None, stamp, position, quaternion) -> bool:
         """
         Let a candidate follow poses that the track cannot use, and believe it in time.
+
+        Args:
+            believed: the track, or None while it is not believed.
+            stamp: of the pose [s].
+            position: (3,) of the marker body in world [m].
+            quaternion: (4,) marker body to world.
 
         Returns:
             False when the pose contradicts the candidate, which then starts anew from it.
 
         """
-        agrees = self._candidate is None
-        if not agrees:
-            agrees = self._candidate.correct(stamp, position, quaternion)
+        candidate = self._candidate
+        agrees = candidate is None
+        if candidate is not None:
+            agrees = candidate.correct(stamp, position, quaternion)
             if agrees:
                 limits = self._parameters.status
-                needed = limits.jump_poses if believed else limits.start_poses
-                if self._candidate.fixes >= needed:
-                    if believed and self._turned_at_once():
+                needed = limits.start_poses if believed is None else limits.jump_poses
+                if candidate.fixes >= needed:
+                    if believed is not None and self._turned_at_once(believed, candidate):
                         self.rejected['attitude_jump'] += 1
                         return True
-                    self._track, self._candidate = self._candidate, None
+                    self._track, self._candidate = candidate, None
                 return True
         # What was known of the biases helps once; if it contradicts the poses, start without.
         known = self._track.newest if agrees and self._track is not None else None
         self._candidate = self._started(stamp, position, quaternion, known)
         return agrees
 
-    def _turned_at_once(self) -> bool:
+    def _turned_at_once(self, track: Track, candidate: Track) -> bool:
         """Whether the candidate's attitude is one that the gyroscope rules out."""
-        track, candidate = self._track.newest, self._candidate.newest
-        deviation = sqrt(np.trace(track.covariance[ATTITUDE, ATTITUDE]))
-        return geodesic_angle(track.quaternion, candidate.quaternion) \
+        deviation = sqrt(np.trace(track.newest.covariance[ATTITUDE, ATTITUDE]))
+        return geodesic_angle(track.newest.quaternion, candidate.newest.quaternion) \
             > self._parameters.status.jump_attitude + SURE * deviation
 
     def _started(self, stamp, position, quaternion, known) -> Track:
         """Start a track at a pose, with the biases of ``known``, and bring it up to now."""
         later = [reading for reading in self._readings if reading[0] > stamp + SAME_INSTANT]
         before = self._readings[len(self._readings) - len(later) - 1]
-        at_pose = interpolate(stamp, before, later[0]) if later else before[1:3]
-        first = self._model.start(stamp, *at_pose, position, quaternion, known)
+        force, rate = interpolate(stamp, before, later[0]) if later else (before[1], before[2])
+        first = self._model.start(stamp, force, rate, position, quaternion, known)
         time_deviation = (self._parameters.initial.time_offset_std if known is None else
                           sqrt(known.covariance[TIME_OFFSET, TIME_OFFSET]))
         track = Track(self._model, first, self._parameters.mocap.delay_limit, time_deviation)

@@ -8,6 +8,8 @@ import numpy as np
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.robot.spikes import SpikeFilter
 
+Checked = tuple[float, np.ndarray, np.ndarray]   # stamp and two vectors of a sample
+
 
 class InputGuard:
     """
@@ -29,13 +31,14 @@ class InputGuard:
         self._out_of_range = False
         self._last_reading: float | None = None
         self._last_pose = -inf
-        self._same_pose, self._pose_values = 0, None
-        self._reading_values, self._moved = None, False
-        self._same_reading, self._pose_moved = 0, False
+        self._pose_values: tuple[float, ...] | None = None
+        self._reading_values: tuple[float, ...] | None = None
+        self._same_pose = self._same_reading = 0
+        self._pose_moved = self._moved = False
         self._spikes = SpikeFilter(self._imu.impact_change, self._imu.spike_change)
         self._refused: list[float] = []  # stamps refused in a row, each shortly after the last
 
-    def reading(self, sample) -> tuple[float, np.ndarray, np.ndarray] | None:
+    def reading(self, sample) -> Checked | None:
         """
         Check an IMU sample.
 
@@ -88,7 +91,7 @@ class InputGuard:
         refused.append(stamp)
         return len(refused) >= self._imu.resync_samples
 
-    def pose(self, sample, oldest: float) -> tuple[float, np.ndarray, np.ndarray] | None:
+    def pose(self, sample, oldest: float) -> Checked | None:
         """
         Check a MoCap pose.
 
@@ -132,8 +135,10 @@ class InputGuard:
         self._moved = False
         return self._same_pose >= self._mocap.frozen_poses
 
-    def _refuse(self, reason) -> None:
+    def _refuse(self, reason: str) -> Checked | None:
+        """Count a refusal; return what the caller returns then."""
         self.rejected[reason] += 1
+        return None
 
 
 def _finite(stamp, *vectors) -> bool:

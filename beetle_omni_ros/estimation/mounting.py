@@ -72,7 +72,8 @@ class Mounting:
         def covariance():
             found = self._aged_covariance(then, node, age) if late else node.covariance
             found = found[:ERROR_STATES, :ERROR_STATES]
-            return found if self._arm is None else self._covariance_at_base(node, rate, found)
+            return found if self._arm is None else \
+                self._covariance_at_base(node, rate, found, self._arm)
 
         return Estimate(node.stamp, position, velocity, node.quaternion, rate,
                         node.accelerometer_bias, node.gyroscope_bias, covariance)
@@ -121,15 +122,15 @@ class Mounting:
         jacobian[ATTITUDE, TIME_OFFSET] = rate
         return jacobian @ before.covariance @ jacobian.T
 
-    def _covariance_at_base(self, node, rate, covariance):
+    def _covariance_at_base(self, node, rate, covariance, lever: np.ndarray) -> np.ndarray:
         """
         Move a state's covariance (15, 15) from the IMU to base_link's origin.
 
         With arm r, rate w: p = p_imu - R r and v = v_imu - R (w x r). The noise of the rate
         sample itself enters the velocity through the arm.
         """
-        swing = np.cross(rate, self._arm)
-        arm = node.rotation @ rotations.skew(self._arm)
+        swing = np.cross(rate, lever)
+        arm = node.rotation @ rotations.skew(lever)
         jacobian = np.eye(ERROR_STATES)
         jacobian[POSITION, ATTITUDE] = arm
         jacobian[VELOCITY, ATTITUDE] = node.rotation @ rotations.skew(swing)

@@ -71,7 +71,7 @@ class NoiseMonitor:
         turn = rotations.log(rotations.multiply(
             rotations.conjugate(last[2]).tolist(), quaternion.tolist()))
         self._moves.append((position - last[1], turn, stamp - last[0]))
-        if len(self._moves) < self._moves.maxlen:
+        if len(self._moves) < POSES - 1:
             return
         moves, turns, intervals = zip(*self._moves)
         if max(intervals) - min(intervals) > EVEN * max(intervals):

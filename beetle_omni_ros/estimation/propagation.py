@@ -8,7 +8,7 @@ The navigated point is the IMU itself: its accelerometer then needs no correctio
 angular acceleration, which nobody measures.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from beetle_omni_ros.robot import rotations
 # Behind the 15 error states that leave the estimator, the offset between the sensors' clocks.
 TIME_OFFSET = ERROR_STATES
 STATES = ERROR_STATES + 1
+UNKNOWN = np.full((STATES, STATES), np.nan)
 
 
 @dataclass(slots=True, eq=False)
@@ -44,7 +45,7 @@ class Node:
         gyroscope_bias: (3,) base_link axes [rad/s].
         time_offset: by how much the stamps of the IMU are later than those of the MoCap [s].
         shaken: whether readings just before were beyond the sensor's range.
-        covariance: (16, 16) of the error states and the time offset.
+        covariance: (16, 16) of the error states and the time offset; NaN until it is propagated.
 
     """
 
@@ -59,7 +60,7 @@ class Node:
     gyroscope_bias: np.ndarray
     time_offset: float
     shaken: bool = False
-    covariance: np.ndarray | None = None
+    covariance: np.ndarray = field(default_factory=lambda: UNKNOWN)
 
 
 def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,

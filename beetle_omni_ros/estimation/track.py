@@ -11,7 +11,7 @@ VELOCITY_KNOWN = 5  # poses after which the motion is known well enough to doubt
 SAME_INSTANT = 1e-6  # [s] well below a sample period, well above the resolution of a stamp
 
 
-def interpolate(stamp, before, after):
+def interpolate(stamp, before, after) -> tuple[np.ndarray, np.ndarray]:
     """Force and rate at ``stamp`` on the line between two readings (stamp, force, rate)."""
     share = (stamp - before[0]) / (after[0] - before[0])
     return (before[1] + share * (after[1] - before[1]),

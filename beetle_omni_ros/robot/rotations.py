@@ -6,12 +6,16 @@ second; the tests hold them equal to scipy.spatial.transform. Arrays are taken a
 floats first: arithmetic on numpy's scalars costs several times as much.
 """
 
+from collections.abc import Sequence
 from math import atan2, cos, sin, sqrt
+from typing import Any
 
 import numpy as np
 
+Vector = np.ndarray | Sequence[float]
 
-def matrix(quaternion: np.ndarray) -> np.ndarray:
+
+def matrix(quaternion: Vector) -> np.ndarray:
     """Rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
     x, y, z, w = _floats(quaternion)
     return np.array([
@@ -20,24 +24,24 @@ def matrix(quaternion: np.ndarray) -> np.ndarray:
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
 
 
-def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def multiply(a: Vector, b: Vector) -> np.ndarray:
     """Quaternion product: first ``b``, then ``a`` (R(a) R(b))."""
     return np.array(product(*_floats(a), *_floats(b)))
 
 
-def product(ax, ay, az, aw, bx, by, bz, bw) -> tuple:
+def product(ax, ay, az, aw, bx, by, bz, bw) -> tuple[Any, Any, Any, Any]:
     """Quaternion product of :func:`multiply` by components x, y, z, w, numbers or arrays."""
     return (aw * bx + ax * bw + ay * bz - az * by, aw * by - ax * bz + ay * bw + az * bx,
             aw * bz + ax * by - ay * bx + az * bw, aw * bw - ax * bx - ay * by - az * bz)
 
 
-def conjugate(quaternion: np.ndarray) -> np.ndarray:
+def conjugate(quaternion: Vector) -> np.ndarray:
     """Inverse of a unit quaternion."""
     x, y, z, w = _floats(quaternion)
     return np.array([-x, -y, -z, w])
 
 
-def exp(vector: np.ndarray) -> np.ndarray:
+def exp(vector: Vector) -> np.ndarray:
     """Unit quaternion of a rotation vector [rad]."""
     x, y, z = _floats(vector)
     squared = x * x + y * y + z * z
@@ -49,7 +53,7 @@ def exp(vector: np.ndarray) -> np.ndarray:
     return np.array([scale * x, scale * y, scale * z, w])
 
 
-def log(quaternion: np.ndarray) -> np.ndarray:
+def log(quaternion: Vector) -> np.ndarray:
     """Rotation vector [rad] of the shorter of the two rotations of a unit quaternion."""
     x, y, z, w = quaternion if quaternion[3] >= 0 else -np.asarray(quaternion)
     norm = sqrt(x * x + y * y + z * z)
@@ -57,19 +61,19 @@ def log(quaternion: np.ndarray) -> np.ndarray:
     return np.array([scale * x, scale * y, scale * z])
 
 
-def normalized(quaternion: np.ndarray) -> np.ndarray:
+def normalized(quaternion: Vector) -> np.ndarray:
     """``quaternion`` scaled to unit length."""
     q = np.asarray(quaternion, dtype=float)
     return q / sqrt(float(q @ q))
 
 
-def skew(vector: np.ndarray) -> np.ndarray:
+def skew(vector: Vector) -> np.ndarray:
     """Cross-product matrix (3, 3) of a vector."""
     x, y, z = _floats(vector)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def geodesic_angle(a: np.ndarray, b: np.ndarray) -> float:
+def geodesic_angle(a: Vector, b: Vector) -> float:
     """Angle [rad] of R(b)^T R(a), the package's orientation error, 0 to pi."""
     bx, by, bz, bw = _floats(b)
     x, y, z, w = product(-bx, -by, -bz, bw, *_floats(a))
@@ -85,7 +89,7 @@ def from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
                      cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy])
 
 
-def to_rpy(quaternion: np.ndarray) -> np.ndarray:
+def to_rpy(quaternion: Vector) -> np.ndarray:
     """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll)."""
     x, y, z, w = _floats(quaternion)
     sin_pitch = min(1.0, max(-1.0, 2 * (w * y - z * x)))
@@ -94,5 +98,5 @@ def to_rpy(quaternion: np.ndarray) -> np.ndarray:
                      atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))])
 
 
-def _floats(vector):
+def _floats(vector: Vector) -> Sequence[float]:
     return vector.tolist() if isinstance(vector, np.ndarray) else vector

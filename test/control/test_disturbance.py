@@ -27,7 +27,7 @@ def test_every_command_within_the_delay_acts_from_its_own_time_on(delay):
     p = NmpcParameters.load()
     p = replace(p, model=replace(p.model, command_delay=delay))
     advance = FunctionCall(model.integrator(ROBOT), None)
-    estimator = DisturbanceEstimator(ROBOT, p, advance)
+    estimator = DisturbanceEstimator(ROBOT, p.disturbance, p.model.command_delay, advance)
     now, rest = 12, State(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0, 0, 1]), np.zeros(3),
                           np.zeros(4), np.zeros(4), 0.0)
     for k in range(now + 1):    # the robot stands still; only the last prediction is looked at

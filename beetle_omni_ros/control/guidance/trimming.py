@@ -12,8 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import hypot, inf, sqrt
 
-import numpy as np
-
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import parameter
@@ -79,9 +77,9 @@ class Trimming:
         if learn and 0.0 < elapsed <= LONGEST_STEP:
             self._add(elapsed, state, given)
         x, y, z = (0.5 * angle for angle in self.rotation)
-        turned = rotations.product(*given.quaternion.tolist(), x, y, z,
-                                   sqrt(1.0 - (x * x + y * y + z * z)))
-        return PoseTarget(given.position + self.position, np.array(turned), given.stamp)
+        turned = rotations.multiply(given.quaternion,
+                                    (x, y, z, sqrt(1.0 - (x * x + y * y + z * z))))
+        return PoseTarget(given.position + self.position, turned, given.stamp)
 
     def _add(self, elapsed, state, given):
         p = self._p

@@ -71,11 +71,11 @@ class Turning:
             if self._given is None or not given.same_pose(self._given):
                 self._lowest = min(float(given.position[2]), z)
             self._given = given
-        passing = aim is not None and aim is not given
+        aim = given if aim is None else aim
+        passing = aim is not given
         left = rotations.geodesic_angle(state.quaternion, given.quaternion)
         if not (passing or left > min(p.settled, p.angle)):
             return given
-        aim = aim if passing else given
         place = aim.position.tolist()
         if passing or left > p.angle:
             place[2] = max(place[2], p.height)
