@@ -58,7 +58,7 @@ FILES = {
                        'Limits of the checks of a recording against itself.'),
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
     'faults.yaml': ('sim.faults.listed:FaultList', 'The listed faults.'),
-    'gap.yaml': (None, 'The gap finder.')}
+    'gap.yaml': ('identify.gap.parameters:GapParameters', 'The gap finder.')}
 
 # Nodes whose code is not in a file of their own name; '' is no node of its own.
 SHARED = {'controller_node': 'nmpc_node, rl_node', 'health': 'every node', 'operator': '',
@@ -160,23 +160,6 @@ def _load(name: str):
     return kind.load(str(ROOT / 'params' / name))
 
 
-def _undeclared(name: str) -> list[list[str]]:
-    """Rows of a file whose keys are described by its comments alone."""
-    rows, note = [], None
-    for line in (ROOT / 'params' / name).read_text(encoding='utf-8').splitlines():
-        entry = re.match(r'(\w+): *(.*?) *(?:#\s*(?:\[([^\]]*)\])?\s*(.*))?$', line)
-        more = re.match(r'\s{8,}#\s*(.*)$', line)
-        if entry:
-            unit = '' if entry[3] in (None, '-') else entry[3]
-            note = [f'`{entry[1]}`', entry[2], unit, entry[4] or '']
-            rows.append(note)
-        elif more and note and note[3]:
-            note[3] += ' ' + more[1]
-        else:
-            note = None
-    return rows
-
-
 def parameters() -> str:
     """Every parameter of every shipped file."""
     text = [f'# Parameters\n\n{MADE}\n'
@@ -189,10 +172,6 @@ def parameters() -> str:
         text.append(f'\n## {name}\n\n{what}\n\n')
         if name == 'faults.yaml':
             text.append('The faults themselves are in [the list of faults](faults.md).\n\n')
-        if kind is None:
-            text.append(table(['key', 'value', 'unit', 'comment of the file'],
-                              _undeclared(name)))
-            continue
         if kind in seen:
             same = {key: value for key, _, value in _leaves(_load(seen[kind]))}
             rows = [[f'`{key}`', _value(value) if repr(value) != '{}' else 'none',

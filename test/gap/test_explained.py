@@ -16,7 +16,7 @@ from beetle_omni_ros.identify.gap.keys import (
     TILT_BUS,
     tolerances,
 )
-from beetle_omni_ros.identify.gap.search import BEYOND, Search
+from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.gap.trial import Trial
 
 LAG, OTHER = 'rotor_lag.time_constant', 'inertia.inertia[0]'
@@ -58,6 +58,7 @@ class Curved(Straight):
 def test_a_slow_fit_leaves_nothing_for_others_to_gain():
     problem = Curved(0.25, 0.0)
     search = Search.__new__(Search)
+    search.p = P
     search.problem, search.always, search.wide, search.names = problem, [LAG, OTHER], {}, []
     state, cost = search._settle({}, [])
     _, again = problem.refine(state, search.always, frozenset(), 10)
@@ -101,6 +102,7 @@ def before(truth, overlap=0.0):
     """Objective without effects: as fitted, and with believable tolerances only."""
     problem = Straight(truth, overlap)
     search = Search.__new__(Search)
+    search.p = P
     search.problem, search.always = problem, [LAG, OTHER]
     start = State({}, problem.residual({}), problem.columns, [LAG, OTHER])
     state, cost = problem.refine(start, search.always, frozenset())
@@ -125,14 +127,14 @@ def test_a_lag_within_tolerance_is():
 
 @pytest.mark.parametrize('x, expected', [(0.02, 0.02), (0.2, 0.09), (-0.2, -0.09)])
 def test_a_belief_has_an_end(x, expected):
-    assert Belief(0.03).within(x, BEYOND) == pytest.approx(expected)
+    assert Belief(0.03).within(x, P.beyond) == pytest.approx(expected)
 
 
 def test_a_free_range_ends_beyond_itself():
     belief = Belief(5e-4, 0.010, 0.005, 0.003)
-    assert belief.within(0.004, BEYOND) == 0.004
-    assert belief.within(0.02, BEYOND) == pytest.approx(0.0065)
-    assert belief.within(-0.02, BEYOND) == pytest.approx(-0.0115)
+    assert belief.within(0.004, P.beyond) == 0.004
+    assert belief.within(0.02, P.beyond) == pytest.approx(0.0065)
+    assert belief.within(-0.02, P.beyond) == pytest.approx(-0.0115)
 
 
 @pytest.mark.parametrize('gain, left, agreement, of_beliefs, named', [
@@ -157,7 +159,8 @@ def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch
     monkeypatch.setattr(Search, '_cross_validate', agreed)
     monkeypatch.setattr(Search, '_fought', lambda self, trial, accepted: False)
     search = Search.__new__(Search)
-    search.p, search.problem = P, type('Problem', (), {'keys': KEYS})()
+    search.p = P
+    search.problem = type('Problem', (), {'keys': KEYS})()
     assert (search._judge([trial], 1000.0 + left, 1000.0, []) is trial) == named
 
 

@@ -90,11 +90,16 @@ def test_a_charge_table_is_a_list(tmp_path):
 
 
 @pytest.mark.parametrize('text, says', [
-    ('grid: x\n', "key 'grid': expected a number, found 'x'"),
-    ('grid: .nan\n', "key 'grid': expected a number, found nan"),
-    ('floors: 3\n', "key 'floors': expected a list of 5, found 3"),
-    ('floors: [1, 2, 3, 4, x]\n', "key 'floors': expected a number, found 'x'")])
-def test_numbers_of_the_gap_finder_keep_their_kind(tmp_path, text, says):
+    ('grid: x\n', "key 'grid': expected a number [s], found 'x'"),
+    ('grid: .nan\n', "key 'grid': nan is not finite"),
+    ('grid: 1\n', "key 'grid': 1 is outside 0.005 to 0.05 s"),
+    ('crowd: 2.5\n', "key 'crowd': expected an integer, found 2.5"),
+    ('least_gian: 3\n', "key 'least_gian': unknown key; did you mean 'least_gain'?"),
+    ('slow_below: 1.0\n', "key 'slow_below': 1 Hz is none of band_edges [0.3, 0.6, 1.2, 2.4]"),
+    ('floors: 3\n', "key 'floors': expected shape (5,), found ()"),
+    ('floors: [1, 2, 3, 4, x]\n', "key 'floors': expected numbers, found [1, 2, 3, 4, 'x']"),
+    ('floors: [0.1, 0.1, 0.1, 0.1, -1]\n', "key 'floors': -1 is outside 1e-09 to 1000")])
+def test_numbers_of_the_gap_finder_keep_type_range_and_shape(tmp_path, text, says):
     assert says in refusal(GapParameters, text, tmp_path)
 
 

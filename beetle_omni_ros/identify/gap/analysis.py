@@ -40,13 +40,8 @@ from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 JUDGED = HORIZONS.index(0.5)
-AT_FLOOR = 1.1          # a gap below so much times the floor cannot be closed
-RUNS_A_BLOCK = 8        # free runs that share gusts: 4 s of flight
-CLEARLY = 2.0           # standard errors by which flights held out are worse
-WORSE = 1.05            # a regime may get worse by this
-# Noise floors that what is named may leave where it closes less than half of the gap. In the blind
-# campaign whatever was named left 3 at most; flights that are out of control leave hundreds.
-FAR_OFF, LEAST_CLOSED = 5.0, 0.5
+CLOSURES = (('closure', 'before', 'after'), ('placebo_closure', 'before', 'placebo'),
+            ('closure_of_effects_alone', 'file', 'effects_alone'))
 
 
 @dataclass
@@ -251,24 +246,24 @@ def _falsify(a, wide):
         before, after = (gap(a.runs[name], JUDGED, regime, trim)
                          for name in ('before', 'after'))
         a.regimes[str(regime)] = {'before': before, 'after': after,
-                                  'worse': bool(after > WORSE * before)}
+                                  'worse': bool(after > a.problem.p.regime_worse * before)}
     disagreement(a, a.gaps[HORIZONS[JUDGED]]['before'])
 
 
 def _refuted(a, trim):
     """Why flights that judge speak against what is named, in words; '' where they do not."""
-    judged = a.gaps[HORIZONS[JUDGED]]
+    judged, p = a.gaps[HORIZONS[JUDGED]], a.problem.p
     before, after = judged['before'], judged['after']
     if not np.isfinite([before, after]).all():
         return 'leaves free runs that end nowhere'
-    if a.held_out and after > max(AT_FLOOR, WORSE * before):
+    if a.held_out and after > max(p.at_floor, p.regime_worse * before):
         return 'makes the held-out ones worse'
-    if after > max(FAR_OFF, 1 + (1 - LEAST_CLOSED) * (before - 1)):
+    if after > max(p.far_off, 1 + (1 - p.least_closed) * (before - 1)):
         return 'leaves most of what free runs show'
     if not a.held_out:
         return ''
-    fall, scatter = _fall(a.runs['before'], a.runs['after'], trim)
-    if after > AT_FLOOR and fall < -CLEARLY * scatter:
+    fall, scatter = _fall(a.runs['before'], a.runs['after'], trim, p.runs_a_block)
+    if after > p.at_floor and fall < -p.clearly_worse * scatter:
         return 'makes the held-out ones worse'
     gain, error = _gain_held_out(a)
     if fall <= scatter and gain <= error:
@@ -276,13 +271,13 @@ def _refuted(a, trim):
     return ''
 
 
-def _fall(before, after, trim):
+def _fall(before, after, trim, together):
     """Mean fall of the squared gap at 0.5 s over blocks of free runs, and its standard error."""
     falls = []
     for one, other in zip(before, after, strict=True):
         floor = one.floor[JUDGED] * trim[JUDGED]
         each = ((one.error[JUDGED]**2 - other.error[JUDGED]**2) / floor**2).mean(axis=1)
-        count = max(1, len(each) // RUNS_A_BLOCK)
+        count = max(1, len(each) // together)
         falls += [part.mean() for part in np.array_split(each, count)]
     return float(np.mean(falls)), _error(falls)
 
@@ -305,10 +300,9 @@ def _measure(a, trim):
     """The gap at each horizon, and what of it is closed."""
     for h, horizon in enumerate(HORIZONS):
         values = {name: gap(runs, h, trim=trim) for name, runs in a.runs.items()}
-        a.gaps[horizon] = {**values, 'closure': closure(values['before'], values['after']),
-                           'placebo_closure': closure(values['before'], values['placebo']),
-                           'closure_of_effects_alone': closure(values['file'],
-                                                               values['effects_alone'])}
+        a.gaps[horizon] = values | {name: closure(values[before], values[after],
+                                                  a.problem.p.at_floor)
+                                    for name, before, after in CLOSURES}
 
 
 def _plain(a, theta, named):
@@ -319,9 +313,9 @@ def _plain(a, theta, named):
             and name in a.problem.beliefs and name not in named}
 
 
-def closure(before: float, after: float) -> float | None:
+def closure(before: float, after: float, at_floor: float) -> float | None:
     """Part of the excess over the floor (1) that is gone; None where there was none."""
-    if not before > AT_FLOOR:
+    if not before > at_floor:
         return None
     return float(1 - max(after**2 - 1, 0.0) / (before**2 - 1))
 

@@ -18,9 +18,6 @@ import numpy as np
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import CHANNELS, THIN
 
-EDGES = (0.0, 0.3, 0.6, 1.2, 2.4, np.inf)   # [Hz] between the bands
-SLOW = 1.2              # [Hz] below which controllers answer gusts
-
 
 def by_band(problem: Problem, x: np.ndarray, r: np.ndarray,
             groups: str = 'B') -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -37,6 +34,7 @@ def by_band(problem: Problem, x: np.ndarray, r: np.ndarray,
 
     """
     p, first = problem.p, 0
+    edges = [0.0, *p.band_edges, np.inf]
     periods = {'B': THIN * p.grid * p.body_every, 'A': p.grid * p.world_every,
                'W': p.grid * p.rate_every, 'J': p.grid * p.joint_every}
     for group, channels in CHANNELS.items():
@@ -46,7 +44,7 @@ def by_band(problem: Problem, x: np.ndarray, r: np.ndarray,
         if group not in groups:
             continue
         spectra = [_spectrum(x[keep], r[keep], periods[group]) for keep in rows if keep.any()]
-        for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
+        for low, high in zip(edges[:-1], edges[1:], strict=True):
             score, information = np.zeros(x.shape[1]), np.zeros((x.shape[1],) * 2)
             for frequency, slopes, rest in spectra:
                 band = (frequency >= low) & (frequency < high)
@@ -65,11 +63,12 @@ def apart(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float, float]
         r: (n,) whitened residual without the numbers, likewise.
 
     Returns:
-        chi2 gained by one set of numbers for all bands; by one for the bands below SLOW and none
-        above, or the other way round, whichever is more.
+        chi2 gained by one set of numbers for all bands; by one for the bands below ``slow_below``
+        and none above, or the other way round, whichever is more.
 
     """
-    parts, edge = list(by_band(problem, x, r)), EDGES.index(SLOW)
+    parts = list(by_band(problem, x, r))
+    edge = 1 + list(problem.p.band_edges).index(problem.p.slow_below)
     everywhere, slow, quick = (_gain(*(sum(part[k] for part in some) for k in (0, 1)))
                                for some in (parts, parts[:edge], parts[edge:]))
     return everywhere, max(slow, quick)

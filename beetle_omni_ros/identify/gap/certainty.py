@@ -14,16 +14,6 @@ from beetle_omni_ros.identify.gap.residual import THIN
 from beetle_omni_ros.identify.gap.series import matrices
 from beetle_omni_ros.robot.effects import CATALOGUE
 
-# No form is exactly the robot's: Stribeck curves, flapping blades or a second lag in series are
-# off by this part of an effect in all flights alike, and by this part of what is worth naming.
-# The one rule for every effect; 0.04 is the median error of forms that differ (docs/gap.md).
-FORM_PART, FORM_SHARE = 0.05, 0.25
-BUS_DELAY = 0.002       # [s] that commands may differ by, when asking what could be seen
-DISAGREE = 1.5          # times what noise alone makes of it: then a scatter between bands counts
-EXCITATIONS = 4         # groups of samples of equal information
-LEAST_BANDS = 4         # that a number comes from, at least; a scatter of fewer says too little
-LEAST_SCALE = 0.3       # of the variance, where a floor made the data look noisier than they are
-
 
 def deviations(problem: Problem, state: State, names: list[str],
                free: frozenset[str]) -> dict[str, float]:
@@ -35,7 +25,7 @@ def deviations(problem: Problem, state: State, names: list[str],
     excitation, none of which needs a noise model. The last two see what is the same in all
     flights: answers to gusts, and a form that is not quite that of the robot.
     """
-    columns = [state.index[name] for name in names]
+    columns, p = [state.index[name] for name in names], problem.p
     s = state.slopes[:, columns]
     data = s.T @ s
     belief = np.zeros(len(names))
@@ -51,37 +41,39 @@ def deviations(problem: Problem, state: State, names: list[str],
     scores = np.array([s[rows].T @ state.r[rows] for rows in blocks])
     slow_to_quick = list(by_band(problem, s, state.r, 'BAWJ'))
     for k, name in enumerate(names):
-        level = max(LEAST_SCALE, float((s[:, k]**2 * state.r**2).sum() / max(weights[k], 1e-12)))
+        level = max(p.least_variance,
+                    float((s[:, k]**2 * state.r**2).sum() / max(weights[k], 1e-12)))
         a = inverse[k]
         curvature = level * float(a @ data @ a) + float((a * a * belief).sum())
         half = max(1.96 * np.sqrt(curvature), _scattered(scores @ a, len(blocks)))
         shares = np.array([score @ a for score, _ in slow_to_quick])
         expected = level * np.array([a @ information @ a for _, information in slow_to_quick])
-        if (shares**2).sum() > DISAGREE * expected.sum():
+        if (shares**2).sum() > p.disagree * expected.sum():
             half = max(half, _scattered(shares, max(
-                LEAST_BANDS, expected.sum()**2 / max((expected**2).sum(), 1e-30))))
+                p.least_bands, expected.sum()**2 / max((expected**2).sum(), 1e-30))))
         if name in free:
-            shares = _by_excitation(s @ a, state.r)
-            if (shares**2).sum() > DISAGREE * level * float(a @ data @ a):
-                half = max(half, _scattered(shares, EXCITATIONS))
-        form = FORM_PART * abs(state.theta.get(name, 0.0)) \
-            + FORM_SHARE * problem.keys[name].smallest
+            shares = _by_excitation(s @ a, state.r, p.excitations)
+            if (shares**2).sum() > p.disagree * level * float(a @ data @ a):
+                half = max(half, _scattered(shares, p.excitations))
+        form = p.form_part * abs(state.theta.get(name, 0.0)) \
+            + p.form_share * problem.keys[name].smallest
         widths[name] = half + form
     return widths
 
 
-def _by_excitation(weight, r):
+def _by_excitation(weight, r, groups):
     """
-    Shares (EXCITATIONS,) of a number that weakly to strongly excited samples want to change it by.
+    Shares (groups,) of a number that weakly to strongly excited samples want to change it by.
 
     Args:
         weight: (n,) by which each sample's residual enters the number.
         r: (n,) whitened residual.
+        groups: how many, of equal information.
 
     """
     order = np.argsort(np.abs(weight))
     part = np.cumsum(weight[order]**2)
-    edges = np.searchsorted(part, part[-1] * np.arange(1, EXCITATIONS) / EXCITATIONS)
+    edges = np.searchsorted(part, part[-1] * np.arange(1, groups) / groups)
     return np.array([some.sum() for some in np.split((weight * r)[order], edges)])
 
 
@@ -137,7 +129,8 @@ def visibility(problem: Problem, state: State, always: list[str],
     base = np.array([index[name] for name in always])
     # Where a belief says nothing within a range, a realistic effect may well lie outside.
     prior = np.array([problem.beliefs[name].slope(state.theta.get(name, 0.0))**2
-                      if not name.startswith('base.') else BUS_DELAY**-2 for name in always])
+                      if not name.startswith('base.') else problem.p.bus_seen**-2
+                      for name in always])
 
     def left(own, also):
         """Information on ``own`` beside what is believed and ``also``."""

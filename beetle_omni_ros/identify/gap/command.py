@@ -109,7 +109,7 @@ def _analysed(runs, holdout, robot, p, fix, progress):
         # A verdict about the other flights would pass for one about all that were given.
         return Analysis('bad_data', str(unusable[0]),
                         damages=[damage for f in unusable for damage in f.problems])
-    check_flights(given, flights)
+    check_flights(given, flights, p.same_flight)
     fitted, judging = flights[:len(runs)], flights[len(runs):]
     if not judging and len(fitted) > LEAST_FITTED:
         fitted, judging = fitted[:-1], fitted[-1:]

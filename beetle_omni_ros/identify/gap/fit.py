@@ -15,7 +15,6 @@ from beetle_omni_ros.identify.gap.residual import FlightModel
 
 CURVED = ('delay', 'rotation', 'time_constant', 'kp', 'kd', 'velocity_limit',
           'effort_limit', 'coulomb', 'stiction', 'gap', 'thrust_max', 'deflection_per_newton')
-LEAST_BLOCKS = 6        # of all flights together
 HALVINGS = 4
 RIDGE = 1e-9
 # Deviations, residual, columns that changed and their slopes: what a state is beside another.
@@ -90,7 +89,7 @@ class Problem:
         blocks, where, flights, times, first = [], [], [], [], 0
         for k, model in enumerate(self.models):
             pieces = max(round(model.flight.duration / self.p.block),
-                         -(-LEAST_BLOCKS // len(self.models)))
+                         -(-self.p.least_blocks // len(self.models)))
             counts = {g: len(model.times(g)) for g in self.noise.taps}
             for c, (group, _, index) in enumerate(self.noise.places(counts)):
                 t = model.times(group)[index]

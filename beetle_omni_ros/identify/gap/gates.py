@@ -11,14 +11,8 @@ from beetle_omni_ros.identify.gap.keys import Key
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.trial import Found, Trial
 
-LEAST_ELSEWHERE = 8.0   # of chi2, outside the block that gains most
-# Of chi2, from which blocks may gain unevenly as long as they gain. In the blind campaign what
-# gained less, and that unevenly, was not there (4 of 4, up to 97); what gained more was (7 of 7,
-# from 708).
-LEAST_UNEVEN = 300.0
 AGES = ('imu_filter_lag.delay', 'joint_feedback_delay.delay')   # of readings at their stamps
 COMMANDS = ('command_latency.delay', 'joint_command_latency.delay', 'rotor_dead_time.delay')
-EARLY = 5e-4            # [s] before a stamp, as well as a fit knows a delay
 # Two forms of one response: where one is joined and the other still gains beside it, the response
 # has a shape that neither holds, such as a lag of second order, and which number is wrong is open.
 ONE_RESPONSE = {'rotor_lag', 'rotor_dead_time'}
@@ -55,7 +49,8 @@ def believed(p: GapParameters, gain: float, of_beliefs: float, price: float = 0.
     return min(gain, of_beliefs) >= p.least_believed + price
 
 
-def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = ()) -> bool:
+def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = (),
+             early: float = 0.0) -> bool:
     """
     Whether a number is as far off as it can be.
 
@@ -66,10 +61,11 @@ def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = ())
         keys: by name.
         trial: with its numbers.
         delays: from the stamps of tilt and thrust commands until they act, with them [s].
+        early: that a command may act before its stamp [s].
 
     """
     if any(name in COMMANDS for name in trial.candidate.keys) \
-            and min(delays, default=0.0) < -EARLY:
+            and min(delays, default=0.0) < -early:
         return True
     for name in trial.candidate.keys:
         x, key = trial.theta.get(name, 0.0), keys[name]
@@ -81,10 +77,13 @@ def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = ())
 
 def holds(trial: Trial, p: GapParameters) -> bool:
     """Whether blocks that were left out agree; see :func:`cross_validate`."""
-    sure = trial.cross[0] >= 2 * trial.cross[1] or trial.positive >= 0.85 and (
-        trial.gain >= LEAST_UNEVEN or trial.believed >= p.least_believed)
-    return sure and trial.cross[0] >= 0.3 * trial.gain and trial.positive >= 0.55 \
-        and trial.without_best >= max(0.05 * min(trial.cross[0], trial.gain), LEAST_ELSEWHERE)
+    gain, error = trial.cross
+    sure = gain >= p.held_out_errors * error or trial.positive >= p.held_out_nearly_all and (
+        trial.gain >= p.least_uneven or trial.believed >= p.least_believed)
+    return sure and gain >= p.held_out_share * trial.gain \
+        and trial.positive >= p.held_out_blocks \
+        and trial.without_best >= max(p.elsewhere_share * min(gain, trial.gain),
+                                      p.least_elsewhere)
 
 
 def neither_holds(found: Found, own: str, other: str, least: float) -> bool:

@@ -9,8 +9,6 @@ from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag_reader import bag_files
 
-SAME = 0.5      # of the IMU's readings that are alike to the last digit; noise makes none
-
 
 def check_apart(runs: list[Path]) -> None:
     """
@@ -46,13 +44,14 @@ def names_of(runs: list[Path]) -> list[str]:
     return names
 
 
-def check_flights(runs: list[Path], flights: list[Flight]) -> None:
+def check_flights(runs: list[Path], flights: list[Flight], same: float) -> None:
     """
     Refuse one flight in two recordings, whose files differ: cut, converted or recorded twice.
 
     Args:
         runs: paths, for the message.
         flights: what was read there.
+        same: part of the IMU's readings that only one flight has in common.
 
     Raises:
         ParameterError: naming both recordings.
@@ -61,7 +60,7 @@ def check_flights(runs: list[Path], flights: list[Flight]) -> None:
     readings = [{row.tobytes() for row in flight.imu} for flight in flights]
     for k, own in enumerate(readings):
         for j in range(k):
-            if len(own & readings[j]) > SAME * min(len(own), len(readings[j])):
+            if len(own & readings[j]) > same * min(len(own), len(readings[j])):
                 raise ParameterError(f'{runs[j]} and {runs[k]}: the same flight in two '
                                      'recordings; expected different flights, each once')
 

@@ -14,10 +14,6 @@ from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-SETTLE = 1.0            # [s] after take-off that are not looked at
-LIFTED = 0.8            # of the weight: commanded thrust that flies
-SPREAD = 0.4            # by which measured and commanded specific force may differ
-
 
 class UnusableFlight(ValueError):
     """
@@ -124,7 +120,7 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
     if wrong:
         raise UnusableFlight(wrong[0].text, wrong)
     series = {topic: _in_order(name, topic, recording, findings) for topic in recording.times}
-    begin, end = _flown(name, recording, series, robot)
+    begin, end = _flown(name, recording, series, robot, p)
     begin, end = _without_gaps(name, series, begin, end, p, findings)
     least = max(p.least_duration, shortest_flight(p))
     if end - begin < least:
@@ -139,7 +135,7 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
     flight = Flight(name, begin, end - begin, *cut['imu/data_raw'], cut['mocap/pose'][0], pose,
                     *cut['joint_states'], *cut['command'], *cut['battery_state'],
                     findings=findings)
-    _check_robot(flight, robot)
+    _check_robot(flight, robot, p)
     return flight
 
 
@@ -163,18 +159,18 @@ def _in_order(name, topic, recording, findings):
     return t, values[first]
 
 
-def _flown(name, recording, series, robot):
+def _flown(name, recording, series, robot, p):
     """First and last moment of the flight that is looked at."""
     t, command = series['command']
-    lifted = command[:, 4:].sum(axis=1) > LIFTED * robot.mass * robot.gravity
+    lifted = command[:, 4:].sum(axis=1) > p.lifted * robot.mass * robot.gravity
     if lifted.mean() < 0.2:
         raise _unusable(name, 'command', 'the robot does not fly: commanded thrust is above '
-                        f'{LIFTED:g} of its weight in {lifted.mean():.0%} of the time')
+                        f'{p.lifted:g} of its weight in {lifted.mean():.0%} of the time')
     begin = t[np.argmax(lifted)]
     height, when = series['mocap/pose'][1][:, 2], series['mocap/pose'][0]
     if begin > when[0] + 0.3:       # the take-off was recorded
         risen = when[(when > begin) & (height > height[0] + 0.15)]
-        begin = (risen[0] if len(risen) else begin) + SETTLE
+        begin = (risen[0] if len(risen) else begin) + p.settle
         flying = [at for at, state in recording.states if state.startswith('flying')]
         if flying and when[0] - 1 < flying[0] < when[-1]:
             begin = max(begin, flying[0])
@@ -215,7 +211,7 @@ def _continuous(quaternion):
     return unit * np.concatenate([[1.0], np.cumprod(turn)])[:, None]
 
 
-def _check_robot(flight, robot):
+def _check_robot(flight, robot, p):
     """A robot file that is of another robot altogether."""
     total = np.median(np.linalg.norm(flight.imu[:, :3], axis=1))
     if total < 0.3 * robot.gravity:
@@ -223,6 +219,6 @@ def _check_robot(flight, robot):
                         f'near {robot.gravity:.2f} m/s^2 expected')
     asked = np.median(flight.command[:, 4:].sum(axis=1)) / robot.mass
     # Thrusts also work against each other, so only far too little is impossible.
-    if asked < (1 - SPREAD) * total or asked > 3 * total:
+    if asked < (1 - p.wrong_robot) * total or asked > 3 * total:
         raise _unusable(flight.name, 'command', 'the robot file does not fit: commanded thrust '
                         f'over its mass is {asked:.1f} m/s^2, the IMU measures {total:.1f} m/s^2')

@@ -25,8 +25,6 @@ SMALLEST = 0.02         # ratio to the file's own number ...
 # the file's 3 N m against the 0.05 N m of quick poses.
 SMALLEST_OF = {'effort_limit': 1e-3}
 TILT_BUS, THRUST_BUS = 'base.tilt_delay', 'base.thrust_delay'   # of commands on their way
-# Within its range a bus may be as late as it likes, and a little rather at its nominal delay [s].
-BUS_NEAR, BUS_NEAR_COARSE = 0.0035, 0.006
 GROUPS = {  # signal-layer entries -> channel groups in which they show
     'rotor_lag': 'B', 'rotor_dead_time': 'B', 'thrust_saturation': 'B', 'command_latency': 'BJ',
     'joint_command_latency': 'J', 'joint_bandwidth': 'J', 'joint_velocity_limit': 'J',
@@ -201,7 +199,7 @@ def tolerances(p: GapParameters, coarse: bool = False,
     beliefs['imu_filter_lag.delay'] = Belief(p.tolerance_delay, 0.0, p.imu_averaging, 0.002)
     reach, nominal = p.command_delay_range, p.command_delay
     for bus in (TILT_BUS, THRUST_BUS):
-        beliefs[bus] = Belief(5e-4, nominal, reach / 2, BUS_NEAR)
+        beliefs[bus] = Belief(5e-4, nominal, reach / 2, p.bus_near[0])
     near = p.tolerance_swing
     beliefs['swing.ratio'] = Belief(p.tolerance_lag, near, max(swing, near), swing + near)
     if coarse:
@@ -209,7 +207,7 @@ def tolerances(p: GapParameters, coarse: bool = False,
         beliefs['imu_filter_lag.delay'] = Belief(p.tolerance_delay, 0.0, imu, imu)
         beliefs['joint_feedback_delay.delay'] = Belief(p.tolerance_delay, 0.0, joint, joint)
         for bus in (TILT_BUS, THRUST_BUS):
-            beliefs[bus] = Belief(5e-4, nominal, reach / 2, BUS_NEAR_COARSE)
+            beliefs[bus] = Belief(5e-4, nominal, reach / 2, p.bus_near[1])
     return beliefs
 
 

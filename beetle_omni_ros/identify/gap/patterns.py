@@ -22,14 +22,6 @@ from beetle_omni_ros.identify.gap.series import matrices
 SWINGING = 'a mass that swings'
 ROTORS = tuple(f'rotor_thrust_coefficient.scale[{k}]' for k in range(4))
 WORLD = tuple(f'wind.force[{k}]' for k in range(3))
-FORCE, PART = 0.5, 0.05     # sizes that are likely: [N], and of a rotor's thrust
-WARM = 20.0                 # [s] in which something that warms up does
-SPACING, WIDTH = 0.9, 0.7   # [m] of the places where a force is sought
-SWINGS = (0.8, 1.1, 1.5, 2.0, 2.7)   # [Hz] of loose masses, weakly damped
-DAMPING = 0.1
-SWUNG = 0.05                # likely mass of them, of the robot's
-RHYTHMS = 0.5, 6.0          # [Hz] of forces that come by themselves: below, a task repeats
-NEAR = 0.4                  # [Hz] to both sides that a line must exceed
 
 
 @dataclass(frozen=True)
@@ -105,15 +97,16 @@ def questions(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarr
     """Text -> (N, 6, K) specific force and angular acceleration of likely size, every THIN."""
     x = {name: values[::THIN] for name, values in model.inputs(theta).items()}
     exact = model._body.derivatives(x, theta, (*ROTORS, *WORLD))
-    rotor, world = PART * exact[:, :, :4], FORCE * exact[:, :, 4:]
+    p = model.p
+    rotor, world = p.pattern_thrust * exact[:, :, :4], p.pattern_force * exact[:, :, 4:]
     rotation = matrices(x['quaternion'])
     body = np.einsum('ncj,nji->nci', world, rotation)
     speed = np.linalg.norm(x['velocity'], axis=1)[:, None]
     own = np.einsum('nji,nj->ni', rotation, x['velocity'])
-    time = THIN * model.p.grid * np.arange(len(speed))[:, None]
+    time = THIN * p.grid * np.arange(len(speed))[:, None]
     tilts = np.concatenate([np.sin(x['tilt']), np.cos(x['tilt'])], axis=1)
     return {
-        'the place': _times(world, _places(x['position'])),
+        'the place': _times(world, _places(x['position'], p)),
         'the direction of motion': np.concatenate([
             _times(world, x['velocity'] / (speed + 0.05)), _times(body, own / (speed + 0.05))],
             axis=2),
@@ -122,8 +115,8 @@ def questions(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarr
         'tilts of the rotors, through thrust': _times(rotor, tilts),
         'thrust of the rotors': _times(rotor, x['thrust'] / 8.0 - 1.0),
         'time of flight, through thrust': _times(rotor, np.concatenate(
-            [1 - np.exp(-time / WARM), time / time[-1]], axis=1)),
-        SWINGING: _swings(model._body(x, theta)[:, :3], THIN * model.p.grid)}
+            [1 - np.exp(-time / p.warm_up), time / time[-1]], axis=1)),
+        SWINGING: _swings(model._body(x, theta)[:, :3], THIN * p.grid, p)}
 
 
 def _times(forces, shares):
@@ -132,31 +125,32 @@ def _times(forces, shares):
     return both.reshape(*forces.shape[:2], -1)
 
 
-def _places(position):
+def _places(position, p):
     """(N, B) nearness to points of a grid in the plane, height, and one."""
-    corners = SPACING * np.array([(i, j) for i in range(-2, 3) for j in range(-2, 3)])
+    corners = p.place_spacing * np.array([(i, j) for i in range(-2, 3) for j in range(-2, 3)])
     off = position[:, None, :2] - corners
-    near = np.exp(-0.5 * (off**2).sum(axis=2) / WIDTH**2)
+    near = np.exp(-0.5 * (off**2).sum(axis=2) / p.place_width**2)
     return np.column_stack([near, position[:, 2] - 1.0])
 
 
-def _swings(force, period):
+def _swings(force, period, p):
     """
     (N, 6, K) what masses on weak springs return of the body's specific force.
 
     Args:
         force: (N, 3) that the model expects: measured, it would hold the gust that it explains.
         period: between samples [s].
+        p: parameters.
 
     """
-    size = np.zeros((len(force), 6, 3 * len(SWINGS)))
-    for j, frequency in enumerate(SWINGS):
+    size, twice = np.zeros((len(force), 6, 3 * len(p.swings))), 2 * p.swing_damping
+    for j, frequency in enumerate(p.swings):
         w = 2 * np.pi * frequency
-        b, a = bilinear([2 * DAMPING * w, w * w], [1.0, 2 * DAMPING * w, w * w], 1 / period)
+        b, a = bilinear([twice * w, w * w], [1.0, twice * w, w * w], 1 / period)
         # Less what a mass that is tied down would do: that is in the robot's own mass.
         swung = lfilter(b, a, force - force[0], axis=0) - (force - force[0])
         for k in range(3):
-            size[:, k, k * len(SWINGS) + j] = SWUNG * swung[:, k]
+            size[:, k, k * len(p.swings) + j] = p.swing_mass * swung[:, k]
     return size
 
 
@@ -217,7 +211,7 @@ def rhythm(problem: Problem, theta: dict[str, float]) -> Rhythm:
             window = np.hanning(len(r))[:, None]
             power = np.abs(np.fft.rfft((r - r.mean(axis=0)) * window, count, axis=0))**2
             spectra.append(2 * power.sum(axis=1) / (window.sum()**2))
-        found = _line(np.fft.rfftfreq(count, h), np.mean(spectra, axis=0))
+        found = _line(np.fft.rfftfreq(count, h), np.mean(spectra, axis=0), problem.p)
         best = max(best, found, key=lambda line: line.ratio)
     return best
 
@@ -228,11 +222,11 @@ def _turns(model):
     return rotation[model.filters['B'].centres(len(rotation))]
 
 
-def _line(frequency, power):
+def _line(frequency, power, p):
     """The line that exceeds its surroundings most."""
     step = frequency[1]
-    reach = round(NEAR / step)
-    inside = np.flatnonzero((frequency > RHYTHMS[0]) & (frequency < RHYTHMS[1]))
+    reach = round(p.line_beside / step)
+    inside = np.flatnonzero((frequency > p.rhythms[0]) & (frequency < p.rhythms[1]))
     inside = inside[(inside >= reach) & (inside + reach < len(power))]
     beside = np.array([np.median(power[k - reach:k + reach + 1]) for k in inside])
     ratio = power[inside] / np.maximum(beside, 1e-30)

@@ -10,11 +10,6 @@ from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.trial import Trial
 
-REFINED = 5             # candidates of each step that are fitted, not only estimated
-PROMISING = 0.25        # of the best linear gain
-LEAST_LOOKED_AT = 0.5   # of what an effect must gain: a straight line may promise too little
-PROMISING_CURVED = 0.1  # likewise, of those that a straight line cannot judge
-
 
 class Proposals:
     """
@@ -77,9 +72,10 @@ class Proposals:
         What leads may be too small to matter, or hold in one block only: then it must not hide
         what explains less and is there.
         """
-        least = LEAST_LOOKED_AT * self.problem.p.least_gain
+        p = self.problem.p
+        least = p.looked_at * p.least_gain
         chosen = [k for k, trial in enumerate(self.trials)
-                  if not trial.refined and trial.gain >= least][:REFINED]
+                  if not trial.refined and trial.gain >= least][:p.refined]
         labels = {self.trials[k].candidate.label for k in chosen}
         self._fit(chosen)
         return [trial for trial in self.trials if trial.candidate.label in labels]
@@ -105,14 +101,14 @@ class Proposals:
 def _promising(problem, trials):
     """Indices of the trials, best first, that are worth a fit of their own."""
     best = max(trials[0].gain, 1.0) if trials else 1.0
-    chosen = []
+    chosen, p = [], problem.p
     for k, trial in enumerate(trials):
         curved = any(problem.keys[n].parameter in CURVED for n in trial.candidate.keys)
-        if trial.gain < (PROMISING_CURVED if curved else PROMISING) * best \
-                or trial.gain < LEAST_LOOKED_AT * problem.p.least_gain \
-                or len(chosen) >= REFINED + 3:
+        if trial.gain < (p.promising_curved if curved else p.promising) * best \
+                or trial.gain < p.looked_at * p.least_gain \
+                or len(chosen) >= p.refined + 3:
             continue
-        if len(chosen) < REFINED or curved:
+        if len(chosen) < p.refined or curved:
             chosen.append(k)
     return chosen
 

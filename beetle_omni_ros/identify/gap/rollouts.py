@@ -18,21 +18,11 @@ from beetle_omni_ros.identify.gap.loads import module_load, spin_load, undescrib
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
 from beetle_omni_ros.identify.gap.servo import simulate, Windows
-from beetle_omni_ros.identify.gap.signals import (
-    FINE,
-    matrices,
-    play,
-    SMOOTH_IMU,
-    SMOOTH_JOINT,
-    SMOOTH_POSE,
-)
+from beetle_omni_ros.identify.gap.signals import FINE, matrices, play
 
 HORIZONS = (0.1, 0.5, 1.0)      # [s]
-EVERY = 0.5                     # [s] between starts
 STATES = ('position', 'velocity', 'orientation', 'rate', 'joint')
 UNITS = dict(zip(STATES, ('m', 'm/s', 'rad', 'rad/s', 'rad'), strict=True))
-LEAST = np.array([1e-3, 5e-3, 2e-3, 1e-2, 1e-3])   # floors of the floor, by state
-DRAWS = 200
 PLAY = 'joint_backlash.gap'
 
 
@@ -57,7 +47,7 @@ class Runs:
 def free_runs(model: FlightModel, theta: dict[str, float], noise: Noise) -> Runs:
     """Run the model with these numbers through one flight."""
     s, h = model.signals, model.p.grid
-    steps, between = round(HORIZONS[-1] / h), round(EVERY / h)
+    steps, between = round(HORIZONS[-1] / h), round(model.p.run_every / h)
     starts = np.arange(0, len(s.t) - steps - 2, between)
     fine = np.array([model.trusted[k:k + steps + 1].all() for k in starts])
     starts = starts[fine] if fine.any() else starts
@@ -171,7 +161,7 @@ def regimes_at(model: FlightModel, times: np.ndarray) -> np.ndarray:
 
 def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
     """(H, 5) errors that a perfect model would show."""
-    pose, gravity = model.flight.pose, model.robot.gravity
+    pose, gravity, p = model.flight.pose, model.robot.gravity, model.p
     third = np.diff(pose, 3, axis=0)
     seen = np.median(np.abs(third), axis=0) / 0.6745 / np.sqrt(20)
     position = float(np.sqrt((seen[:3]**2).sum()))
@@ -181,17 +171,17 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
                           / 20).sum()))
     # Readings at 100 Hz, interpolated to the fine grid: neighbours share their noise.
     share = np.sqrt(2.0)
-    coarse = model.signals.position_noise > model.p.coarse_noise
-    slope = low_pass(model.p.velocity_edge if coarse else SMOOTH_POSE, 1, FINE)
+    coarse = model.signals.position_noise > p.coarse_noise
+    slope = low_pass(p.velocity_edge if coarse else p.smooth_pose, 1, FINE)
     velocity0 = position * share * np.linalg.norm(
         slope(np.eye(1, 4 * slope.margin + 1, 2 * slope.margin)[0], 1))
-    smooth = low_pass(SMOOTH_IMU, 1, FINE)
+    smooth = low_pass(p.smooth_imu, 1, FINE)
     rate0 = gyro * np.linalg.norm(smooth.taps)
     angle0 = angle * share * np.linalg.norm(low_pass(10.0, 1, FINE).taps)
     s = model.signals
-    edge = SMOOTH_JOINT if s.guide is None else model.p.guide_edge
+    edge = p.smooth_joint if s.guide is None else p.guide_edge
     joint0 = s.reading_noise * np.linalg.norm(low_pass(edge, 1, FINE).taps)
-    push = _pushed(noise, model.p, gravity)
+    push = _pushed(noise, p, gravity)
     floors = []
     for k, horizon in enumerate(HORIZONS):
         floors.append([
@@ -201,7 +191,7 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
             2 * angle0**2 + (horizon * rate0)**2 + push[k][2]**2,
             2 * rate0**2 + push[k][3]**2,
             4 * float(np.mean(noise.spread['J']**2)) + 8 * joint0**2])
-    return np.maximum(np.sqrt(floors), LEAST)
+    return np.maximum(np.sqrt(floors), p.run_floors)
 
 
 def _pushed(noise, p, gravity):
@@ -217,7 +207,7 @@ def _pushed(noise, p, gravity):
     rng = np.random.default_rng(0)
     once, twice = [], []
     for c in range(6):
-        drive = level[c] * rng.standard_normal((DRAWS, count + 60))
+        drive = level[c] * rng.standard_normal((p.run_draws, count + 60))
         pushed = lfilter([1.0], noise.taps['B'][c], drive, axis=1)[:, 60:]
         speed = np.cumsum(pushed, axis=1) * h
         once.append(speed)

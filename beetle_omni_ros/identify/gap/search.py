@@ -24,13 +24,6 @@ from beetle_omni_ros.identify.gap.keys import SHAPES
 from beetle_omni_ros.identify.gap.proposals import Proposals
 from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, IMPOSSIBLE, NOT_HELD, TOO_SMALL
 
-MOST_TURNS = 4          # of fresh slopes, while a fit runs away from them
-FAR = 0.2               # typical sizes of a curved number
-BEYOND = 3.0            # standard deviations of a tolerance that no robot has ...
-ROUNDS = 3              # ... and how often others may take over from it
-MOST_ITERATIONS = 10    # of a fit, which ends by itself where it gains no more
-WIDE = 4.0              # typical sizes, within which anything is sought
-
 
 class Search:
     """
@@ -49,7 +42,7 @@ class Search:
         self.problem, self.candidates, self.progress = problem, candidates, progress
         self.p = problem.p
         self.names = [name for name, key in problem.keys.items() if key.parameter not in SHAPES]
-        self.wide = {name: WIDE * problem.keys[name].typical for name in self.names}
+        self.wide = {name: problem.p.wide * problem.keys[name].typical for name in self.names}
         self.always = [name for name in problem.beliefs if name in problem.keys]
 
     _proposals: Proposals | None = None     # of the present step
@@ -111,14 +104,14 @@ class Search:
         would say of the effect: what the effect explains must not be counted against that.
         """
         problem, held, theta = self.problem, set(), dict(state.theta)
-        for _ in range(ROUNDS):
+        for _ in range(self.p.takeovers):
             beyond = {n for n in self.always if n not in held
-                      and abs(problem.beliefs[n].residual(theta.get(n, 0.0))) > BEYOND}
+                      and abs(problem.beliefs[n].residual(theta.get(n, 0.0))) > self.p.beyond}
             if not beyond:
                 break
             held |= beyond
             for name in beyond:
-                theta[name] = problem.beliefs[name].within(theta[name], BEYOND)
+                theta[name] = problem.beliefs[name].within(theta[name], self.p.beyond)
             start = State(theta, problem.residual(theta), state.slopes, state.names)
             names = [n for n in self.always if n not in held]
             now, cost = problem.refine(start, names, frozenset(), 2)
@@ -133,7 +126,7 @@ class Search:
             problem.guide(theta)
             problem.state(theta, self.names)
         state = problem.learn_noise(self.wide)
-        for _ in range(MOST_TURNS):
+        for _ in range(self.p.most_turns):
             state, _ = self._refit(state, accepted)
             if not self._far(at, state.theta):
                 problem.renew(state.theta)
@@ -144,11 +137,11 @@ class Search:
             state = problem.learn_noise(self.wide, 2)
         state = problem.learn_noise(self.wide, 2)
         # To the end: what this fit leaves on the way is a gain of every candidate's.
-        return self._refit(state, accepted, MOST_ITERATIONS, apart=True)
+        return self._refit(state, accepted, self.p.most_iterations, apart=True)
 
     def _far(self, a, b):
         """Whether slopes taken at one point are of little use at the other."""
-        return any(abs(a.get(name, 0.0) - b.get(name, 0.0)) > FAR * self.problem.keys[
+        return any(abs(a.get(name, 0.0) - b.get(name, 0.0)) > self.p.far * self.problem.keys[
             name].typical for name in {*a, *b} if self.problem.keys[name].parameter in CURVED)
 
     def _floor(self, state):
@@ -195,7 +188,7 @@ class Search:
             else:
                 self._cross_validate(trial, accepted)
                 much = p.weak_agreement if trial.gain > p.weak_gain * need else p.strong_agreement
-                sure = trial.cross[0] > much * trial.cross[1] and trial.positive >= 0.7
+                sure = trial.cross[0] > much * trial.cross[1] and trial.positive >= p.sure_blocks
                 if not holds(trial, p):
                     trial.reason = NOT_HELD
                 elif trial.share < p.least_share and not (
@@ -209,7 +202,7 @@ class Search:
     def _impossible(self, trial):
         commanded = any(name in COMMANDS for name in trial.candidate.keys)
         return at_bound(self.problem.keys, trial, self.problem.models[0].signals.delays(
-            trial.theta) if commanded else ())
+            trial.theta) if commanded else (), self.p.early_command)
 
     def _fought(self, trial, accepted):
         return fought(self.problem, trial, self._proposals.points[trial.candidate.label],

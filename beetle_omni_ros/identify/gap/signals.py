@@ -27,14 +27,9 @@ from beetle_omni_ros.identify.gap.series import (
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 FINE = 0.005            # [s] grid on which measurements are smoothed
-SMOOTH_IMU, SMOOTH_JOINT, SMOOTH_POSE = 22.0, 20.0, 6.0     # [Hz] of the model's inputs
-# [Hz] of what is compared. Every other reading as it is would let the noise above the grid's
-# Nyquist rate through, differently for every shift in time: a fit finds delays where that pays.
-SMOOTH_READING = 35.0
 # The IMU's clock is everybody's: what it is late by, all else is early by. Shifting the IMU itself
 # would sample its noise elsewhere, which changes chi2 by more than a delay is worth.
 IMU_LAG = 'imu_filter_lag.delay'
-MEMORY = 0.9            # [s] of rotors and commands before the first sample
 
 
 class Signals:
@@ -63,7 +58,7 @@ class Signals:
         pad = 0.5
         self._fine = np.arange(EDGE - pad, self.t[-1] + pad + FINE / 2, FINE)
         self._lead = round(pad / FINE)
-        self._step, self._begin = FINE / 2, self._fine[0] - MEMORY    # of the rotors' filter
+        self._step, self._begin = FINE / 2, self._fine[0] - p.memory    # of the rotors' filter
         # Not straight lines: between two readings those would halve the noise's power, and a fit
         # would shift the IMU to where that pays.
         self._imu = CubicSpline(*filled(*spread(flight.imu_t, flight.imu)))
@@ -88,7 +83,7 @@ class Signals:
 
     def follow(self, guide: np.ndarray) -> None:
         """Take the tilts (N, 4) [rad] of a servo model where encoders say only noise."""
-        self.guide, self._expected = guide, derivatives(guide, SMOOTH_JOINT, self.p.grid)
+        self.guide, self._expected = guide, derivatives(guide, self.p.smooth_joint, self.p.grid)
         self._kept = {key: value for key, value in self._kept.items() if key[0] != 'joints'}
 
     def _cached(self, what, theta, names, make):
@@ -111,8 +106,9 @@ class Signals:
     def _own_imu(self):
         """Specific force, rates and their derivative (N, 3) each, as the IMU says."""
         fine = self._imu(np.clip(self._fine, self.flight.imu_t[0], self.flight.imu_t[-1]))
-        return (self._smooth(fine[:, :3], SMOOTH_IMU), self._smooth(fine[:, 3:], SMOOTH_IMU),
-                self._smooth(fine[:, 3:], SMOOTH_IMU, 1))
+        edge = self.p.smooth_imu
+        return (self._smooth(fine[:, :3], edge), self._smooth(fine[:, 3:], edge),
+                self._smooth(fine[:, 3:], edge, 1))
 
     def imu(self, theta):
         """Specific force, rates and their derivative (N, 3) each, of base_link."""
@@ -152,9 +148,9 @@ class Signals:
         quaternion = self._smooth(fine[:, 3:], 10.0)
         quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
         if self.position_noise > self.p.coarse_noise:
-            velocity = self._fused(self._smooth(fine[:, :3], SMOOTH_POSE), quaternion)
+            velocity = self._fused(self._smooth(fine[:, :3], self.p.smooth_pose), quaternion)
         else:
-            velocity = self._smooth(fine[:, :3], SMOOTH_POSE, 1)
+            velocity = self._smooth(fine[:, :3], self.p.smooth_pose, 1)
         return position, quaternion, velocity
 
     def _fused(self, position, quaternion):
@@ -177,21 +173,23 @@ class Signals:
         def make():
             fine = self._joint(np.clip(self._fine + delay - late, self.flight.joint_t[0],
                                        self.flight.joint_t[-1]))
-            raw = self._smooth(fine, SMOOTH_READING)
+            raw = self._smooth(fine, self.p.smooth_reading)
             if gap > 0:
                 fine = play(fine, gap / 2)
             if self.guide is not None:
                 return *self._guided(raw, gap), raw
-            return tuple(self._smooth(fine, SMOOTH_JOINT, k) for k in range(3)) + (raw,)
+            return tuple(self._smooth(fine, self.p.smooth_joint, k) for k in range(3)) + (raw,)
         return self._cached('joints', theta, names, make)
 
     def _guided(self, raw, gap):
         """Angle, rate, acceleration (N, 4): slow motion as read, quick motion as expected."""
         guide = play(self.guide, gap / 2) if gap > 0 else self.guide
-        expected = self._expected if gap <= 0 else derivatives(guide, SMOOTH_JOINT, self.p.grid)
-        slow = [within(low_pass(self.p.guide_edge, 1, self.p.grid), raw - guide, 0)]
+        p, expected = self.p, self._expected
+        if gap > 0:
+            expected = derivatives(guide, p.smooth_joint, p.grid)
+        slow = [within(low_pass(p.guide_edge, 1, p.grid), raw - guide, 0)]
         for _ in range(2):
-            slow.append(np.gradient(slow[-1], self.p.grid, axis=0))
+            slow.append(np.gradient(slow[-1], p.grid, axis=0))
         return tuple(a + b for a, b in zip(expected, slow, strict=True))
 
     def delays(self, theta):

@@ -13,7 +13,6 @@ from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel, THIN
 from beetle_omni_ros.identify.gap.series import matrices
 
-RIDGE = 3.0             # of a whitened and scaled regression
 TERMS_SHOWN = 4
 ALIKE = 1e-6            # singular values of slopes, of the largest, below which they say the same
 
@@ -114,7 +113,8 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
                     for model, made in zip(problem.models, columns, strict=True)]
             x, smooth = (np.concatenate([pair[i] for pair in both]) for i in (0, 1))
             held, scores, weights, explained, r = _cross(
-                x, fitted[rows], state.r[rows], problem.block[rows], problem.blocks)
+                x, fitted[rows], state.r[rows], problem.block[rows], problem.blocks,
+                problem.p.remainder_ridge)
             name = CHANNELS[group][k]
             size[name] = float(np.sqrt(((smooth @ weights)**2).mean()))
             if group == 'B' and _fought(problem, rows, explained, r):
@@ -153,7 +153,7 @@ def _whitened(problem, model, group, channel, columns):
     return white, smooth[len(tap) - 1:]
 
 
-def _cross(x, fitted, r, block, blocks):
+def _cross(x, fitted, r, block, blocks, ridge):
     """
     A ridge regression, judged on blocks left out.
 
@@ -174,7 +174,7 @@ def _cross(x, fitted, r, block, blocks):
     h = [x[block == b].T @ x[block == b] for b in range(blocks)]
     g = [x[block == b].T @ r[block == b] for b in range(blocks)]
     all_h, all_g = sum(h), sum(g)
-    ridge = RIDGE * np.trace(all_h) / max(len(all_h), 1) / 100 * np.eye(len(all_h))
+    ridge = ridge * np.trace(all_h) / max(len(all_h), 1) / 100 * np.eye(len(all_h))
     held = np.zeros(blocks)
     for b in range(blocks):
         w = np.linalg.solve(all_h - h[b] + ridge, all_g - g[b])
