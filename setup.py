@@ -114,6 +114,7 @@ DEVELOPMENT = [
     'colcon-common-extensions>=0.3',
     'mypy>=1.15,<3',
     'ruff>=0.9',
+    'trimesh>=4',       # description/generate_meshes.py
 ]
 
 setup(

@@ -1,7 +1,6 @@
 """Write the URDF of a robot file: ``python description/generate_urdf.py [--robot FILE]``."""
 
 import argparse
-from math import atan2, hypot
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +10,11 @@ from beetle_omni_ros.sim.mass_properties import mass_properties
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 OUTPUT = Path(__file__).parent / 'beetle_omni.urdf'
-HUB_RADIUS, HUB_HEIGHT, ARM_RADIUS, LEG_RADIUS = 0.06, 0.05, 0.009, 0.005   # [m] for the eye
-DISC_HEIGHT = 0.006                                                         # [m] for the eye
+MESHES = 'package://beetle_omni_ros/description/meshes'
+DISC_HEIGHT = 0.003         # [m] of the disc that a turning propeller looks like
+COLOURS = {'dark': '0.10 0.105 0.12 1', 'shell': '0.82 0.84 0.87 1', 'metal': '0.5 0.52 0.56 1',
+           'front': '0.88 0.14 0.10 1', 'rear': '0.13 0.15 0.18 1', 'ball': '0.97 0.60 0.08 1',
+           'propeller': '0.35 0.62 0.90 0.25'}
 
 
 def text(*numbers) -> str:
@@ -34,18 +36,19 @@ def inertial(mass, centre, inertia) -> str:
             f'<inertia {entries}/></inertial>')
 
 
-def shape(geometry, position=(0, 0, 0), rpy=(0, 0, 0), material='dark', collision=False) -> str:
-    """A <visual>, and the same as <collision> if asked."""
-    body = f'{origin(position, rpy)}<geometry>{geometry}</geometry>'
-    visual = f'<visual>{body}<material name="{material}"/></visual>'
-    return visual + (f'\n    <collision>{body}</collision>' if collision else '')
+def mesh(name) -> str:
+    """The <geometry> of one file of generate_meshes.py."""
+    return f'<geometry><mesh filename="{MESHES}/{name}.stl"/></geometry>'
 
 
-def rod(start, end, radius, material='dark') -> str:
-    """A cylinder between two points."""
-    x, y, z = np.subtract(end, start)
-    return shape(f'<cylinder radius="{text(radius)}" length="{text(hypot(x, y, z))}"/>',
-                 np.add(start, end) / 2, (0, atan2(hypot(x, y), z), atan2(y, x)), material)
+def visual(geometry, material) -> str:
+    """A <visual> at the link's origin."""
+    return f'<visual>{origin()}{geometry}<material name="{material}"/></visual>'
+
+
+def collision(name, position=(0, 0, 0)) -> str:
+    """A <collision> with one convex mesh."""
+    return f'<collision>{origin(position)}{mesh(name)}</collision>'
 
 
 def link(name, *content) -> str:
@@ -61,32 +64,28 @@ def fixed(name, parent, child, position=(0, 0, 0)) -> str:
             f'<child link="{child}"/>\n    {origin(position)}\n  </joint>')
 
 
-def main_body(robot, plant, parts) -> str:
-    """Hub, arms and legs; the main body's frame is parallel to base_link."""
-    ball = [0, 0, robot.multibody.end_effector.height]
-    arms = [rod([0, 0, robot.multibody.module.joint_height], joint - parts.main_origin, ARM_RADIUS,
-                'front' if joint[0] > 0 else 'dark') for joint in parts.joint_origins]
-    legs = []
-    for x, y in [(1, 1), (-1, 1), (-1, -1), (1, -1)]:
-        foot = np.array([x * plant.foot_spread, y * plant.foot_spread,
-                         plant.foot_radius - plant.foot_depth]) - parts.main_origin
-        legs += [rod(0.5 * np.array([x, y, 0]) * HUB_RADIUS, foot, LEG_RADIUS),
-                 shape(f'<sphere radius="{text(plant.foot_radius)}"/>', foot, collision=True)]
+def main_body(plant, parts) -> str:
+    """Frame, shell, arms and legs; the main body's frame is parallel to base_link."""
+    feet = [np.array([x * plant.foot_spread, y * plant.foot_spread,
+                      plant.foot_radius - plant.foot_depth]) - parts.main_origin
+            for x, y in [(1, 1), (-1, 1), (-1, -1), (1, -1)]]
     body = parts.main_body
     return link('main_body', inertial(body.mass, body.centre - parts.main_origin, body.inertia),
-                shape(f'<cylinder radius="{text(HUB_RADIUS)}" length="{text(HUB_HEIGHT)}"/>',
-                      collision=True), rod([0, 0, 0], ball, LEG_RADIUS), *arms, *legs)
+                visual(mesh('frame'), 'dark'), visual(mesh('shell'), 'shell'),
+                visual(mesh('arms_front'), 'front'), visual(mesh('arms_rear'), 'rear'),
+                collision('hub_collision'), *(collision('foot_collision', foot) for foot in feet))
 
 
 def module(robot, plant, parts, k) -> str:
     """One tilting module with its rotor; x of the module's frame is the tilt axis."""
     module, joints = robot.multibody.module, robot.joints
-    disc = (f'<cylinder radius="{text(plant.propeller_radius)}" '
-            f'length="{text(DISC_HEIGHT)}"/>')
+    disc = (f'<geometry><cylinder radius="{text(plant.propeller_radius)}" '
+            f'length="{text(DISC_HEIGHT)}"/></geometry>')
+    propeller = 'rotor_anticlockwise' if robot.rotors.spin[k] > 0 else 'rotor_clockwise'
     return '\n'.join([
         link(f'module{k + 1}', inertial(module.mass, module.centre_of_mass,
                                         np.diag(module.inertia)),
-             rod([0, 0, 0], [module.rotor_offset, 0, 0], ARM_RADIUS)),
+             visual(mesh('module'), 'metal')),
         f'  <joint name="{JOINT_NAMES[k]}" type="revolute">\n    <parent link="base_link"/>'
         f'<child link="module{k + 1}"/>\n    '
         f'{origin(parts.joint_origins[k], (0, 0, robot.rotors.arm_yaw[k]))}\n    '
@@ -94,7 +93,8 @@ def module(robot, plant, parts, k) -> str:
         f'    <limit lower="{text(-joints.position_limit)}" upper="{text(joints.position_limit)}" '
         f'effort="{text(joints.effort_limit)}" velocity="{text(joints.velocity_limit)}"/>\n'
         '  </joint>',
-        link(ROTOR_NAMES[k], shape(disc, material='propeller', collision=True)),
+        link(ROTOR_NAMES[k], visual(mesh(propeller), 'dark'), visual(disc, 'propeller'),
+             collision('rotor_collision')),
         fixed(f'{ROTOR_NAMES[k]}_mount', f'module{k + 1}', ROTOR_NAMES[k],
               (module.rotor_offset, 0, 0))])
 
@@ -103,20 +103,19 @@ def urdf(robot: RobotParameters, plant) -> str:
     """The whole description; base_link is the centre of gravity."""
     parts = mass_properties(robot)
     ball = robot.multibody.end_effector
-    materials = ''.join(f'  <material name="{name}"><color rgba="{rgba}"/></material>\n'
-                        for name, rgba in [('dark', '0.15 0.15 0.17 1'),
-                                           ('front', '0.85 0.2 0.15 1'),
-                                           ('propeller', '0.25 0.5 0.75 0.5')])
+    materials = '\n'.join(f'  <material name="{name}"><color rgba="{rgba}"/></material>'
+                          for name, rgba in COLOURS.items())
     solid = np.zeros((3, 3))
     return '\n'.join([
         '<?xml version="1.0"?>',
         '<!-- Written by description/generate_urdf.py from params/robot.yaml; edit those. -->',
-        f'<robot name="{robot.name}">', materials.rstrip('\n'),
-        link('base_link'), main_body(robot, plant, parts),
+        f'<robot name="{robot.name}">',
+        '  <mujoco><compiler meshdir="meshes" strippath="true"/></mujoco>', materials,
+        link('base_link'), main_body(plant, parts),
         fixed('main_body_mount', 'base_link', 'main_body', parts.main_origin),
         *[module(robot, plant, parts, k) for k in range(4)],
         link('end_effector', inertial(ball.mass, np.zeros(3), solid),
-             shape(f'<sphere radius="{text(plant.end_effector_radius)}"/>', collision=True)),
+             visual(mesh('end_effector'), 'ball'), collision('end_effector_collision')),
         fixed('end_effector_mount', 'main_body', 'end_effector', (0, 0, ball.height)),
         link('imu'), fixed('imu_mount', 'base_link', 'imu'), '</robot>', ''])
 

@@ -116,3 +116,48 @@ def test_file_is_what_the_generator_writes():
 def test_mujoco_reads_it():
     mujoco = pytest.importorskip('mujoco')
     assert mujoco.MjModel.from_xml_path(str(URDF)).njnt == 4
+
+
+def test_every_mesh_is_shipped_closed_and_faces_outwards():
+    trimesh = pytest.importorskip('trimesh')
+    prefix = 'package://beetle_omni_ros/'
+    names = {mesh.get('filename') for mesh in TREE.iter('mesh')}
+    assert all(name.startswith(prefix) for name in names)
+    assert {share_path(name.removeprefix(prefix)) for name in names} \
+        == set(share_path('description/meshes').glob('*.stl'))
+    for name in names:
+        mesh = trimesh.load(share_path(name.removeprefix(prefix)))
+        assert mesh.is_watertight and mesh.volume > 0, name
+        assert np.abs(mesh.bounds).max() < 0.5, name
+
+
+def test_meshes_are_what_the_generator_makes():
+    trimesh = pytest.importorskip('trimesh')
+    script = Path(__file__).parents[2] / 'description' / 'generate_meshes.py'
+    if not script.is_file():
+        pytest.skip('no source checkout')
+    spec = importlib.util.spec_from_file_location('generate_meshes', script)
+    generator = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(generator)
+    for name, made in generator.meshes(ROBOT, SimulatorParameters.load().plant).items():
+        kept = trimesh.load(share_path(f'description/meshes/{name}.stl'))
+        np.testing.assert_allclose(kept.bounds, made.bounds, atol=1e-6, err_msg=name)
+        assert kept.volume == pytest.approx(made.volume, rel=1e-4), name
+
+
+def test_feet_and_propellers_touch_where_those_of_the_simulated_plant_do():
+    trimesh = pytest.importorskip('trimesh')
+    plant = SimulatorParameters.load().plant
+    placed = poses()
+    lowest, widest = 0.0, 0.0
+    for name, (rotation, position) in placed.items():
+        for part in LINKS[name].findall('collision'):
+            turn, at = transform(part)
+            file = part.find('geometry/mesh').get('filename').rpartition('/')[2]
+            points = trimesh.load(share_path(f'description/meshes/{file}')).vertices
+            points = (points @ turn.T + at) @ rotation.T + position
+            lowest = min(lowest, points[:, 2].min())
+            widest = max(widest, np.hypot(points[:, 0], points[:, 1]).max())
+    reach = np.hypot(*ROBOT.rotors.positions[:, :2].T).max() + plant.propeller_radius
+    assert lowest == pytest.approx(-plant.foot_depth, abs=1e-6)
+    assert reach - 0.005 < widest < reach + 1e-6
