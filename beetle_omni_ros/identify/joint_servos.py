@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.identify.servo_model import INDEX, OFF, TERMS
-from beetle_omni_ros.robot.effects_actuator import per_joint, SLIDING_RATE
+from beetle_omni_ros.robot.effects_actuator import per_joint
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import SLIDING_RATE
 
 GROUPS = {'joint_friction': ('coulomb',), 'joint_command_latency': ('delay',),
           'joint_bandwidth': ('kp', 'kd'), 'joint_offset': ('offset',),

@@ -1,11 +1,12 @@
 """
 The tilt servo as it answers a command, for many parameter sets at a time.
 
-    q'' = wn^2 (limit(q*(t - delay) + offset - load(q) - q) - friction) - 2 zeta wn q'
+    q'' = limit(wn^2 (q*(t - delay) + offset - q) - 2 zeta wn q') - wn^2 (load(q) + friction)
 
-Without a torque in the log only ratios to the stiffness Kp show. Friction, load and the torque
-limit are therefore angles: the position error at which the servo pushes as hard. Every step is
-vectorised over parameter sets, so that many starts, terms and blocks are fitted at once.
+The step is that of :mod:`beetle_omni_ros.robot.servo` for an inertia of 1. Without a torque in
+the log only ratios to the stiffness Kp show. Friction, load and the torque limit are therefore
+angles: the position error at which the servo pushes as hard. Every step is vectorised over
+parameter sets, so that many starts, terms and blocks are fitted at once.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.robot.parameters import JointParameters
+from beetle_omni_ros.robot.servo import NUMPY, play, Servo, Step
 
 LONGEST_STEP = 0.0025   # [s]; with (wn step)^2 / 24 the frequency is true to 0.3 % at 100 rad/s
 NEVER = 1e3             # a limit that is never reached
@@ -118,63 +120,38 @@ def _commands(log, joint, delay, edges, held):
 
 
 def _integrate(value, command, early, q, v, step):
-    """
-    Positions (K + 1, B); ``early``: where within a step the command changes.
-
-    Most batches are small and most of the time goes into calls of numpy: what is constant, absent
-    or can be done for all steps at once stays out of the loop, and nothing is allocated in it.
-    """
-    wn, half = value['natural_frequency'], 0.5 * step
-    damping = step * value['damping_ratio'] * wn
-    keep, gain = (1 - damping) / (1 + damping), step * wn**2 / (1 + damping)
-    coulomb, stiction = value['coulomb_friction'] * gain, value['stiction'] * gain
-    sine, cosine = value['load_sine'], value['load_cosine']
+    """Positions (K + 1, B); ``early``: where within a step the command changes."""
+    stiffness = value['natural_frequency']**2
+    damping = 2 * value['damping_ratio'] * value['natural_frequency']
+    coulomb, stiction = value['coulomb_friction'] * stiffness, value['stiction'] * stiffness
     torque, speed = value['torque_limit'], value['velocity_limit']
-    sticky, load = stiction.any(), sine.any() or cosine.any()
-    weak, slow = (torque < 0.9 * NEVER).any(), (speed < 0.9 * NEVER).any()
+    sticky, weak, slow = (coulomb + stiction).any(), (torque < 0.9 * NEVER).any(), \
+        (speed < 0.9 * NEVER).any()
+    servo = Servo(1.0, stiffness, damping, speed if slow else None,
+                  torque * stiffness if weak else None, coulomb=coulomb if sticky else None,
+                  stiction=coulomb + stiction, fading_rate=value['stribeck_velocity'],
+                  gaussian=False)
+    move = Step(NUMPY, servo, step)
+    sine, cosine = value['load_sine'] * stiffness, value['load_cosine'] * stiffness
+    loaded = sine.any() or cosine.any()
     # Positions half a step ahead of their velocities: one addition moves both halves.
     middle, velocity = np.empty((2, len(command) + 1, len(q)))
-    middle[0], velocity[0] = q + half * v, v
-    error, part, friction, opposite = np.empty_like(q), np.empty_like(q), coulomb, -coulomb
-    jumps, jump = early.any(axis=1).tolist(), early * (gain * step)
-    add, subtract, multiply = np.add, np.subtract, np.multiply
-    maximum, minimum = np.maximum, np.minimum
-    rows = zip(command, middle, middle[1:], velocity, velocity[1:], jumps, jump)
-    for target, here, ahead, before, after, jumped, moved in rows:
-        subtract(target, here, out=error)
-        if load:
-            error -= sine * np.sin(here) + cosine * np.cos(here)
-        if weak:
-            minimum(maximum(error, -torque, out=error), torque, out=error)
-        if sticky:
-            friction = coulomb + stiction * np.exp(-np.abs(before) / value['stribeck_velocity'])
-            opposite = -friction
-        multiply(keep, before, out=after)
-        add(after, multiply(gain, error, out=part), out=after)
-        minimum(maximum(after, opposite, out=part), friction, out=part)
-        subtract(after, part, out=after)
-        if slow:
-            minimum(maximum(after, -speed, out=after), speed, out=after)
-        add(here, multiply(step, after, out=part), out=ahead)
-        if jumped:
+    middle[0], velocity[0] = q + 0.5 * step * v, v
+    jumps, jump = early.any(axis=1).tolist(), early * (move.gain * stiffness * step)
+    for k, (target, here, before) in enumerate(zip(command, middle, velocity)):
+        load = -sine * np.sin(here) - cosine * np.cos(here) if loaded else None
+        after = velocity[k + 1] = move.kick(target, here, before, load)
+        middle[k + 1] = here + step * after
+        if jumps[k]:
             # A joint that friction or a limit holds does not feel when the command changed.
             free = after != 0
             if slow:
                 free &= np.abs(after) < speed
             if weak:
-                free &= np.abs(error) < torque
-            add(ahead, multiply(moved, free, out=part), out=ahead)
-    positions = middle - half * velocity
-    return _with_play(positions, value['backlash']) if value['backlash'].any() else positions
-
-
-def _with_play(positions, gap):
-    """What the encoder shows behind a play of ``gap`` to each side."""
-    shown = positions[0]
-    low, high = positions - gap, positions + gap
-    for k in range(1, len(positions)):
-        shown = positions[k] = np.minimum(np.maximum(shown, low[k]), high[k])
-    return positions
+                free &= np.abs(target - here) < torque
+            middle[k + 1] += jump[k] * free
+    positions = middle - 0.5 * step * velocity
+    return play(positions, value['backlash']) if value['backlash'].any() else positions
 
 
 def _at_samples(positions, places):

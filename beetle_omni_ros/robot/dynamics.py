@@ -14,6 +14,7 @@ import numpy as np
 
 from beetle_omni_ros.robot.effects import CATALOGUE, ServoTerms, Terms
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import CASADI, Servo
 
 # Slices of the full state (25): world position [m] and velocity [m/s], attitude (x, y, z, w) body
 # to world, body rates [rad/s], tilt angles [rad] and rates [rad/s], thrusts [N].
@@ -139,18 +140,30 @@ def servo_acceleration(robot: RobotParameters, tilt, tilt_rate, target, thrust=0
     """
     Second-order tilt servo within its torque and rate limits, [rad/s^2].
 
-    J q'' = Kp (q* - q) - Kd q', torque clipped to the effort limit, plus what the robot
-    file's effects add; at the rate limit the servo no longer accelerates outward.
+    The equation is that of :mod:`beetle_omni_ros.robot.servo` with the robot file's effects.
     """
-    terms = ServoTerms(target, tilt, tilt_rate, thrust, 0.0, gyroscopic)
+    servo, terms = tilt_servo(robot, joint, target, thrust, gyroscopic)
+    return servo.acceleration(CASADI, terms.target, tilt, tilt_rate, terms.load)
+
+
+def tilt_servo(robot: RobotParameters, joint: int, target, thrust=0.0,
+               gyroscopic=0.0) -> tuple[Servo, ServoTerms]:
+    """
+    Servo of one joint and what acts on it, with the robot file's effects.
+
+    Args:
+        robot: parameters and effects.
+        joint: index, 0 to 3.
+        target: angle asked for [rad].
+        thrust: of the joint's rotor [N].
+        gyroscopic: as :func:`gyroscopic_load` gives it [rad/s].
+
+    """
+    terms = ServoTerms(target, thrust, gyroscopic)
     for name, values in robot.effects.items():
         if CATALOGUE[name].servo is not None:
             CATALOGUE[name].servo(terms, joint, **values)
-    joint = robot.joints
-    torque = joint.kp * (terms.target - tilt) - joint.kd * tilt_rate
-    torque = ca.fmin(ca.fmax(torque, -joint.effort_limit), joint.effort_limit) + terms.torque
-    outward = ca.logic_and(ca.fabs(tilt_rate) >= joint.velocity_limit, torque * tilt_rate > 0)
-    return ca.if_else(outward, 0, torque / joint.inertia)
+    return Servo.of(robot.joints, coulomb=terms.coulomb, stiction=terms.stiction), terms
 
 
 def derivative(robot: RobotParameters, x, u, d):

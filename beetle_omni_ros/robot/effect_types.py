@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import casadi as ca
 
@@ -104,25 +105,25 @@ class Terms:
 @dataclass
 class ServoTerms:
     """
-    One tilt servo of one instant, CasADi expressions.
+    What acts on one tilt servo at one instant, numbers of any namespace.
 
     Attributes:
         target: angle asked for [rad].
-        tilt: encoder angle [rad].
-        tilt_rate: [rad/s].
         thrust: of the joint's rotor [N].
-        torque: added to the servo's own [N m].
         gyroscopic: what the rotor's spin puts on the joint for each N m s of its angular
-            momentum in hover [rad/s], or 0 where nobody knows the body's rate.
+            momentum in hover [rad/s], or 0 where the body's rate is unknown.
+        load: torque beside the motor's [N m].
+        coulomb: friction while it slides [N m], or None.
+        stiction: friction at rest [N m], or None.
 
     """
 
-    target: ca.SX
-    tilt: ca.SX
-    tilt_rate: ca.SX
-    thrust: ca.SX
-    torque: ca.SX
-    gyroscopic: ca.SX | float = 0.0
+    target: Any
+    thrust: Any = 0.0
+    gyroscopic: Any = 0.0
+    load: Any = 0.0
+    coulomb: Any = None
+    stiction: Any = None
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import casadi as ca
 from beetle_omni_ros.robot.effect_types import Effect, EffectParameter, vector
 
 NAN = float('nan')
-SLIDING_RATE = 0.05     # [rad/s] over which the smooth model's friction turns round
 
 
 def _voltage_sag(terms, exponent):
@@ -25,9 +24,7 @@ def _joint_offset(terms, offset):
 
 
 def _joint_deflection(servo, joint, deflection_per_newton):
-    servo.target = servo.target + vector(deflection_per_newton)[joint] * servo.thrust \
-        if isinstance(deflection_per_newton, tuple) \
-        else servo.target + deflection_per_newton * servo.thrust
+    servo.target = servo.target + per_joint(deflection_per_newton, joint) * servo.thrust
 
 
 def per_joint(value, joint: int):
@@ -36,11 +33,8 @@ def per_joint(value, joint: int):
 
 
 def _joint_friction(servo, joint, coulomb, stiction):
-    coulomb, stiction = per_joint(coulomb, joint), per_joint(stiction, joint)
-    speed = servo.tilt_rate / SLIDING_RATE
-    sliding = speed / ca.sqrt(1 + speed * speed)
-    servo.torque = servo.torque - sliding * (
-        coulomb + ca.fmax(stiction - coulomb, 0) * ca.exp(-speed * speed))
+    servo.coulomb = per_joint(coulomb, joint)
+    servo.stiction = ca.fmax(per_joint(stiction, joint), servo.coulomb)
 
 
 def _delay(typical, smallest=0.003):

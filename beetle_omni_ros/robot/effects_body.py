@@ -113,7 +113,7 @@ def _ground_effect(terms, exponential_share=0.0, **values):
 
 def _gyroscopic_load(servo, joint, angular_momentum_at_hover, spin_up_share=1.0,
                      joint_share=0.0):
-    servo.torque = servo.torque + joint_share * angular_momentum_at_hover * servo.gyroscopic
+    servo.load = servo.load + joint_share * angular_momentum_at_hover * servo.gyroscopic
 
 
 def _propeller_gyroscopic_torque(terms, angular_momentum_at_hover, spin_up_share=1.0,

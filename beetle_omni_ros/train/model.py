@@ -10,12 +10,14 @@ belong to the model, which is what makes a policy level on the true robot.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import exp
 
 import casadi as ca
 
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import CASADI, Step
 
 # What differs from robot to robot: mass [kg], inertia (3) [kg m^2], centre of mass (3) [m].
 MASS, INERTIA, CENTRE = slice(0, 1), slice(1, 4), slice(4, 7)
@@ -46,15 +48,20 @@ def nominal_body(robot: RobotParameters) -> list[float]:
             *effects.get('centre_of_mass', {}).get('offset', (0.0, 0.0, 0.0))]
 
 
-def _servo_step(joints, tilt, rate, target, h):
-    """Tilt and rate after ``h`` seconds, within rate limit and stops."""
-    torque = joints.kp * (target - tilt) - joints.kd * rate
-    torque = ca.fmin(ca.fmax(torque, -joints.effort_limit), joints.effort_limit)
-    after = rate + h / joints.inertia * torque
-    after = ca.fmin(ca.fmax(after, -joints.velocity_limit), joints.velocity_limit)
-    free = tilt + h * (rate + after) / 2
-    held = ca.fmin(ca.fmax(free, -joints.position_limit), joints.position_limit)
-    return held, ca.if_else(ca.fabs(free) > joints.position_limit, 0, after)
+def _servos(robot, x, target, h):
+    """Tilts (4,) and rates (4,) after ``h`` seconds, within rate limit and stops."""
+    tilts, rates = [], []
+    for i in range(4):
+        tilt, rate, thrust = x[model.TILT][i], x[model.TILT_RATE][i], x[model.THRUST][i]
+        servo, terms = model.tilt_servo(robot, i, target[i], thrust, model.gyroscopic_load(
+            robot, x[model.RATE], tilt, thrust, i))
+        step = Step(CASADI, replace(servo, position_limit=robot.joints.position_limit),
+                    h / SERVO_STEPS)
+        for _ in range(SERVO_STEPS):
+            tilt, rate = step(terms.target, tilt, rate, terms.load)
+        tilts.append(tilt)
+        rates.append(rate)
+    return ca.vertcat(*tilts), ca.vertcat(*rates)
 
 
 def substep(robot: RobotParameters, duration: float) -> ca.Function:
@@ -81,10 +88,8 @@ def substep(robot: RobotParameters, duration: float) -> ca.Function:
         return ca.fmin(ca.fmax(value, low), high)
 
     rate = x[model.TILT_RATE]
-    new_tilt, new_rate = x[model.TILT], rate
     target = clip(u[model.TILT_COMMAND], -joints.position_limit, joints.position_limit)
-    for _ in range(SERVO_STEPS):
-        new_tilt, new_rate = _servo_step(joints, new_tilt, new_rate, target, h / SERVO_STEPS)
+    new_tilt, new_rate = _servos(robot, x, target, h)
 
     thrust_target = clip(u[model.THRUST_COMMAND], rotors.thrust_min, rotors.thrust_max)
     thrust = x[model.THRUST]

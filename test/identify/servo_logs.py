@@ -38,8 +38,9 @@ def servo(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0,
     positions = np.empty(len(fine))
     for k, wanted in enumerate(held.tolist()):
         positions[k] = shown
-        error = min(max(wanted + offset - q, -torque_limit), torque_limit)
-        v += STEP * (frequency**2 * error - 2 * damping * frequency * v)
+        # the limit is that of the motor's torque, which also brakes
+        push = frequency**2 * (wanted + offset - q) - 2 * damping * frequency * v
+        v += STEP * min(max(push, -frequency**2 * torque_limit), frequency**2 * torque_limit)
         grip = STEP * frequency**2 * (coulomb + stiction * np.exp(-abs(v) / stribeck)
                                       if stiction else coulomb)
         v = 0.0 if abs(v) <= grip else v - grip * (1 if v > 0 else -1)

@@ -53,7 +53,7 @@ def finely(robot, x, u, step=1e-5):
     torque = clip(joints.kp * (clip(command[:4], joints.position_limit) - tilt)
                   - joints.kd * rate, joints.effort_limit)
     new_rate = clip(rate + step * torque / joints.inertia, joints.velocity_limit)
-    free = tilt + step * new_rate
+    free = tilt + step * (rate + new_rate) / 2
     target = ca.fmin(ca.fmax(command[4:], robot.rotors.thrust_min), robot.rotors.thrust_max)
     effects = {**robot.effects, 'module_reaction': model.module_reaction(robot)} \
         if robot.multibody else robot.effects

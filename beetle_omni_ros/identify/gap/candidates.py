@@ -9,6 +9,7 @@ import numpy as np
 from beetle_omni_ros.identify.gap.keys import Key, SHAPES
 from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.servo import NUMPY, Servo
 
 # Without a slope at their neutral value: they need a start where they already act.
 LIMITS = ('thrust_saturation', 'joint_velocity_limit', 'joint_torque_limit', 'joint_friction',
@@ -114,4 +115,4 @@ def _torques(model):
     times = s.t[model._starts][:, None] + model.p.grid * np.arange(run.shape[1])
     edges = np.append(times.ravel(), times[-1, -1] + model.p.grid)
     target = s.tilt_targets(edges, s.delays({})[0]).reshape(run.shape)
-    return joint.kp * (target - run) - joint.kd * rate
+    return Servo.of(joint, effort_limit=None).motor(NUMPY, target - run, rate)

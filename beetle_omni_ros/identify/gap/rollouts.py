@@ -18,7 +18,8 @@ from beetle_omni_ros.identify.gap.loads import module_load, spin_load, undescrib
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
 from beetle_omni_ros.identify.gap.servo import simulate, Windows
-from beetle_omni_ros.identify.gap.signals import FINE, matrices, play
+from beetle_omni_ros.identify.gap.signals import FINE, matrices
+from beetle_omni_ros.robot.servo import play
 
 HORIZONS = (0.1, 0.5, 1.0)      # [s]
 STATES = ('position', 'velocity', 'orientation', 'rate', 'joint')

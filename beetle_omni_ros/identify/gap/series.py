@@ -80,12 +80,3 @@ def turned(quaternion, vector):
     x, y, z, w = quaternion.T
     return np.stack([w * x2 + x * w2 + y * z2 - z * y2, w * y2 - x * z2 + y * w2 + z * x2,
                      w * z2 + x * y2 - y * x2 + z * w2, w * w2 - x * x2 - y * y2 - z * z2], axis=1)
-
-
-def play(x, half, first=None):
-    """Output (N, n) of a play of +-``half`` behind each column, ``first`` (n,) before it moves."""
-    out, y = np.empty_like(x), x[0] if first is None else first
-    for k, row in enumerate(x):
-        y = np.minimum(np.maximum(y, row - half), row + half)
-        out[k] = y
-    return out

@@ -1,10 +1,8 @@
 """
 Tilt servos simulated from their commands, for many flights' windows and parameter sets at once.
 
-    J q'' = clip(Kp (q* + c f - q) - Kd q', limit) + load - friction
-
-The equations are the catalogue's; friction here holds a joint that stands, which a fit must have
-and the smooth model of the controllers must not. Each window begins at the measured state and
+The step is that of :mod:`beetle_omni_ros.robot.servo`, whose friction holds a joint that stands:
+a fit must have that, and the smooth model of the controllers must not. Each window begins at the measured state and
 has forgotten it when it counts, for a servo's memory is far shorter than the run-in.
 """
 
@@ -15,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.identify.gap.keys import GYROSCOPIC, MODULES
-from beetle_omni_ros.robot.effects_actuator import SLIDING_RATE
 from beetle_omni_ros.robot.parameters import JointParameters
+from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
 
 
 @dataclass(frozen=True)
@@ -86,44 +84,28 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
     hanging = [(torque, base[name] + column(f'{MODULES}.{name}')) for torque, name in
                zip(windows.undescribed, ('mass_moment', 'module_inertia'), strict=False)]
     hanging = [(torque, size) for torque, size in hanging if size.any()]
-    inertia = joint.inertia * column('swing.ratio', np.exp)
-    damping = 0.5 * h * kd / inertia
-    keep, gain = (1 - damping) / (1 + damping), h / inertia / (1 + damping)
-    sliding, more = coulomb * gain, (stiction - coulomb) * gain
-    rubs, bends, loaded = sliding.any() or more.any(), soft.any(), share.any()
-    spins = momentum.any()
+    rubs, loaded = coulomb.any() or (stiction - coulomb).any(), share.any()
     # The clip of the torque matters only where the largest error could meet it.
     reach = kp * np.abs(targets - windows.start).max() * 1.5 + kd * speed
-    weak, kick = bool((effort < reach).any()), h * effort / inertia
+    step = Step(NUMPY, Servo(
+        joint.inertia * column('swing.ratio', np.exp), kp, kd, speed,
+        effort if (effort < reach).any() else None,
+        coulomb=coulomb if rubs else None, stiction=stiction), h)
+    loads = [(windows.load, share)] if loaded else []
+    loads += hanging + ([(windows.spin, momentum)] if momentum.any() else [])
     count = targets.shape[1]
     q = np.broadcast_to(windows.start, (len(sets), *windows.start.shape)).copy()
     v = np.broadcast_to(windows.start_rate, q.shape).copy()
     shown = np.empty(((count - windows.skip) // windows.every, *q.shape))
-    stiff = kp * gain
     for k in range(count):
         if k >= windows.skip and (k - windows.skip) % windows.every == 0:
             index = (k - windows.skip) // windows.every
             if index < len(shown):
                 shown[index] = q
-        q += 0.5 * h * v
-        error = targets[:, k] - q
-        if bends:
-            error += soft * windows.thrust[k]
-        force = stiff * error
-        if loaded:
-            force += gain * share * windows.load[k]
-        for torque, size in hanging:
-            force += gain * size * torque[k]
-        if spins:
-            force += gain * momentum * windows.spin[k]
-        if weak:
-            change = (keep - 1) * v + force
-            new = v + np.minimum(np.maximum(change, -kick), kick)
-        else:
-            new = keep * v + force
-        if rubs:
-            friction = sliding + more * np.exp(-(v / SLIDING_RATE)**2)
-            new -= np.minimum(np.maximum(new, -friction), friction)
-        v = np.minimum(np.maximum(new, -speed), speed)
-        q += 0.5 * h * v
+        target = targets[:, k]
+        if soft.any():
+            target = target + soft * windows.thrust[k]
+        load = sum((size * torque[k] for torque, size in loads[1:]),
+                   loads[0][1] * loads[0][0][k]) if loads else None
+        q, v = step(target, q, v, load)
     return shown.transpose(1, 0, 2, 3)

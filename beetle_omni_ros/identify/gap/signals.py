@@ -18,13 +18,13 @@ from beetle_omni_ros.identify.gap.series import (
     held_at,
     integral,
     matrices,
-    play,
     spread,
     turn,
     turned,
     within,
 )
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import play
 
 FINE = 0.005            # [s] grid on which measurements are smoothed
 # The IMU's clock is everybody's: what it is late by, all else is early by. Shifting the IMU itself

@@ -1,10 +1,11 @@
-"""Motion of the servos for tests without a plant: J q'' = Kp (q* - q) - Kd q'."""
+"""Motion of the servos for tests without a plant."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from beetle_omni_ros.robot.parameters import JointParameters
+from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
 
 STEP = 0.001  # [s] far below the period of the servo's 11 Hz
 
@@ -21,7 +22,8 @@ class SecondOrderMotion:
     """
 
     def __init__(self, joints: JointParameters, count: int):
-        self.joints = joints
+        self._servo = Servo.of(joints)
+        self._step = Step(NUMPY, self._servo, STEP)
         self.position, self.velocity, self.effort = np.zeros((3, count))
         self._time = None
 
@@ -29,13 +31,10 @@ class SecondOrderMotion:
         """Move until ``now`` [s] towards ``goals`` [rad]; without power a servo stays put."""
         if self._time is None or now - self._time > 1.0:
             self._time = now
-        joints = self.joints
         while self._time + STEP <= now:
             self._time += STEP
-            effort = joints.kp * (goals - self.position) - joints.kd * self.velocity
-            effort = np.clip(effort, -joints.effort_limit, joints.effort_limit)
-            self.effort = np.where(powered, effort, 0.0)
-            velocity = self.velocity + self.effort / joints.inertia * STEP
-            limit = joints.velocity_limit
-            self.velocity = np.where(powered, np.clip(velocity, -limit, limit), 0.0)
-            self.position = self.position + self.velocity * STEP
+            moved = self._step(goals, self.position, np.where(powered, self.velocity, 0.0))
+            self.position, self.velocity = np.where(
+                powered, moved, [self.position, np.zeros_like(self.velocity)])
+            self.effort = np.where(powered, self._servo.motor(
+                NUMPY, goals - self.position, self.velocity), 0.0)

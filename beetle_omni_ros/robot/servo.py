@@ -1,0 +1,191 @@
+"""
+The tilt servo: one equation and one step, for whatever the numbers are kept in.
+
+    J q'' = clip(Kp (q* - q) - Kd q', effort limit) + load - friction,   |q'| <= rate limit
+
+Friction is Coulomb's, and at low rates up to the stiction (Armstrong-Helouvry 1994). The motor's
+torque is limited, what others put on the joint is not. A namespace holds the functions in
+which numpy, CasADi and torch differ; torch and C code for training and control are written out
+from CasADi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from beetle_omni_ros.robot.parameters import JointParameters
+
+SLIDING_RATE = 0.05     # [rad/s] over which friction falls from stiction to Coulomb's
+
+
+class Namespace(NamedTuple):
+    """Functions of one kind of number."""
+
+    minimum: Any
+    maximum: Any
+    exp: Any
+    sqrt: Any
+    where: Any
+
+
+NUMPY = Namespace(np.minimum, np.maximum, np.exp, np.sqrt, np.where)
+CASADI = Namespace(ca.fmin, ca.fmax, ca.exp, ca.sqrt, ca.if_else)
+
+
+@dataclass(frozen=True)
+class Servo:
+    """
+    Numbers of a servo, or arrays of them; None stands for what the servo lacks.
+
+    Attributes:
+        inertia: [kg m^2].
+        kp: stiffness [N m/rad].
+        kd: damping [N m s/rad].
+        velocity_limit: [rad/s].
+        effort_limit: of the motor [N m].
+        position_limit: stop to each side [rad].
+        coulomb: friction while it slides [N m].
+        stiction: friction at rest [N m].
+        fading_rate: over which the one becomes the other [rad/s].
+        gaussian: whether stiction fades as exp(-x^2), else as exp(-|x|), with x = q' / fading rate.
+
+    """
+
+    inertia: Any
+    kp: Any
+    kd: Any
+    velocity_limit: Any = None
+    effort_limit: Any = None
+    position_limit: Any = None
+    coulomb: Any = None
+    stiction: Any = None
+    fading_rate: Any = SLIDING_RATE
+    gaussian: bool = True
+
+    @classmethod
+    def of(cls, joints: JointParameters, **more) -> Servo:
+        """Servo of a robot file; ``more`` adds to it or replaces its numbers."""
+        own = {'inertia': joints.inertia, 'kp': joints.kp, 'kd': joints.kd,
+               'velocity_limit': joints.velocity_limit, 'effort_limit': joints.effort_limit}
+        return cls(**{**own, **more})
+
+    def friction(self, space: Namespace, rate):
+        """Largest friction at a rate of turn [N m]."""
+        x = rate / self.fading_rate
+        shape = space.exp(-x * x if self.gaussian else -space.maximum(x, -x))
+        return self.coulomb + (self.stiction - self.coulomb) * shape
+
+    def motor(self, space: Namespace, error, rate):
+        """Torque of the motor [N m] at an error of position [rad] and a rate of turn [rad/s]."""
+        torque = self.kp * error - self.kd * rate
+        return torque if self.effort_limit is None else _within(space, torque, self.effort_limit)
+
+    def acceleration(self, space: Namespace, target, tilt, rate, load=0.0):
+        """
+        Acceleration of one instant [rad/s^2], smooth but at the limits.
+
+        Friction turns round smoothly over the sliding rate. At the rate limit the servo no longer
+        accelerates outward.
+        """
+        torque = self.motor(space, target - tilt, rate) + load
+        if self.coulomb is not None:
+            speed = rate / SLIDING_RATE
+            torque = torque - speed / space.sqrt(1 + speed * speed) * self.friction(space, rate)
+        if self.velocity_limit is None:
+            return torque / self.inertia
+        fast = space.maximum(rate, -rate) >= self.velocity_limit
+        return space.where(fast * (torque * rate > 0), 0, torque / self.inertia)
+
+
+class Step:
+    """
+    Motion of servos over one step: leapfrog, second order, stable for any damping.
+
+    Damping and friction are implicit: a joint that friction can hold stands exactly still.
+
+    Args:
+        space: of the servo's numbers and the states.
+        servo: numbers.
+        duration: of the step [s].
+
+    """
+
+    def __init__(self, space: Namespace, servo: Servo, duration: float):
+        """Work out what is the same in every step."""
+        self._space, self._servo, self._half = space, servo, 0.5 * duration
+        per_torque = duration / servo.inertia
+        damping = 0.5 * per_torque * servo.kd
+        self.gain = per_torque / (1 + damping)      # change of rate for each N m [rad/s]
+        self._loss = 2 * damping / (1 + damping)    # share of the rate that damping takes
+        self._keep, self._stiff = 1 - self._loss, servo.kp * self.gain
+        self._per_torque, self._damping = per_torque, damping
+
+    def kick(self, target, tilt, rate, load=None):
+        """
+        Rate after the step [rad/s].
+
+        Args:
+            target: angle asked for [rad].
+            tilt: in the middle of the step [rad].
+            rate: before it [rad/s].
+            load: torque beside the motor's [N m].
+
+        """
+        space, servo = self._space, self._servo
+        push = self._stiff * (target - tilt)
+        if servo.effort_limit is None:
+            after = self._keep * rate + push
+            if load is not None:
+                after = after + self.gain * load
+        else:
+            push = push - self._loss * rate
+            if load is not None:
+                push = push - self._damping * self.gain * load
+            after = rate + _within(space, push, self._per_torque * servo.effort_limit)
+            if load is not None:
+                after = after + self._per_torque * load
+        if servo.coulomb is not None:
+            after = after - _within(space, after, self.gain * servo.friction(space, rate))
+        if servo.velocity_limit is not None:
+            after = _within(space, after, servo.velocity_limit)
+        return after
+
+    def __call__(self, target, tilt, rate, load=None):
+        """Angle [rad] and rate [rad/s] after the step; arguments as of :meth:`kick`."""
+        space, limit = self._space, self._servo.position_limit
+        tilt = tilt + self._half * rate
+        rate = self.kick(target, tilt, rate, load)
+        tilt = tilt + self._half * rate
+        if limit is None:
+            return tilt, rate
+        held = _within(space, tilt, limit)
+        return held, space.where(held == tilt, rate, 0.0)
+
+
+def play(positions: np.ndarray, half: float | np.ndarray,
+         first: np.ndarray | None = None) -> np.ndarray:
+    """
+    Follow a loosely coupled shaft.
+
+    Args:
+        positions: (K, ...) of the driving side [rad].
+        half: play to each side [rad].
+        first: (...) of the driven side before it moves; by default the driving side's.
+
+    Returns:
+        (K, ...) of the driven side.
+
+    """
+    made, shown = np.empty_like(positions), positions[0] if first is None else first
+    low, high = positions - half, positions + half
+    for k in range(len(positions)):
+        shown = made[k] = np.minimum(np.maximum(shown, low[k]), high[k])
+    return made
+
+
+def _within(space, value, limit):
+    return space.minimum(space.maximum(value, -limit), limit)

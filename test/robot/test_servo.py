@@ -1,0 +1,126 @@
+"""One servo: the same numbers in numpy, CasADi, torch and C, and the motion of exact solutions."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from beetle_omni_ros.robot import dynamics, native
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.servo import CASADI, NUMPY, play, Servo, Step
+
+torch = pytest.importorskip('torch')
+
+ROBOT = RobotParameters.load()
+PLAIN = Servo.of(ROBOT.joints)
+KINDS = {
+    'plain': Servo.of(ROBOT.joints, velocity_limit=None, effort_limit=None),
+    'limits': Servo.of(ROBOT.joints, effort_limit=0.05, position_limit=0.5),
+    'friction': Servo.of(ROBOT.joints, coulomb=0.01, stiction=0.03),
+    'fading': Servo.of(ROBOT.joints, coulomb=0.01, stiction=0.03, fading_rate=0.2,
+                       gaussian=False)}
+
+
+def states(count=200, seed=0):
+    """(4, count) targets, tilts [rad], rates [rad/s] and loads [N m]."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1, 1, (4, count)) * [[1.0], [0.6], [12.0], [0.02]]
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_numpy_casadi_torch_and_c_take_the_same_step(kind):
+    from beetle_omni_ros.train.codegen import torch_function
+    target, tilt, rate, load = states()
+    expected = np.array(Step(NUMPY, KINDS[kind], 0.001)(target, tilt, rate, load))
+    names = ca.SX.sym('x', 4)
+    after = ca.vertcat(*Step(CASADI, KINDS[kind], 0.001)(*ca.vertsplit(names)))
+    step = ca.Function(f'servo_{kind}', [names], [after], ['x'], ['y'])
+    rows = np.stack([target, tilt, rate, load])
+    for found in (np.array(step.map(200)(rows)), np.array(native.compiled(step).map(200)(rows)),
+                  torch_function(step)(torch.tensor(rows.T)).numpy().T):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_numpy_and_casadi_have_the_same_acceleration(kind):
+    target, tilt, rate, load = states(seed=1)
+    expected = KINDS[kind].acceleration(NUMPY, target, tilt, rate, load)
+    x = ca.SX.sym('x', 4)
+    found = ca.Function('a', [x], [KINDS[kind].acceleration(CASADI, *ca.vertsplit(x))]).map(200)
+    np.testing.assert_allclose(np.array(found(np.stack([target, tilt, rate, load])))[0], expected,
+                               rtol=1e-12)
+
+
+def test_small_steps_go_where_the_acceleration_points():
+    target, tilt, rate, load = states(seed=2)
+    inside = np.abs(rate) < 9
+    h = 1e-7
+    for kind in ('plain', 'friction'):
+        _, after = Step(NUMPY, KINDS[kind], h)(target, tilt, rate, load)
+        change = KINDS[kind].acceleration(NUMPY, target, tilt, rate, load)
+        sliding = inside & (np.abs(rate) > 1.0)     # the smooth friction is full there
+        np.testing.assert_allclose(((after - rate) / h)[sliding], change[sliding], rtol=3e-3,
+                                   atol=1.0)
+
+
+def test_a_step_is_of_second_order():
+    kp, kd, inertia = ROBOT.joints.kp, ROBOT.joints.kd, ROBOT.joints.inertia
+    servo = Servo(inertia, kp, kd)
+    a = np.array([[0, 1], [-kp / inertia, -kd / inertia]])
+    values, vectors = np.linalg.eig(a)
+    exact = (vectors @ np.diag(np.exp(0.05 * values)) @ np.linalg.inv(vectors)).real @ [0.3, 2.0]
+
+    def error(count):
+        step, tilt, rate = Step(NUMPY, servo, 0.05 / count), 0.3, 2.0
+        for _ in range(count):
+            tilt, rate = step(0.0, tilt, rate)
+        return abs(tilt - exact[0])
+
+    assert error(80) < error(40) / 3.7 < error(20) / 3.7**2
+    assert error(80) < 1e-4
+
+
+def test_stiction_holds_a_joint_exactly_still_and_releases_it_beyond():
+    servo = replace(PLAIN, coulomb=0.01, stiction=0.03)
+    step = Step(NUMPY, servo, 0.001)
+    assert step(0.9 * 0.03 / servo.kp, 0.0, 0.0) == (0.0, 0.0)
+    assert step(1.1 * 0.03 / servo.kp, 0.0, 0.0)[1] > 0
+    assert step(0.0, 0.0, 0.0, 0.029) == (0.0, 0.0)
+
+
+def test_a_load_beyond_the_motors_torque_moves_the_joint():
+    servo = replace(PLAIN, effort_limit=0.05)
+    assert servo.acceleration(NUMPY, 1.0, 0.0, 0.0, -0.08) == pytest.approx(
+        -0.03 / servo.inertia)
+    _, rate = Step(NUMPY, servo, 1e-5)(1.0, 0.0, 0.0, -0.08)
+    assert rate == pytest.approx(-0.03 / servo.inertia * 1e-5)
+
+
+def test_play_follows_only_where_it_is_pushed():
+    driving = np.array([0.0, 0.05, 0.2, 0.15, -0.05])
+    np.testing.assert_allclose(play(driving, 0.1), [0.0, 0.0, 0.1, 0.1, 0.05])
+
+
+@pytest.mark.parametrize('effects', [
+    {'joint_friction': {'coulomb': 0.01, 'stiction': 0.02}},
+    {'joint_deflection': {'deflection_per_newton': 0.002}},
+    {'propeller_gyroscopic_torque': {'angular_momentum_at_hover': 0.066, 'joint_share': 1.0}}])
+def test_a_joint_effect_changes_the_controllers_model_and_a_training_step(effects):
+    from beetle_omni_ros.train import model
+    rng = np.random.default_rng(3)
+    x = np.concatenate([rng.normal(size=6), [0, 0, 0, 1.0], rng.normal(size=3),
+                        rng.uniform(-1, 1, 4), [3, -3, 4, -4], rng.uniform(4, 9, 4)])
+    u = np.concatenate([x[13:17] + [0.1, -0.1, 0.1, -0.1], x[21:]])
+    changed = replace(ROBOT, effects=effects)
+
+    def tilting(robot):
+        after = model.substep(robot, 0.0025)(x, u, np.zeros(6), model.nominal_body(robot))
+        rates = np.array(after).ravel()[dynamics.TILT_RATE]
+        there = np.array(dynamics.full_model(robot)(x, u, np.zeros(10))).ravel()
+        return (rates - x[dynamics.TILT_RATE]) / 0.0025, there[dynamics.TILT_RATE]
+
+    trained, modelled = (a - b for a, b in zip(tilting(changed), tilting(ROBOT), strict=True))
+    assert np.abs(modelled).max() > 1
+    # The step's mean of the change, while damping takes some of it back.
+    np.testing.assert_allclose(trained, modelled, rtol=0.35, atol=0.1 * np.abs(modelled).max())
