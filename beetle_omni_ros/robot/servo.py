@@ -51,7 +51,8 @@ class Servo:
         coulomb: friction while it slides [N m].
         stiction: friction at rest [N m].
         fading_rate: over which the one becomes the other [rad/s].
-        gaussian: whether stiction fades as exp(-x^2), else as exp(-|x|), with x = q' / fading rate.
+        gaussian: whether stiction fades as exp(-x^2), else as exp(-|x|); x is the rate over
+            the fading rate.
 
     """
 

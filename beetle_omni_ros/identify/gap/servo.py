@@ -2,8 +2,9 @@
 Tilt servos simulated from their commands, for many flights' windows and parameter sets at once.
 
 The step is that of :mod:`beetle_omni_ros.robot.servo`, whose friction holds a joint that stands:
-a fit must have that, and the smooth model of the controllers must not. Each window begins at the measured state and
-has forgotten it when it counts, for a servo's memory is far shorter than the run-in.
+a fit must have that, and the smooth model of the controllers must not. Each window begins at the
+measured state and has forgotten it when it counts, for a servo's memory is far shorter than the
+run-in.
 """
 
 from __future__ import annotations
