@@ -4,7 +4,7 @@ Write the pages of docs/reference that are made from code: ``python docs/generat
 | page | made from |
 | --- | --- |
 | parameters.md | the dataclasses that read params/*.yaml, and the values in these files |
-| topics.md | runs/topics.py, and the publishers and subscribers in nodes/*.py |
+| topics.md | messages/topics.py, and the publishers and subscribers in nodes/*.py |
 | command_line.md | the options of ``beetle_omni`` and its subcommands |
 | effects.md | the catalogue of effects |
 | faults.md | params/faults.yaml |

@@ -78,10 +78,9 @@ def wanted(given):
 
 def recorded_topics(namespace, controllers):
     """Absolute names of the topics of INTERFACES, and of these controllers."""
-    from beetle_omni_ros.nodes.recorder_node import OWN_TOPICS
-    from beetle_omni_ros.runs.topics import topics_with
+    from beetle_omni_ros.messages.topics import ALL, topics_with
     prefix = f"/{namespace.strip('/')}/" if namespace.strip('/') else '/'
-    return [prefix + topic for topic in (*topics_with(controllers), *OWN_TOPICS)]
+    return [prefix + topic for topic in {**topics_with(controllers), **ALL}]
 
 
 def composed(arguments, nodes, namespace):

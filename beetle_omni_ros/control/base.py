@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import sqrt
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -58,6 +58,21 @@ class State:
     tilt_velocity: np.ndarray
     tilt_stamp: float
     command: Command | None = None
+
+    @classmethod
+    def join(cls, estimate: Any, joints: Any, command: Command | None = None) -> State:
+        """
+        Join the estimate, the measured joints and the command in force.
+
+        Args:
+            estimate: with the first five attributes of a state.
+            joints: with stamp, position and velocity.
+            command: the command in force.
+
+        """
+        return cls(estimate.stamp, estimate.position, estimate.velocity, estimate.quaternion,
+                   estimate.angular_velocity, joints.position, joints.velocity, joints.stamp,
+                   command)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
+from beetle_omni_ros.messages.topics import topics_with
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs import metrics as metrics_of_runs
 from beetle_omni_ros.runs import table
@@ -30,7 +31,6 @@ from beetle_omni_ros.runs.pose_file import check_steps
 from beetle_omni_ros.runs.recorder import LogRecorder, Tee
 from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.runs.tasks import make_task, Task
-from beetle_omni_ros.runs.topics import topics_with
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.sim.faults import Fault

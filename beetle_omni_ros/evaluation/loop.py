@@ -27,6 +27,7 @@ from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
 from beetle_omni_ros.evaluation.processes import Processes
+from beetle_omni_ros.messages.values import Battery, Joints, Odom, Wrench
 from beetle_omni_ros.robot.actuator_health import ALL_WELL
 from beetle_omni_ros.runs.target_checks import out_of_reach
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
@@ -55,7 +56,7 @@ class FlightLoop:
         estimator: the EKF.
         controllers: name -> controller; each is stepped, the supervisor selects.
         supervisor: with the active controller selected.
-        recorder: takes ``write_*`` calls (LogRecorder, BagWriter or both).
+        recorder: LogRecorder, BagWriter or both.
         gyroscope_noise: of one sample, for the covariance of the recorded twist [rad/s].
         faults: of robot, devices and processes; their ``at`` counts from the task's start.
         check_target: reason why a target that somebody else asks for is refused, or ''.
@@ -133,8 +134,8 @@ class FlightLoop:
             if moment.changed:
                 self._simulator.set_wrench(moment.force_world, moment.torque_body)
                 self._simulator.set_payload(moment.payload)
-                self._recorder.write_wrench(self._simulator.time, moment.force_world,
-                                            moment.torque_body)
+                self._recorder.write('disturbance', Wrench(
+                    self._simulator.time, moment.force_world, moment.torque_body))
             if moment.finished or self._crashed:
                 break
             self.step()
@@ -194,7 +195,7 @@ class FlightLoop:
         new = estimate is not None and estimate.stamp != self._estimated
         if new and self._joints is not None:
             self._estimated = estimate.stamp    # the estimator tells each estimate once
-            state = processes.estimate(self._state(estimate))
+            state = processes.estimate(State.join(estimate, self._joints, self._command))
             if state is not None:
                 self._answer(state, estimate, now)
         for late in processes.requests(None, now):
@@ -211,8 +212,7 @@ class FlightLoop:
         self._control(state, now)
         covariances = () if not recorder.keeps_covariances else (
             pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
-        recorder.write_odom(state.stamp, state.position, state.quaternion, state.velocity,
-                            state.angular_velocity, *covariances)
+        recorder.write('odom', Odom.of(state, *covariances))
 
     def _execute(self, command, now):
         if command is None:
@@ -222,42 +222,33 @@ class FlightLoop:
             self._command = command
             self._simulator.command(replace(
                 command, stamp=command.stamp - self._processes.clock_step))
-            self._recorder.write_command(command.stamp, command.tilt, command.thrust, received=now)
+            self._recorder.write('command', command, now)
 
     def _sense(self, frame):
         recorder, tell, now = self._recorder, self._processes.tell, frame.time
-        truth = frame.truth
-        recorder.write_truth(truth.stamp, truth.position, truth.quaternion, truth.velocity,
-                             truth.angular_velocity)
+        recorder.write('ground_truth/odom', Odom.of(frame.truth))
         if frame.mocap is not None:
             self._estimator.pose(frame.mocap)
             tell('on_mocap', frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion)
-            recorder.write_mocap(frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion,
-                                 received=now)
+            recorder.write('mocap/pose', frame.mocap, now)
         if frame.joints is not None:
             self._joints = joints = frame.joints
             tell('on_joints', joints.stamp, joints.position, joints.velocity)
-            recorder.write_joints(joints.stamp, joints.position, joints.velocity, joints.effort,
-                                  received=now)
+            recorder.write('joint_states', Joints(joints.stamp, joints.position, joints.velocity,
+                                                  joints.effort), now)
         if frame.battery is not None:
             tell('on_battery', frame.battery.voltage)
-            recorder.write_battery(frame.battery.stamp, frame.battery.voltage,
-                                   frame.battery.current)
+            recorder.write('battery_state', Battery(
+                frame.battery.stamp, frame.battery.voltage, frame.battery.current))
         if frame.imu is not None:
             imu = frame.imu
             self._estimator.imu(imu)
             tell('on_imu', imu.stamp, imu.specific_force, imu.angular_velocity)
-            recorder.write_imu(imu.stamp, imu.specific_force, imu.angular_velocity)
+            recorder.write('imu/data_raw', imu)
         if frame.rotors is not None:
             tell('on_rotors', frame.rotors.stamp, frame.rotors.speed)
         for name, text in self._processes.bridges.items():
             tell('on_actuators', name, text, now)
-
-    def _state(self, estimate):
-        joints = self._joints
-        return State(estimate.stamp, estimate.position, estimate.velocity, estimate.quaternion,
-                     estimate.angular_velocity, joints.position, joints.velocity, joints.stamp,
-                     self._command)
 
     def _control(self, state, now):
         """Step whoever is due; without a target yet, hold the pose of the take-off's end."""
@@ -280,8 +271,7 @@ class FlightLoop:
                 self._request(name, command, now)
 
     def _request(self, name, command, now):
-        self._recorder.write_request(name, command.stamp, command.tilt, command.thrust,
-                                     received=now)
+        self._recorder.write(f'{name}/command', command, now)
         self._processes.tell('on_command', name, command, now)
 
     def _wanted(self):
@@ -307,7 +297,7 @@ class FlightLoop:
         name = self._supervisor.state if self._supervisor.state != 'flying' else told
         if told != self._told:
             self._told = told
-            self._recorder.write_state(now, told)
+            self._recorder.write('supervisor/state', told, now)
         if name != self._state_name:
             if self._state_name.startswith(('flying', 'fallback')) \
                     and name in ('landing', 'emergency_stop', 'disarmed'):

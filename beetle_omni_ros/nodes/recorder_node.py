@@ -7,28 +7,17 @@ from importlib import import_module
 import sys
 
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rosbags.interfaces import QosDurability
 
 from beetle_omni_ros.control import registry
+from beetle_omni_ros.messages.topics import ALL, topics_with
 from beetle_omni_ros.nodes import health, qos, runner
 from beetle_omni_ros.nodes.every_offer import EveryOffer
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.runs.bag import BagError, BagWriter
 from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS
-from beetle_omni_ros.runs.topics import LATCHED as LATCHED_TOPIC
-from beetle_omni_ros.runs.topics import SENSOR as SENSOR_TOPIC
-from beetle_omni_ros.runs.topics import Topic, topics_with
 
 FLUSH_PERIOD = 0.4      # s; a crash loses at most what came after the last flush
-STATE = Topic('std_msgs/msg/String', LATCHED_TOPIC)
-OWN_TOPICS = {'reference/state': STATE, 'joint_bridge/state': STATE, 'rotor_bridge/state': STATE,
-              'rotor_states': Topic('sensor_msgs/msg/JointState', SENSOR_TOPIC),
-              'supervisor/identity': STATE,
-              'supervisor/actuators': Topic('sensor_msgs/msg/JointState', LATCHED_TOPIC),
-              'supervisor/target': Topic('trajectory_msgs/msg/MultiDOFJointTrajectory',
-                                         LATCHED_TOPIC)}
-
 TARGETS = 'target_pose', 'target_trajectory'    # of anybody, however they are published
 
 
@@ -62,14 +51,13 @@ class RecorderNode(FlightNode):
         self._written = self._lost = 0
         self._failure = None
         prefix = self.get_namespace().rstrip('/') + '/'
-        for name, topic in {**topics, **OWN_TOPICS}.items():
+        for name, topic in {**ALL, **topics}.items():
             kind, write = _message_class(topic.type), self._writer(prefix + name, topic.type)
             if name in TARGETS:
                 EveryOffer(self, kind, name, write, depth=50, raw=True, on_lost=self._on_lost)
                 continue
-            latched = topic.qos.durability == QosDurability.TRANSIENT_LOCAL
             self.create_subscription(
-                kind, name, write, qos.LATCHED_LOG if latched else qos.LOG, raw=True,
+                kind, name, write, qos.LATCHED_LOG if topic.qos.latched else qos.LOG, raw=True,
                 event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
         self.health.report('bag', self._bag_status)
         self.create_timer(FLUSH_PERIOD, self._flush, clock=self.steady_clock)

@@ -6,23 +6,25 @@ from collections.abc import Sequence
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import WriterError
 import yaml
 
-from beetle_omni_ros.control.base import Target
+from beetle_omni_ros.messages.bag_types import BAG, offered, to_bytes, TYPESTORE
+from beetle_omni_ros.messages.conversions import nanoseconds
+from beetle_omni_ros.messages.topics import ALL, EVENT, Qos, topic_of, TOPICS
 from beetle_omni_ros.robot.yaml_file import read_yaml
-from beetle_omni_ros.runs import messages
 from beetle_omni_ros.runs.bag_reader import BagError, META_KEY, read_bag, read_messages
-from beetle_omni_ros.runs.log import COMPUTE_KEYS
+from beetle_omni_ros.runs.log import RUN_STATUS
+from beetle_omni_ros.runs.recorder import Recorder
 from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS, JazzyWriter
-from beetle_omni_ros.runs.topics import EVENT, Topic, topic_of, TOPICS
 
 
-class BagWriter:
+class BagWriter(Recorder):
     """
-    Writes one bag; takes the same ``write_*`` calls as ``LogRecorder``.
+    Writes one bag.
 
     Use it as a context manager, or call :meth:`close`. All topics are declared before the
     first message, because rosbag2 cannot read a chunk in which a declaration follows
@@ -40,7 +42,7 @@ class BagWriter:
             path: folder to create; it must not exist.
             meta: what is known of the flight: task, conditions, seed, robot, version.
             namespace: of the topics, '' or e.g. '/robot1'.
-            topics: names to declare, see :func:`~beetle_omni_ros.runs.topics.topic_of`.
+            topics: names to declare, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
             compression: of the chunks in the file, 'none' or 'zstd'.
 
         Raises:
@@ -53,7 +55,7 @@ class BagWriter:
         self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
         self._writer = _open(self.path, compression)
         for name in topics:
-            self._declare(self._prefix + name, topic_of(name))
+            self._declare(self._prefix + name, topic_of(name).type, topic_of(name).qos)
         self._last_t = None      # [s] of the newest message
         if meta:
             self.write_meta(meta)
@@ -71,29 +73,22 @@ class BagWriter:
         """Messages written so far, by topic."""
         return {topic: self._writer.counts[c.id] for topic, c in self._connections.items()}
 
-    def _declare(self, topic, entry):
+    def _declare(self, topic: str, msgtype: str, qos: Qos) -> Connection:
         storage = self._writer.storage
         if storage.chunk.msgs:
             storage.close_chunk()
         self._connections[topic] = self._writer.add_connection(
-            topic, entry.type, typestore=messages.TYPESTORE, offered_qos_profiles=[entry.qos])
+            topic, msgtype, typestore=TYPESTORE, offered_qos_profiles=[offered(qos)])
         return self._connections[topic]
 
-    def write(self, name: str, message, t: float) -> None:
-        """
-        Write one message of rosbags' type store.
-
-        Args:
-            name: without namespace, see :func:`~beetle_omni_ros.runs.topics.topic_of`.
-            message: see :mod:`~beetle_omni_ros.runs.messages`.
-            t: time of recording [s].
-
-        """
-        topic, entry = self._prefix + name, topic_of(name)
-        if topic not in self._connections and self._writer is not None:
-            self._declare(topic, entry)
-        self.write_raw(topic, entry.type, messages.TYPESTORE.serialize_cdr(message, entry.type),
-                       t)
+    def write(self, topic: str, value: Any, received: float | None = None) -> None:
+        """Write one value, see :class:`Recorder`."""
+        name, entry = self._prefix + topic, topic_of(topic)
+        if name not in self._connections and self._writer is not None:
+            self._declare(name, entry.type, entry.qos)
+        if received is None:
+            received = value[0].t if isinstance(value, list) else value.stamp
+        self.write_raw(name, entry.type, to_bytes(entry.write(BAG, value), entry.type), received)
 
     def write_raw(self, topic: str, msgtype: str, data: bytes | memoryview, t: float) -> None:
         """
@@ -113,14 +108,15 @@ class BagWriter:
             raise BagError(f'{self.path}: the bag is closed')
         connection = self._connections.get(topic)
         if connection is None:
-            if msgtype not in messages.TYPESTORE.types:
+            if msgtype not in TYPESTORE.types:
                 raise BagError(f'{self.path}: topic {topic} has the unknown type {msgtype}')
-            connection = self._declare(topic, Topic(msgtype, EVENT))
+            ours = ALL.get(topic.removeprefix(self._prefix))
+            connection = self._declare(topic, msgtype, ours.qos if ours else EVENT)
         first, self._last_t = self._last_t is None, t
         if first and self.meta:     # with a time of the flight
             self._tell_meta()
         try:
-            self._writer.write(connection, max(0, messages.nanoseconds(t)), data)
+            self._writer.write(connection, max(0, nanoseconds(t)), data)
         except OSError as error:
             raise BagError(f'{self.path}: {error.strerror}') from error
 
@@ -158,69 +154,7 @@ class BagWriter:
             self._tell_meta()
 
     def _tell_meta(self):
-        self.write_diagnostic(self._last_t, f'recorder_node: {messages.RUN_STATUS}', self.meta)
-
-    def write_truth(self, t, position, quaternion, velocity, angular_velocity) -> None:
-        """Simulated truth; velocity in world, angular velocity in base_link."""
-        self.write('ground_truth/odom', messages.odometry(t, position, quaternion, velocity,
-                                                          angular_velocity), t)
-
-    def write_odom(self, t, position, quaternion, velocity, angular_velocity,
-                   pose_covariance=None, twist_covariance=None) -> None:
-        """Record an estimate; velocity in world; covariances (6, 6) as in nav_msgs/Odometry."""
-        self.write('odom', messages.odometry(t, position, quaternion, velocity, angular_velocity,
-                                             pose_covariance, twist_covariance), t)
-
-    def write_imu(self, t, specific_force, angular_velocity) -> None:
-        """One IMU sample in base_link."""
-        self.write('imu/data_raw', messages.imu(t, specific_force, angular_velocity), t)
-
-    def write_mocap(self, t, position, quaternion, received=None) -> None:
-        """One MoCap pose, captured at ``t``, available at ``received``."""
-        self.write('mocap/pose', messages.pose_stamped(t, position, quaternion),
-                   t if received is None else received)
-
-    def write_joints(self, t, position, velocity, effort=None, received=None) -> None:
-        """One joint feedback, captured at ``t``, available at ``received``."""
-        self.write('joint_states', messages.joint_state(t, position, velocity, effort),
-                   t if received is None else received)
-
-    def write_battery(self, t, voltage, current) -> None:
-        """Pack voltage [V] and current [A, negative when discharging]."""
-        self.write('battery_state', messages.battery(t, voltage, current), t)
-
-    def write_command(self, t, tilt, thrust, received=None) -> None:
-        """Record the selected command; ``t`` is the stamp of the estimate that it answers."""
-        self.write('command', messages.command(t, tilt, thrust),
-                   t if received is None else received)
-
-    def write_request(self, controller: str, t, tilt, thrust, received=None) -> None:
-        """What one controller asked for, before the supervisor."""
-        self.write(f'{controller}/command', messages.command(t, tilt, thrust),
-                   t if received is None else received)
-
-    def write_wrench(self, t, force_world, torque_body) -> None:
-        """External wrench from ``t`` until the next."""
-        self.write('disturbance', messages.wrench(t, force_world, torque_body), t)
-
-    def write_target(self, target: Target, received=None) -> None:
-        """One pose or trajectory target, in force from its stamp."""
-        name, message = messages.target_message(target)
-        self.write(name, message, target.stamp if received is None else received)
-
-    def write_state(self, t, state: str) -> None:
-        """Record the supervisor's state, e.g. 'flying:nmpc', whenever it changes."""
-        self.write('supervisor/state', messages.String(state), t)
-
-    def write_compute(self, t, controller: str, **times) -> None:
-        """CPU time of one controller's steps since its start, as ``LogRecorder`` takes it."""
-        values = {key: times[name] for key, name in COMPUTE_KEYS.items()}
-        self.write_diagnostic(t, f'{controller}_node: {messages.COMPUTE_STATUS}', values)
-
-    def write_diagnostic(self, t, name: str, values: dict, level: int = 0,
-                         message: str = '') -> None:
-        """One status of one node."""
-        self.write('diagnostics', messages.diagnostic(t, name, values, level, message), t)
+        self.write_diagnostic(self._last_t, f'recorder_node: {RUN_STATUS}', self.meta)
 
 
 def check_new(path: str | Path, compression: str = 'none') -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 import json
 from pathlib import Path
 from typing import NamedTuple
@@ -11,11 +12,14 @@ from typing import NamedTuple
 from mcap.exceptions import InvalidMagic
 from mcap.reader import NonSeekingReader
 
+from beetle_omni_ros.control.base import TrajectoryTarget
+from beetle_omni_ros.messages.bag_types import from_bytes
+from beetle_omni_ros.messages.conversions import from_nanoseconds
+from beetle_omni_ros.messages.topics import is_ambiguous, split_topic, topic_of, TOPICS
+from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, YamlError
-from beetle_omni_ros.runs import decode, messages
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.recorder import LogRecorder
-from beetle_omni_ros.runs.topics import is_ambiguous, split_topic, topic_of, TOPICS
 
 META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
 
@@ -104,7 +108,7 @@ def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterat
                 reader = NonSeekingReader(_WholeReads(stream), validate_crcs=True)
                 for schema, channel, message in reader.iter_messages(log_time_order=False):
                     yield RawMessage(channel.topic, schema.name if schema else '', message.data,
-                                     messages.seconds(message.log_time))
+                                     from_nanoseconds(message.log_time))
         except OSError as error:
             raise BagError(f'{file}: {error.strerror}') from None
         except InvalidMagic:
@@ -165,10 +169,11 @@ class _Reading:
         if name is None:
             return
         try:
-            if message.type != topic_of(name).type:
-                raise decode.LayoutError(f'type is {message.type}, not {topic_of(name).type}')
-            decoded = messages.TYPESTORE.deserialize_cdr(message.data, message.type)
-            decode.record(self.recorder, name, decoded, message.received)
+            topic = topic_of(name)
+            if message.type != topic.type:
+                raise MessageError(f'type is {message.type}, not {topic.type}')
+            value = topic.read(from_bytes(message.data, message.type))
+            self.recorder.write(name, _stamped(value, message.received), message.received)
             self._counts[name] += 1
         except Exception as error:  # one message that cannot be used must not lose the others
             self._bad[name] += 1
@@ -200,6 +205,17 @@ class _Reading:
         for name, count in self._bad.items():
             self.warnings.append(f'{name}: {count} messages not used ({self._reason[name]})')
         return self.warnings
+
+
+def _stamped(value, received):
+    """The value; where its stamp is not set, as quick tools leave it, with the time of receipt."""
+    if isinstance(value, list):
+        return [entry if entry.t else replace(entry, t=received) for entry in value]
+    if isinstance(value, str) or value.stamp:
+        return value
+    if isinstance(value, TrajectoryTarget):
+        return replace(value, stamp=received, times=value.times + received)
+    return replace(value, stamp=received)
 
 
 def _rooted(namespace):

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from beetle_omni_ros.control.base import Target
+from beetle_omni_ros.messages.values import Diagnostic
 
 SERIES = {
     'truth': {'position': 3, 'quaternion': 4, 'velocity': 3, 'angular_velocity': 3},
@@ -25,10 +26,17 @@ SERIES = {
 }
 """Series -> channel -> width; 0 is a scalar channel. Each has times ``<series>_t``."""
 
+SERIES_OF = {'ground_truth/odom': 'truth', 'odom': 'odom', 'imu/data_raw': 'imu',
+             'mocap/pose': 'mocap', 'joint_states': 'joint', 'battery_state': 'battery',
+             'command': 'command', 'disturbance': 'wrench'}
+"""Topic -> series that its values are kept in, channel by channel."""
+
 WIDTHS = {name: 1 + sum(max(1, width) for width in channels.values())
           for name, channels in SERIES.items()}
 """Series -> numbers in one sample, with its time."""
 
+RUN_STATUS = 'run'  # diagnostic status '<node>: run' that carries a flight's meta data
+COMPUTE_STATUS = 'compute'  # diagnostic status '<name>_node: compute'
 SUPERVISOR_STATUS, FAULT_KEY = 'supervisor_node: supervisor', 'fault.'
 COMPUTE_KEYS = {'median_ms': 'median', 'p99_ms': 'p99', 'max_ms': 'max',
                 'deadline_misses': 'deadline_misses', 'count': 'count'}
@@ -47,17 +55,6 @@ class Commands:
     received: np.ndarray = _empty(0)
     tilt: np.ndarray = _empty(4)
     thrust: np.ndarray = _empty(4)
-
-
-@dataclass(frozen=True)
-class Diagnostic:
-    """One diagnostic status: level 0 ok, 1 warning, 2 error, 3 stale; values as text."""
-
-    t: float
-    name: str
-    level: int
-    message: str
-    values: dict[str, str]
 
 
 @dataclass

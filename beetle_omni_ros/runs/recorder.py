@@ -1,93 +1,106 @@
 """
 Collecting a flight while it happens.
 
-:class:`LogRecorder` and :class:`~beetle_omni_ros.runs.bag.BagWriter` take the same
-``write_*`` calls, so that a loop records into memory, onto disk, or both with
-:class:`Tee`.
+:class:`LogRecorder` and :class:`~beetle_omni_ros.runs.bag.BagWriter` take the same calls, so that
+a loop records into memory, onto disk, or both with :class:`Tee`.
 """
 
 from __future__ import annotations
 
 from array import array
+from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Target
-from beetle_omni_ros.runs.log import Commands, COMPUTE_KEYS, Diagnostic, FlightLog, SERIES, WIDTHS
+from beetle_omni_ros.control.base import Command, PoseTarget, Target
+from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
+from beetle_omni_ros.messages.topics import requester
+from beetle_omni_ros.messages.values import Battery, Diagnostic, Joints, Odom, Wrench
+from beetle_omni_ros.runs.log import (
+    Commands,
+    COMPUTE_KEYS,
+    COMPUTE_STATUS,
+    FlightLog,
+    RUN_STATUS,
+    SERIES,
+    SERIES_OF,
+    WIDTHS,
+)
 
 
-class LogRecorder:
+class Recorder:
     """
-    Collects a :class:`FlightLog` from ``write_*`` calls; see there for units and frames.
+    What takes a flight: :meth:`write` for every topic, and shorter calls that lead to it.
 
     Attributes:
-        keeps_covariances: whether ``write_odom`` does anything with them.
+        keeps_covariances: whether those of ``odom`` go anywhere.
 
     """
 
     keeps_covariances = False
 
-    def __init__(self, meta: dict | None = None):
-        self._rows = {name: array('d') for name in SERIES}  # flat: hours of flight fit
-        self._requests: dict[str, array] = {}
-        self._log = FlightLog(meta=dict(meta or {}))
-        self._states: list[tuple[float, str]] = []
+    def write(self, topic: str, value: Any, received: float | None = None) -> None:
+        """
+        Take one value.
 
-    def _add(self, series, *row, rows=None):
-        if len(row) != WIDTHS[series]:
-            raise ValueError(f'{series}: expected {WIDTHS[series]} values, found {len(row)}')
-        (self._rows[series] if rows is None else rows).extend(row)
+        Args:
+            topic: without namespace, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
+            value: as the table of topics has it for this one.
+            received: time of recording [s]; default: the value's stamp. Text needs it.
+
+        """
+        raise NotImplementedError
 
     def write_meta(self, meta: dict) -> None:
         """Add to what is known of the flight: task, conditions, seed, robot, version."""
-        self._log.meta.update(meta)
+        raise NotImplementedError
 
     def write_truth(self, t, position, quaternion, velocity, angular_velocity) -> None:
         """Simulated truth; velocity in world, angular velocity in base_link."""
-        self._add('truth', t, *position, *quaternion, *velocity, *angular_velocity)
+        self.write('ground_truth/odom', Odom(t, position, velocity, quaternion, angular_velocity))
 
-    def write_odom(self, t, position, quaternion, velocity, angular_velocity,
-                   pose_covariance=None, twist_covariance=None) -> None:
-        """Record an estimate; velocity in world, angular velocity in base_link."""
-        self._add('odom', t, *position, *quaternion, *velocity, *angular_velocity)
+    def write_odom(self, t, position, quaternion, velocity, angular_velocity, *covariances,
+                   ) -> None:
+        """Record an estimate; velocity in world; covariances as :class:`Odom` has them."""
+        self.write('odom', Odom(t, position, velocity, quaternion, angular_velocity,
+                                *covariances))
 
     def write_imu(self, t, specific_force, angular_velocity) -> None:
         """One IMU sample in base_link."""
-        self._add('imu', t, *specific_force, *angular_velocity)
+        self.write('imu/data_raw', ImuSample(t, specific_force, angular_velocity))
 
     def write_mocap(self, t, position, quaternion, received=None) -> None:
-        """One MoCap pose, captured at ``t``."""
-        self._add('mocap', t, *position, *quaternion)
+        """One MoCap pose, captured at ``t``, available at ``received``."""
+        self.write('mocap/pose', PoseSample(t, position, quaternion), received)
 
     def write_joints(self, t, position, velocity, effort=None, received=None) -> None:
-        """One joint feedback, captured at ``t``."""
-        effort = (np.nan,) * 4 if effort is None else effort
-        self._add('joint', t, *position, *velocity, *effort)
+        """One joint feedback, captured at ``t``, available at ``received``."""
+        self.write('joint_states', Joints(t, position, velocity, effort), received)
 
     def write_battery(self, t, voltage, current) -> None:
         """Pack voltage [V] and current [A, negative when discharging]."""
-        self._add('battery', t, voltage, current)
+        self.write('battery_state', Battery(t, voltage, current))
 
     def write_command(self, t, tilt, thrust, received=None) -> None:
         """Record the selected command; ``t`` is the stamp of the estimate that it answers."""
-        self._add('command', t, t if received is None else received, *tilt, *thrust)
+        self.write('command', Command(t, tilt, thrust), received)
 
     def write_request(self, controller: str, t, tilt, thrust, received=None) -> None:
         """What one controller asked for, before the supervisor."""
-        self._add('command', t, t if received is None else received, *tilt, *thrust,
-                  rows=self._requests.setdefault(controller, array('d')))
+        self.write(f'{controller}/command', Command(t, tilt, thrust), received)
 
     def write_wrench(self, t, force_world, torque_body) -> None:
         """External wrench from ``t`` until the next."""
-        self._add('wrench', t, *force_world, *torque_body)
+        self.write('disturbance', Wrench(t, force_world, torque_body))
 
     def write_target(self, target: Target, received=None) -> None:
         """One pose or trajectory target, in force from its stamp."""
-        self._log.targets.append(target)
+        self.write('target_pose' if isinstance(target, PoseTarget) else 'target_trajectory',
+                   target, received)
 
     def write_state(self, t, state: str) -> None:
         """Record the supervisor's state, e.g. 'flying:nmpc', whenever it changes."""
-        self._states.append((t, state))
+        self.write('supervisor/state', state, t)
 
     def write_compute(self, t, controller: str, **times) -> None:
         """
@@ -99,16 +112,72 @@ class LogRecorder:
             times: median, p99, max [ms], deadline_misses, count.
 
         """
-        report = {name: int(times[name]) if name in ('deadline_misses', 'count')
-                  else float(times[name]) for name in COMPUTE_KEYS.values()}
-        self._log.compute[controller] = report
-        self._log.compute_history.setdefault(controller, []).append((t, report))
+        self.write_diagnostic(t, f'{controller}_node: {COMPUTE_STATUS}',
+                              {key: times[name] for key, name in COMPUTE_KEYS.items()})
 
     def write_diagnostic(self, t, name: str, values: dict, level: int = 0,
                          message: str = '') -> None:
         """One status of one node: name 'ekf_node: estimator', values as numbers or text."""
-        self._log.diagnostics.append(Diagnostic(
-            t, name, int(level), message, {str(k): str(v) for k, v in values.items()}))
+        self.write('diagnostics', [Diagnostic(t, name, int(level), message, {
+            str(key): str(value) for key, value in values.items()})])
+
+
+class LogRecorder(Recorder):
+    """Collects a :class:`FlightLog`; see there for units and frames."""
+
+    def __init__(self, meta: dict | None = None):
+        self._rows = {name: array('d') for name in SERIES}  # flat: hours of flight fit
+        self._requests: dict[str, array] = {}
+        self._log = FlightLog(meta=dict(meta or {}))
+        self._states: list[tuple[float, str]] = []
+
+    def write(self, topic: str, value: Any, received: float | None = None) -> None:
+        """Take one value; those of other topics than a log has are left out."""
+        series = SERIES_OF.get(topic)
+        if series:
+            self._add(series, self._rows[series], value, received)
+        elif requester(topic):
+            self._add('command', self._requests.setdefault(requester(topic), array('d')), value,
+                      received)
+        elif topic in ('target_pose', 'target_trajectory'):
+            self._log.targets.append(value)
+        elif topic == 'supervisor/state':
+            self._states.append((received, value))
+        elif topic == 'diagnostics':
+            for entry in value:
+                self._take(entry)
+
+    def _add(self, series, rows, value, received):
+        row = [value.stamp]
+        for channel, width in SERIES[series].items():
+            part = getattr(value, channel) if channel != 'received' else \
+                value.stamp if received is None else received
+            if width:
+                row.extend([np.nan] * width if part is None else part)
+            else:
+                row.append(part)
+        if len(row) != WIDTHS[series]:
+            raise ValueError(f'{series}: expected {WIDTHS[series]} values, found {len(row)}')
+        rows.extend(row)
+
+    def write_meta(self, meta: dict) -> None:
+        """Add to what is known of the flight."""
+        self._log.meta.update(meta)
+
+    def _take(self, entry):
+        values = entry.values
+        node, _, kind = entry.name.rpartition(': ')
+        if kind == RUN_STATUS:
+            seed = values.get('seed', '')
+            self.write_meta({**values, 'seed': int(seed)} if seed.isdigit() else values)
+        elif kind == COMPUTE_STATUS and set(COMPUTE_KEYS) <= set(values):
+            report = {name: int(values[key]) if name in ('deadline_misses', 'count')
+                      else float(values[key]) for key, name in COMPUTE_KEYS.items()}
+            name = node.rpartition('/')[2].removesuffix('_node')
+            self._log.compute[name] = report
+            self._log.compute_history.setdefault(name, []).append((entry.t, report))
+        else:
+            self._log.diagnostics.append(entry)
 
     def log(self) -> FlightLog:
         """Build the flight so far, each series sorted by time."""
@@ -148,21 +217,19 @@ def _in_order(targets):
     return kept
 
 
-class Tee:
-    """Passes every ``write_*`` call on to several recorders."""
+class Tee(Recorder):
+    """Passes everything on to several recorders."""
 
-    def __init__(self, *recorders):
+    def __init__(self, *recorders: Recorder):
         self._recorders = recorders
         self.keeps_covariances = any(recorder.keeps_covariances for recorder in recorders)
 
-    def __getattr__(self, name):
-        """Look the method up in every recorder."""
-        if not name.startswith('write_'):
-            raise AttributeError(name)
-        methods = [getattr(recorder, name) for recorder in self._recorders]
+    def write(self, topic: str, value: Any, received: float | None = None) -> None:
+        """Let each have it."""
+        for recorder in self._recorders:
+            recorder.write(topic, value, received)
 
-        def write(*args, **kwargs):
-            for method in methods:
-                method(*args, **kwargs)
-        setattr(self, name, write)
-        return write
+    def write_meta(self, meta: dict) -> None:
+        """Let each have it."""
+        for recorder in self._recorders:
+            recorder.write_meta(meta)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from beetle_omni_ros.runs.messages import Time
 from gap_damage_kinds.kind import damage, FIRST, HARMLESS, REPAIRABLE
 from gap_damage_kinds.recording import COMMAND, IMU, JOINTS, MOCAP
 
@@ -122,7 +121,7 @@ def mocap_stamps_nanoseconds(bag, random, other):
     """They do not fit in 32 bits and wrap."""
     for m, t in zip(bag.on(MOCAP), bag.stamps(MOCAP), strict=True):
         wrapped = (round(t * 1e9) + 2**31) % 2**32 - 2**31
-        m.content.header.stamp = Time(wrapped, 0)
+        m.content.header.stamp.sec, m.content.header.stamp.nanosec = wrapped, 0
 
 
 @damage('joint milliseconds in the seconds of the stamp', JOINTS, causes=[

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from beetle_omni_ros.messages.bag_types import TYPESTORE
+from beetle_omni_ros.messages.conversions import nanoseconds
+from beetle_omni_ros.messages.topics import split_topic, TOPICS
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.runs.bag import BagWriter
 from beetle_omni_ros.runs.bag_reader import META_KEY, read_messages
-from beetle_omni_ros.runs.messages import nanoseconds, Time, TYPESTORE
-from beetle_omni_ros.runs.topics import split_topic, TOPICS
 
 MOCAP, IMU, JOINTS, COMMAND = 'mocap/pose', 'imu/data_raw', 'joint_states', 'command'
 BATTERY = 'battery_state'
@@ -69,7 +70,8 @@ class Message:
 
     @stamp.setter
     def stamp(self, t: float) -> None:
-        self.content.header.stamp = Time(*divmod(nanoseconds(t), SECOND))
+        stamp = self.content.header.stamp
+        stamp.sec, stamp.nanosec = divmod(nanoseconds(t), SECOND)
 
     def numbers(self) -> list[np.ndarray]:
         """Values of this topic as they are changed together, see ``Recording.values``."""

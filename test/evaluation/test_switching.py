@@ -55,8 +55,9 @@ class Switching(LogRecorder):
         super().__init__()
         self.supervisor, self.times, self.switched = supervisor, list(times), []
 
-    def write_odom(self, t, *values):
-        super().write_odom(t, *values)
+    def write(self, topic, value, received=None):
+        super().write(topic, value, received)
+        t = value.stamp if topic == 'odom' else -np.inf
         if self.times and t >= self.times[0] and self.supervisor.state == 'flying':
             self.times.pop(0)
             other = 'rl' if self.supervisor.active == 'nmpc' else 'nmpc'

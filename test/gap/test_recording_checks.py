@@ -8,11 +8,11 @@ import pytest
 from recordings import columns, kept, late_half, recording, ROBOT, turned_pose
 from scipy.spatial.transform import Rotation, Slerp
 
-from beetle_omni_ros.identify.gap import bags
 from beetle_omni_ros.identify.gap.bags import read_recording
 from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.recording.check import damages, repaired
+from beetle_omni_ros.messages import columns as message_columns
 from beetle_omni_ros.runs.bag import BagWriter
 
 P = GapParameters.load()
@@ -298,7 +298,7 @@ def test_reading_all_messages_at_once_gives_what_reading_each_gives(tmp_path, mo
         for k in range(60):
             bag.write_raw(f'/{IMU}', 'sensor_msgs/msg/Imu', _imu_bytes(k), 0.1 * k + 1.0)
     at_once = read_recording(tmp_path / 'bag')
-    monkeypatch.setattr(bags, 'WIDE', {})
+    monkeypatch.setattr(message_columns, 'LAYOUTS', 0)
     one_by_one = read_recording(tmp_path / 'bag')
     for part in ('times', 'values', 'received'):
         assert np.array_equal(getattr(at_once, part)[IMU], getattr(one_by_one, part)[IMU])

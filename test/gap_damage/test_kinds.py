@@ -16,7 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from small_bags import DURATION, small_bag
 
-from beetle_omni_ros.runs.messages import TYPESTORE
+from beetle_omni_ros.messages.bag_types import TYPESTORE
 
 TIMES = ('received_hour_late', 'another_day', 'joint_stamps_1970', 'duplicates', 'two_flights',
          'in_namespace')      # touch every topic

@@ -15,13 +15,13 @@ from witness import HEADER, READY
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.messages.topics import split_topic, topic_of, topics_with
 from beetle_omni_ros.nodes import convert, plan
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import read_bag
-from beetle_omni_ros.runs.topics import split_topic, topic_of, topics_with
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 OWN = f"{Path(__file__).resolve().parents[2] / 'examples' / 'own_controller.py'}:PoseController"

@@ -8,11 +8,11 @@ from types import ModuleType
 
 import pytest
 
+from beetle_omni_ros.messages.topics import TOPICS
 from beetle_omni_ros.nodes import discovery, plan, private
 from beetle_omni_ros.nodes.actuators import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.topics import TOPICS
 
 
 class Recorded:

@@ -17,7 +17,11 @@ from synthetic_flights import fly
 import yaml
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
-from beetle_omni_ros.runs import messages
+from beetle_omni_ros.estimation.samples import ImuSample
+from beetle_omni_ros.messages import conversions
+from beetle_omni_ros.messages.bag_types import BAG, to_bytes, TYPESTORE
+from beetle_omni_ros.messages.topics import TOPICS
+from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.runs.bag import (
     add_meta,
     BagError,
@@ -29,7 +33,6 @@ from beetle_omni_ros.runs.bag import (
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.recorder import LogRecorder, Tee
 from beetle_omni_ros.runs.tasks import make_task
-from beetle_omni_ros.runs.topics import TOPICS
 
 META = {'task': 'lemniscate', 'conditions': 'nominal', 'seed': 4, 'version': '0.1.0'}
 
@@ -92,7 +95,7 @@ def test_a_run_may_be_named_by_its_folder_its_mcap_file_or_its_metadata(recorded
 def test_two_independent_readers_agree_on_every_message(recorded):
     folder, _, counts = recorded
     theirs = {}
-    with AnyReader([folder], default_typestore=messages.TYPESTORE) as reader:
+    with AnyReader([folder], default_typestore=TYPESTORE) as reader:
         for connection, t, raw in reader.messages():
             theirs.setdefault(connection.topic, []).append(
                 (t, reader.deserialize(raw, connection.msgtype)))
@@ -133,7 +136,7 @@ def test_metadata_says_what_ros2_bag_info_needs(recorded):
 def test_a_command_is_laid_out_as_the_interface_says(recorded):
     folder, _, _ = recorded
     raw = next(m for m in read_messages(folder) if m.topic == '/command')
-    message = messages.TYPESTORE.deserialize_cdr(raw.data, raw.type)
+    message = TYPESTORE.deserialize_cdr(raw.data, raw.type)
     assert message.name == ['gimbal1', 'gimbal2', 'gimbal3', 'gimbal4',
                             'rotor1', 'rotor2', 'rotor3', 'rotor4']
     assert np.isnan(message.position).tolist() == [False] * 4 + [True] * 4
@@ -143,8 +146,8 @@ def test_a_command_is_laid_out_as_the_interface_says(recorded):
 
 def test_odometry_carries_the_twist_in_base_link():
     quaternion = np.array([0, 0, np.sqrt(0.5), np.sqrt(0.5)])  # yaw 90 deg
-    message = messages.odometry(1.0, np.zeros(3), quaternion, np.array([0.0, 2.0, 0.0]),
-                                np.zeros(3))
+    message = conversions.write_odom(BAG, Odom(1.0, np.zeros(3), np.array([0.0, 2.0, 0.0]),
+                                               quaternion, np.zeros(3)))
     twist = message.twist.twist.linear
     assert (twist.x, twist.y, twist.z) == pytest.approx((2.0, 0.0, 0.0))
 
@@ -247,15 +250,23 @@ def test_an_empty_bag_is_readable(tmp_path):
     with BagWriter(tmp_path / 'bag'):
         pass
     assert len(read_bag(tmp_path / 'bag').truth_t) == 0
-    with AnyReader([tmp_path / 'bag'], default_typestore=messages.TYPESTORE) as reader:
+    with AnyReader([tmp_path / 'bag'], default_typestore=TYPESTORE) as reader:
         assert reader.message_count == 0
+
+
+def joint_states(t, names, position, velocity=()):
+    """Type and bytes of a message with any names."""
+    message = BAG.new('sensor_msgs/msg/JointState')
+    conversions.set_time(message.header.stamp, t)
+    message.name, message.position = names, BAG.doubles(position)
+    message.velocity = BAG.doubles(velocity)
+    return 'sensor_msgs/msg/JointState', to_bytes(message, 'sensor_msgs/msg/JointState')
 
 
 def test_a_message_that_cannot_be_used_is_counted_and_loses_no_other(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
         writer.write_joints(1.0, np.ones(4), np.zeros(4))
-        writer.write('joint_states', messages.JointState(
-            messages.header(2.0), ['wheel'], np.ones(1), np.zeros(1), np.zeros(0)), 2.0)
+        writer.write_raw('/joint_states', *joint_states(2.0, ['wheel'], [1.0], [0.0]), 2.0)
         writer.write_raw('/odom', 'nav_msgs/msg/Odometry', b'\x00\x01\x00\x00', 2.5)
         writer.write_joints(3.0, np.ones(4), np.zeros(4))
     log = read_bag(tmp_path / 'bag')
@@ -266,15 +277,13 @@ def test_a_message_that_cannot_be_used_is_counted_and_loses_no_other(tmp_path):
 
 def test_joints_are_found_by_name_in_any_order(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
-        writer.write('joint_states', messages.JointState(
-            messages.header(1.0), ['gimbal3', 'gimbal1', 'extra', 'gimbal4', 'gimbal2'],
-            np.array([3.0, 1, 9, 4, 2]), np.zeros(0), np.zeros(0)), 1.0)
+        writer.write_raw('/joint_states', *joint_states(
+            1.0, ['gimbal3', 'gimbal1', 'extra', 'gimbal4', 'gimbal2'], [3.0, 1, 9, 4, 2]), 1.0)
     assert read_bag(tmp_path / 'bag').joint_position.tolist() == [[1, 2, 3, 4]]
 
 
 def test_raw_messages_and_late_topics_stay_readable_by_both_readers(tmp_path):
-    typestore = messages.TYPESTORE
-    text = typestore.serialize_cdr(messages.String('hello'), 'std_msgs/msg/String')
+    text = to_bytes(conversions.write_text(BAG, 'hello'), 'std_msgs/msg/String')
     with BagWriter(tmp_path / 'bag', topics=['imu/data_raw']) as writer:
         writer.write_imu(1.0, (0, 0, 9.8), (0, 0, 0))
         writer.write_raw('/notes', 'std_msgs/msg/String', text, 2.0)
@@ -292,8 +301,8 @@ def test_namespaces_are_taken_off_and_several_robots_need_a_choice(tmp_path):
     with BagWriter(tmp_path / 'one', namespace='robot1') as writer:
         writer.write_command(1.0, np.ones(4), np.ones(4))
         writer.write_request('nmpc', 1.0, np.zeros(4), np.ones(4))
-        imu = messages.TYPESTORE.serialize_cdr(messages.imu(2.0, (0, 0, 1), (0, 0, 0)),
-                                               'sensor_msgs/msg/Imu')
+        imu = to_bytes(conversions.write_imu(BAG, ImuSample(2.0, (0, 0, 1), (0, 0, 0))),
+                       'sensor_msgs/msg/Imu')
         writer.write_raw('/robot2/imu/data_raw', 'sensor_msgs/msg/Imu', imu, 2.0)
     with pytest.raises(BagError, match='several robots'):
         read_bag(tmp_path / 'one')
@@ -304,7 +313,8 @@ def test_namespaces_are_taken_off_and_several_robots_need_a_choice(tmp_path):
 
 @pytest.mark.parametrize('t', [0.0, 0.1, 1.005, 1.7e9 + 0.123456789, 1.9e9 - 1e-6])
 def test_times_keep_every_bit(t):
-    assert messages.seconds(messages.nanoseconds(t)) == pytest.approx(t, rel=1e-16, abs=1e-9)
+    again = conversions.from_nanoseconds(conversions.nanoseconds(t))
+    assert again == pytest.approx(t, rel=1e-16, abs=1e-9)
 
 
 def test_an_unset_stamp_is_the_time_of_receipt(tmp_path):
@@ -332,7 +342,7 @@ def test_meta_data_can_be_added_to_a_finished_bag(tmp_path):
         writer.write_imu(1.0, (0, 0, 9.8), (0, 0, 0))
     add_meta(tmp_path / 'bag', {'seed': 3})
     assert read_bag(tmp_path / 'bag').meta == {'task': 'hover', 'seed': 3}
-    with AnyReader([tmp_path / 'bag'], default_typestore=messages.TYPESTORE) as reader:
+    with AnyReader([tmp_path / 'bag'], default_typestore=TYPESTORE) as reader:
         assert reader.message_count == 2
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
     with pytest.raises(BagError, match=r'metadata\.yaml'):

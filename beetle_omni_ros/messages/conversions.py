@@ -1,0 +1,523 @@
+"""
+Messages to values and back, by attribute access alone.
+
+``read_*`` takes a message as it stands: of rclpy, of a bag, or of
+:mod:`~beetle_omni_ros.messages.columns`, whose numbers are arrays over many messages. Vectors then
+have the shape (N, 3). ``take_*`` reads one message for a flight and refuses what cannot be flown
+with. ``write_*`` fills a message of a :class:`Kind`. Every scalar passes through ``float``: a
+wrong Python type in a float field would be serialised as garbage without a word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import floor, isfinite, isnan
+from typing import Any, Protocol
+
+import numpy as np
+
+from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
+from beetle_omni_ros.messages.values import (
+    Battery,
+    Diagnostic,
+    Joints,
+    MessageError,
+    Odom,
+    RotorSpeeds,
+    ToldHealth,
+    Wish,
+    Wrench,
+)
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
+
+WORLD, BODY = 'world', 'base_link'
+JOINTS, ROTORS = list(JOINT_NAMES), list(ROTOR_NAMES)
+COMMAND_NAMES = [*JOINTS, *ROTORS]
+HEALTH_NAMES = [*COMMAND_NAMES, *(f'{name}_zero' for name in JOINT_NAMES)]
+NO_VALUE = [float('nan')] * 4
+# A quaternion further from unit length than this is a broken message, not a rounded one.
+UNIT_TOLERANCE = 0.01
+POINTS = 10_000     # of a trajectory: 100 s at 100 Hz; more would hold up the node that reads it
+
+
+class Kind(Protocol):
+    """A family of message classes."""
+
+    def new(self, name: str) -> Any:
+        """Make a message with default values, by its ROS type."""
+
+    def doubles(self, values: Sequence[float] | np.ndarray) -> Any:
+        """Numbers as a field ``float64[]`` takes them."""
+
+    def singles(self, values: Sequence[float]) -> Any:
+        """Numbers as a field ``float32[]`` takes them."""
+
+    def byte(self, value: int) -> Any:
+        """Return a number as a field ``byte`` takes it."""
+
+
+# --- times, vectors, names ----------------------------------------------------------------------
+
+def nanoseconds(t: float) -> int:
+    """Seconds to integer nanoseconds, whole seconds apart: an epoch time keeps every bit."""
+    whole = floor(t)
+    return whole * 1_000_000_000 + round((t - whole) * 1e9)
+
+
+def from_nanoseconds(time: int) -> float:
+    """Integer nanoseconds to seconds, the inverse of :func:`nanoseconds`."""
+    whole, rest = divmod(time, 1_000_000_000)
+    return whole + rest * 1e-9
+
+
+def seconds(time: Any) -> float:
+    """Time message, or a duration, to seconds."""
+    return time.sec + time.nanosec * 1e-9
+
+
+def set_time(time: Any, t: float) -> None:
+    """Fill a time message; one before 0 becomes 0."""
+    time.sec, time.nanosec = divmod(max(0, nanoseconds(t)), 1_000_000_000)
+
+
+def xyz(v: Any) -> np.ndarray:
+    """Three fields as an array (3,), or (N, 3)."""
+    return np.array([v.x, v.y, v.z]).T
+
+
+def xyzw(q: Any) -> np.ndarray:
+    """Four fields as an array (4,), or (N, 4)."""
+    return np.array([q.x, q.y, q.z, q.w]).T
+
+
+def set_xyz(v: Any, values: Sequence[float] | np.ndarray) -> None:
+    """Fill three fields."""
+    v.x, v.y, v.z = float(values[0]), float(values[1]), float(values[2])
+
+
+def set_xyzw(q: Any, values: Sequence[float] | np.ndarray) -> None:
+    """Fill four fields."""
+    q.x, q.y, q.z, q.w = float(values[0]), float(values[1]), float(values[2]), float(values[3])
+
+
+def finite(values: np.ndarray, what: str) -> np.ndarray:
+    """Refuse what is not finite."""
+    if not np.isfinite(values).all():
+        raise MessageError(f'{what} is not finite')
+    return values
+
+
+def unit(q: np.ndarray, low: float = 1 - UNIT_TOLERANCE,
+         high: float = 1 + UNIT_TOLERANCE) -> np.ndarray:
+    """Normalise a quaternion; refuse one that was not meant to be one."""
+    norm = float(q @ q) ** 0.5
+    if not low < norm < high:      # catches NaN as well
+        raise MessageError('orientation is not a unit quaternion')
+    return q / norm
+
+
+def _begin(kind, name, stamp, frame=''):
+    message = kind.new(name)
+    set_time(message.header.stamp, stamp)
+    message.header.frame_id = frame
+    return message
+
+
+def _set_pose(pose, position, quaternion):
+    set_xyz(pose.position, position)
+    set_xyzw(pose.orientation, quaternion)
+
+
+def _order(names, wanted):
+    if names == wanted:
+        return range(len(wanted))
+    try:
+        return [names.index(name) for name in wanted]
+    except ValueError:
+        raise MessageError(f"names are not {', '.join(wanted)}") from None
+
+
+def _values(values, order, what):
+    try:
+        return np.array([values[k] for k in order], dtype=float).T
+    except IndexError:
+        raise MessageError(f'{what} has {len(values)} values, too few for the names') from None
+
+
+def _floats(values):
+    return [float(v) for v in values]
+
+
+# --- sensors ------------------------------------------------------------------------------------
+
+def read_imu(message: Any) -> ImuSample:
+    """Specific force and rates."""
+    return ImuSample(seconds(message.header.stamp), xyz(message.linear_acceleration),
+                     xyz(message.angular_velocity))
+
+
+def take_imu(message: Any) -> ImuSample:
+    """Refuse what is not finite."""
+    sample = read_imu(message)
+    finite(sample.specific_force, 'linear_acceleration')
+    finite(sample.angular_velocity, 'angular_velocity')
+    return sample
+
+
+def write_imu(kind: Kind, value: ImuSample) -> Any:
+    """Without orientation, as REP-145 has it."""
+    message = _begin(kind, 'sensor_msgs/msg/Imu', value.stamp, BODY)
+    message.orientation.w = 1.0
+    message.orientation_covariance[0] = -1.0
+    set_xyz(message.linear_acceleration, value.specific_force)
+    set_xyz(message.angular_velocity, value.angular_velocity)
+    return message
+
+
+def read_pose(message: Any) -> PoseSample:
+    """Pose of base_link in world."""
+    return PoseSample(seconds(message.header.stamp), xyz(message.pose.position),
+                      xyzw(message.pose.orientation))
+
+
+def take_pose(message: Any) -> PoseSample:
+    """Refuse what is not finite; the estimator judges the quaternion by its own tolerance."""
+    sample = read_pose(message)
+    finite(sample.position, 'position')
+    finite(sample.quaternion, 'orientation')
+    return sample
+
+
+def write_pose(kind: Kind, value: PoseSample | PoseTarget) -> Any:
+    """Pose in world, measured or wanted."""
+    message = _begin(kind, 'geometry_msgs/msg/PoseStamped', value.stamp, WORLD)
+    _set_pose(message.pose, value.position, value.quaternion)
+    return message
+
+
+def read_joints(message: Any) -> Joints:
+    """Read the four tilt joints, in whatever order the message names them."""
+    order = _order(message.name, JOINTS)
+    return Joints(seconds(message.header.stamp), _values(message.position, order, 'position'),
+                  _values(message.velocity, order, 'velocity') if len(message.velocity) else None,
+                  _values(message.effort, order, 'effort') if len(message.effort) else None)
+
+
+def take_joints(message: Any) -> Joints:
+    """Refuse what is not finite; joints whose rates are not told stand still."""
+    order = _order(message.name, JOINTS)
+    position = _values(message.position, order, 'position')
+    velocity = _values(message.velocity, order, 'velocity') if len(message.velocity) \
+        else np.zeros(4)
+    return Joints(seconds(message.header.stamp), finite(position, 'position'),
+                  finite(velocity, 'velocity'))
+
+
+def take_known_joints(message: Any) -> Joints:
+    """Read those tilt joints that the message names; angle and rate of the others are nan."""
+    places = [k for k, name in enumerate(JOINTS) if name in message.name]
+    order = _order(message.name, [JOINTS[k] for k in places])
+    position, velocity = np.full((2, 4), np.nan)
+    position[places] = finite(_values(message.position, order, 'position'), 'position')
+    velocity[places] = finite(_values(message.velocity, order, 'velocity'), 'velocity') \
+        if len(message.velocity) else 0.0
+    return Joints(seconds(message.header.stamp), position, velocity)
+
+
+def write_joints(kind: Kind, value: Joints) -> Any:
+    """All four, or those that the value names."""
+    message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
+    message.name = list(value.names)
+    message.position = kind.doubles(value.position)
+    if value.velocity is not None:
+        message.velocity = kind.doubles(value.velocity)
+    if value.effort is not None:
+        message.effort = kind.doubles(value.effort)
+    return message
+
+
+def read_rotors(message: Any) -> RotorSpeeds:
+    """Read the speeds by the ESCs."""
+    if list(message.name) != ROTORS or len(message.velocity) != len(ROTORS):
+        raise MessageError(f'expected velocities of {ROTORS}')
+    return RotorSpeeds(seconds(message.header.stamp), np.array(message.velocity, dtype=float).T)
+
+
+def write_rotors(kind: Kind, value: RotorSpeeds) -> Any:
+    """Speeds as velocities of the rotors."""
+    message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
+    message.name = ROTORS
+    message.velocity = kind.doubles(value.speed)
+    return message
+
+
+def read_battery(message: Any) -> Battery:
+    """Voltage and current."""
+    return Battery(seconds(message.header.stamp), message.voltage, message.current)
+
+
+def take_battery(message: Any) -> Battery:
+    """Refuse a voltage that is not finite."""
+    if not isfinite(message.voltage):
+        raise MessageError('voltage is not finite')
+    return read_battery(message)
+
+
+def write_battery(kind: Kind, value: Battery) -> Any:
+    """Voltage and current; what nobody measures is NaN."""
+    message = _begin(kind, 'sensor_msgs/msg/BatteryState', value.stamp)
+    message.voltage, message.current = float(value.voltage), float(value.current)
+    message.temperature = message.charge = message.capacity = message.design_capacity \
+        = message.percentage = float('nan')
+    message.power_supply_status = message.POWER_SUPPLY_STATUS_DISCHARGING
+    message.power_supply_technology = message.POWER_SUPPLY_TECHNOLOGY_LIPO
+    message.present = True
+    message.cell_voltage = kind.singles([float('nan')] * value.cells)
+    return message
+
+
+# --- state and commands -------------------------------------------------------------------------
+
+def read_odom(message: Any) -> Odom:
+    """Pose in world, velocity turned to world."""
+    return _odom(message, xyz(message.pose.pose.position), xyzw(message.pose.pose.orientation))
+
+
+def take_odom(message: Any) -> Odom:
+    """Refuse what is not finite, and an orientation that is none."""
+    pose = message.pose.pose
+    odom = _odom(message, finite(xyz(pose.position), 'position'), unit(xyzw(pose.orientation)))
+    finite(odom.velocity, 'linear velocity')
+    finite(odom.angular_velocity, 'angular velocity')
+    return odom
+
+
+def _odom(message, position, quaternion):
+    twist = message.twist.twist
+    velocity = xyz(twist.linear)
+    velocity = rotations.matrix(quaternion) @ velocity if velocity.ndim == 1 else \
+        np.einsum('ijn,nj->ni', rotations.matrix(tuple(quaternion.T)), velocity)
+    return Odom(seconds(message.header.stamp), position, velocity, quaternion, xyz(twist.angular))
+
+
+def write_odom(kind: Kind, value: Odom) -> Any:
+    """Pose in world, twist in base_link."""
+    message = _begin(kind, 'nav_msgs/msg/Odometry', value.stamp, WORLD)
+    message.child_frame_id = BODY
+    _set_pose(message.pose.pose, value.position, value.quaternion)
+    set_xyz(message.twist.twist.linear, rotations.matrix(value.quaternion).T @ value.velocity)
+    set_xyz(message.twist.twist.angular, value.angular_velocity)
+    if value.pose_covariance is not None:
+        message.pose.covariance = _flat(value.pose_covariance)
+    if value.twist_covariance is not None:
+        message.twist.covariance = _flat(value.twist_covariance)
+    return message
+
+
+def _flat(matrix):
+    return np.ascontiguousarray(matrix, dtype=float).reshape(36)
+
+
+def read_command(message: Any) -> Command:
+    """Four tilts and four thrusts."""
+    order = _order(message.name, COMMAND_NAMES)
+    return Command(seconds(message.header.stamp), _values(message.position, order[:4], 'position'),
+                   _values(message.effort, order[4:], 'effort'))
+
+
+def take_command(message: Any) -> Command:
+    """Refuse what is not finite."""
+    command = read_command(message)
+    finite(command.tilt, 'tilt')
+    finite(command.thrust, 'thrust')
+    return command
+
+
+def write_command(kind: Kind, value: Command) -> Any:
+    """Tilts as positions and thrusts as efforts, NaN where not used."""
+    message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
+    message.name = COMMAND_NAMES
+    message.position = kind.doubles([*_floats(value.tilt), *NO_VALUE])
+    message.effort = kind.doubles([*NO_VALUE, *_floats(value.thrust)])
+    return message
+
+
+def read_health(message: Any) -> ToldHealth:
+    """Which actuators work."""
+    if len(message.position) != len(HEALTH_NAMES) or len(message.effort) != len(HEALTH_NAMES):
+        raise MessageError('expected four joints, four rotors and four zeros')
+    stuck, zeros, efforts = message.position[:4], message.position[8:], message.effort[4:8]
+    if any(abs(angle) > np.pi * 2 for angle in stuck) or not all(map(isfinite, zeros)):
+        raise MessageError('expected angles within one turn and finite zeros')
+    return ToldHealth(seconds(message.header.stamp), ActuatorHealth(
+        rotors=tuple(effort != 0 for effort in efforts),
+        stuck=tuple(None if isnan(a) else float(a) for a in stuck),
+        held=tuple(None if isnan(f) or f == 0 else float(f) for f in efforts),
+        zeros=tuple(map(float, zeros))))
+
+
+def write_health(kind: Kind, value: ToldHealth) -> Any:
+    """
+    Which actuators work.
+
+    Positions: angles of stuck joints, NaN of others, then the encoders' zeros, as if they were
+    joints. Efforts: NaN of rotors that obey, 0 of lost ones, else the thrust that one holds.
+    """
+    health = value.health
+    stuck = [np.nan if angle is None else float(angle) for angle in health.stuck]
+    efforts = [0.0 if not works else np.nan if held is None else float(held)
+               for works, held in zip(health.rotors, health.held)]
+    message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
+    message.name = HEALTH_NAMES
+    message.position = kind.doubles([*stuck, *NO_VALUE, *map(float, health.zeros)])
+    message.effort = kind.doubles([*NO_VALUE, *efforts, *NO_VALUE])
+    return message
+
+
+def read_wrench(message: Any) -> Wrench:
+    """Force in world and torque in base_link, whatever the frame_id."""
+    return Wrench(seconds(message.header.stamp), xyz(message.wrench.force),
+                  xyz(message.wrench.torque))
+
+
+def take_wrench(message: Any) -> Wrench:
+    """Refuse what is not finite."""
+    wrench = read_wrench(message)
+    finite(wrench.force, 'force')
+    finite(wrench.torque, 'torque')
+    return wrench
+
+
+def write_wrench(kind: Kind, value: Wrench) -> Any:
+    """Force in world and torque in base_link."""
+    message = _begin(kind, 'geometry_msgs/msg/WrenchStamped', value.stamp, WORLD)
+    set_xyz(message.wrench.force, value.force)
+    set_xyz(message.wrench.torque, value.torque)
+    return message
+
+
+# --- targets ------------------------------------------------------------------------------------
+
+def read_pose_target(message: Any) -> PoseTarget:
+    """Pose that was asked for; its quaternion may be far from unit length."""
+    return PoseTarget(xyz(message.pose.position), unit(xyzw(message.pose.orientation), 0.5, 2.0),
+                      seconds(message.header.stamp))
+
+
+def take_pose_target(message: Any) -> PoseTarget:
+    """Refuse what is no pose in world."""
+    position = finite(xyz(message.pose.position), 'position')
+    quaternion = unit(xyzw(message.pose.orientation))
+    _check_frame(message)
+    return PoseTarget(position, quaternion, seconds(message.header.stamp))
+
+
+def _check_frame(message):
+    if message.header.frame_id not in ('', WORLD):
+        raise MessageError(f"frame_id '{message.header.frame_id[:40]}' is not '{WORLD}'",
+                           'wrong frame')
+
+
+def read_trajectory(message: Any) -> TrajectoryTarget:
+    """Read a trajectory; times count from the header's stamp."""
+    start, points = seconds(message.header.stamp), message.points
+    if not points or any(len(p.transforms) != 1 or len(p.velocities) != 1 for p in points):
+        raise MessageError('each trajectory point needs one transform and one velocity')
+    return TrajectoryTarget(
+        start + np.array([seconds(p.time_from_start) for p in points]),
+        np.array([xyz(p.transforms[0].translation) for p in points]),
+        np.array([xyzw(p.transforms[0].rotation) for p in points]),
+        np.array([xyz(p.velocities[0].linear) for p in points]),
+        np.array([xyz(p.velocities[0].angular) for p in points]), stamp=start)
+
+
+def take_trajectory(message: Any) -> TrajectoryTarget:
+    """Refuse what is no trajectory in world."""
+    if not 2 <= len(message.points) <= POINTS:
+        raise MessageError(f'a trajectory of {len(message.points)} points: expected 2 to {POINTS}',
+                           'too few or too many points')
+    _check_frame(message)
+    path = read_trajectory(message)
+    if np.any(np.diff(path.times) <= 0):
+        raise MessageError('trajectory times do not increase')
+    finite(path.positions, 'translation')
+    finite(path.velocities, 'velocity')
+    finite(path.angular_velocities, 'angular velocity')
+    return TrajectoryTarget(path.times, path.positions,
+                            np.array([unit(q) for q in path.quaternions]), path.velocities,
+                            path.angular_velocities, path.stamp)
+
+
+def write_trajectory(kind: Kind, value: TrajectoryTarget) -> Any:
+    """Angular velocities stay in the reference's body frame."""
+    message = _begin(kind, 'trajectory_msgs/msg/MultiDOFJointTrajectory', value.stamp, WORLD)
+    message.joint_names = [BODY]
+    message.points = [_point(kind, value, k) for k in range(len(value.times))]
+    return message
+
+
+def _point(kind, path, k):
+    point = kind.new('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
+    transform, twist = kind.new('geometry_msgs/msg/Transform'), kind.new('geometry_msgs/msg/Twist')
+    set_xyz(transform.translation, path.positions[k])
+    set_xyzw(transform.rotation, path.quaternions[k])
+    set_xyz(twist.linear, path.velocities[k])
+    set_xyz(twist.angular, path.angular_velocities[k])
+    point.transforms, point.velocities = [transform], [twist]
+    offset = point.time_from_start
+    offset.sec, offset.nanosec = divmod(nanoseconds(path.times[k] - path.stamp), 1_000_000_000)
+    return point
+
+
+def take_wish(message: Any) -> Wish:
+    """Read the supervisor's target; a message without points takes it back."""
+    return Wish(seconds(message.header.stamp),
+                take_trajectory(message) if message.points else None)
+
+
+def write_wish(kind: Kind, value: Wish) -> Any:
+    """None takes the target back."""
+    return kind.new('trajectory_msgs/msg/MultiDOFJointTrajectory') if value.target is None \
+        else write_trajectory(kind, value.target)
+
+
+# --- text ---------------------------------------------------------------------------------------
+
+def read_text(message: Any) -> str:
+    """One line."""
+    return message.data
+
+
+def write_text(kind: Kind, value: str) -> Any:
+    """One line."""
+    message = kind.new('std_msgs/msg/String')
+    message.data = value
+    return message
+
+
+def read_diagnostics(message: Any) -> list[Diagnostic]:
+    """Every status of the message, each with the message's stamp."""
+    t = seconds(message.header.stamp)
+    return [Diagnostic(t, status.name, ord(status.level) if isinstance(status.level, bytes)
+                       else int(status.level), status.message,
+                       {pair.key: pair.value for pair in status.values})
+            for status in message.status]
+
+
+def write_diagnostics(kind: Kind, value: Sequence[Diagnostic]) -> Any:
+    """Statuses of one moment, that of the first."""
+    message = _begin(kind, 'diagnostic_msgs/msg/DiagnosticArray', value[0].t)
+    for entry in value:
+        status = kind.new('diagnostic_msgs/msg/DiagnosticStatus')
+        status.level, status.name = kind.byte(entry.level), entry.name
+        status.message, status.hardware_id = entry.message, 'beetle_omni'
+        for key, text in entry.values.items():
+            pair = kind.new('diagnostic_msgs/msg/KeyValue')
+            pair.key, pair.value = str(key), str(text)
+            status.values.append(pair)
+        message.status.append(status)
+    return message
+

@@ -1,0 +1,134 @@
+"""What messages carry, as the pure code takes it. Stamps in seconds, SI units."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from beetle_omni_ros.control.base import TrajectoryTarget
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.parameters import JOINT_NAMES
+
+
+class MessageError(ValueError):
+    """
+    A message cannot be used; the text says why.
+
+    Attributes:
+        kind: under which it is counted: one of a few, where the text holds numbers or names.
+
+    """
+
+    def __init__(self, text: str, kind: str = ''):
+        """Count under ``kind``, or under the text itself."""
+        super().__init__(text)
+        self.kind = kind or text
+
+
+@dataclass(frozen=True)
+class Odom:
+    """
+    Pose and velocities of base_link.
+
+    Attributes:
+        stamp: [s].
+        position: (3,) in world [m].
+        velocity: (3,) in world [m/s]; the message carries it in base_link.
+        quaternion: (4,) body to world, xyzw.
+        angular_velocity: (3,) in base_link [rad/s].
+        pose_covariance: (6, 6) of position (world) and small rotation (world axes), or None.
+        twist_covariance: (6, 6) of the twist in base_link, or None. Covariances are not read.
+
+    """
+
+    stamp: float
+    position: np.ndarray
+    velocity: np.ndarray
+    quaternion: np.ndarray
+    angular_velocity: np.ndarray
+    pose_covariance: np.ndarray | None = None
+    twist_covariance: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, state: Any, *covariances: np.ndarray, stamp: float | None = None) -> Odom:
+        """Take over the five of an estimate, a state or the truth, at another stamp if given."""
+        return cls(state.stamp if stamp is None else stamp, state.position, state.velocity,
+                   state.quaternion, state.angular_velocity, *covariances)
+
+
+@dataclass(frozen=True)
+class Joints:
+    """
+    Measured tilt joints.
+
+    Attributes:
+        stamp: of capture [s].
+        position: (4,) [rad].
+        velocity: (4,) [rad/s], or None where none were measured.
+        effort: (4,) [N m], or None where none were measured.
+        names: of the joints, where a message is written for fewer than four.
+
+    """
+
+    stamp: float
+    position: np.ndarray
+    velocity: np.ndarray | None
+    effort: np.ndarray | None = None
+    names: Sequence[str] = JOINT_NAMES
+
+
+@dataclass(frozen=True)
+class Battery:
+    """Pack voltage under load [V] and current [A, negative when discharging]; its cells."""
+
+    stamp: float
+    voltage: float
+    current: float
+    cells: int = 0
+
+
+@dataclass(frozen=True)
+class RotorSpeeds:
+    """Speeds of the rotors by their ESCs (4,) [rad/s], positive for both spins; NaN unknown."""
+
+    stamp: float
+    speed: np.ndarray
+
+
+@dataclass(frozen=True)
+class Wrench:
+    """External force in world (3,) [N] and torque in base_link (3,) [N m]."""
+
+    stamp: float
+    force: np.ndarray
+    torque: np.ndarray
+
+
+@dataclass(frozen=True)
+class ToldHealth:
+    """Which actuators work, by the supervisor."""
+
+    stamp: float
+    health: ActuatorHealth
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What the supervisor wants flown in place of the operator's target, or None."""
+
+    stamp: float
+    target: TrajectoryTarget | None
+
+
+@dataclass(frozen=True)
+class Diagnostic:
+    """One diagnostic status: level 0 ok, 1 warning, 2 error, 3 stale; values as text."""
+
+    t: float
+    name: str
+    level: int
+    message: str
+    values: dict[str, str] = field(default_factory=dict)
