@@ -3,7 +3,6 @@
 from dataclasses import replace
 from io import StringIO
 import json
-import os
 import shutil
 import sys
 
@@ -13,6 +12,7 @@ from rich.console import Console
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.evaluation.command import fly
+from beetle_omni_ros.identify.gap import workers
 from beetle_omni_ros.identify.gap.command import gap_results, run_gap
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -60,8 +60,7 @@ def test_the_hidden_wind_is_named_with_its_size(made):
 @pytest.mark.skipif(sys.platform != 'linux', reason='forks on Linux only')
 def test_on_two_cores_it_says_the_same_as_on_one(made, monkeypatch):
     folder, results, _ = made
-    monkeypatch.setattr(os, 'sched_getaffinity', lambda process: {0, 1})
-    monkeypatch.setenv('OMP_NUM_THREADS', '2')
+    monkeypatch.setattr(workers, 'width', lambda: 2)
     again = gap_results([folder / 'flight0'], [folder / 'flight1'], console=quiet())
     for name in results.keys() - {'meta'}:
         assert again[name] == results[name], name

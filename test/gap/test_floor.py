@@ -25,8 +25,8 @@ def made(push):
     return flight
 
 
-def fitted(*pushes):
-    problem = Problem([made(push) for push in pushes], KEYS, tolerances(P), P)
+def fitted(*pushes, others=()):
+    problem = Problem([made(push) for push in pushes], KEYS, tolerances(P), P, others)
     problem.state({}, NAMES)
     problem.learn_noise(WIDE)
     return problem
@@ -37,10 +37,9 @@ def spread(noise):
 
 
 def test_every_flight_has_its_own_gusts():
-    problem, windy = fitted(gusts(MOTION, 1, 0.1), gusts(MOTION, 2, 0.1)), made(
-        gusts(MOTION, 3, 0.4))
-    calm = [problem.noise_of(m, {}, WIDE) for m in problem.models]
-    storm = problem.noise_of(windy, {}, WIDE)
+    windy = made(gusts(MOTION, 3, 0.4))
+    problem = fitted(gusts(MOTION, 1, 0.1), gusts(MOTION, 2, 0.1), others=[windy])
+    *calm, storm = problem.noises({}, WIDE)
     assert spread(storm) / spread(calm[0]) == pytest.approx(4, rel=0.3)
     assert spread(calm[1]) / spread(calm[0]) == pytest.approx(1, rel=0.3)
     calm, storm = (replace(noise, seen={'B': noise.seen['B'] * ([1] * 3 + [0] * 3)})
@@ -49,9 +48,9 @@ def test_every_flight_has_its_own_gusts():
 
 
 def test_a_force_that_the_catalogue_knows_is_no_noise():
-    problem = fitted(gusts(MOTION, 1, 0.1))
-    plain, blown = (problem.noise_of(made(gusts(MOTION, 3, 0.1) + push), {}, WIDE)
-                    for push in ([0, 0, 0], [0.8, -0.5, 0.0]))
+    problem = fitted(gusts(MOTION, 1, 0.1), others=[
+        made(gusts(MOTION, 3, 0.1) + push) for push in ([0, 0, 0], [0.8, -0.5, 0.0])])
+    _, plain, blown = problem.noises({}, WIDE)
     assert spread(blown) == pytest.approx(spread(plain), rel=0.02)
 
 

@@ -18,7 +18,6 @@ from beetle_omni_ros.identify.gap.certainty import (
     visibility,
 )
 from beetle_omni_ros.identify.gap.fit import Problem
-from beetle_omni_ros.identify.gap.forks import forked, team
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, Key, tolerances
 from beetle_omni_ros.identify.gap.parameters import GapParameters
@@ -36,6 +35,7 @@ from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.gap.trial import Found, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
 from beetle_omni_ros.identify.gap.verdict import decide, disagreement, not_met, withdraw
+from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -120,11 +120,6 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
         progress: called with a short text at each stage.
 
     """
-    with team() as first:
-        return _analysed(fitted, judging, robot, p, progress if first else lambda text: None)
-
-
-def _analysed(fitted, judging, robot, p, progress):
     a = Analysis(held_out=bool(judging))
     a.keys = {**all_keys(robot), **extra_keys()}
     body = BodyModel(robot, a.keys, _modules(robot))
@@ -137,8 +132,16 @@ def _analysed(fitted, judging, robot, p, progress):
     beliefs = tolerances(p, coarse, _swing(robot))
     if robot.multibody is None or 'module_reaction' in robot.effects:
         del beliefs['modules.share']
-    a.problem = Problem(models, a.keys, beliefs, p)
-    _choose_modules(a.problem, others)
+    a.problem = Problem(models, a.keys, beliefs, p, others)
+    _choose_modules(a.problem)
+    with Workers(a.problem) as a.problem.workers:
+        _find(a, progress)
+    return a
+
+
+def _find(a, progress):
+    """Search, judge what was found, and decide."""
+    models, p = a.models[0], a.problem.p
     tried = candidates(a.keys, models)
     search = Search(a.problem, tried, progress)
     a.found = search.run()
@@ -157,7 +160,6 @@ def _analysed(fitted, judging, robot, p, progress):
         a.unseen = [*not_met(a, p), *limits_out_of_sight(a.problem, a.found.state)]
     progress('free runs')
     _falsify(a, search.wide)
-    return a
 
 
 def _modules(robot):
@@ -174,17 +176,17 @@ def _swing(robot):
     return float(np.log(max(inertia / robot.joints.inertia, 1.0))) if inertia else 0.0
 
 
-def _choose_modules(problem, others):
+def _choose_modules(problem):
     """Take the file's tilting modules into the model where the data have them."""
     if 'modules.share' not in problem.beliefs:
         return
     costs = []
     for share in (0.0, 1.0):
-        for model in [*problem.models, *others]:
+        for model in problem.everyone:
             model.modules = share
         r = problem.residual({})
         costs.append(float(np.minimum(r * r, 100.0).sum()))
-    for model in [*problem.models, *others]:
+    for model in problem.everyone:
         model.modules = float(np.argmin(costs))
 
 
@@ -209,8 +211,7 @@ def _where(a):
 def _falsify(a, wide):
     """Free runs before, after and with a placebo, on the flights that judge."""
     found, judges = a.found, a.models[1]
-    for model in judges:
-        model.guide(found.theta)
+    a.problem.guide(found.theta, judges)
     keys, refused = ({n for t in trials for n in t.candidate.keys}
                      for trials in (found.accepted, a.partial))
     # What explains a part and is not named closes no gap.
@@ -222,19 +223,19 @@ def _falsify(a, wide):
     plain = _plain(a, reached, keys)
     points |= {'file': plain, 'effects_alone': {**plain, **{n: found.theta[n] for n in keys}},
                'placebo': _placebo(a)}
-    everyone = list(dict.fromkeys([*a.models[0], *judges]))
-    noise = dict(zip(everyone, forked(
-        lambda m: a.problem.noise_of(m, found.theta, wide).bounded(ceilings(m, a.problem.p)),
-        everyone), strict=True))
+    everyone = a.problem.everyone
+    noise = [own.bounded(ceilings(model, a.problem.p)) for model, own in zip(
+        everyone, a.problem.noises(found.theta, wide), strict=True)]
+    fitted, judging = range(len(a.models[0])), [everyone.index(model) for model in judges]
     if not found.accepted:
         points = {name: points[name] for name in ('before', 'file')}
-    flown = iter(forked(lambda pair: free_runs(pair[1], pair[0], noise[pair[1]]),
-                        [(theta, m) for theta in points.values() for m in judges]))
+    flown = iter(a.problem.share(_flown, [(theta, k) for theta in points.values()
+                                          for k in judging], noise))
     for name in points:
         a.runs[name] = [next(flown) for _ in judges]
     for name, same in (('after', 'before'), ('placebo', 'before'), ('effects_alone', 'file')):
         a.runs.setdefault(name, a.runs[same])
-    trim = trimmed(forked(lambda m: free_runs(m, found.theta, noise[m]), a.models[0]))
+    trim = trimmed(a.problem.share(_flown, [(found.theta, k) for k in fitted], noise))
     _measure(a, trim)
     why = _refuted(a, trim) if found.accepted else ''
     if why:
@@ -248,6 +249,12 @@ def _falsify(a, wide):
         a.regimes[str(regime)] = {'before': before, 'after': after,
                                   'worse': bool(after > a.problem.p.regime_worse * before)}
     disagreement(a, a.gaps[HORIZONS[JUDGED]]['before'])
+
+
+def _flown(problem, item, noise):
+    """Free runs of a flight at a point."""
+    theta, k = item
+    return free_runs(problem.everyone[k], theta, noise[k])
 
 
 def _refuted(a, trim):

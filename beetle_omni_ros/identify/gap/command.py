@@ -10,7 +10,6 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from beetle_omni_ros.identify.gap.analysis import analyse, Analysis
 from beetle_omni_ros.identify.gap.apply import write_corrected
 from beetle_omni_ros.identify.gap.bags import read_recording
-from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.given import check_apart, check_flights, names_of
 from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
 from beetle_omni_ros.identify.gap.joint_changes import change_grids
@@ -18,6 +17,7 @@ from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log
 from beetle_omni_ros.identify.gap.page import gap_page
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.results import grids, headline, results
+from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.robot_file import check_not_base, write_text
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -95,15 +95,9 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
 
 
 def _analysed(runs, holdout, robot, p, fix, progress):
-    def loaded(path_and_name):
-        path, name = path_and_name
-        try:
-            return load_flight(path, robot, p, fix, name)
-        except UnusableFlight as error:
-            return error
-
     given = [*runs, *holdout]
-    flights = forked(loaded, list(zip(given, names_of(given), strict=True)))
+    with Workers() as workers:
+        flights = workers.map(_loaded, zip(given, names_of(given), strict=True), robot, p, fix)
     unusable = [flight for flight in flights if isinstance(flight, UnusableFlight)]
     if unusable:
         # A verdict about the other flights would pass for one about all that were given.
@@ -116,6 +110,15 @@ def _analysed(runs, holdout, robot, p, fix, progress):
     a = analyse(fitted, judging, robot, p, progress)
     a.findings = [text for flight in flights for text in flight.findings] + a.findings
     return a
+
+
+def _loaded(_, named, robot, p, fix):
+    """A flight, or why it cannot be used."""
+    path, name = named
+    try:
+        return load_flight(path, robot, p, fix, name)
+    except UnusableFlight as error:
+        return error
 
 
 def _first_damaged(paths, damage):

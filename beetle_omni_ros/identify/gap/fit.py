@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from beetle_omni_ros.identify.gap.candidates import LIMITS
-from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.keys import Belief, Key
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.residual import FlightModel
+from beetle_omni_ros.identify.gap.workers import Workers
 
 CURVED = ('delay', 'rotation', 'time_constant', 'kp', 'kd', 'velocity_limit',
           'effort_limit', 'coulomb', 'stiction', 'gap', 'thrust_max', 'deflection_per_newton')
@@ -69,18 +71,25 @@ class Problem:
         keys: by name.
         beliefs: of keys that always are free.
         p: parameters.
+        others: flights that judge, whose work is shared as well.
 
     Attributes:
         noise: in force; change it by :meth:`learn_noise`.
+        workers: processes that share the work, or None.
         block: (n,) number of the block that a whitened sample belongs to.
         where: (n,) index of group and channel of a sample.
 
     """
 
+    workers: Workers | None = None
+
     def __init__(self, models: list[FlightModel], keys: dict[str, Key],
-                 beliefs: dict[str, Belief], p: GapParameters):
+                 beliefs: dict[str, Belief], p: GapParameters,
+                 others: list[FlightModel] | tuple = ()):
         """See the class."""
         self.models, self.keys, self.beliefs, self.p = models, keys, beliefs, p
+        self.everyone = [*models, *others]
+        self._guides: list[tuple[dict[str, float], list[int]]] = []
         self.noise = Noise.white(p)
         self._raw: list | None = None
         self._label()
@@ -109,28 +118,49 @@ class Problem:
 
     def residual(self, theta: dict[str, float]) -> np.ndarray:
         """(n,) whitened."""
-        return np.concatenate(forked(lambda m: self.noise.whiten(m.residual(theta)), self.models))
+        return np.concatenate(self.share(_residual, range(len(self.models)), theta))
 
     def slopes(self, theta: dict[str, float], names: list[str]) -> np.ndarray:
         """(n, len(names)) whitened."""
-        return np.concatenate(forked(lambda m: self.noise.whiten(m.slopes(theta, names)),
-                                     self.models))
+        return np.concatenate(self.share(_slopes, range(len(self.models)), theta, names))
 
     def state(self, theta: dict[str, float], names: list[str]) -> State:
         """Residual and slopes at a point."""
-        self._raw = forked(lambda m: (m.residual(theta), m.slopes(theta, names), names, theta),
-                           self.models)
+        self._raw = [(*raw, names, theta)
+                     for raw in self.share(_raw, range(len(self.models)), theta, names)]
         return self._whitened()
 
-    def guide(self, theta: dict[str, float]) -> None:
+    def guide(self, theta: dict[str, float], models: list[FlightModel] | None = None) -> None:
         """Let noisy encoders' tilts follow the servos at this point; see FlightModel."""
-        for model in self.models:
-            model.guide(theta)
+        self._follow([*self._guides, (theta, [self.everyone.index(model) for model in (
+            self.models if models is None else models)])])
+
+    def _follow(self, guides):
+        """Do the last of these, those that were not done here; each builds on the one before."""
+        for theta, some in guides[len(self._guides):]:
+            for k in some:
+                self.everyone[k].guide(theta)
+        self._guides = guides
+
+    def share(self, function: Callable, items: Iterable, *common: Any) -> list:
+        """
+        ``[function(self, item, *common) for item in items]``, in several processes.
+
+        Args:
+            function: of a module. It sees this noise and these guides, and must not change them.
+            items: which can be sent to another process.
+            common: likewise.
+
+        """
+        if self.workers is None:
+            return [function(self, item, *common) for item in items]
+        return self.workers.map(_shared, items, self.noise, self._guides, function, common)
 
     def renew(self, theta: dict[str, float]) -> None:
         """Take the residual at a point nearby; slopes stay those of the last :meth:`state`."""
-        self._raw = [(m.residual(theta), old[1], old[2], theta)
-                     for m, old in zip(self.models, self._raw, strict=True)]
+        rest = self.share(_raw, range(len(self.models)), theta, [])
+        self._raw = [(r, old[1], old[2], theta)
+                     for (r, _), old in zip(rest, self._raw, strict=True)]
 
     def _whitened(self):
         r = np.concatenate([self.noise.whiten(raw) for raw, *_ in self._raw])
@@ -162,26 +192,22 @@ class Problem:
         assert len(names) == state.slopes.shape[1]
         return state
 
-    def noise_of(self, model: FlightModel, theta: dict[str, float],
-                 wide: dict[str, float]) -> Noise:
+    def noises(self, theta: dict[str, float], wide: dict[str, float]) -> list[Noise]:
         """
-        Noise of one flight alone, around a fit of everything to it.
+        Noise of each flight alone, around a fit of everything to it.
 
         Gusts differ from flight to flight; what any known number could explain is none of them.
 
         Args:
-            model: of the flight, fitted here or not.
-            theta: point at which slopes are taken, if it was not fitted.
+            theta: point at which slopes are taken of flights that were not fitted.
             wide: as of :meth:`learn_noise`.
 
+        Returns:
+            the noise of each flight that was fitted, then of the others.
+
         """
-        alone = Problem([model], self.keys, self.beliefs, self.p)
-        if model in self.models:
-            alone._raw = [self._raw[self.models.index(model)]]
-        else:
-            alone.state(theta, self._raw[0][2])
-        alone.learn_noise(wide)
-        return alone.noise
+        raw = [*self._raw, *[None] * (len(self.everyone) - len(self.models))]
+        return self.share(_noise_of, enumerate(raw), self._raw[0][2], theta, wide)
 
     def _solve_all(self, state, wide):
         h, g = state.slopes.T @ state.slopes, state.slopes.T @ state.r
@@ -302,3 +328,34 @@ class Problem:
             key = self.keys[name]
             moved[name] = float(np.clip(theta.get(name, 0.0) + change, key.low, key.high))
         return moved
+
+
+def _shared(problem, item, noise, guides, function, common):
+    """Do one piece of work at the noise and the guides that the first process has by now."""
+    problem.noise = noise
+    problem._follow(guides)
+    return function(problem, item, *common)
+
+
+def _residual(problem, k, theta):
+    return problem.noise.whiten(problem.models[k].residual(theta))
+
+
+def _slopes(problem, k, theta, names):
+    return problem.noise.whiten(problem.models[k].slopes(theta, names))
+
+
+def _raw(problem, k, theta, names):
+    model = problem.models[k]
+    return model.residual(theta), model.slopes(theta, names) if names else None
+
+
+def _noise_of(problem, item, names, theta, wide):
+    k, raw = item
+    alone = Problem([problem.everyone[k]], problem.keys, problem.beliefs, problem.p)
+    if raw is None:
+        alone.state(theta, names)
+    else:
+        alone._raw = [raw]
+    alone.learn_noise(wide)
+    return alone.noise

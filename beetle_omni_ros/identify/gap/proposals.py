@@ -6,7 +6,6 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
 from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
-from beetle_omni_ros.identify.gap.forks import forked
 from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.trial import Trial
 
@@ -34,31 +33,15 @@ class Proposals:
         """Estimate all of them from slopes."""
         self.problem, self.state, self.cost = problem, state, cost
         self.involved, self.free = involved, free
-        h, g = state.slopes.T @ state.slopes, state.slopes.T @ state.r
-        chi2 = float(state.r @ state.r)
-
-        def estimated(c):
-            names, released = self._with(c)
-            if c.starts or c.fixed:
-                trial, point = _elsewhere(problem, state, cost, c, names, released)
-                return trial, point.beside(state)
-            index = [state.index[name] for name in names]
-            theta = handed_over(state.theta, c)
-            step, reached, _ = problem.solve(theta, names, released, h[np.ix_(index, index)],
-                                             g[index], chi2)
-            trial = Trial(c, cost - reached, problem.moved(theta, names, step))
-            return trial, None if theta is state.theta else State(
-                theta, problem.residual(theta), state.slopes, state.names).beside(state)
-
+        normal = (state.slopes.T @ state.slopes, state.slopes.T @ state.r,
+                  float(state.r @ state.r))
+        made = problem.share(_estimated, candidates, state, cost, involved, free, normal)
         self.trials: list[Trial] = []
         self.points: dict[str, State] = {}
-        for c, (trial, difference) in zip(candidates, forked(estimated, candidates), strict=True):
+        for c, (trial, difference) in zip(candidates, made, strict=True):
             self.trials.append(trial)
             self.points[c.label] = state.with_difference(difference) if difference else state
         self.trials.sort(key=lambda t: -t.gain)
-
-    def _with(self, c):
-        return list(dict.fromkeys([*self.involved, *c.keys])), self.free | set(c.keys)
 
     def fit_best(self) -> list[Trial]:
         """Fit the most promising ones; all trials, most gain first."""
@@ -82,20 +65,44 @@ class Proposals:
 
     def _fit(self, chosen):
         problem, state, trials, points = self.problem, self.state, self.trials, self.points
-
-        def refined(k):
-            c = trials[k].candidate
-            new, reached = problem.refine(points[c.label], *self._with(c), 4)
-            return new.beside(state), reached
-
-        for k, (difference, reached) in zip(chosen, forked(refined, chosen), strict=True):
+        begun = [(trials[k].candidate, points[trials[k].candidate.label].beside(state))
+                 for k in chosen]
+        made = problem.share(_refined, begun, state, self.involved, self.free)
+        for k, (difference, reached) in zip(chosen, made, strict=True):
             c = trials[k].candidate
             points[c.label] = state.with_difference(difference)
             theta = dict(points[c.label].theta)
             believed = problem.prior(state.theta, self.free) - problem.prior(
-                theta, self._with(c)[1])
+                theta, _with(c, self.involved, self.free)[1])
             trials[k] = Trial(c, self.cost - reached, theta, True, believed)
         trials.sort(key=lambda t: -t.gain)
+
+
+def _with(c, involved, free):
+    """Keys of a fit with a candidate, and those of which nothing is believed."""
+    return list(dict.fromkeys([*involved, *c.keys])), free | set(c.keys)
+
+
+def _estimated(problem, c, state, cost, involved, free, normal):
+    """A candidate's trial by slopes alone, and the difference of its point to ``state``."""
+    names, released = _with(c, involved, free)
+    if c.starts or c.fixed:
+        trial, point = _elsewhere(problem, state, cost, c, names, released)
+        return trial, point.beside(state)
+    (h, g, chi2), index = normal, [state.index[name] for name in names]
+    theta = handed_over(state.theta, c)
+    step, reached, _ = problem.solve(theta, names, released, h[np.ix_(index, index)], g[index],
+                                     chi2)
+    trial = Trial(c, cost - reached, problem.moved(theta, names, step))
+    return trial, None if theta is state.theta else State(
+        theta, problem.residual(theta), state.slopes, state.names).beside(state)
+
+
+def _refined(problem, begun, state, involved, free):
+    """The fitted point of a candidate, as difference to ``state``, and the objective there."""
+    c, difference = begun
+    new, reached = problem.refine(state.with_difference(difference), *_with(c, involved, free), 4)
+    return new.beside(state), reached
 
 
 def _promising(problem, trials):

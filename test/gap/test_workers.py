@@ -1,0 +1,174 @@
+"""Work on several cores gives what one core gives, whatever happens to a worker."""
+
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import joblib
+import numpy as np
+import pytest
+
+from beetle_omni_ros.identify.gap import workers
+from beetle_omni_ros.identify.gap.workers import width, Workers
+
+pytestmark = pytest.mark.skipif(sys.platform != 'linux', reason='forks on Linux only')
+PARENT = os.getpid()
+SCRIPT = """
+import os, sys, time
+from pathlib import Path
+from beetle_omni_ros.identify.gap import workers
+from beetle_omni_ros.identify.gap.workers import Workers
+
+def work(folder, k):
+    (Path(folder) / str(os.getpid())).touch()
+    time.sleep(600)
+
+workers.width = lambda: 3
+with Workers(sys.argv[1]) as shared:
+    shared.map(work, range(3))
+"""
+
+
+def children():
+    return {process for tasks in Path('/proc/self/task').glob('*/children')
+            for process in tasks.read_text().split()}
+
+
+@pytest.fixture(params=[1, 2, 3])
+def cores(request, monkeypatch):
+    monkeypatch.setattr(workers, 'width', lambda: request.param)
+    return request.param
+
+
+def columns(big, k, add=0.0):
+    return k, big[:, :k] + add
+
+
+def process(subject, k):
+    time.sleep(0.05)        # so that nobody is done before the others have begun
+    return os.getpid()
+
+
+def counted(learnt, k):
+    time.sleep(0.05)
+    learnt.append(k)
+    return os.getpid(), len(learnt)
+
+
+def bad(subject, k, which):
+    if k == which:
+        raise ValueError(f'item {k}')
+    return k
+
+
+def dies(subject, k):
+    if os.getpid() != PARENT:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return k * k
+
+
+def leaves(subject, k):
+    if os.getpid() != PARENT:
+        os._exit(0)
+    return k * k
+
+
+def inner(shared, k):
+    return len({os.getpid(), *shared[0].map(process, range(3))})
+
+
+def test_results_come_in_the_order_of_the_items(cores):
+    big = np.random.default_rng(0).normal(size=(200, 5000))      # more than a pipe holds
+    with Workers(big) as shared:
+        for add in (0.0, 1.5):
+            made = shared.map(columns, range(7), add)
+            assert [k for k, _ in made] == list(range(7))
+            assert all(np.array_equal(array, big[:, :k] + add) for k, array in made)
+        assert shared.map(columns, []) == []
+
+
+def test_workers_do_the_work_and_end(cores):
+    before = children()
+    with Workers() as shared:
+        by = set(shared.map(process, range(6)))
+        assert len(by) == cores and (os.getpid() in by) == (cores == 1)
+    assert children() == before
+    assert shared.map(process, range(2)) == [PARENT] * 2        # afterwards as on one core
+
+
+def test_what_a_worker_has_learnt_stays_with_it(cores):
+    with Workers([]) as shared:
+        done = [row for _ in range(3) for row in shared.map(counted, range(cores))]
+    for who in {who for who, _ in done}:
+        counts = [count for by, count in done if by == who]
+        assert counts == list(range(1, len(counts) + 1))
+
+
+def test_a_worker_shares_nothing(cores):
+    subject = []
+    with Workers(subject) as shared:
+        subject.append(shared)
+        assert shared.map(inner, range(cores)) == [1] * cores
+
+
+@pytest.mark.parametrize('which', [0, 1, 2])
+def test_an_error_of_any_item_is_raised_and_no_worker_is_left(cores, which):
+    before = children()
+    with pytest.raises(ValueError, match=f'item {which}'), Workers() as shared:
+        shared.map(bad, range(6), which)
+    assert children() == before
+
+
+def test_an_error_beside_the_work_ends_the_workers(cores):
+    before = children()
+    with pytest.raises(KeyError), Workers() as shared:
+        shared.map(process, range(6))
+        raise KeyError
+    assert children() == before
+
+
+@pytest.mark.parametrize('end', [dies, leaves])
+def test_what_a_dead_worker_leaves_is_done_here(cores, end):
+    before = children()
+    with Workers() as shared:
+        assert shared.map(end, range(5)) == [0, 1, 4, 9, 16]
+        assert shared.map(process, range(2)) == [PARENT] * 2 or cores == 1
+    assert children() == before
+
+
+@pytest.mark.parametrize('end', [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_at_once_with_the_first_process(tmp_path, end):
+    busy = subprocess.Popen([sys.executable, '-c', SCRIPT, str(tmp_path)],
+                            stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 60
+        while len(list(tmp_path.iterdir())) < 3 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        started = [Path('/proc') / file.name for file in tmp_path.iterdir()]
+        assert len(started) == 3
+        busy.send_signal(end)
+        assert busy.wait(20) != 0
+        while any(process.exists() for process in started) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert not any(process.exists() for process in started)
+        assert ('KeyboardInterrupt' in busy.stderr.read()) == (end == signal.SIGINT)
+    finally:
+        busy.kill()
+        busy.wait()
+
+
+@pytest.mark.parametrize('threads, expected', [('1', 1), ('2', 2), ('99', 3), ('', 3), ('x', 3)])
+def test_who_limits_threads_limits_processes(monkeypatch, threads, expected):
+    monkeypatch.setattr(joblib, 'cpu_count', lambda: 3)
+    monkeypatch.setenv('OMP_NUM_THREADS', threads)
+    assert width() == expected
+
+
+def test_without_a_limit_of_threads_there_is_one_process(monkeypatch):
+    monkeypatch.setattr(joblib, 'cpu_count', lambda: 3)
+    monkeypatch.delenv('OMP_NUM_THREADS', raising=False)
+    monkeypatch.setattr(workers, 'threadpool_limits', None)
+    assert width() == 1
