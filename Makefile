@@ -12,7 +12,7 @@ unexport LD_LIBRARY_PATH
 endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE PYTHONHOME VIRTUAL_ENV
 
-.PHONY: help setup setup-train fly test lint docs evaluate compare faults gap report clean
+.PHONY: help setup setup-train fly test lint docs evaluate compare faults gap report film clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1|/p' Makefile | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -61,6 +61,11 @@ report: setup  ## one HTML page about the runs in runs_out/ (or RUNS='DIR...')
 	    [ -n '$(RUNS)' ] || [ ! -f "$$bag" ] || runs="$$runs $${bag%/*}"; done; \
 	if [ -z "$$runs" ]; then echo 'no runs in runs_out/: make fly first, or RUNS=DIR' >&2; exit 2; fi; \
 	mkdir -p runs_out; $(TOOL) report $$runs --output runs_out/report.html $(ARGS)
+
+film: setup  ## fly and draw the films of the pages: docs/pictures/*.gif, runs_out/film/*.mp4
+	@.venv/bin/python -c 'import imageio_ffmpeg' 2>/dev/null || \
+	    .venv/bin/python -m pip install --quiet --editable '.[film]'
+	.venv/bin/python benchmarks/film.py $(ARGS)
 
 clean:  ## remove the environment and what builds and tools leave; keeps runs_out/
 	rm -rf .venv build install log dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -22,6 +22,7 @@ ALLOWED = {
     'runs': ('robot', 'control.base', 'control.registry', 'estimation.samples', 'messages'),
     'evaluation': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'messages'),
     'faults': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation'),
+    'film': ('robot', 'control.base', 'runs', 'sim'),
     'comparison': ('robot', 'control', 'runs', 'evaluation'),
     'identify': ('robot', 'runs', 'messages'),
     'bringup': ('robot', 'drivers', 'runs.json_file'),
@@ -30,7 +31,7 @@ ALLOWED = {
     'train': ('robot', 'control.observation', 'control.onnx_runtime', 'control.policy_file',
               'control.policy_checksum', 'runs.json_file'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
-            'faults', 'nodes', 'train', 'identify', 'bringup'),
+            'faults', 'film', 'nodes', 'train', 'identify', 'bringup'),
 }
 
 # Library -> the only room that imports it.

@@ -28,7 +28,7 @@ HELP = {'help_option_names': ['-h', '--help']}
 app = typer.Typer(no_args_is_help=True, add_completion=False, context_settings=HELP,
                   help='Fly, evaluate and report on the tiltable quadrotor.')
 for command in (flights.fly, flights.evaluate, flights.compare, flights.faults, flights.report,
-                gaps.gap, training.train, hardware.check, listing.controllers):
+                flights.film, gaps.gap, training.train, hardware.check, listing.controllers):
     app.command()(command)
 identify = typer.Typer(no_args_is_help=True, context_settings=HELP,
                        help='Fit the actuator models from measured data.')

@@ -269,3 +269,43 @@ def report(runs: Annotated[list[Path], typer.Argument(
         check_writable(json_path)
     from beetle_omni_ros.runs.report import run_report
     run_report(runs, output, json_path=json_path)
+
+
+def film(runs: Annotated[list[Path], typer.Argument(
+             metavar='RUN...', help='Recorded bags, side by side: rosbag2 folders, or one of '
+                                    'their files.')],
+         output: Annotated[list[Path], typer.Option(
+             '--output', '-o', metavar='FILE', help='The film, .gif or .mp4; may be repeated.')],
+         model: Annotated[Optional[list[Path]], typer.Option(
+             '--model', metavar='FILE',
+             help='Robot file: over one RUN, what its model expects from the commands, put right '
+                  'each second; a panel for each --model.')] = None,
+         robot: Annotated[Optional[Path], typer.Option(
+             '--robot', metavar='FILE', help='Dimensions of the robot that is drawn. '
+                                             'Default: the shipped params/robot.yaml.')] = None,
+         start: Annotated[float, typer.Option(
+             '--start', metavar='SECONDS', help='Since the first target.')] = 0.0,
+         duration: Annotated[Optional[float], typer.Option(
+             '--duration', metavar='SECONDS', help='Of the flight. Default: to its end.')] = None,
+         speed: Annotated[float, typer.Option(
+             '--speed', metavar='FACTOR', min=0.05, max=50.0, help='1 is real time.')] = 1.0,
+         size: Annotated[int, typer.Option(
+             '--size', metavar='PIXELS', min=160, max=1600, help='Width of a panel, even.')]
+         = 440):
+    """
+    Draw recorded flights as a film: the robot, its target, its path, errors, thrusts.
+
+    Needs an OpenGL that draws without a window; says what to install where there is none.
+    Example: beetle_omni film my_run/rl my_run/nmpc --output flight.gif
+    """
+    from beetle_omni_ros.runs.json_file import check_writable
+    for file in (*(model or ()), *((robot,) if robot else ())):
+        if not file.is_file():
+            raise ParameterError(f'{file}: no such file')
+    for path in output:
+        check_writable(path, 'film')
+    from beetle_omni_ros.film.graphics import choose_backend
+    choose_backend()
+    from beetle_omni_ros.film.command import run_film
+    run_film(runs, output, models=model or [], robot=robot, start=start, duration=duration,
+             speed=speed, size=size)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 
@@ -13,57 +15,61 @@ from beetle_omni_ros.sim.parameters import PlantParameters
 CARBON, SHELL, METAL = (0.06, 0.065, 0.075), (0.82, 0.84, 0.87), (0.5, 0.52, 0.56)
 FRONT, REAR, SERVO = (0.88, 0.14, 0.10), (0.13, 0.15, 0.18), (0.10, 0.11, 0.13)
 BALL, LEG, BLADE = (0.97, 0.60, 0.08), (0.17, 0.18, 0.21), (0.05, 0.05, 0.06)
-DISC_FRONT, DISC_REAR, THRUST = (0.95, 0.45, 0.35), (0.35, 0.62, 0.90), (0.10, 0.75, 0.55)
-TRAIL = (0.35, 0.42, 0.55)
-DISC_OPACITY, THRUST_OPACITY = 0.22, 0.75
+DISC_FRONT, DISC_REAR = (0.95, 0.45, 0.35), (0.35, 0.62, 0.90)
+DISC_OPACITY = 0.22
 ARM, STALK, HUB = 0.011, 0.006, 0.070
-THRUST_SCALE = 0.022            # [m/N] length of an arrow
+HUB_HEIGHT = 0.012              # of a propeller above its joint axis
 BLADES = 3
+LIGHT = 'mass="0.001"'          # of anything: MuJoCo refuses a moving body without mass
 
 
 def _numbers(*values):
     return ' '.join(f'{x:.6g}' for x in np.hstack([np.ravel(value) for value in values]))
 
 
+@dataclass(frozen=True)
+class Look:
+    """
+    How a robot is drawn.
+
+    Attributes:
+        opacity: 1 solid, less for a ghost.
+        tint: (3,) one colour for all of it, or None for its own.
+
+    """
+
+    opacity: float = 1.0
+    tint: tuple[float, float, float] | None = None
+
+
 class Figure:
-    """MJCF text of one robot in one pose, as a body without joints or mass."""
+    """
+    MJCF text of one robot as a free body whose joints and propellers turn.
+
+    Generalised positions: base_link's place and attitude (7), then for each arm the tilt and
+    the turn of the propeller (8).
+    """
 
     def __init__(self, robot: RobotParameters, plant: PlantParameters):
         """Take sizes and places from the robot and its simulated contact geometry."""
         self._robot, self._plant = robot, plant
         self._parts = mass_properties(robot)
-        self._opacity = 1.0
+        self._look = Look()
 
-    def body(self, position, quaternion, tilt, thrust=None, opacity: float = 1.0) -> str:
-        """
-        Draw one pose.
-
-        Args:
-            position: (3,) of base_link in world [m].
-            quaternion: (4,) xyzw.
-            tilt: (4,) [rad].
-            thrust: (4,) [N] drawn as arrows, or None.
-            opacity: 1 solid, less for a ghost.
-
-        """
-        self._opacity = opacity
-        x, y, z, w = quaternion
-        modules = ''.join(self._module(k, tilt[k], None if thrust is None else thrust[k])
-                          for k in range(4))
-        return (f'<body pos="{_numbers(position)}" quat="{_numbers(w, x, y, z)}">'
-                f'{self._main_body()}{modules}</body>\n')
-
-    def mark(self, point) -> str:
-        """A dot of a path."""
-        self._opacity = 1.0
-        return self._geom('sphere', (0.009,), TRAIL, point, opacity=0.6, shine=False)
+    def body(self, look: Look = Look()) -> str:
+        """Draw a robot of this look."""
+        self._look = look
+        modules = ''.join(self._module(k) for k in range(4))
+        return f'<body><freejoint/>{self._main_body()}{modules}</body>\n'
 
     def _geom(self, kind, size, colour, pos=None, ends=None, quat=None, opacity=1.0, shine=True):
+        look = self._look
         place = f'fromto="{_numbers(ends)}"' if ends is not None else f'pos="{_numbers(pos)}"'
         turn = f'quat="{_numbers(quat)}"' if quat is not None else ''
         material = 'gloss' if shine else 'glow'
-        return (f'<geom type="{kind}" size="{_numbers(size)}" {place} {turn} '
-                f'material="{material}" rgba="{_numbers(colour, opacity * self._opacity)}"/>\n')
+        return (f'<geom type="{kind}" size="{_numbers(size)}" {place} {turn} {LIGHT} '
+                f'material="{material}" '
+                f'rgba="{_numbers(look.tint or colour, opacity * look.opacity)}"/>\n')
 
     def _main_body(self):
         origin, parts, plant = self._parts.main_origin, self._parts, self._plant
@@ -93,39 +99,29 @@ class Figure:
             shapes.append(self._geom('sphere', (plant.foot_radius,), CARBON, foot))
         return ''.join(shapes)
 
-    def _module(self, k, tilt, thrust):
-        turn, axis_turn, quaternion = np.empty(4), np.empty(4), np.empty(4)
+    def _module(self, k):
+        axis_turn = np.empty(4)
         mujoco.mju_mat2Quat(axis_turn, self._parts.module_rotations[k].ravel())
-        mujoco.mju_axisAngle2Quat(turn, np.array([1.0, 0, 0]), tilt)
-        mujoco.mju_mulQuat(quaternion, axis_turn, turn)
         rotor = np.array([self._robot.parts.module.rotor_offset, 0, 0])
         radius = self._plant.propeller_radius
         disc = DISC_FRONT if self._robot.tilt_axes[k][0] > 0 else DISC_REAR
-        hub = rotor + [0, 0, 0.012]
+        hub = rotor + [0, 0, HUB_HEIGHT]
         shapes = [
             self._geom('capsule', (0.010,), METAL, ends=([-0.015, 0, 0], rotor)),
             self._geom('cylinder', (0.016, 0.016), METAL, rotor - [0, 0, 0.010]),
             self._geom('cylinder', (0.017, 0.004), FRONT if disc is DISC_FRONT else CARBON,
                        rotor - [0, 0, 0.022]),
-            self._geom('ellipsoid', (0.011, 0.011, 0.014), CARBON, hub),
             self._geom('cylinder', (radius, 0.0012), disc, hub, opacity=DISC_OPACITY,
                        shine=False)]
+        blades = [self._geom('ellipsoid', (0.011, 0.011, 0.014), CARBON, np.zeros(3))]
         for blade in range(BLADES):
             angle = 2 * np.pi * blade / BLADES + 0.7 * k
             along = np.array([np.cos(angle), np.sin(angle), 0])
             twist = np.empty(4)
             mujoco.mju_axisAngle2Quat(twist, np.array([0, 0, 1.0]), angle)
-            shapes.append(self._geom('ellipsoid', (0.48 * radius, 0.011, 0.0025), BLADE,
-                                     hub + 0.5 * radius * along, quat=twist))
-        if thrust is not None:
-            shapes.append(self._arrow(hub, thrust))
+            blades.append(self._geom('ellipsoid', (0.48 * radius, 0.011, 0.0025), BLADE,
+                                     0.5 * radius * along, quat=twist))
         return (f'<body pos="{_numbers(self._parts.joint_origins[k])}" '
-                f'quat="{_numbers(quaternion)}">{"".join(shapes)}</body>\n')
-
-    def _arrow(self, start, thrust):
-        """A thrust vector: a shaft with a pointed tip (a slim ellipsoid)."""
-        tip = start + [0, 0, 0.03 + THRUST_SCALE * thrust]
-        return (self._geom('cylinder', (0.0045,), THRUST, ends=(start + [0, 0, 0.02], tip),
-                           opacity=THRUST_OPACITY)
-                + self._geom('ellipsoid', (0.011, 0.011, 0.026), THRUST, tip,
-                             opacity=THRUST_OPACITY))
+                f'quat="{_numbers(axis_turn)}"><joint axis="1 0 0"/>{"".join(shapes)}'
+                f'<body pos="{_numbers(hub)}"><joint axis="0 0 1"/>{"".join(blades)}</body>'
+                '</body>\n')

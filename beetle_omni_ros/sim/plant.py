@@ -88,6 +88,23 @@ class Plant:
         self.data.qpos[3:7] = rotations.normalized(quaternion)[[3, 0, 1, 2]]
         self._update()
 
+    def set_body(self, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray,
+                 angular_velocity: np.ndarray) -> None:
+        """
+        Put base_link into a state of motion; joints and rotors stay in theirs.
+
+        Args:
+            position: (3,) in world [m].
+            quaternion: (4,) xyzw.
+            velocity: (3,) in world [m/s].
+            angular_velocity: (3,) in base_link [rad/s].
+
+        """
+        self._qpos[:3] = position
+        self._qpos[3:7] = rotations.normalized(quaternion)[[3, 0, 1, 2]]
+        self._qvel[:3], self._qvel[3:6] = velocity, angular_velocity
+        self._update()
+
     def _standing_height(self):
         """Where base_link comes to rest on its feet [m]; found once, by letting it settle."""
         if self._ground_height is None:

@@ -1,22 +1,29 @@
 """
-Pictures of the robot without a display; nothing that simulates imports this module.
+Pictures of robots without a display; nothing that simulates imports this module.
 
-Needs an off-screen OpenGL: on a machine without a display set MUJOCO_GL=egl (Debian and
-Ubuntu: package libegl1 with Mesa's drivers).
+Needs an off-screen OpenGL, see :func:`beetle_omni_ros.film.graphics.choose_backend`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.sim.figure import Figure
+from beetle_omni_ros.sim.figure import Figure, HUB_HEIGHT, Look
 from beetle_omni_ros.sim.parameters import PlantParameters, SimulatorParameters
 
-SAMPLES = 8             # for smooth edges
+SAMPLES = 4                     # for smooth edges
+JOINTS = 15                     # generalised positions of one robot
+SPIN = 47.0                     # [rad/s] drawn; a true propeller would only flicker
+THRUST = (0.02, 0.66, 0.42)
+THRUST_SCALE = 0.030            # [m/N] length of an arrow
+SHAFT, TRAIL_WIDTH = 0.011, 0.009
+MOST_GEOMS = 4000
+HAZE, FLOOR = (0.93, 0.95, 0.97), (0.73, 0.77, 0.82)
 
 
 @dataclass(frozen=True)
@@ -29,7 +36,7 @@ class Pose:
         quaternion: (4,) xyzw.
         tilt: (4,) [rad].
         thrust: (4,) [N] drawn as arrows, or None.
-        opacity: 1 solid, less for a ghost.
+        time: [s] by which the propellers have turned.
 
     """
 
@@ -37,7 +44,7 @@ class Pose:
     quaternion: np.ndarray
     tilt: np.ndarray
     thrust: np.ndarray | None = None
-    opacity: float = 1.0
+    time: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -48,74 +55,149 @@ class Camera:
     distance: float = 3.85
     azimuth: float = 112.0
     elevation: float = -17.0
-    field_of_view: float = 30.0
 
 
-def render(robot: RobotParameters, poses: list[Pose], camera: Camera | None = None,
-           width: int = 1600, height: int = 900, trail: np.ndarray | None = None,
-           plant: PlantParameters | None = None) -> np.ndarray:
+@dataclass(frozen=True)
+class Trail:
+    """A path: (N, 3) points [m] and its colour, which fades towards the start."""
+
+    points: np.ndarray
+    colour: tuple[float, float, float]
+
+
+class Stage:
     """
-    One picture with the robot in every pose.
+    Robots over a floor, drawn one picture at a time.
 
     Args:
         robot: its dimensions.
-        poses: solid ones and ghosts, for example the samples of a flight.
-        camera: the viewpoint.
+        looks: of the robots, in the order of the poses; what is not drawn is below the floor.
         width: [pixels].
         height: [pixels].
-        trail: (N, 3) points of a path to mark [m], or None.
+        field_of_view: vertical [deg].
         plant: sizes of feet and propellers; default: params/simulator.yaml.
 
-    Returns:
-        (height, width, 3) uint8.
-
     Raises:
-        RuntimeError: there is no off-screen OpenGL here; the text says what to install.
+        RuntimeError: there is no off-screen OpenGL here.
 
     """
-    camera = camera or Camera()
-    figure = Figure(robot, plant or SimulatorParameters.load().plant)
-    bodies = ''.join(figure.body(pose.position, pose.quaternion, pose.tilt, pose.thrust,
-                                 pose.opacity) for pose in poses)
-    if trail is not None:
-        bodies += ''.join(figure.mark(point) for point in trail)
-    model = mujoco.MjModel.from_xml_string(_scene(bodies, camera, width, height))
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    view = mujoco.MjvCamera()
-    view.lookat[:] = camera.lookat
-    view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
-    try:
-        renderer = mujoco.Renderer(model, height, width)
-    except Exception as error:
-        # Each OpenGL back end fails in its own way, with exceptions of its own.
-        raise RuntimeError('no off-screen OpenGL: set MUJOCO_GL=egl and install libegl1 with '
-                           f"Mesa's drivers ({type(error).__name__}: {error})") from error
-    try:
-        renderer.update_scene(data, view)
-        return renderer.render()
-    finally:
-        renderer.close()
+
+    def __init__(self, robot: RobotParameters, looks: Sequence[Look], width: int, height: int,
+                 field_of_view: float = 30.0, plant: PlantParameters | None = None):
+        """See the class."""
+        figure = Figure(robot, plant or SimulatorParameters.load().plant)
+        scene = _scene(''.join(map(figure.body, looks)), field_of_view, width, height)
+        self._spin = robot.rotors.spin
+        self._model = mujoco.MjModel.from_xml_string(scene)
+        self._data = mujoco.MjData(self._model)
+        self._arms = np.array([self._model.body(2 + 9 * k + 2 * arm).id
+                               for k in range(len(looks)) for arm in range(4)]).reshape(-1, 4)
+        ghosts = {2 + 9 * k - 1 + part for k, look in enumerate(looks) if look.opacity < 1
+                  for part in range(9)}
+        self._ghostly = {geom for geom, body in enumerate(self._model.geom_bodyid)
+                         if int(body) in ghosts}
+        self._rotor = np.array([robot.parts.module.rotor_offset, 0, HUB_HEIGHT])
+        try:
+            self._renderer = mujoco.Renderer(self._model, height, width, MOST_GEOMS)
+        except Exception as error:
+            # Each OpenGL back end fails in its own way, with exceptions of its own.
+            raise RuntimeError(f'no off-screen OpenGL ({type(error).__name__}: {error})') \
+                from error
+
+    def __enter__(self) -> Stage:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *exception) -> None:
+        """Free the graphics context."""
+        self._renderer.close()
+
+    def draw(self, poses: Sequence[Pose | None], camera: Camera,
+             trails: Sequence[Trail] = ()) -> np.ndarray:
+        """
+        Draw one picture.
+
+        Args:
+            poses: of the robots; None hides one.
+            camera: the viewpoint.
+            trails: paths to mark.
+
+        Returns:
+            (height, width, 3) uint8.
+
+        """
+        for k, pose in enumerate(poses):
+            self._data.qpos[JOINTS * k:JOINTS * (k + 1)] = self._joints(pose)
+        mujoco.mj_forward(self._model, self._data)
+        view = mujoco.MjvCamera()
+        view.lookat[:] = camera.lookat
+        view.distance, view.azimuth = camera.distance, camera.azimuth
+        view.elevation = camera.elevation
+        self._renderer.update_scene(self._data, view)
+        for geom in self._renderer.scene.geoms[:self._renderer.scene.ngeom]:
+            if geom.objid in self._ghostly and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                geom.category = mujoco.mjtCatBit.mjCAT_DECOR    # which casts no shadow
+        for trail in trails:
+            self._path(trail)
+        for arms, pose in zip(self._arms, poses, strict=True):
+            if pose is not None and pose.thrust is not None:
+                for arm, thrust in zip(arms, pose.thrust, strict=True):
+                    self._arrow(arm, thrust)
+        return self._renderer.render()
+
+    def _joints(self, pose):
+        if pose is None:
+            return np.concatenate([[0, 0, -9, 1], np.zeros(JOINTS - 4)])
+        x, y, z, w = pose.quaternion
+        turns = np.asarray(self._spin) * SPIN * pose.time
+        return np.concatenate([pose.position, [w, x, y, z],
+                               np.stack([pose.tilt, turns], axis=1).ravel()])
+
+    def _arrow(self, arm, thrust):
+        turn = self._data.xmat[arm].reshape(3, 3)
+        hub = self._data.xpos[arm] + turn @ self._rotor
+        self._connect(mujoco.mjtGeom.mjGEOM_ARROW, SHAFT, hub + 0.02 * turn[:, 2],
+                      hub + (0.03 + THRUST_SCALE * thrust) * turn[:, 2], (*THRUST, 0.9))
+
+    def _path(self, trail):
+        share = np.linspace(0.0, 0.9, len(trail.points))[:, None]
+        colours = share * np.array(trail.colour) + (1 - share) * np.array(FLOOR)
+        for start, end, colour in zip(trail.points, trail.points[1:], colours):
+            self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, TRAIL_WIDTH, start, end, (*colour, 1.0))
+
+    def _connect(self, kind, width, start, end, colour):
+        scene = self._renderer.scene
+        if scene.ngeom >= scene.maxgeom or not np.linalg.norm(end - start) > 1e-9:
+            return
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9),
+                            np.array(colour, dtype=np.float32))
+        mujoco.mjv_connector(geom, kind, width, np.asarray(start, float), np.asarray(end, float))
+        geom.emission, geom.specular = 0.1, 0.1
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+        scene.ngeom += 1
 
 
-def _scene(bodies, camera, width, height):
+def _scene(bodies, field_of_view, width, height):
+    haze, floor = (' '.join(map(str, colour)) for colour in (HAZE, FLOOR))
     return f"""
 <mujoco>
+  <statistic center="0 0 0.5" extent="4"/>
   <compiler angle="radian"/>
   <visual>
-    <global offwidth="{width}" offheight="{height}" fovy="{camera.field_of_view}"/>
-    <quality offsamples="{SAMPLES}" shadowsize="8192" numslices="64" numstacks="32"/>
+    <global offwidth="{width}" offheight="{height}" fovy="{field_of_view}"/>
+    <quality offsamples="{SAMPLES}" shadowsize="2048" numslices="20" numstacks="10"/>
     <headlight ambient="0.42 0.43 0.45" diffuse="0.22 0.22 0.24" specular="0.1 0.1 0.1"/>
-    <map znear="0.05" zfar="40" fogstart="5" fogend="16" haze="0.4"/>
-    <rgba fog="0.90 0.93 0.96 1" haze="0.90 0.93 0.96 1"/>
+    <map znear="0.05" zfar="40" fogstart="6" fogend="13" haze="0.4"/>
+    <rgba fog="{haze} 1" haze="{haze} 1"/>
   </visual>
   <asset>
-    <texture type="skybox" builtin="gradient" rgb1="0.90 0.93 0.96" rgb2="0.62 0.74 0.88"
+    <texture type="skybox" builtin="flat" rgb1="{haze}" rgb2="{haze}"
              width="512" height="512"/>
-    <texture name="tiles" type="2d" builtin="checker" rgb1="0.80 0.83 0.86"
-             rgb2="0.74 0.77 0.81" mark="edge" markrgb="0.66 0.70 0.75" width="512" height="512"/>
+    <texture name="tiles" type="2d" builtin="flat" rgb1="{floor}" rgb2="{floor}"
+             mark="edge" markrgb="0.50 0.56 0.63" width="512" height="512"/>
     <material name="floor" texture="tiles" texrepeat="2 2" texuniform="true"
-              specular="0.2" shininess="0.3"/>
+              specular="0.1" shininess="0.1"/>
     <material name="gloss" specular="0.6" shininess="0.6"/>
     <material name="glow" specular="0.1" shininess="0.1" emission="0.35"/>
   </asset>

@@ -103,6 +103,13 @@ class Simulator:
                                 self._plant.effort)
         self._sensors.start_imu(self.truth, self._plant.specific_force)
 
+    def set_body(self, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray,
+                 angular_velocity: np.ndarray) -> None:
+        """Put a whole robot into a state of motion, see :meth:`.plant.Plant.set_body`."""
+        self._plant.set_body(position, quaternion, velocity, angular_velocity)
+        self._crash.reset()
+        self.truth = self._truth()
+
     def command(self, command) -> bool:
         """
         Send a command (stamp, tilt (4,), thrust (4,)); it acts at its stamp plus the delay.

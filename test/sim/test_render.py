@@ -6,31 +6,37 @@ import sys
 
 import numpy as np
 import pytest
-from sim_robots import LEVEL, ROBOT, WORLD
+from sim_robots import ROBOT, WORLD
 
 from beetle_omni_ros.sim.figure import Figure
 
 DRAW = """
 import numpy as np
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.sim.render import Camera, Pose, render
-robot = RobotParameters.load()
+from beetle_omni_ros.sim.figure import Look
+from beetle_omni_ros.sim.render import Camera, Pose, Stage, Trail
 level, tilt = np.array([0, 0, 0, 1.0]), np.zeros(4)
 camera = Camera(lookat=(0, 0, 0.8), distance=2.0)
-poses = [Pose(np.array([0, 0, 0.8]), level, tilt, np.full(4, 7.0))]
-empty = render(robot, [], camera, 160, 90)
-drawn = render(robot, poses, camera, 160, 90, trail=np.zeros((2, 3)))
+pose = Pose(np.array([0, 0, 0.8]), level, tilt, np.full(4, 7.0))
+path = Trail(np.array([[-0.4, 0, 0.5], [0.4, 0, 0.5]]), (1, 0, 0))
+with Stage(RobotParameters.load(), [Look(), Look(0.3, (0, 0, 1))], 160, 90) as stage:
+    empty = stage.draw([None, None], camera)
+    drawn = stage.draw([pose, None], camera)
+    ghost = stage.draw([None, pose], camera)
+    again = stage.draw([None, None], camera, [path])
 assert drawn.shape == (90, 160, 3) and drawn.dtype == np.uint8
-changed = np.abs(drawn.astype(int) - empty).max(axis=2) > 40
-assert 0.02 < changed[20:70, 40:120].mean() < 0.9, changed.mean()
-red = (drawn[..., 0] > 120) & (drawn[..., 1] < 90)
-assert red.sum() > 5
+def changed(picture, limit=40):
+    return np.abs(picture.astype(int) - empty).max(axis=2) > limit
+assert 0.02 < changed(drawn)[20:70, 40:120].mean() < 0.9
+assert ((drawn[..., 0] > 120) & (drawn[..., 1] < 90)).sum() > 5
+assert 20 < changed(ghost).sum() < changed(drawn).sum()
+assert changed(ghost)[75:].sum() == 0 < changed(again).sum() < 400
 """
 
 
 def test_figure_has_its_rotors_where_the_robot_has_them():
     mujoco = pytest.importorskip('mujoco')
-    text = Figure(ROBOT, WORLD.plant).body(np.zeros(3), LEVEL, np.zeros(4))
+    text = Figure(ROBOT, WORLD.plant).body()
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><compiler angle="radian"/><asset><material name="gloss"/><material name="glow"/>'
         f'</asset><worldbody>{text}</worldbody></mujoco>')
