@@ -68,6 +68,7 @@ class Holding:
     Attributes:
         directions: (N, 3) unit vectors, up in base_link.
         margins: (N,) margin of each [m/s^2, rad/s^2], 0 where it cannot be held.
+        tilts: (N, 4) tilts that hold each, within +-pi [rad].
 
     """
 
@@ -79,8 +80,8 @@ class Holding:
         self._allocator = DegradedAllocator(robot, health)
         self._scale = 1 / np.r_[np.full(3, self._allocator.mass), robot.inertia]
         self.directions = sphere(self.parameters.directions)
-        self._tilts, self._thrusts, met = self._held(self.directions)
-        self.margins = self._measured(self._tilts, self._thrusts, met)
+        self.tilts, self._thrusts, met = self._held(self.directions)
+        self.margins = self._measured(self.tilts, self._thrusts, met)
 
     def margin(self, quaternion: np.ndarray) -> float:
         """Margin of one attitude (4,) [m/s^2, rad/s^2], 0 where it cannot be held."""
@@ -137,7 +138,7 @@ class Holding:
         if not firm.size:
             firm = np.array([np.argmax(self.margins)])
         angle = np.arccos(np.clip(self.directions[firm] @ up(quaternion), -1.0, 1.0))
-        travel = np.abs(self._on_nearest_turn(self._tilts[firm], tilt) - tilt)
+        travel = np.abs(self._on_nearest_turn(self.tilts[firm], tilt) - tilt)
         travel[self._thrusts[firm] < LITTLE] = 0.0
         time = angle / p.turn_rate + travel.max(axis=1) / p.tilt_rate
         return leaned(quaternion, self.directions[firm[np.argmin(time)]])

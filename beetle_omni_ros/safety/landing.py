@@ -18,8 +18,10 @@ from beetle_omni_ros.safety.levelling import plan, Way
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.ramp import inclination, Ramp
 from beetle_omni_ros.safety.support import SupportGauge
+from beetle_omni_ros.safety.turnover import find_turnover, Turnover
 from beetle_omni_ros.safety.vehicle import Vehicle
 
+FADING_STEPS = 10       # in which a rotor comes to rest
 STILL = 1.0     # [s] without IMU: it should sink and does not
 AHEAD, BETWEEN = 20.0, 0.1      # [s] how far ahead, and how densely, a way is told
 
@@ -54,6 +56,7 @@ class Landing:
         self._standing_for, self._still_for, self._blind_for = 0.0, 0.0, 0.0
         self._blind = False
         self._robot, self._health = robot, ALL_WELL
+        self._turnover: Turnover | None = None
 
     @property
     def way(self) -> TrajectoryTarget:
@@ -128,8 +131,11 @@ class Landing:
         state = vehicle.backup_state(now) if vehicle.backup.running else vehicle.seen(in_force)
         p, blind = self._parameters, self._without_mocap
         level = replace(p.level, rate=p.blind_level_rate) if blind else p.level
+        self._end_turnover()
         way = plan(state.quaternion, state.tilt, self._allocator, level) if self._health.healthy \
             else self._way_with_what_is_left(state, level.rate)
+        if way.lost > p.turnover.lost_lift and self._begin_turnover(state, level):
+            return
         slanted = inclination(state.quaternion) > p.level_first or not self._health.healthy
         wait = way.duration if slanted else 0.0
         height = max(0.0, state.position[2] - self._floor)
@@ -139,6 +145,53 @@ class Landing:
             else (-inf, p.speed, p.acceleration)))
         self._due = now + wait + (height - fast) / p.speed + (
             self._ramp.duration - wait if fast else 0.0)
+
+    def _begin_turnover(self, state, level):
+        """Fly to where a joint turns over with its rotor at rest; whether that exists."""
+        found = find_turnover(state.quaternion, state.tilt, self._robot, self._allocator, level,
+                              self._parameters.turnover)
+        if found is None:
+            return False
+        way = Way.straight(state.quaternion, found.quaternion, level.rate)
+        p = self._parameters
+        wait = way.duration + p.turnover.time_limit
+        self._turnover, self._arrived, self._share, self._full = found, None, 1.0, 0.0
+        self._ramp = Ramp(state.stamp, state.position, way, wait, -inf, p.speed, p.acceleration)
+        self._due = inf     # not before the joint has turned
+        return True
+
+    def _turn_over(self, state, command):
+        """The command with the turning joint's own target; goes on once four rotors push again."""
+        found, elapsed = self._turnover, state.stamp - self._ramp.stamp
+        p = self._parameters.turnover
+        since = elapsed - self._ramp.way.duration - p.settling_time
+        if since < 0:
+            self._full = float(command.thrust[found.joint])
+        elif self._arrived is None:
+            # The others take over in steps, so that their joints follow.
+            share = self._rest(1 - since / p.fading_time)
+            if share <= 0:
+                command = replace(command, tilt=np.where(
+                    np.arange(4) == found.joint, found.tilt, command.tilt))
+                if abs(state.tilt[found.joint] - found.tilt) < p.arrived \
+                        or elapsed > self._ramp.wait:
+                    self._arrived = state.stamp
+        elif self._rest((state.stamp - self._arrived) / p.fading_time) >= 1:
+            self.set_out(state.stamp, command)
+        return command
+
+    def _rest(self, share):
+        """Let the rotor give a share of its thrust, in steps; return the step's share."""
+        share = float(np.clip(np.round(share * FADING_STEPS) / FADING_STEPS, 0.0, 1.0))
+        if share != self._share:
+            self._share = share
+            self._hover.set_health(self._turnover.health(share * self._full))
+        return share
+
+    def _end_turnover(self):
+        if self._turnover is not None:
+            self._turnover = None
+            self._hover.set_health(self._health)
 
     def _way_with_what_is_left(self, state, rate):
         """Towards the attitude nearest level that leaves a margin for control."""
@@ -180,7 +233,8 @@ class Landing:
         self._feel_ground(state, dt, specific_force_up, reference)
         # Rates from MoCap alone are late and noisy: nothing to learn from.
         self._hover.observe(state, free=self._vehicle.backup.imu_alive)
-        return self._hover.step(state, _Now(reference))
+        command = self._hover.step(state, _Now(reference))
+        return command if self._turnover is None else self._turn_over(state, command)
 
     def _slow_enough(self, stamp, reference):
         """Whether the fast descent ends: it brakes, down to the speed of the touchdown."""

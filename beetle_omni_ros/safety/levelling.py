@@ -44,14 +44,15 @@ class Way:
     An attitude that turns along a path, piece by piece at steady rates.
 
     Args:
-        times: (P,) increasing, from 0 [s].
+        times: (P,) increasing [s]; until the first it stands at its start.
         quaternions: (P, 4) base_link to world, xyzw.
+        lost: lift that joints lose that turn over on it, in hover thrusts of one rotor [s].
 
     """
 
-    def __init__(self, times: np.ndarray, quaternions: np.ndarray):
+    def __init__(self, times: np.ndarray, quaternions: np.ndarray, lost: float = 0.0):
         """See the class."""
-        self._times, self._quaternions = times, quaternions
+        self._times, self._quaternions, self.lost = times, quaternions, lost
         self._turns = [rotations.log(rotations.multiply(rotations.conjugate(a), b))
                        for a, b in zip(quaternions[:-1], quaternions[1:])]
 
@@ -82,7 +83,7 @@ class Way:
         times = self._times
         if elapsed >= times[-1]:
             return self._quaternions[-1], np.zeros(3)
-        if elapsed <= 0:
+        if elapsed <= times[0]:
             return self._quaternions[0], np.zeros(3)
         k = int(np.searchsorted(times, elapsed, side='right')) - 1
         length = times[k + 1] - times[k]
@@ -116,7 +117,7 @@ def plan(quaternion: np.ndarray, tilt: np.ndarray, allocator: Allocator,
     times = np.maximum(_angles_between(up) / p.rate, waits)
     best = int(np.argmin(times.sum(axis=1) + p.missing_thrust * lost))
     length = len(paths[best])
-    return _way(quaternion, paths[best], times[best, :length])
+    return _way(quaternion, paths[best], times[best, :length], float(lost[best]))
 
 
 def _corners(start, allocator):
@@ -173,7 +174,7 @@ def _follow(tilt, up, allocator, p):
     return waits, lost
 
 
-def _way(quaternion, path, times):
+def _way(quaternion, path, times, lost):
     """Attitudes along a path: the smallest turns that carry one up direction to the next."""
     attitudes = [rotations.normalized(quaternion)]
     for a, b in zip(path[:-1], path[1:]):
@@ -182,4 +183,4 @@ def _way(quaternion, path, times):
         turn = axis / sine * np.arctan2(sine, a @ b) if sine > 1e-12 else np.zeros(3)
         attitudes.append(rotations.normalized(rotations.multiply(attitudes[-1],
                                                                  rotations.exp(turn))))
-    return Way(np.cumsum(times), np.array(attitudes))
+    return Way(np.cumsum(times), np.array(attitudes), lost)

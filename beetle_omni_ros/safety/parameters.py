@@ -10,6 +10,7 @@ from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
 from beetle_omni_ros.safety.levelling import LevellingParameters
+from beetle_omni_ros.safety.turnover import TurnoverParameters
 from beetle_omni_ros.safety.watch.parameters import Detection
 
 
@@ -103,6 +104,7 @@ class LandingParameters:
     speed: float = parameter(0.3, doc='descent speed', unit='m/s', low=0.05, high=3)
     acceleration: float = parameter(0.5, doc='of the descent', unit='m/s^2', low=0.05, high=10)
     level: LevellingParameters = group(LevellingParameters)
+    turnover: TurnoverParameters = group(TurnoverParameters, 'joints wound the wrong way')
     level_first: float = parameter(0.3, doc='more inclination is levelled before the descent',
                                    unit='rad', low=0, high=3.15)
     blind_level_rate: float = parameter(1.6, doc='angular rate of the levelling without MoCap',

@@ -84,3 +84,12 @@ def test_a_straight_way_is_the_shortest_turn():
     way = Way.straight(ATTITUDES[1], goal, 0.5)
     assert way.duration == pytest.approx(rotations.geodesic_angle(goal, ATTITUDES[1]) / 0.5)
     assert Way.straight(goal, goal, 0.5).duration == 0.0
+
+
+def test_a_joint_that_waits_at_the_start_holds_the_attitude_meanwhile():
+    tilt = held(ATTITUDES[0])
+    tilt[0] -= 0.8
+    way = plan(ATTITUDES[0], tilt, ALLOCATOR, P)
+    attitude, rate = way.at(0.01)
+    np.testing.assert_allclose(np.abs(attitude @ ATTITUDES[0]), 1, atol=1e-9)
+    np.testing.assert_allclose(rate, 0)

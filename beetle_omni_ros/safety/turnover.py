@@ -1,0 +1,134 @@
+"""
+A joint that is wound the wrong way turns over while its rotor rests.
+
+Upside down each tilt may be +-pi. Opposite arms see up on opposite sides, so on every way to level
+one joint of a pair turns forwards and the other backwards. Where both are wound the same way, one
+of them ends at its stop. It has to turn back by a whole turn, during which its rotor pushes in
+every direction. The robot therefore flies to an attitude that the other three rotors hold with a
+margin, rests that rotor, turns its joint, and goes on with four.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.allocation import Allocator, ROTORS
+from beetle_omni_ros.robot.holding import Holding, leaned, up
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.safety.levelling import LevellingParameters, plan
+
+TURN = 2 * np.pi
+
+
+@dataclass(frozen=True, kw_only=True)
+class TurnoverParameters:
+    """When a joint turns over with its rotor at rest, and how; params/supervisor.yaml says why."""
+
+    lost_lift: float = parameter(
+        0.3, doc='a way to level that loses more lift, in hover thrusts of one rotor, waits until '
+        'a joint has turned over', unit='s', low=0, high=100)
+    room: float = parameter(0.3, doc='distance that tilts keep from their stops meanwhile',
+                            unit='rad', low=0, high=0.8)
+    farthest: float = parameter(1.0, doc='largest turn to the attitude in which the rotor rests',
+                                unit='rad', low=0, high=3.15)
+    settling_time: float = parameter(0.5, doc='in the attitude, before the rotor comes to rest',
+                                     unit='s', low=0, high=10)
+    fading_time: float = parameter(0.5, doc='in which the rotor comes to rest, and comes back',
+                                   unit='s', low=0.02, high=10)
+    arrived: float = parameter(0.2, doc='distance at which the joint has turned over', unit='rad',
+                               low=0.01, high=1)
+    time_limit: float = parameter(4.0, doc='longest time for one joint', unit='s', low=0.5,
+                                  high=60)
+
+
+@dataclass(frozen=True)
+class Turnover:
+    """
+    Which joint turns over, where, and to which angle.
+
+    Attributes:
+        joint: index of the joint and its rotor.
+        quaternion: (4,) attitude in which its rotor rests.
+        tilt: angle at which the joint ends [rad].
+
+    """
+
+    joint: int
+    quaternion: np.ndarray
+    tilt: float
+
+    def health(self, thrust: float = 0.0) -> ActuatorHealth:
+        """The robot while the rotor gives ``thrust`` [N], or rests."""
+        if thrust <= 0:
+            return ActuatorHealth(rotors=tuple(i != self.joint for i in range(ROTORS)))
+        return ActuatorHealth(held=tuple(thrust if i == self.joint else None
+                                         for i in range(ROTORS)))
+
+
+def find_turnover(quaternion: np.ndarray, tilt: np.ndarray, robot: RobotParameters,
+                  allocator: Allocator, level: LevellingParameters,
+                  p: TurnoverParameters) -> Turnover | None:
+    """
+    Find the first joint to turn over, so that the way to level needs no other under load.
+
+    Args:
+        quaternion: (4,) present attitude, base_link to world, xyzw.
+        tilt: (4,) present tilt angles [rad].
+        robot: the robot.
+        allocator: of the robot.
+        level: of the levelling that follows.
+        p: tuning.
+
+    Returns:
+        what to do first, or None where no turnover helps.
+
+    """
+    for joint in _wrong_joints(quaternion, tilt, allocator, level, p.lost_lift):
+        found = _place(joint, quaternion, tilt, robot, allocator, p)
+        if found is not None:
+            return found
+    return None
+
+
+def _wrong_joints(quaternion, tilt, allocator, level, lost_lift):
+    """The joints of the smallest set that, turned over, leaves a way that loses no lift."""
+    turned = tilt - np.copysign(TURN, tilt)
+    wound = np.flatnonzero(np.abs(turned) <= allocator.tilt_limit)
+    for count in range(1, len(wound) + 1):
+        best = min(combinations(wound.tolist(), count), default=(), key=lambda joints: plan(
+            quaternion, _with(tilt, turned, joints), allocator, level).lost)
+        if plan(quaternion, _with(tilt, turned, best), allocator, level).lost <= lost_lift:
+            return best
+    return ()
+
+
+def _with(tilt, turned, joints):
+    return np.where(np.isin(np.arange(ROTORS), joints), turned, tilt)
+
+
+def _place(joint, quaternion, tilt, robot, allocator, p):
+    """Nearest attitude that three rotors hold and where both turns of the joint are legal."""
+    resting = Turnover(joint, quaternion, 0.0).health()
+    holding = Holding(robot, resting)
+    others = np.arange(ROTORS) != joint
+    angles, _ = allocator.upright(holding.directions)
+    healthy, three = (_nearest_turn(one, tilt) for one in (angles, holding.tilts))
+    limit = allocator.tilt_limit - p.room
+    target = healthy[:, joint] - np.copysign(TURN, healthy[:, joint])
+    fit = (np.abs(target) <= limit) & np.all(np.abs(healthy) <= limit, axis=1) \
+        & np.all(np.abs(three[:, others]) <= limit, axis=1) \
+        & np.all(np.abs(three - healthy)[:, others] <= np.pi / 2, axis=1)
+    near = holding.directions @ up(quaternion) >= np.cos(p.farthest)
+    best = np.argmax(np.where(fit & near, holding.margins, 0.0))
+    if holding.margins[best] < holding.parameters.flying_margin or not (fit & near)[best]:
+        return None
+    return Turnover(joint, leaned(quaternion, holding.directions[best]), float(target[best]))
+
+
+def _nearest_turn(angles, present):
+    return angles + TURN * np.round((present - angles) / TURN)
