@@ -94,7 +94,8 @@ MEANINGS = {
     'ground_truth/odom': 'the simulated truth',
     'diagnostics': 'health, rates, ages, timing and faults of each node',
     '/clock': 'simulated time, where it is simulated',
-    '/tf': 'frames for viewers, where tf2_msgs is installed',
+    '/tf': 'frames that move: `world`, `base_link`, each tilting module; 50 Hz, in each bag',
+    '/tf_static': 'frames that stay: rotors, main body, end effector, IMU',
     'robot_description': 'URDF for viewers',
     'markers': 'targets and thrusts for viewers'}
 QOS = {'SENSOR': 'best effort, depth 5', 'COMMAND': 'reliable, depth 1',
@@ -234,8 +235,8 @@ def _graph() -> dict[str, dict]:
                 continue
             way = {'create_publisher': 'from', 'create_subscription': 'to',
                    'listen': 'to'}.get(call.func.attr)
-            kind = call.args[0].id if isinstance(call.args[0], ast.Name) else None
-            if not way or kind not in types and kind != 'TFMessage':
+            kind = getattr(call.args[0], 'id', getattr(call.args[0], 'attr', None))
+            if not way or kind not in types and kind != '_transform_message':
                 continue
             profile = next((part.attr for part in ast.walk(call)
                             if isinstance(part, ast.Attribute) and part.attr in QOS
@@ -263,7 +264,8 @@ def topics() -> str:
     return (f'# Topics\n\n{MADE}\n'
             'Names are relative; a launch argument sets a namespace. On the robot the drivers of '
             'MoCap and IMU\npublish what `sim_node` publishes in the simulation. `recorder_node` '
-            'subscribes to every topic\nof a bag, and `viewer_node` publishes for viewers.\n\n'
+            'subscribes to every topic\nof a bag but the frames, which it makes of `odom` and '
+            '`joint_states`.\n`viewer_node` publishes for viewers.\n\n'
             + table(['topic', 'type', 'meaning'], said)
             + '\n## Publishers and subscribers\n\n'
             + table(['topic', 'published by', 'subscribed by', 'quality of service'], ends)

@@ -76,11 +76,32 @@ def wanted(given):
             'motor_board_file', 'plant_file', 'policy', 'robot_file', 'servo_bus_file', 'task')})
 
 
+def has_state_publisher():
+    """Whether robot_state_publisher is installed."""
+    from ament_index_python.packages import get_package_prefix, PackageNotFoundError
+    try:
+        return bool(get_package_prefix('robot_state_publisher'))
+    except PackageNotFoundError:
+        return False
+
+
+def state_publisher(namespace):
+    """The node that publishes description and frames of the links."""
+    from launch_ros.parameter_descriptions import ParameterValue
+
+    from beetle_omni_ros.robot.urdf import description
+    return Node(package='robot_state_publisher', executable='robot_state_publisher',
+                namespace=namespace, output='screen', parameters=[{
+                    'robot_description': ParameterValue(description(), value_type=str),
+                    'publish_frequency': 50.0}])
+
+
 def recorded_topics(namespace, controllers):
-    """Absolute names of the topics of INTERFACES, and of these controllers."""
+    """Absolute names of the topics of INTERFACES, of these controllers, and of the frames."""
     from beetle_omni_ros.messages.topics import ALL, topics_with
     prefix = f"/{namespace.strip('/')}/" if namespace.strip('/') else '/'
-    return [prefix + topic for topic in {**topics_with(controllers), **ALL}]
+    return ['/tf', '/tf_static', *(prefix + topic for topic in (
+        *{**topics_with(controllers), **ALL}, 'robot_description'))]
 
 
 def composed(arguments, nodes, namespace):
@@ -104,6 +125,9 @@ def actions(context):
     for name, reason in planned.left_out.items():
         print(f'{name} does not stand by: {reason}', file=sys.stderr)
     processes = []
+    if 'viewer_node' in nodes and has_state_publisher():
+        nodes['viewer_node']['links'] = False
+        processes.append(state_publisher(given['namespace']))
     if given['record'] and 'recorder_node' not in nodes:
         controllers = nodes['supervisor_node'].get('controllers', ())
         processes.append(ExecuteProcess(

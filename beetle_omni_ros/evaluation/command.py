@@ -22,6 +22,7 @@ from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.messages.topics import topics_with
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs import metrics as metrics_of_runs
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import BagWriter
@@ -68,7 +69,8 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         recorder = memory
         if bag is not None:
             writer = stack.enter_context(BagWriter(
-                bag, meta=meta, topics=tuple(topics_with([name])), compression=compression))
+                bag, meta=meta, topics=tuple(topics_with([name])), compression=compression,
+                description=description()))
             recorder = Tee(memory, writer)
         estimator = EkfParameters.load()
         supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),

@@ -105,10 +105,10 @@ def plan(wanted: Wanted) -> Plan:
     # Only what these nodes do not know by themselves.
     others = {} if active in registry.standing_by() else {
         'controllers': [active, *registry.standing_by()]}
+    packed = {} if wanted.compression == 'none' else {'compression': wanted.compression}
     bridges = _bridges(wanted, believed)
     table = (
-        ('recorder_node', wanted.bag, {'bag': wanted.bag, 'compression': wanted.compression,
-                                       **others}),
+        ('recorder_node', wanted.bag, {'bag': wanted.bag, **packed, **others}),
         ('sim_node', wanted.simulated, {
             **true, 'conditions': wanted.conditions, 'seed': wanted.seed,
             **bridges.get('sim_node', {})}),

@@ -14,6 +14,7 @@ from beetle_omni_ros.nodes import health, qos, runner
 from beetle_omni_ros.nodes.every_offer import EveryOffer
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
+from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import BagError, BagWriter
 from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS
 
@@ -29,6 +30,8 @@ class RecorderNodeParameters:
     controllers: NAMES = parameter(
         tuple(registry.standing_by()), read_only=True,
         doc='whose requests are recorded beside the rest: registered names')
+    urdf_file: str = parameter('', doc='robot description, whose frames are recorded; empty: the '
+                                       'shipped one', read_only=True)
     compression: str = parameter('none', choices=COMPRESSIONS, read_only=True,
                                  doc='of the chunks in the MCAP file')
 
@@ -45,7 +48,8 @@ class RecorderNode(FlightNode):
         try:
             self._bag = BagWriter(self.parameters.bag, namespace=self.get_namespace(),
                                   topics=tuple(topics),
-                                  compression=self.parameters.compression)
+                                  compression=self.parameters.compression,
+                                  description=description(self.parameters.urdf_file))
         except BagError as error:
             raise ParameterError(f"key 'bag': {error}") from None
         self._written = self._lost = 0

@@ -1,4 +1,4 @@
-"""What RViz and Foxglove need: the robot's description, its frame, and drawn forces."""
+"""What RViz and Foxglove need: the robot's description, its frames, and drawn forces."""
 
 from __future__ import annotations
 
@@ -13,15 +13,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from beetle_omni_ros.nodes import convert, qos, runner, targets
 from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.nodes.transform_message import transform_message
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter, ParameterError
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:         # not on every installation; the markers need no transform
-    TFMessage = None
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
+from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.robot.urdf import description, joints
 
 BODY_COLOUR, THRUST_COLOUR, TARGET_COLOUR = (0.3, 0.3, 0.35), (0.9, 0.5, 0.1), (0.2, 0.7, 0.3)
 
@@ -33,6 +29,10 @@ class ViewerNodeParameters:
     robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
     urdf_file: str = parameter('', doc='robot description; empty: the shipped one',
                                read_only=True)
+    links: bool = parameter(True, doc='publish description and frames of the links; false beside '
+                                      'robot_state_publisher', read_only=True)
+    frame_rate: float = parameter(50.0, doc='of the frames', unit='Hz', low=0.5, high=200,
+                                  read_only=True)
     rate: float = parameter(20.0, doc='of the markers', unit='Hz', low=0.5, high=100,
                             read_only=True)
     newton_per_metre: float = parameter(40.0, doc='thrust that is drawn as one metre',
@@ -47,13 +47,17 @@ class ViewerNode(FlightNode):
         super().__init__('viewer_node', ViewerNodeParameters, on_change=self._changed)
         given = self.parameters
         self._robot = RobotParameters.load(given.robot_file or None)
-        self._description = self.create_publisher(String, 'robot_description', qos.LATCHED)
-        self._description.publish(String(data=_text(given.urdf_file)))
-        self._transforms = self.create_publisher(TFMessage, '/tf', qos.EVENT) if TFMessage \
-            else None
+        self._transform_message = transform_message()
+        self._transforms = self._moving = None
+        if given.links:
+            self._describe(description(given.urdf_file))
+        if self._transform_message:
+            self._transforms = self.create_publisher(self._transform_message, '/tf', qos.EVENT)
+            self.create_timer(1 / given.frame_rate, self._move, clock=self.steady_clock)
         self._markers = self.create_publisher(MarkerArray, 'markers', qos.EVENT)
         self._odom = self._joints = self._command = self._target = None
-        self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.SENSOR)
+        self._moved = None      # stamp of the estimate that the frames show
+        self.listen(Odometry, 'odom', convert.odom, self._keep('_odom'), qos.SENSOR)
         self.listen(JointState, 'joint_states', convert.joints, self._keep('_joints'))
         self.listen(JointState, 'command', convert.command, self._keep('_command'), qos.SENSOR,
                     stale_after=None)
@@ -67,19 +71,36 @@ class ViewerNode(FlightNode):
     def _keep(self, name):
         return lambda value: setattr(self, name, value)
 
-    def _on_odom(self, odom):
-        self._odom = odom
-        if self._transforms is None:
+    def _describe(self, text):
+        """Publish what does not change: the description, and the frames that are fixed."""
+        tree = joints(text)
+        self._moving = [joint for joint in tree if joint.axis is not None]
+        self._description = self.create_publisher(String, 'robot_description', qos.LATCHED)
+        self._description.publish(String(data=text))
+        if self._transform_message:
+            self._fixed = self.create_publisher(self._transform_message, '/tf_static', qos.LATCHED)
+            self._fixed.publish(self._transform_message(transforms=[
+                _transform(self.now(), joint.parent, joint.child, joint.position,
+                           joint.quaternion) for joint in tree if joint.axis is None]))
+
+    def _move(self):
+        """Publish the frames that move, where somebody listens."""
+        odom, angles = self._odom, self._joints
+        if odom is None or odom.stamp == self._moved or \
+                not self._transforms.get_subscription_count():
             return
-        transform = TransformStamped(child_frame_id=convert.BODY)
-        transform.header.stamp = convert.time_message(odom.stamp)
-        transform.header.frame_id = convert.WORLD
-        transform.transform.translation = convert.vector(odom.position)
-        transform.transform.rotation = convert.quaternion(odom.quaternion)
-        self._transforms.publish(TFMessage(transforms=[transform]))
+        self._moved = odom.stamp
+        frames = [_transform(odom.stamp, convert.WORLD, convert.BODY, odom.position,
+                             odom.quaternion)]
+        if angles is not None and self._moving:
+            angle = dict(zip(JOINT_NAMES, angles.position))
+            frames += [_transform(angles.stamp, joint.parent, joint.child, joint.position,
+                                  joint.turned(angle[joint.name]))
+                       for joint in self._moving if joint.name in angle]
+        self._transforms.publish(self._transform_message(transforms=frames))
 
     def _draw(self):
-        if self._odom is None:
+        if self._odom is None or not self._markers.get_subscription_count():
             return
         odom, markers = self._odom, MarkerArray()
         to_world = rotations.matrix(odom.quaternion)
@@ -114,13 +135,13 @@ class ViewerNode(FlightNode):
         return marker
 
 
-def _text(path):
-    path = path or share_path('description/beetle_omni.urdf')
-    try:
-        with open(path) as file:
-            return file.read()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ParameterError(f"key 'urdf_file': {path} cannot be read ({error})") from None
+def _transform(stamp, parent, child, position, quaternion):
+    frame = TransformStamped(child_frame_id=child)
+    frame.header.stamp = convert.time_message(stamp)
+    frame.header.frame_id = parent
+    frame.transform.translation = convert.vector(position)
+    frame.transform.rotation = convert.quaternion(quaternion)
+    return frame
 
 
 def main(args=None):

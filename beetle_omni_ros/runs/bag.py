@@ -17,6 +17,7 @@ from beetle_omni_ros.messages.conversions import nanoseconds
 from beetle_omni_ros.messages.topics import ALL, EVENT, Qos, topic_of, TOPICS
 from beetle_omni_ros.robot.yaml_file import read_yaml
 from beetle_omni_ros.runs.bag_reader import BagError, META_KEY, read_bag, read_messages
+from beetle_omni_ros.runs.frames import FrameWriter
 from beetle_omni_ros.runs.log import RUN_STATUS
 from beetle_omni_ros.runs.recorder import Recorder
 from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS, JazzyWriter
@@ -34,7 +35,8 @@ class BagWriter(Recorder):
     keeps_covariances = True
 
     def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
-                 topics: Sequence[str] = tuple(TOPICS), compression: str = 'none'):
+                 topics: Sequence[str] = tuple(TOPICS), compression: str = 'none',
+                 description: str = ''):
         """
         Create the folder and the bag in it.
 
@@ -44,6 +46,7 @@ class BagWriter(Recorder):
             namespace: of the topics, '' or e.g. '/robot1'.
             topics: names to declare, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
             compression: of the chunks in the file, 'none' or 'zstd'.
+            description: URDF of the robot, whose frames then come into the bag; '' for none.
 
         Raises:
             BagError: the folder exists or cannot be made; unknown compression.
@@ -56,6 +59,11 @@ class BagWriter(Recorder):
         self._writer = _open(self.path, compression)
         for name in topics:
             self._declare(self._prefix + name, topic_of(name).type, topic_of(name).qos)
+        self._frames = None
+        if description:
+            self._frames = FrameWriter(self.write_raw, description, self._prefix)
+            for name, (msgtype, qos) in self._frames.topics.items():
+                self._declare(name, msgtype, qos)
         self._last_t = None      # [s] of the newest message
         if meta:
             self.write_meta(meta)
@@ -119,6 +127,8 @@ class BagWriter(Recorder):
             self._writer.write(connection, max(0, nanoseconds(t)), data)
         except OSError as error:
             raise BagError(f'{self.path}: {error.strerror}') from error
+        if self._frames is not None:
+            self._frames.take(topic, data, t)
 
     def flush(self) -> None:
         """Hand everything written so far to the operating system: it survives a SIGKILL."""

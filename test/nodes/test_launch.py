@@ -28,7 +28,8 @@ def bringup(monkeypatch):
     classes = {'launch': ['LaunchDescription'],
                'launch.actions': ['DeclareLaunchArgument', 'ExecuteProcess', 'OpaqueFunction'],
                'launch.substitutions': ['LaunchConfiguration'],
-               'launch_ros': [], 'launch_ros.actions': ['Node']}
+               'launch_ros': [], 'launch_ros.actions': ['Node'],
+               'launch_ros.parameter_descriptions': ['ParameterValue']}
     for name, members in classes.items():
         module = ModuleType(name)
         for member in members:
@@ -49,6 +50,7 @@ def bringup(monkeypatch):
                             lambda self, context: given[self.args[0]], raising=False)
         return module.actions(None)
 
+    monkeypatch.setattr(module, 'has_state_publisher', lambda: False)
     module.start = start
     return module
 
@@ -79,6 +81,20 @@ def test_separate_nodes_and_no_simulator_for_another_backend(bringup):
     assert [n.kwargs['executable'] for n in nodes] == [
         'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node', 'viewer_node']
     assert all(n.kwargs['namespace'] == 'robot1' for n in nodes)
+
+
+def test_robot_state_publisher_where_it_is_installed_has_the_links(bringup, monkeypatch):
+    monkeypatch.setattr(bringup, 'has_state_publisher', lambda: True)
+    state_publisher, *_ = bringup.start(viewer='true', namespace='robot1', composed='false')
+    given = state_publisher.kwargs
+    assert (given['package'], given['namespace']) == ('robot_state_publisher', 'robot1')
+    text = given['parameters'][0]['robot_description']
+    assert text.args[0].startswith('<?xml') and text.kwargs == {'value_type': str}
+    viewer, = (n for n in bringup.start(viewer='true', composed='false')
+               if n.kwargs.get('name') == 'viewer_node')
+    assert viewer.kwargs['parameters'][0] == {'links': False}
+    assert all(n.kwargs['package'] != 'robot_state_publisher'
+               for n in bringup.start(composed='false'))
 
 
 def test_simulator_and_bridges_meet_at_the_same_ports(bringup):

@@ -1,11 +1,17 @@
 """The viewer draws what the topics say."""
 
+import time
+
 import numpy as np
 import pytest
 import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from std_msgs.msg import String
 
 from beetle_omni_ros.control.base import Command, PoseTarget
-from beetle_omni_ros.nodes import convert
+from beetle_omni_ros.nodes import convert, qos
+from beetle_omni_ros.nodes.transform_message import transform_message
 from beetle_omni_ros.nodes.viewer_node import ViewerNode
 from beetle_omni_ros.robot import rotations
 
@@ -15,12 +21,15 @@ class Sent(list):
 
     publish = list.append
 
+    def get_subscription_count(self):
+        return 1
+
 
 @pytest.fixture
 def viewer(ros_domain):
     rclpy.init(domain_id=ros_domain)
     node = ViewerNode()
-    node._markers = Sent()
+    node._markers, node._transforms = Sent(), Sent()
     yield node
     node.destroy_node()
     rclpy.try_shutdown()
@@ -49,6 +58,61 @@ def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     assert markers['rotor1'].header.frame_id == 'world'
 
 
-def test_the_description_is_the_shipped_one():
-    from beetle_omni_ros.nodes.viewer_node import _text
-    assert '<robot' in _text('')
+def test_the_frames_of_all_links_form_one_tree_and_stand_where_the_rotors_are(ros_domain):
+    if transform_message() is None:
+        pytest.skip('no tf2_msgs here, and none can be made')
+    context = Context()
+    rclpy.init(context=context, domain_id=ros_domain)
+    listener = rclpy.create_node('listener', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(listener)
+    heard = {'/tf': [], '/tf_static': [], 'robot_description': []}
+    for topic, profile in (('/tf', qos.EVENT), ('/tf_static', qos.LATCHED)):
+        listener.create_subscription(transform_message(), topic, heard[topic].append, profile)
+    listener.create_subscription(String, 'robot_description', heard['robot_description'].append,
+                                 qos.LATCHED)
+    rclpy.init(domain_id=ros_domain)
+    node = ViewerNode()
+    try:
+        rotation = rotations.from_rpy(0.4, -0.2, 1.0)
+        position, tilt = np.array([1.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, 0.0, -0.3])
+        node._odom = convert.Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
+        node._joints = convert.Joints(4.9, tilt, np.zeros(4))
+        end = time.monotonic() + 20
+        while not all(heard.values()) and time.monotonic() < end:
+            node._moved = None
+            node._move()
+            executor.spin_once(timeout_sec=0.1)
+        frames = {frame.child_frame_id: frame for topic in ('/tf', '/tf_static')
+                  for frame in heard[topic][-1].transforms}
+        assert set(frames) == {'base_link', 'main_body', 'end_effector', 'imu', *(
+            f'{kind}{k}' for kind in ('module', 'rotor') for k in (1, 2, 3, 4))}
+        assert frames['base_link'].header.stamp.sec == 5
+        for k in range(4):
+            at, turn, name = np.zeros(3), np.array([0, 0, 0, 1.0]), f'rotor{k + 1}'
+            while name != 'world':
+                frame = frames[name]
+                here = convert.xyzw(frame.transform.rotation)
+                at = rotations.matrix(here) @ at + convert.xyz(frame.transform.translation)
+                turn, name = rotations.multiply(here, turn), frame.header.frame_id
+            axes = rotations.matrix(rotation)
+            assert at == pytest.approx(position + axes @ node._robot.rotors.positions[k])
+            tilted = rotations.matrix(rotations.exp(node._robot.tilt_axes[k] * tilt[k]))
+            assert rotations.matrix(turn)[:, 2] == pytest.approx(axes @ tilted[:, 2])
+        assert '<robot' in heard['robot_description'][0].data
+    finally:
+        node.destroy_node()
+        listener.destroy_node()
+        executor.shutdown()
+        rclpy.try_shutdown()
+        rclpy.try_shutdown(context=context)
+
+
+def test_nothing_is_drawn_where_nobody_looks(viewer):
+    viewer._odom = convert.Odom(5.0, np.zeros(3), np.zeros(3), np.array([0, 0, 0, 1.0]),
+                                np.zeros(3))
+    for publisher in (viewer._markers, viewer._transforms):
+        publisher.get_subscription_count = lambda: 0
+    viewer._draw()
+    viewer._move()
+    assert not viewer._markers and not viewer._transforms

@@ -9,13 +9,19 @@ import sys
 
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
+from scipy.spatial.transform import Rotation
 from synthetic_flights import fly
 import yaml
 
 from beetle_omni_ros import cli
+from beetle_omni_ros.messages.bag_types import BAG, to_bytes
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.urdf import description, joints
 from beetle_omni_ros.runs.bag import BagError, BagWriter, read_bag
 from beetle_omni_ros.runs.tasks import make_task
 
@@ -157,3 +163,75 @@ def test_ros2_bag_tells_and_plays(packed):
     assert '/imu/data_raw' in told and 'mcap' in told
     subprocess.run(['ros2', 'bag', 'play', '--rate', '10', str(packed)], capture_output=True,
                    timeout=60, check=True)
+
+
+def test_the_tree_of_frames_stands_in_the_bag_as_the_estimate_and_the_joints_say(tmp_path):
+    robot = RobotParameters.load()
+    with BagWriter(tmp_path / 'bag', namespace='robot1', description=description()) as writer:
+        fly(writer, make_task('hover'), duration=2.0, start=1.7e9)
+    heard = {}
+    with AnyReader([tmp_path / 'bag']) as reader:
+        for connection, t, data in reader.messages():
+            heard.setdefault(connection.topic, []).append(
+                (t, reader.deserialize(data, connection.msgtype)))
+    assert len(heard['/tf_static']) == len(heard['/robot1/robot_description']) == 1
+    assert heard['/robot1/robot_description'][0][1].data == description()
+    length = 1e-9 * (heard['/robot1/odom'][-1][0] - heard['/robot1/odom'][0][0])
+    assert 48 * length <= len(heard['/tf']) <= 51 * length + 1      # 50 a second
+    topics = {entry['topic_metadata']['name']: entry['topic_metadata']
+              for entry in information(tmp_path / 'bag')['topics_with_message_count']}
+    assert topics['/tf_static']['offered_qos_profiles'][0]['durability'] == 'transient_local'
+    fixed = {frame.child_frame_id: frame for frame in heard['/tf_static'][0][1].transforms}
+    stamped = {message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec: message
+               for _, message in heard['/robot1/odom']}
+    angles = {message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec: message.position
+              for _, message in heard['/robot1/joint_states']}
+    for _, message in heard['/tf'][::20]:
+        frames = {**fixed, **{frame.child_frame_id: frame for frame in message.transforms}}
+        assert {frame.header.frame_id for frame in frames.values()} <= {'world', *frames}
+        base, module = frames['base_link'].header.stamp, frames['module1'].header.stamp
+        odom = stamped[base.sec + 1e-9 * base.nanosec]
+        q = angles[module.sec + 1e-9 * module.nanosec]
+        for k in range(4):
+            axes, at = placed(frames, f'rotor{k + 1}')
+            here = odom.pose.pose
+            body = Rotation.from_quat([here.orientation.x, here.orientation.y,
+                                       here.orientation.z, here.orientation.w])
+            place = np.array([here.position.x, here.position.y, here.position.z])
+            np.testing.assert_allclose(
+                at, place + body.apply(robot.rotors.positions[k]), atol=1e-7)
+            tilt = Rotation.from_rotvec(q[k] * robot.tilt_axes[k])
+            np.testing.assert_allclose(axes.apply([0, 0, 1]), (body * tilt).apply([0, 0, 1]),
+                                       atol=1e-7)
+
+
+def placed(frames, name):
+    """Rotation and position of a frame in world."""
+    axes, at = Rotation.identity(), np.zeros(3)
+    while name != 'world':
+        frame = frames[name]
+        turn, shift = frame.transform.rotation, frame.transform.translation
+        here = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
+        axes, at = here * axes, here.apply(at) + [shift.x, shift.y, shift.z]
+        name = frame.header.frame_id
+    return axes, at
+
+
+def test_odd_joint_states_cost_frames_and_nothing_else(tmp_path):
+    kind = 'sensor_msgs/msg/JointState'
+    odd = BAG.new(kind)
+    odd.name, odd.position = ['gimbal1'], BAG.doubles([0.1])
+    with BagWriter(tmp_path / 'bag', description=description()) as writer:
+        writer.write_raw('/joint_states', kind, b'\x00\x01\x00\x00\xff', 1.0)
+        writer.write_odom(1.0, np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3))
+        writer.write_raw('/joint_states', kind, to_bytes(odd, kind), 1.1)
+        writer.write_odom(1.1, np.full(3, np.nan), np.array([0, 0, 0, 1.0]), np.zeros(3),
+                          np.zeros(3))
+        assert writer.counts['/tf'] == 0 and writer.counts['/odom'] == 2
+
+
+def test_a_description_that_is_none_is_refused_in_one_line(tmp_path):
+    for text in ('hello', '<robot><joint name="a" type="prismatic"/></robot>',
+                 '<robot><joint name="a" type="fixed"/></robot>'):
+        with pytest.raises(ParameterError, match='robot description: not usable'):
+            joints(text)
