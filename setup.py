@@ -152,8 +152,7 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            f'beetle_omni = {PACKAGE}.cli:main',
-            *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in NODES),
+            *(f'{name} = {PACKAGE}.start:{name}' for name in ('beetle_omni', *NODES)),
         ],
         'beetle_omni_ros.controllers': controllers(),
     },

@@ -19,10 +19,14 @@ ARGUMENTS = {
     # name: (default, choices or None, description)
     'backend': ('sim', ['sim', 'none'],
                 'who provides the sensors: the simulator, or nodes started elsewhere'),
-    'actuators': ('bridges', ['bridges', 'direct', 'none'],
+    'actuators': ('', ['', 'bridges', 'direct', 'none'],
                   'how commands reach the actuators: through joint_bridge_node and '
                   'rotor_bridge_node (with backend sim to emulated devices); straight into the '
-                  'simulated plant; or by nodes started elsewhere'),
+                  'simulated plant; or by nodes started elsewhere; empty: bridges, direct with '
+                  'clock simulated'),
+    'clock': ('system', ['system', 'simulated'],
+              'real time, or simulated time on /clock, which waits for nodes that are late: for a '
+              'computer that is too slow'),
     'autostart': ('', ['', 'none', 'configure', 'activate'],
                   'how far joint_bridge_node goes by itself; empty: activate with backend sim, '
                   'else configure'),
@@ -64,16 +68,18 @@ def wanted(given):
     from beetle_omni_ros.nodes.plan import Wanted
     from beetle_omni_ros.nodes.private import scratch
     simulated = given['backend'] == 'sim'
-    emulated = simulated and given['actuators'] == 'bridges'
+    actuators = given['actuators'] or (
+        'direct' if given['clock'] == 'simulated' else 'bridges')
+    emulated = simulated and actuators == 'bridges'
     # in a folder of its own: ports of two simulations must not meet
     return Wanted(
-        simulated=simulated, ports=str(scratch('ports')) if emulated else '',
+        simulated=simulated, actuators=actuators, ports=str(scratch('ports')) if emulated else '',
         bag=given['record'] if given['record'] and not has_ros2_bag() else '',
         seed=int(given['seed']),
         **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
         **{key: given[key] for key in (
-            'actuators', 'autostart', 'compression', 'conditions', 'controller',
-            'motor_board_file', 'plant_file', 'policy', 'robot_file', 'servo_bus_file', 'task')})
+            'autostart', 'clock', 'compression', 'conditions', 'controller', 'motor_board_file',
+            'plant_file', 'policy', 'robot_file', 'servo_bus_file', 'task')})
 
 
 def has_state_publisher():
@@ -110,7 +116,7 @@ def composed(arguments, nodes, namespace):
                  for argument in ('-p', f'{node}:{key}:={value}')]
     if namespace:
         overrides += ['-r', f'__ns:=/{namespace}']
-    return ExecuteProcess(cmd=[sys.executable, '-m', f'{PACKAGE}.nodes.composed', *arguments,
+    return ExecuteProcess(cmd=[sys.executable, '-m', f'{PACKAGE}.start', 'composed', *arguments,
                                '--ros-args', *overrides], output='screen')
 
 

@@ -117,10 +117,11 @@ def test_every_executable_has_its_function(setup_arguments):
     for script in scripts:
         _, target = (part.strip() for part in script.split('='))
         module, function = target.split(':')
-        if module.startswith(f'{PACKAGE}.nodes') and not HAS_ROS:
-            assert importlib.util.find_spec(module), f'{script}: no such module'
+        program, = getattr(import_module(module), function).args
+        if program.startswith(f'{PACKAGE}.nodes') and not HAS_ROS:
+            assert importlib.util.find_spec(program), f'{script}: no such module'
             continue
-        assert callable(getattr(import_module(module), function)), script
+        assert callable(import_module(program).main), script
 
 
 def test_every_node_file_is_an_executable(setup_arguments):

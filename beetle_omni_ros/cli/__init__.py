@@ -15,7 +15,7 @@ from typer.main import get_command
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.cli import flights, gaps, hardware, listing, training
-from beetle_omni_ros.cli.options import fail, INTERRUPTED, UNUSABLE
+from beetle_omni_ros.cli.options import fail, INTERRUPTED, refuse_empty, UNUSABLE, usage_text
 from beetle_omni_ros.robot.resources import PACKAGE
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -25,7 +25,7 @@ HARDWARE_MODULES = ('dynamixel_sdk', 'pymavlink', 'serial')
 TRAIN_MODULES = ('onnx', 'onnxscript', 'rsl_rl', 'tensorboard', 'tensordict', 'torch')
 HELP = {'help_option_names': ['-h', '--help']}
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, context_settings=HELP,
+app = typer.Typer(no_args_is_help=True, context_settings=HELP,
                   help='Fly, evaluate and report on the tiltable quadrotor.')
 for command in (flights.fly, flights.evaluate, flights.compare, flights.faults, flights.report,
                 flights.film, gaps.gap, training.train, hardware.check, listing.controllers):
@@ -55,6 +55,7 @@ def main(args: list[str] | None = None) -> int:
     if args[:1] == ['gap']:
         args = ['gap', *gaps.spread(args[1:])]
     try:
+        refuse_empty(args)
         status = get_command(app).main(args=args, prog_name='beetle_omni', standalone_mode=False)
         return status if isinstance(status, int) else 0
     except ModuleNotFoundError as error:
@@ -76,8 +77,8 @@ def main(args: list[str] | None = None) -> int:
     except Exception as error:
         # usage errors of typer's parser, and bag errors, without importing either for --help
         if hasattr(error, 'format_message'):
-            text = error.format_message()  # empty after the help of a bare `beetle_omni`
-            return fail(f'{text} See beetle_omni --help.', UNUSABLE) if text else UNUSABLE
+            text = usage_text(error, args)  # empty after the help of a bare `beetle_omni`
+            return fail(text, UNUSABLE) if text else UNUSABLE
         if type(error).__name__ == 'BagError':
             return fail(error, UNUSABLE)
         raise

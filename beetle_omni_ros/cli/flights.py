@@ -17,6 +17,7 @@ from beetle_omni_ros.cli.options import (
     DiscoveryOption,
     fail,
     FAILED,
+    FaultsOption,
     JsonOption,
     KNOWN,
     OtherRobotOption,
@@ -56,6 +57,7 @@ def fly(bag: Annotated[Path, typer.Option(
         composed: Annotated[bool, typer.Option(
             '--composed/--separate', help='One process, and one for the bridges; or one for '
                                           'each node.')] = True,
+        faults: FaultsOption = None,
         domain_id: Annotated[Optional[int], typer.Option(
             '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
         discovery: DiscoveryOption = None,
@@ -67,15 +69,15 @@ def fly(bag: Annotated[Path, typer.Option(
     Example: beetle_omni fly --controller nmpc --task waypoints --bag my_flight
     """
     check_flight(task=task, seed=seed, conditions=conditions, bag=bag, compression=compression,
-                 json_path=json_path, files=(robot, plant, policy))
+                 json_path=json_path, files=(robot, plant, policy, faults))
     from beetle_omni_ros.nodes.fly import FlightError, run_fly
     try:
         code = run_fly(controller=controller, task=task, bag=bag, compression=compression,
                        seed=seed, conditions=conditions, actuators=actuators, clock=clock,
                        robot=robot, plant=plant, policy=policy,
                        allow_other_robot=allow_other_robot, standby=standby,
-                       composed=composed, json_path=json_path, domain_id=domain_id,
-                       discovery=discovery)
+                       composed=composed, faults=faults, json_path=json_path,
+                       domain_id=domain_id, discovery=discovery)
     except FlightError as error:
         raise typer.Exit(fail(error, FAILED)) from None
     raise typer.Exit(code if isinstance(code, int) else 0)
@@ -99,9 +101,7 @@ def evaluate(controllers: Annotated[str, typer.Option(
                  '--bag', metavar='DIR', help='New folder for the bag; with several controllers '
                                               'it holds one bag for each.')] = None,
              compression: CompressionOption = 'none',
-             faults: Annotated[Optional[Path], typer.Option(
-                 '--faults', metavar='FILE', help='What fails, when and for how long (YAML, see '
-                                                  'docs/faults.md).')] = None,
+             faults: FaultsOption = None,
              json_path: JsonOption = None):
     """
     Fly a task in one process: deterministic and faster than real time.

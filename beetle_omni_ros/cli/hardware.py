@@ -33,7 +33,7 @@ def joint(logs: Annotated[list[Path], typer.Argument(
     """
     log, *more = logs      # `--validate a.csv b.csv` leaves b.csv here
     if more and not validate:
-        raise ParameterError(f'{more[0]}: one log is identified from; further ones follow '
+        raise ParameterError(f'{more[0]}: one log is identified from; expected further ones after '
                              '--validate')
     from beetle_omni_ros.identify.command import run_identify_joint
     run_identify_joint(log, validate=[*(validate or []), *more], robot=robot, report=report,

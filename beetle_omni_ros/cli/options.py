@@ -44,6 +44,9 @@ DiscoveryOption = Annotated[Optional[str], typer.Option(
     help='Who can find the nodes. Default: programs of this computer alone.')]
 CompressionOption = Annotated[str, typer.Option(
     '--compression', metavar='none|zstd', help='Of the chunks in the bag.')]
+FaultsOption = Annotated[Optional[Path], typer.Option(
+    '--faults', metavar='FILE', help='What fails, when and for how long (YAML, see '
+                                     'docs/faults.md).')]
 JsonOption = Annotated[Optional[Path], typer.Option(
     '--json', metavar='FILE', help='Write the results there as JSON.')]
 
@@ -54,12 +57,50 @@ def fail(error: Exception | str, status: int) -> int:
     return status
 
 
+MAY_BE_EMPTY = ('--namespace',)
+
+
+def refuse_empty(args: list[str]) -> None:
+    """Refuse '' as a value: as a path it would be the working folder, as a name nothing."""
+    for option, value in zip(['', *args], args):
+        if value == '' and option not in MAY_BE_EMPTY:
+            where = option if option.startswith('-') else 'argument'
+            raise ParameterError(f"{where} '': expected a value")
+
+
+def usage_text(error: Exception, args: list[str]) -> str:
+    """
+    One line about a usage error of typer's parser: what was given where, what was expected.
+
+    Args:
+        error: with ``format_message()``; a wrong value has ``param`` and ``ctx``.
+        args: of the command line, in which the value is looked for.
+
+    """
+    text, context = error.format_message(), getattr(error, 'ctx', None)
+    if not text:
+        return ''
+    names = getattr(getattr(error, 'param', None), 'opts', ())
+    if type(error).__name__ == 'BadParameter' and names:
+        given = [value for name, value in zip(args, args[1:]) if name in names] + [
+            arg.partition('=')[2] for arg in args if arg.partition('=')[0] in names and '=' in arg]
+        # pydantic's words, of newer versions of typer
+        wanted = str(error.message).partition(', unable')[0].replace('Input should be', 'expected')
+        text = f"{names[0]} '{given[0]}': {wanted}." if given else text
+    command = context.command_path if context else 'beetle_omni'
+    return f'{text} See {command} --help.'
+
+
 def check_flight(*, task, seed, conditions, bag, compression, json_path, files):
     """Refuse unusable input before anything long starts."""
     from beetle_omni_ros.runs.json_file import check_writable
+    from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS
     from beetle_omni_ros.runs.tasks import make_task
     if conditions not in CONDITIONS:
         raise ParameterError(f"--conditions '{conditions}': expected {' or '.join(CONDITIONS)}")
+    if compression not in COMPRESSIONS:
+        raise ParameterError(f"--compression '{compression}': expected "
+                             f"{' or '.join(COMPRESSIONS)}")
     for file in files:
         if file is not None and not file.is_file():
             raise ParameterError(f'{file}: no such file')

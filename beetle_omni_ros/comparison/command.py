@@ -36,6 +36,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import write_json
 
 PAGE, NUMBERS, TEXT = 'comparison.html', 'comparison.json', 'README.md'
+HOW = '../how-to/comparison.md'     # from a folder in docs/ alone
 WIDE = 120  # characters of a terminal that takes all columns
 KEPT = '.flights'  # folder of finished flights in the output's, unless another is named
 
@@ -208,11 +209,12 @@ def _write(results, flown, output, console):
         flown, key=lambda flight: (results['meta']['controllers'].index(flight.controller),
                                    flight))}
     made = page.sections(results, ordered)
+    how = HOW if (output / HOW).is_file() else ''
     try:
         for picture in page.pictures(made):
             (output / f'{picture.name}.png').write_bytes(picture.data)
         for name, text in ((PAGE, page.page(results, made)),
-                           (TEXT, page.markdown(results, made))):
+                           (TEXT, page.markdown(results, made, how))):
             temporary = output / f'{name}.tmp'
             temporary.write_text(text, encoding='utf-8')
             temporary.replace(output / name)

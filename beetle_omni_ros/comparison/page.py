@@ -207,11 +207,15 @@ def _html_section(section, results):
             f'{blocks}</section>\n')
 
 
-def markdown(results: dict, made: list[Section]) -> str:
-    """Write the same for readers of the repository, with pictures as files beside it."""
+def markdown(results: dict, made: list[Section], how: str = '') -> str:
+    """
+    Write the same for readers of the repository, with pictures as files beside it.
+
+    ``how`` is a link to the page that says how it is made, '' where that page is not there.
+    """
     parts = [f'# {TITLE}\n', 'Made by `make compare`; the same with every detail is '
-             '`comparison.html`, all numbers are in `comparison.json`. '
-             '[How it is made](../how-to/comparison.md).\n',
+             '`comparison.html`, all numbers are in `comparison.json`.'
+             + (f' [How it is made]({how}).\n' if how else '\n'),
              '\n'.join(f'- {line}' for line in facts(results)) + '\n',
              '\n'.join(f'- **{term}**: {text}' for term, text in legend(results)) + '\n']
     for section in made:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
+from time import time
 from types import MappingProxyType
 
 from rich.console import Console
@@ -70,7 +71,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         if bag is not None:
             writer = stack.enter_context(BagWriter(
                 bag, meta=meta, topics=tuple(topics_with([name])), compression=compression,
-                description=description()))
+                description=description(), epoch=int(time())))
             recorder = Tee(memory, writer)
         estimator = EkfParameters.load()
         supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),

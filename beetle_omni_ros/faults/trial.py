@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from time import time
 
 import numpy as np
 
@@ -69,7 +70,8 @@ def fly_trial(trial: Trial, listed: FaultList, bags: Path | None = None) -> dict
             recorder = None
             if folder:
                 recorder = stack.enter_context(BagWriter(
-                    folder, meta={**asdict(trial), 'faults': [str(one) for one in case.strike]}))
+                    folder, epoch=int(time()),
+                    meta={**asdict(trial), 'faults': [str(one) for one in case.strike]}))
             result.update(_fly(trial, listed, recorder))
     except Exception as error:          # a campaign goes on, and tells what was raised
         result.update(outcome='error', error=f'{type(error).__name__}: {error}'[:200])

@@ -59,7 +59,7 @@ def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expec
     except FileNotFoundError:
         raise LogError(f'{path}: no such file') from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = getattr(error, 'strerror', None) or f'not a CSV text file ({error})'
+        reason = f"not a CSV text file ({getattr(error, 'strerror', None) or error})"
         raise LogError(f'{path}: {reason}') from None
     lines = [(number, row) for number, row in lines
              if any(row) and not row[0].startswith('#')]

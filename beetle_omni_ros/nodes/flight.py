@@ -46,6 +46,7 @@ class Flight:
         task: what to fly.
         bars: where to show how it goes.
         may_be_slow: try although the simulator does not keep real time.
+        faults: parameter of sim_node from the task's start on.
 
     Attributes:
         measured: CPU of the graph and of its bridges [% of one core], latencies [ms], cycles of
@@ -54,11 +55,11 @@ class Flight:
     """
 
     def __init__(self, graph: Graph, operator: Operator, task: Task, bars: Progress,
-                 may_be_slow: bool = True):
+                 may_be_slow: bool = True, faults: str = ''):
         """Prepare the bar."""
         self._graph, self._operator, self._task = graph, operator, task
         self._bridges = [node for node in graph.nodes if node in BRIDGES]
-        self._bars, self._may_be_slow = bars, may_be_slow
+        self._bars, self._faults, self._may_be_slow = bars, faults, may_be_slow
         self._bar = bars.add_task('', total=task.duration, at='')
         self._reported: set[str] = set()
         self.measured: dict[str, float] = {}
@@ -112,6 +113,8 @@ class Flight:
         self._counts = BridgeCounts(operator.values)
         cpu, bridges_cpu = graph.cpu_seconds(), graph.cpu_seconds(bridges=True)
         start, steady = operator.time(), time.monotonic()
+        if self._faults:
+            self._strike()
         left = operator.countdown(self._task.duration + SPARE_TIME)
         while not operator.progress.startswith('done'):
             self._look()
@@ -127,6 +130,15 @@ class Flight:
                 raise FlightError(f"the flight ended early, supervisor in '{operator.state}'")
             if next(left, None) is None:
                 raise FlightError(f"the task hangs at '{operator.progress}'")
+
+    def _strike(self):
+        """Let the time of the faults begin with the task."""
+        operator = self._operator
+        if not operator.wait(lambda: operator.progress.startswith('flying'), TAKEOFF_TIMEOUT):
+            raise FlightError(f"the task does not begin: '{operator.progress}'")
+        accepted, answer = operator.set('sim_node', 'faults', self._faults)
+        if not accepted:
+            raise FlightError(f'sim_node refuses the faults: {answer}')
 
     def _take_latencies(self):
         operator = self._operator

@@ -29,6 +29,7 @@ from beetle_omni_ros.runs.bag import add_meta, BagError, check_new, read_bag
 from beetle_omni_ros.runs.json_file import check_writable, write_json
 from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import make_task, Task
+from beetle_omni_ros.sim.faults import listed
 
 INTERRUPTED = 130
 CLOCKS = {'auto': ('system', 'simulated'), 'system': ('system',), 'simulated': ('simulated',)}
@@ -40,7 +41,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             actuators: str | None = None,
             clock: str = 'auto', robot: Path | None = None, plant: Path | None = None,
             policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
-            composed: bool = True, json_path: Path | None = None,
+            composed: bool = True, faults: Path | None = None, json_path: Path | None = None,
             domain_id: int | None = None, discovery: str | None = None,
             console: Console | None = None) -> int:
     """
@@ -64,6 +65,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         allow_other_robot: fly a policy that was trained for other robot parameters.
         standby: run those that stand by too, so that they can be selected in flight.
         composed: all nodes in one process, or one process for each.
+        faults: file of what fails, when since the task's start and how long.
         json_path: file for the results.
         domain_id: ROS domain; default a free one.
         discovery: who can find the nodes, see :mod:`discovery`; default this computer alone.
@@ -89,6 +91,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             flown = make_task(task, seed, registry.find(controller).reach(
                 RobotParameters.load(robot)))
             RobotParameters.load(plant or robot)
+            struck = listed.load_faults(faults) if faults else []
+            actuators = _actuators_for(struck, actuators)
             clocks = _clocks(clock, actuators)
             wanted = Wanted(
                 controller=controller, policy=str(policy or ''), standby=standby,
@@ -104,12 +108,14 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
                     'controller': controller, 'composed': composed}
+            if struck:
+                meta['faults'] = [str(fault) for fault in struck]
             for kind in clocks:
                 meta |= {'clock': kind, 'actuators': actuators or (
                     'direct' if kind == 'simulated' else 'emulated')}
                 graph = _make_graph(wanted, meta, folder, number)
                 try:
-                    status = _fly(graph, controller, flown, meta, console,
+                    status = _fly(graph, controller, flown, meta, console, listed.text(struck),
                                   may_be_slow=kind == clocks[-1])
                     break
                 except TooSlowError as error:
@@ -126,6 +132,27 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
     except KeyboardInterrupt:
         print('beetle_omni fly: interrupted; everything is stopped', file=sys.stderr)
         return INTERRUPTED
+
+
+def _actuators_for(faults, actuators):
+    """
+    Actuators for a flight with these faults; emulated devices have faults of their own.
+
+    Raises:
+        ParameterError: a fault that no simulation of the graph can make.
+
+    """
+    for fault in faults:
+        if fault.is_process:
+            raise ParameterError(f"--faults: '{fault.kind}' strikes a process; expected a fault "
+                                 'of the robot or its sensors; beetle_omni faults --ros kills '
+                                 'processes')
+        if fault.changes(*listed.DEVICES):
+            if actuators == 'emulated':
+                raise ParameterError(f"--faults: '{fault.kind}' strikes a device; expected "
+                                     '--actuators direct')
+            actuators = 'direct'
+    return actuators
 
 
 def _clocks(clock, actuators):
@@ -176,7 +203,7 @@ def _absolute(path):
 
 
 def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console,
-         may_be_slow: bool) -> int:
+         faults: str, may_be_slow: bool) -> int:
     """Start, fly, land, stop; report every fault by the node's name."""
     status = runner.OK
     operator = None
@@ -186,7 +213,7 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
         columns = (TextColumn('{task.description}'), BarColumn(),
                    TextColumn('{task.fields[at]}'), TimeElapsedColumn())
         with Progress(*columns, console=console, transient=True) as bars:
-            flight = Flight(graph, operator, task, bars, may_be_slow)
+            flight = Flight(graph, operator, task, bars, may_be_slow, faults)
             try:
                 flight.fly()
             except TooSlowError:

@@ -39,9 +39,7 @@ class Graph:
                  composed: bool = True, simulated: bool = False):
         """Prepare; :meth:`start` starts."""
         if simulated:
-            parameters = {node: {**values, **({'clock': 'simulated'} if node == 'sim_node'
-                                              else {'use_sim_time': True})}
-                          for node, values in parameters.items()}
+            parameters = plan.in_simulated_time(parameters)
         self.folder, self.domain = Path(folder), domain
         self.composed, self.simulated = composed, simulated
         self.nodes = list(parameters)

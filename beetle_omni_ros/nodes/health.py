@@ -90,7 +90,14 @@ class Health:
         entry = self._inputs[topic]
         entry.received += 1
         entry.age = age
-        entry.seen = self._node.elapsed()
+        first, entry.seen = entry.seen is None, self._node.elapsed()
+        if first and entry.stale_after is not None and not self.waits_for():
+            self._node.get_logger().info('all has come that it waited for')
+
+    def waits_for(self) -> list[str]:
+        """Topics that should come and have not yet."""
+        return [topic for topic, entry in self._inputs.items()
+                if entry.seen is None and entry.stale_after is not None]
 
     def rejected(self, topic: str, reason: str, kind: str = '') -> None:
         """

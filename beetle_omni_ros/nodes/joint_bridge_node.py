@@ -77,6 +77,10 @@ class JointBridgeNode(LifecycleFlightNode):
         self.start_by_itself(self.parameters.autostart)
         self.changed()
 
+    def waits_for(self):
+        """The port, or the operator."""
+        return self._told.replace('waiting:', 'its servos:')
+
     # --- lifecycle ----------------------------------------------------------------------------
 
     def configure(self):

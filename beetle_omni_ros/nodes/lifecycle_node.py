@@ -34,6 +34,7 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
         self.refusal = ''
         self._goal = ''
         self._start_timer = None
+        self._starts = False    # by itself, at this moment
         # rclpy lets an impossible transition end the process.
         self._answer_change = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
@@ -66,12 +67,14 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
                                                   clock=self.steady_clock)
 
     def _try_to_start(self):
+        self._starts = True
         if self.stage == UNCONFIGURED:
             self.trigger_configure()
         if self.stage == INACTIVE and self._goal == ACTIVE:
             self.trigger_activate()
         if self.stage not in (UNCONFIGURED, INACTIVE) or self.stage == self._goal:
             self._start_timer.cancel()
+        self._starts = False
         self.changed()
 
     # --- called by rclpy ----------------------------------------------------------------------
@@ -116,12 +119,19 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
             undo()
             self.refusal = ' '.join(str(error).split())
             if self.refusal != before:      # attempts are repeated, lines are not
-                self.get_logger().error(f'cannot {what}: {self.refusal}')
+                self._say_refusal(f'cannot {what}: {self.refusal}')
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             self.get_logger().fatal(f'cannot {what}: {type(error).__name__}: {error}')
             raise
         return TransitionCallbackReturn.SUCCESS
+
+    def _say_refusal(self, text):
+        """As an error to an operator who asked; who starts by itself waits and tries again."""
+        if self._starts:
+            self.get_logger().warning(f'{text}; tries again')
+        else:
+            self.get_logger().error(text)
 
     def _on_change_state(self, request, response):
         try:

@@ -131,6 +131,15 @@ class FlightNode(Node):
         if self._twin_checks >= TWIN_CHECKS:
             self._twin_timer.cancel()
 
+    def waits_for(self) -> str:
+        """What has to come before it does its work; '' where nothing has to."""
+        return ', '.join(self.health.waits_for())
+
+    def introduce(self) -> None:
+        """Say in one line what it is and what it waits for."""
+        what, waits = (type(self).__doc__ or '').strip().partition('\n')[0], self.waits_for()
+        self.get_logger().info(f"{what} Waits for {waits or 'nothing'}.")
+
     def close(self) -> None:
         """Release what only this node holds; each node says what."""
 

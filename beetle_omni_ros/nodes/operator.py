@@ -6,7 +6,9 @@ from collections.abc import Iterator, Sequence
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.srv import SetParameters
 import rclpy
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -137,6 +139,17 @@ class Operator:
         if not self.wait(future.done, timeout):
             return False, f'supervisor_node does not answer to {name}'
         return future.result().success, future.result().message
+
+    def set(self, node: str, name: str, value, timeout: float = 5.0) -> tuple[bool, str]:
+        """Set a parameter of a node: (accepted, its answer)."""
+        client = self._node.create_client(SetParameters, f'{node}/set_parameters')
+        if not self.wait(client.service_is_ready, timeout):
+            return False, f'{node} is not there'
+        future = client.call_async(SetParameters.Request(parameters=[
+            Parameter(name, value=value).to_parameter_msg()]))
+        if not self.wait(future.done, timeout):
+            return False, f'{node} does not answer'
+        return future.result().results[0].successful, future.result().results[0].reason
 
     def values(self, status: str) -> dict[str, str]:
         """Values of a diagnostic status by key; empty when it never came."""

@@ -50,6 +50,7 @@ class Wanted:
         bag: folder for recorder_node; '' for no recording.
         compression: of the bag, 'none' or 'zstd'.
         viewer: whether viewer_node runs.
+        clock: 'system', or 'simulated': time on /clock that waits for nodes that are late.
 
     """
 
@@ -71,6 +72,7 @@ class Wanted:
     bag: str = ''
     compression: str = 'none'
     viewer: bool = False
+    clock: str = 'system'
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,12 @@ def plan(wanted: Wanted) -> Plan:
     List the nodes of a graph.
 
     Raises:
-        ParameterError: the active controller cannot fly.
+        ParameterError: the active controller cannot fly, or the clock does not go with the rest.
 
     """
+    if wanted.clock == 'simulated' and (not wanted.simulated or wanted.actuators == 'bridges'):
+        raise ParameterError("clock 'simulated': devices keep real time; expected the simulator, "
+                             'with direct actuators')
     believed = {'robot_file': wanted.robot_file} if wanted.robot_file else {}
     true = {'robot_file': wanted.plant_file} if wanted.plant_file else believed
     controllers, left_out = controller_nodes(
@@ -119,8 +124,15 @@ def plan(wanted: Wanted) -> Plan:
         ('viewer_node', wanted.viewer, believed),
         *((name, bridges, bridges.get(name)) for name in BRIDGES))
     # Copies: ROS reads no parameter file in which two nodes share a list.
-    return Plan({name: deepcopy(values) for name, is_there, values in table if is_there},
-                left_out)
+    nodes = {name: deepcopy(values) for name, is_there, values in table if is_there}
+    return Plan(in_simulated_time(nodes) if wanted.clock == 'simulated' else nodes, left_out)
+
+
+def in_simulated_time(nodes: Parameters) -> Parameters:
+    """Let sim_node make the time of all others."""
+    return {name: {**values, **({'clock': 'simulated'} if name == 'sim_node'
+                                else {'use_sim_time': True})}
+            for name, values in nodes.items()}
 
 
 def _bridges(wanted, believed):

@@ -12,7 +12,6 @@ import time
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import JointState
 
@@ -77,14 +76,6 @@ class Observer(Operator):
     def _on_asked(self, message):
         if np.nansum(message.effort) > self._limits.idle_thrust:
             self.thrust_at = time.monotonic()
-
-    def set(self, node: str, name: str, value) -> bool:
-        """Whether a node takes the value of a parameter."""
-        client = self.client(node)
-        if not self.wait(client.services_are_ready, 5.0):
-            return False
-        future = client.set_parameters([Parameter(name, value=value)])
-        return self.wait(future.done, 5.0) and future.result().results[0].successful
 
 
 @dataclass(frozen=True)
@@ -157,7 +148,7 @@ def _target(height, x=0.0, stamp=0.0):
 
 
 def _clock(_, observer):
-    return not any(observer.set(node, 'use_sim_time', True)
+    return not any(observer.set(node, 'use_sim_time', True)[0]
                    for node in ('supervisor_node', 'sim_node', 'ekf_node', 'nmpc_node'))
 
 

@@ -77,6 +77,10 @@ class RecorderNode(FlightNode):
                 self._give_up(error)
         return write
 
+    def waits_for(self):
+        """Whatever comes."""
+        return f'messages, and writes them to {self.parameters.bag}'
+
     def _on_lost(self, event):
         self._lost += event.total_count_change
         self.get_logger().warning(f'{event.total_count_change} messages lost on the way')

@@ -63,6 +63,10 @@ class ReferenceNode(FlightNode):
         self.create_timer(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer,
                           clock=self.flight_clock)
 
+    def waits_for(self):
+        """The take-off."""
+        return f"supervisor/state to say flying; then flies task '{self._task.name}'"
+
     def _set_state(self, state):
         if state != self._state:
             self._state = state

@@ -70,6 +70,11 @@ class RotorBridgeNode(FlightNode):
         self.create_subscription(String, 'supervisor/state', self._on_supervisor, qos.LATCHED)
         self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
 
+    def waits_for(self):
+        """The board, or what it lacks."""
+        self._tell()
+        return self._state.replace('waiting:', 'the motor board:')
+
     def _on_command(self, command, published):
         self._command = command
         if not self._send():
@@ -155,8 +160,8 @@ class RotorBridgeNode(FlightNode):
         if self._absent and text.startswith('waiting'):
             text = f'waiting: {self._absent}'       # says why the port is away
         if text != self._state:
-            if text.startswith('lost'):
-                self._log('error', f'motor board: {text}')
+            if not text.startswith('waiting'):
+                self._log('error' if text.startswith('lost') else 'info', f'motor board: {text}')
             self._state = text
             self._states.publish(String(data=text))
 

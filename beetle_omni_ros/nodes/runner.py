@@ -73,6 +73,7 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
             name = executable(node_class)
             node = node_class()
             nodes.append(node)
+            node.introduce()
             executor.add_node(node)
         # What start-up made lives as long as the process: keep the collector off it, so
         # that no pause of some 10 ms lands in a control cycle.

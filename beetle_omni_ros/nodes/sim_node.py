@@ -29,11 +29,10 @@ from beetle_omni_ros.sim.emulated.fault_switches import (
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
-from beetle_omni_ros.sim.faults.listed import parse_faults
+from beetle_omni_ros.sim.faults.listed import DEVICES, parse_faults
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
-DEVICES = 'joints', 'rotors', 'battery', 'command'      # what emulated devices see to themselves
 COMMAND_AGE = 0.1       # s, older commands are not executed
 EVENTS = {*(f'servo_faults.{name}' for name in SERVO_EVENTS),
           *(f'board_faults.{name}' for name in BOARD_EVENTS)}

@@ -84,6 +84,10 @@ class SupervisorNode(FlightNode):
         self.create_timer(WATCH_PERIOD, self._update, clock=self.flight_clock)
         self._update()
 
+    def waits_for(self):
+        """The sensors, the operator."""
+        return f'{super().waits_for()}; then for ~/arm'
+
     def _listen(self):
         supervisor = self._supervisor
         self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.ESTIMATE)

@@ -36,7 +36,7 @@ class BagWriter(Recorder):
 
     def __init__(self, path: str | Path, meta: dict | None = None, *, namespace: str = '',
                  topics: Sequence[str] = tuple(TOPICS), compression: str = 'none',
-                 description: str = ''):
+                 description: str = '', epoch: int = 0):
         """
         Create the folder and the bag in it.
 
@@ -47,6 +47,8 @@ class BagWriter(Recorder):
             topics: names to declare, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
             compression: of the chunks in the file, 'none' or 'zstd'.
             description: URDF of the robot, whose frames then come into the bag; '' for none.
+            epoch: UNIX time [s] at which the times of the ``write_*`` calls begin: a flight that
+                begins at 0 s gets a real date.
 
         Raises:
             BagError: the folder exists or cannot be made; unknown compression.
@@ -54,6 +56,7 @@ class BagWriter(Recorder):
         """
         self.path = Path(path)
         self.meta: dict = {}
+        self._epoch = int(epoch)
         self._connections: dict[str, Connection] = {}
         self._prefix = '/' + namespace.strip('/') + '/' if namespace.strip('/') else '/'
         self._writer = _open(self.path, compression)
@@ -96,7 +99,10 @@ class BagWriter(Recorder):
             self._declare(name, entry.type, entry.qos)
         if received is None:
             received = value[0].t if isinstance(value, list) else value.stamp
-        self.write_raw(name, entry.type, to_bytes(entry.write(BAG, value), entry.type), received)
+        message = entry.write(BAG, value)
+        if self._epoch and hasattr(message, 'header'):
+            message.header.stamp.sec += self._epoch
+        self.write_raw(name, entry.type, to_bytes(message, entry.type), received)
 
     def write_raw(self, topic: str, msgtype: str, data: bytes | memoryview, t: float) -> None:
         """
@@ -106,7 +112,7 @@ class BagWriter(Recorder):
             topic: full name.
             msgtype: ROS type, 'sensor_msgs/msg/Imu'; must be one of Jazzy's common types.
             data: CDR.
-            t: time of recording [s].
+            t: time of recording [s], since ``epoch``.
 
         Raises:
             BagError: unknown type, or the file cannot be written.
@@ -124,7 +130,8 @@ class BagWriter(Recorder):
         if first and self.meta:     # with a time of the flight
             self._tell_meta()
         try:
-            self._writer.write(connection, max(0, nanoseconds(t)), data)
+            self._writer.write(connection, max(0, nanoseconds(t)) + self._epoch * 1_000_000_000,
+                               data)
         except OSError as error:
             raise BagError(f'{self.path}: {error.strerror}') from error
         if self._frames is not None:

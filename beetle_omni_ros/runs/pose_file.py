@@ -49,7 +49,7 @@ def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
     except FileNotFoundError:
         raise TaskError(f'{path}: no such file') from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = getattr(error, 'strerror', None) or f'not a CSV text file ({error})'
+        reason = f"not a CSV text file ({getattr(error, 'strerror', None) or error})"
         raise TaskError(f'{path}: {reason}') from None
     rows = [(line, row) for line, row in rows if any(row)]
     if not rows:

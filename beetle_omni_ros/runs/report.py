@@ -53,7 +53,8 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     for path in paths:
         log = read_bag(path)
         if not len(log.truth_t) and not len(log.odom_t):
-            raise BagError(f'{path}: no pose of the robot in it (ground_truth/odom or odom)')
+            raise BagError(f'{path}: no pose of the robot in it; expected '
+                           'ground_truth/odom or odom')
         for warning in log.warnings:
             print(f'{path}: {warning}', file=sys.stderr)
         logs.append(log)

@@ -216,10 +216,10 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
     if name in ('hover', 'force', 'torque', 'payload'):
         return {'hover': _hover_task, 'force': _force_task, 'torque': _torque_task,
                 'payload': _payload_task}[name](name)
-    if name.lower().endswith('.csv') or Path(name).exists():
+    if name.lower().endswith('.csv') or name and Path(name).exists():
         return _pose_task(name, pose_file.read_poses(name, reach))
-    raise TaskError(f"task '{name}': expected a CSV file of poses, randomN or one of "
-                    f"{', '.join(NAMES)}")
+    raise TaskError(f"task '{name}': expected a CSV file of poses, random1 to random999999 or one "
+                    f"of {', '.join(NAMES)}")
 
 
 def random_poses(count: int, seed: int) -> np.ndarray:

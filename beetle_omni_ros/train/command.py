@@ -102,7 +102,7 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     if json_path:
         check_writable(json_path)
     if output is None and resume is None:
-        raise ParameterError('--output DIR: where the training shall land')
+        raise ParameterError('--output: missing; expected a folder for the training')
     where = choose_device(device)
     checkpoint = last_checkpoint(resume) if resume else None
     output = output or checkpoint.parent

@@ -56,7 +56,8 @@ def last_checkpoint(folder: Path) -> Path:
         return folder
     numbered = checkpoints(folder)
     if not numbered:
-        raise ParameterError(f'--resume {folder}: no checkpoint model_N.pt there')
+        raise ParameterError(f'--resume {folder}: no model_N.pt there; expected the folder of a '
+                             'training')
     return numbered[max(numbered)]
 
 

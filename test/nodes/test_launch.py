@@ -65,10 +65,10 @@ def test_the_arguments_of_the_interface_are_declared(bringup):
 def test_composed_is_one_process_and_one_for_the_bridges(bringup):
     process, bridges = bringup.start(seed='7', namespace='/robot1')
     command = bridges.kwargs['cmd']
-    assert command[3:command.index('--ros-args')] == ['joint_bridge_node', 'rotor_bridge_node']
+    assert command[4:command.index('--ros-args')] == ['joint_bridge_node', 'rotor_bridge_node']
     assert command[-2:] == ['-r', '__ns:=/robot1']
     command = process.kwargs['cmd']
-    nodes = command[3:command.index('--ros-args')]
+    nodes = command[4:command.index('--ros-args')]
     assert nodes == ['sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'supervisor_node']
     assert {*nodes, *BRIDGES} <= set(plan.NODES)
     assert 'sim_node:seed:=7' in command

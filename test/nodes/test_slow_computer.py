@@ -98,7 +98,7 @@ def attempts(monkeypatch):
     """Graphs that `fly` started; the first in real time is too slow."""
     graphs = []
 
-    def one(graph, controller, task, meta, console, may_be_slow):
+    def one(graph, controller, task, meta, console, faults, may_be_slow):
         graphs.append((graph, dict(meta), may_be_slow))
         if not may_be_slow and not graph.simulated:
             raise TooSlowError('the nodes use 99% of a core before the start')

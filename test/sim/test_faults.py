@@ -15,6 +15,7 @@ from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameter
 from beetle_omni_ros.sim.faults import Fault, KINDS
 from beetle_omni_ros.sim.faults.base import Effect
 from beetle_omni_ros.sim.faults.listed import FaultList, load_faults, parse_faults
+from beetle_omni_ros.sim.faults.listed import text as text_of
 from beetle_omni_ros.sim.simulator import Simulator
 
 HOVER = np.full(4, ROBOT.hover_thrust)
@@ -339,6 +340,8 @@ def test_short_texts():
     assert parse_faults(' rotor_stops rotor=2;mocap_lost duration=3 ; ') == [
         Fault('rotor_stops', rotor=2), Fault('mocap_lost', duration=3)]
     assert parse_faults('') == []
+    for case in FaultList.load().cases.values():
+        assert parse_faults(text_of(list(case.strike))) == list(case.strike)
     for text in ('rotor_stops 2', 'rotor_stops rotor=x', 'nothing'):
         with pytest.raises(ParameterError, match='faults'):
             parse_faults(text)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from difflib import get_close_matches
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.robot.yaml_file import quoted, shortened
 from beetle_omni_ros.sim.faults.base import Fault, KINDS
 
+# Hooks of what emulated devices see to themselves.
+DEVICES = 'joints', 'rotors', 'battery', 'command'
 GROUPS = ('limits', 'flight', 'healthy')
 OUTCOMES = ('flies_on', 'lands', 'stops', 'refused')
 
@@ -204,6 +207,14 @@ def _placed(entry, at, named):
                                  'duration')
     return [_fault({'kind': fault.kind, **fault.numbers, 'duration': fault.duration, **numbers},
                    at) for fault in named[what].strike]
+
+
+def text(faults: list[Fault]) -> str:
+    """Write faults as :func:`parse_faults` reads them."""
+    return '; '.join(' '.join([fault.kind, f'at={fault.at!r}', *(
+        f'{key}={float(value)!r}' for key, value in (
+            *(() if fault.duration == inf else (('duration', fault.duration),)),
+            *fault.numbers.items()))]) for fault in faults)
 
 
 def parse_faults(text: str) -> list[Fault]:

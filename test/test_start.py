@@ -1,0 +1,49 @@
+"""Executables end quietly when they are interrupted while their modules load."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from beetle_omni_ros import start
+
+SLOW = 'import time\nprint("loading", flush=True)\ntime.sleep(30)\n'
+INTERRUPTED = 'def main():\n    raise KeyboardInterrupt\n'
+
+
+def launch(tmp_path, text, before=''):
+    """Begin a module of this text in a process of its own."""
+    (tmp_path / 'program.py').write_text(text)
+    return subprocess.Popen(
+        [sys.executable, '-c', f'import sys, signal\n{before}\nsys.path.insert(0, "{tmp_path}")\n'
+         'from beetle_omni_ros.start import begin\nsys.exit(begin("program"))'],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+
+
+def test_an_interrupt_while_modules_load_ends_without_a_traceback(tmp_path):
+    process = launch(tmp_path, SLOW)
+    assert process.stdout.readline() == 'loading\n'
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=10) == ('', '')
+    assert process.returncode == -signal.SIGINT
+
+
+def test_an_interrupt_that_a_program_lets_through_is_status_130(tmp_path):
+    process = launch(tmp_path, INTERRUPTED)
+    assert process.communicate(timeout=10) == ('', '') and process.returncode == 130
+
+
+def test_a_signal_that_the_shell_ignores_stays_ignored(tmp_path):
+    process = launch(tmp_path, 'import signal\ndef main():\n    return int('
+                     'signal.getsignal(signal.SIGINT) == signal.SIG_IGN)\n',
+                     'signal.signal(signal.SIGINT, signal.SIG_IGN)')
+    process.communicate(timeout=10)
+    assert process.returncode == 1
+
+
+@pytest.mark.parametrize(('name', 'module'), [('beetle_omni', 'beetle_omni_ros.cli'),
+                                              ('ekf_node', 'beetle_omni_ros.nodes.ekf_node')])
+def test_each_executable_is_the_main_of_its_module(name, module):
+    assert getattr(start, name).args == (module,)
