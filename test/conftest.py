@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+import re
 import sys
 import time
 
@@ -9,7 +10,8 @@ import pytest
 
 # Jazzy writes a scalar field of a wrong type as garbage unless this is set before the import.
 os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
-if 'PYTEST_XDIST_WORKER' in os.environ:     # each worker has one core
+WORKER = 'PYTEST_XDIST_WORKER' in os.environ
+if WORKER:     # each has one core
     os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 # Appended, so that no helper can shadow an installed module.
@@ -18,25 +20,47 @@ for folder in sorted(Path(__file__).parent.iterdir()):
         sys.path.append(str(folder))
 sys.path.append(str(Path(__file__).parent))
 
-# Flights, buses and devices in real time, some with limits of milliseconds: a computer that stops
-# for a moment, as shared ones do, fails them for no fault of the code. They get a second chance,
-# which the summary names (R); what is broken fails twice. Where the computer was seen to stand
-# still in the second chance too, the test is skipped with the length of the stall: it could not
-# be judged. On a computer that keeps time, nothing is skipped.
-REAL_TIME = ('nodes', 'drivers', 'bringup', 'sim')
+# What runs by the system clock is marked real_time: nodes, buses, devices, some with limits of
+# milliseconds. Flights in simulated time wait for who is late and are marked so. A computer that
+# stops for a moment, as shared ones do, fails the former for no fault of the code. They get a
+# second chance with nothing beside them, which the summary names (R); what is broken fails twice.
+# Where the computer was seen to stand still in the second chance too, the test is skipped with
+# the length of the stall: it could not be judged. On a computer that keeps time, nothing is.
 RERUNS = 1
 STALL = 0.05        # s; the limits of silence in these tests are 50 to 80 ms
+MARKS = re.compile(r'\breal_time\b|\balone\b|\bros_domain\b')
 BEAT, BEGIN = pytest.StashKey(), pytest.StashKey[float]()
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Leave files alone that have no test in real time, where only those are asked for."""
+    if config.getoption('markexpr').startswith(('alone', 'real_time')) \
+            and collection_path.match('test_*.py') and not _says_so(collection_path):
+        return True
+    return None
+
+
+def _says_so(path):
+    return MARKS.search(Path(path).read_text(encoding='utf-8')) is not None
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Mark what runs in real time, give it a second chance, watch the computer meanwhile."""
-    real_time = [item for item in items if Path(item.path).parent.name in REAL_TIME]
+    """Mark who has a ROS domain, give a second chance, watch the computer meanwhile."""
+    waiting = [item for item in items if item.get_closest_marker('simulated_time')]
+    real_time = [item for item in items if item.get_closest_marker('alone')
+                 or item.get_closest_marker('real_time')
+                 or ('ros_domain' in item.fixturenames and item not in waiting)]
+    for path in {item.path for item in real_time}:
+        if not _says_so(path):      # it would be in neither part
+            raise pytest.UsageError(f'{path}: has tests in real time: name the mark in the file')
     for item in real_time:
         item.add_marker(pytest.mark.real_time)
+    # In real time a second chance is worth little beside others; .ci/test gives it alone.
+    for item in [*waiting, *(() if WORKER else real_time)]:
         item.add_marker(pytest.mark.flaky(reruns=RERUNS))
-    if real_time and config.getoption('markexpr') != 'not real_time':
+    if real_time and not WORKER and config.getoption('markexpr') != 'not real_time' \
+            and not config.getoption('numprocesses', None):
         from stillness import Heartbeat
         config.stash[BEAT] = Heartbeat()
 
@@ -48,13 +72,29 @@ def pytest_unconfigure(config):
 
 
 @pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    """Devices answer from threads, by the clock: a test that uses them has to say so."""
+    if item.get_closest_marker('real_time'):
+        return (yield)
+    from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PseudoTerminal, 'plug', _refuse)
+        return (yield)
+
+
+def _refuse(_):
+    raise RuntimeError('an emulated device runs by the clock: mark the test real_time')
+
+
+@pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item, call):
     """Skip what failed in real time on a computer that stood still, with the reason."""
     if call.when == 'setup':
         item.stash[BEGIN] = call.start
     report = yield
     last = getattr(item, 'execution_count', RERUNS + 1) > RERUNS
-    if report.failed and last and item.get_closest_marker('real_time'):
+    if report.failed and last and BEAT in item.config.stash \
+            and item.get_closest_marker('real_time'):
         offset = time.monotonic() - time.time()
         stalls = item.config.stash[BEAT].stalls(item.stash[BEGIN] + offset, call.stop + offset)
         if (longest := max(stalls, default=0.0)) >= STALL:

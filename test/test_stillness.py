@@ -47,12 +47,13 @@ def test_broken():
 
 @pytest.fixture
 def outcomes(tmp_path):
-    """Outcome of each inner test, in a folder of tests in real time and in another one."""
+    """Outcome of each inner test, in a file of tests in real time and in another one."""
     for name in ('conftest.py', 'stillness.py'):
         shutil.copy(HERE / name, tmp_path)
     for folder in ('nodes', 'robot'):
         (tmp_path / folder).mkdir()
-        (tmp_path / folder / f'test_{folder}.py').write_text(INNER)
+        mark = 'import pytest; pytestmark = pytest.mark.real_time' if folder == 'nodes' else ''
+        (tmp_path / folder / f'test_{folder}.py').write_text(f'{mark}\n{INNER}')
     done = subprocess.run(
         [sys.executable, '-m', 'pytest', '-rA', '-p', 'no:cacheprovider', '-c', '/dev/null',
          '--rootdir', str(tmp_path), '--import-mode=importlib', str(tmp_path)],

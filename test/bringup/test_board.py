@@ -12,6 +12,8 @@ from looks import board, levels, patiently, QUICK
 from beetle_omni_ros.drivers import motor_board_messages
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
+pytestmark = pytest.mark.real_time
+
 ALL = ['board port', 'board port latency timer', 'board firmware', 'board hears us',
        'board ready to arm', 'battery', *(f'ESC of rotor {k}' for k in (1, 2, 3, 4)),
        'board clock', 'link from the board', 'link to the board']

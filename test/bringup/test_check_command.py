@@ -46,6 +46,7 @@ def checked(arguments, path):
     return status, json.loads(path.read_text())
 
 
+@pytest.mark.real_time
 def test_a_good_robot_ends_with_status_0(robot, tmp_path, capsys):
     _, _, arguments = robot
     status, result = patiently(
@@ -60,6 +61,7 @@ def test_a_good_robot_ends_with_status_0(robot, tmp_path, capsys):
     assert 'gimbal4' in out and 'not looked at: ros' in out and '0 failed' in out
 
 
+@pytest.mark.real_time
 def test_a_fault_ends_with_status_1(robot, tmp_path, capsys, monkeypatch):
     bus, _, arguments = robot
     monkeypatch.setattr(servos, 'OTHER_IDS', ())
@@ -72,6 +74,7 @@ def test_a_fault_ends_with_status_1(robot, tmp_path, capsys, monkeypatch):
     assert '1 failed' in capsys.readouterr().out
 
 
+@pytest.mark.real_time
 def test_without_ros_the_rest_is_looked_at(robot, tmp_path, monkeypatch):
     _, _, arguments = robot
     for name in [name for name in sys.modules if name.startswith('beetle_omni_ros.nodes')]:
@@ -86,6 +89,7 @@ def test_without_ros_the_rest_is_looked_at(robot, tmp_path, monkeypatch):
     assert 'not installed' in ros['found'] and '[ros]' in ros['remedy']
 
 
+@pytest.mark.real_time
 def test_a_port_that_the_bridge_has_is_not_opened(robot, tmp_path):
     bus, _, _ = robot
     heard = Heard(0, 1.0, {}, {'joint_bridge': 'ready'},

@@ -14,6 +14,8 @@ from servo_bench import JOINTS, running
 from beetle_omni_ros.bringup import servos as room
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
+pytestmark = pytest.mark.real_time
+
 NAMES = [f'gimbal{k}' for k in (1, 2, 3, 4)]
 
 

@@ -24,6 +24,8 @@ from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 
+pytestmark = pytest.mark.real_time
+
 
 def test_thrusts_arrive_as_asked_at_the_measured_voltage():
     with connected() as (emulated, board):

@@ -216,6 +216,7 @@ def test_an_answer_that_the_board_contradicts_at_once_is_no_flight(bench):
     assert arming.text == 'lost: disarmed (heartbeat of the host lost)'
 
 
+@pytest.mark.real_time
 def test_the_real_driver_and_board_follow_it():
     with connected() as (emulated, board):
         arming = Arming(board)

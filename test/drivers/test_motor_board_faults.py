@@ -10,6 +10,8 @@ pytest.importorskip('serial')
 
 from board_bench import flying, HOVER, QUICK, until
 
+pytestmark = pytest.mark.real_time
+
 
 def keeps_flying(emulated, seconds=0.6):
     """Whether the rotors never stop for this long."""

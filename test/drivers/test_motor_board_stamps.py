@@ -9,6 +9,8 @@ pytest.importorskip('serial')
 
 from board_bench import connected, HOVER
 
+pytestmark = pytest.mark.real_time
+
 
 def test_a_step_of_our_clock_does_not_stop_the_rotors():
     """Stamps and clock step together; the board's clock is told by the stamps' age."""

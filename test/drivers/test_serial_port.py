@@ -11,6 +11,8 @@ pytest.importorskip('serial')
 
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 
+pytestmark = pytest.mark.real_time
+
 
 @pytest.fixture
 def ends():

@@ -17,6 +17,7 @@ from beetle_omni_ros.sim.emulated import servo_table as table
 GOAL = np.array([0.4, -1.2, 3.7, -3.9])
 
 
+@pytest.mark.real_time
 def test_configuring_sets_mode_before_gains_and_leaves_torque_off():
     gains = replace(SHIPPED.gains, proportional=640, derivative=300, feedforward_velocity=12)
     with bench(gains=gains, current_limit=0.5) as (bus, emulated):
@@ -32,6 +33,7 @@ def test_configuring_sets_mode_before_gains_and_leaves_torque_off():
         assert not emulated.network.refused, 'nothing that the servo refuses was tried'
 
 
+@pytest.mark.real_time
 def test_configuring_again_writes_no_eeprom(monkeypatch):
     with bench() as (bus, emulated):
         bus.configure()
@@ -45,6 +47,7 @@ def test_configuring_again_writes_no_eeprom(monkeypatch):
         assert not [name for name in written if table.BY_NAME[name].address < table.EEPROM_END]
 
 
+@pytest.mark.real_time
 def test_current_based_mode_caps_the_torque():
     with bench(mode='current_based_position', current_limit=0.3) as (bus, emulated):
         bus.configure()
@@ -53,6 +56,7 @@ def test_current_based_mode_caps_the_torque():
             assert servo['Goal Current'] == 300
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize(('signs', 'zeros'), [
     ([1, 1, 1, 1], [2048, 2048, 2048, 2048]), ([1, -1, 1, -1], [2048, 2000, 2100, 2048]),
     ([-1, -1, -1, -1], [1800, 2500, 2047, 2049])])
@@ -65,6 +69,7 @@ def test_signs_and_zeros_make_tilts_of_counts_and_back(signs, zeros):
         assert not emulated.network.refused
 
 
+@pytest.mark.real_time
 def test_velocity_current_and_effort_have_the_tilts_sign():
     with bench(signs=np.array([1.0, -1.0, 1.0, -1.0]),
                servos={'signs': [1, -1, 1, -1], 'motion': None}) as (bus, emulated):
@@ -77,6 +82,7 @@ def test_velocity_current_and_effort_have_the_tilts_sign():
         assert readings.current == pytest.approx(effort / 0.671, abs=0.002)
 
 
+@pytest.mark.real_time
 def test_torque_comes_on_without_a_jump_whatever_goal_was_left():
     with bench() as (bus, emulated):
         bus.configure()
@@ -88,6 +94,7 @@ def test_torque_comes_on_without_a_jump_whatever_goal_was_left():
         assert emulated.goals == pytest.approx([0.5, -1.0, 1.5, -2.0], abs=COUNT)
 
 
+@pytest.mark.real_time
 def test_torque_is_off_after_disable_and_after_close():
     with running() as (bus, emulated):
         assert emulated.torque_enabled.all()
@@ -100,11 +107,13 @@ def test_torque_is_off_after_disable_and_after_close():
         bus.close()
 
 
+@pytest.mark.real_time
 def test_the_watchdog_runs_while_torque_is_on():
     with running() as (bus, emulated):
         assert [servo['Bus Watchdog'] for servo in emulated.servos] == [5] * 4
 
 
+@pytest.mark.real_time
 def test_goals_beyond_the_travel_are_cut_off_and_no_numbers_are_refused():
     with running() as (bus, emulated):
         assert bus.write_goals([9.0, -9.0, 0.0, 0.0])
@@ -119,6 +128,7 @@ def test_goals_beyond_the_travel_are_cut_off_and_no_numbers_are_refused():
         assert (bus.clipped, bus.rejected) == (1, 4)
 
 
+@pytest.mark.real_time
 def test_old_firmware_is_read_the_plain_way():
     with running(servos={'firmware': 45}) as (bus, emulated):
         until(arrived(GOAL), bus, GOAL)
@@ -126,6 +136,7 @@ def test_old_firmware_is_read_the_plain_way():
         assert bus.statistics.corrupt == 0
 
 
+@pytest.mark.real_time
 def test_health_tells_voltage_temperature_and_torque():
     with running() as (bus, emulated):
         emulated.faults.supply_voltage = 11.1
@@ -136,6 +147,7 @@ def test_health_tells_voltage_temperature_and_torque():
         assert all(one.torque and one.responding and not one.message for one in reports)
 
 
+@pytest.mark.real_time
 def test_checking_changes_nothing_and_names_what_is_wrong():
     with bench(servos={'identifiers': (1, 2, 3, 4)}) as (bus, emulated):
         emulated.servos[0]['Model Number'] = 1200
@@ -150,6 +162,7 @@ def test_checking_changes_nothing_and_names_what_is_wrong():
         assert [bytes(servo._memory[:120]) for servo in emulated.servos] == before
 
 
+@pytest.mark.real_time
 def test_configuring_an_incomplete_bus_fails_in_one_line_for_all():
     with bench() as (bus, emulated):
         emulated.faults.silent = {2, 4}
@@ -160,6 +173,7 @@ def test_configuring_an_incomplete_bus_fails_in_one_line_for_all():
         assert 'gimbal2 (id 2)' in text and 'gimbal4 (id 4)' in text and 'gimbal1' not in text
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize('baud_rate', [9600, 57600, 3_000_000])
 def test_scanning_finds_servos_at_another_baud_rate(baud_rate):
     with bench(servos={'baud_rate': baud_rate, 'timing': True}) as (bus, emulated):
@@ -177,6 +191,7 @@ def test_a_port_is_refused_in_one_line(tmp_path):
     bus.close()
 
 
+@pytest.mark.real_time
 def test_a_port_in_use_is_refused():
     with bench() as (bus, emulated):
         with pytest.raises(ServoBusError, match='used by another process'):

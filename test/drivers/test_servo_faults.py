@@ -10,6 +10,8 @@ from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.servo_guard import Guard
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 
+pytestmark = pytest.mark.real_time
+
 GOAL = np.array([0.5, -1.0, 3.5, -3.5])
 HOME = np.zeros(4)
 # One fault costs one tick here; the others keep the bench's patience.

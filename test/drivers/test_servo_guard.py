@@ -12,6 +12,8 @@ import pytest
 import beetle_omni_ros
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
+pytestmark = pytest.mark.real_time
+
 DRIVER = """
 from dataclasses import replace
 import sys, time

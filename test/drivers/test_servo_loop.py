@@ -141,6 +141,7 @@ def test_a_servo_is_lost_when_it_has_not_obeyed_for_long_enough():
     assert not loop.lost(0.3)
 
 
+@pytest.mark.real_time
 def test_many_threads_offer_goals_and_none_is_left_over():
     bus = FakeBus()
     loop = ServoLoop(bus, lambda *_: None)
@@ -168,6 +169,7 @@ def test_many_threads_offer_goals_and_none_is_left_over():
     assert not loop._thread.is_alive() and not loop.failure and not bus.closed
 
 
+@pytest.mark.real_time
 def test_a_mistake_in_the_thread_closes_the_bus_and_is_told():
     bus, seen = FakeBus(), Event()
 

@@ -36,6 +36,7 @@ def test_the_nearest_turn_is_found(angle, turns, apart):
     assert nearest_turns(angle - 2 * pi * turns, angle + apart) == turns
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize('angles', [[0, 0, 0, 0], [2.3, -2.3, 1.0, -1.0]])
 def test_torque_comes_on_where_the_angle_is_certain(angles):
     with bench() as (bus, emulated):
@@ -45,6 +46,7 @@ def test_torque_comes_on_where_the_angle_is_certain(angles):
         assert bus.read().position == pytest.approx(angles, abs=COUNT)
 
 
+@pytest.mark.real_time
 def test_torque_is_refused_where_the_turn_is_open_and_the_message_says_how_to_settle_it():
     with bench() as (bus, emulated):
         place(emulated, [0.0, 2.8, 0.0, 3.5])
@@ -58,6 +60,7 @@ def test_torque_is_refused_where_the_turn_is_open_and_the_message_says_how_to_se
         assert not bus.enabled and not emulated.torque_enabled.any()
 
 
+@pytest.mark.real_time
 def test_the_operator_settles_it():
     true = np.array([0.0, 2.8, 0.0, 3.5])
     with bench() as (bus, emulated):
@@ -73,6 +76,7 @@ def test_the_operator_settles_it():
         assert np.allclose(emulated._motion.position, goal, atol=2 * COUNT)
 
 
+@pytest.mark.real_time
 def test_turning_it_by_hand_settles_it():
     with bench() as (bus, emulated):
         place(emulated, [0.0, 0.0, 0.0, 3.5])
@@ -87,6 +91,7 @@ def test_turning_it_by_hand_settles_it():
         assert emulated.goals == pytest.approx([0, 0, 0, 1.0], abs=COUNT)
 
 
+@pytest.mark.real_time
 def test_turns_are_kept_over_disable_while_the_servo_has_power():
     with running() as (bus, emulated):
         goal = np.array([3.9, -3.9, 0.0, 0.0])
@@ -99,6 +104,7 @@ def test_turns_are_kept_over_disable_while_the_servo_has_power():
         assert bus.read().position == pytest.approx([-0.5, 0.5, 0, 0], abs=COUNT)
 
 
+@pytest.mark.real_time
 def test_turns_are_not_believed_after_a_restart_without_torque():
     with running() as (bus, emulated):
         goal = np.array([3.5, 0.0, 0.0, 0.0])
@@ -109,6 +115,7 @@ def test_turns_are_not_believed_after_a_restart_without_torque():
             bus.enable()
 
 
+@pytest.mark.real_time
 def test_a_restart_in_flight_is_unwrapped_to_the_last_good_angle():
     with running() as (bus, emulated):
         goal = np.array([3.5, -3.5, 0.3, 0.0])

@@ -23,7 +23,7 @@ from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.sim.simulator import Simulator
 
 ROBOT = RobotParameters.load()
-POSES, SWITCHES = 3, 20
+POSES, SWITCHES = 2, 20
 PERIOD = 0.01       # s between commands
 HANDOVER = SupervisorParameters.load().handover
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
@@ -69,7 +69,7 @@ def fly_switching(policy, seed):
     """Both controllers in one loop, changed at moments drawn from ``seed``."""
     estimator = EkfParameters.load()
     supervisor = Supervisor(SupervisorParameters.load(), ROBOT, HoverController(ROBOT))
-    times = np.sort(np.random.default_rng(seed).uniform(4.0, 4.0 + 8 * POSES, SWITCHES))
+    times = np.sort(np.random.default_rng(seed).uniform(4.0, 3.8 + 8 * POSES, SWITCHES))
     recorder = Switching(supervisor, times)
     controllers = {name: registry.make(name, ROBOT, ControllerOptions(policy=policy)
                                        if name == 'rl' else ControllerOptions())

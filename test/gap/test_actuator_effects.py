@@ -1,6 +1,7 @@
 """Effects of servos and rotors, simulated by plain small steps, are recovered."""
 
 from dataclasses import replace
+from functools import cache
 
 from flights import KEYS, model, Motion, P, ROBOT, solved, STEP
 import numpy as np
@@ -25,31 +26,6 @@ def steps(t):
     return jumps[np.minimum((t / 0.45).astype(int), 29)] + 0.2 * np.sin(7 * t)[:, None]
 
 
-def servo(delay=0.010, kp=JOINT.kp, kd=JOINT.kd, speed=JOINT.velocity_limit,
-          effort=JOINT.effort_limit, coulomb=0.0, stiction=0.0, bend=0.0,
-          fading=1e-3):
-    """(N, 4) joint angles at 200 Hz, by explicit steps of 0.1 ms."""
-    sent = MOTION.t
-    commands, thrust = steps(sent), MOTION.thrust
-    q, v, out = commands[0].copy(), np.zeros(4), []
-    per = round(STEP / FINE)
-    for k in range(len(sent) * per):
-        if k % per == 0:
-            out.append(q.copy())
-        row = int(np.clip(np.floor((k * FINE - delay) / STEP + 1e-6), 0, len(sent) - 1))
-        target = commands[row] + bend * thrust[min(k // per, len(thrust) - 1)]
-        torque = np.clip(kp * (target - q) - kd * v, -effort, effort)
-        if coulomb:
-            still = np.abs(v) < 1e-3
-            held = still & (np.abs(torque) < max(coulomb, stiction))
-            rubbing = coulomb + max(stiction - coulomb, 0.0) * np.exp(-(v / fading)**2)
-            torque = np.where(held, -v * JOINT.inertia / FINE, torque - rubbing * np.sign(
-                np.where(still, torque, v)))
-        v = np.clip(v + FINE * torque / JOINT.inertia, -speed, speed)
-        q = q + FINE * v
-    return np.array(out)
-
-
 def flight(angles):
     """Readings of such joints; commands are stamped when they are sent."""
     made = MOTION.flight()
@@ -70,6 +46,46 @@ CASES = [
      {'joint_friction.coulomb': 0.008}, {'joint_friction.coulomb': 0.006,
                                          'joint_friction.stiction': 0.006}, 0.0012),
     ({'bend': 0.002}, {'joint_deflection.deflection_per_newton': 0.002}, None, 1e-4)]
+SERVO = {'delay': 0.010, 'kp': JOINT.kp, 'kd': JOINT.kd, 'speed': JOINT.velocity_limit,
+         'effort': JOINT.effort_limit, 'coulomb': 0.0, 'stiction': 0.0, 'bend': 0.0,
+         'fading': 1e-3}
+FLOWN = [{}, *(case[0] for case in CASES), {'coulomb': 0.007, 'stiction': 0.007},
+         *({'coulomb': 0.007, 'stiction': 0.010, 'fading': fading} for fading in (0.03, 0.1)),
+         {'effort': 0.05}]
+
+
+def servo(**changes):
+    """(N, 4) joint angles at 200 Hz of one of FLOWN."""
+    return simulated()[:, FLOWN.index(changes)]
+
+
+@cache
+def simulated():
+    """(N, len(FLOWN), 4) joint angles at 200 Hz, by explicit steps of 0.1 ms."""
+    own = {name: np.array([[one.get(name, value)] for one in FLOWN])
+           for name, value in SERVO.items()}
+    kp, kd, speed, effort, coulomb, stiction = (own[name] for name in (
+        'kp', 'kd', 'speed', 'effort', 'coulomb', 'stiction'))
+    sent = MOTION.t
+    commands, thrust = steps(sent), MOTION.thrust
+    q, out = np.tile(commands[0], (len(FLOWN), 1)), []
+    v = np.zeros_like(q)
+    per = round(STEP / FINE)
+    for k in range(len(sent) * per):
+        if k % per == 0:
+            out.append(q.copy())
+        row = np.floor((k * FINE - own['delay'][:, 0]) / STEP + 1e-6).astype(int)
+        target = commands[np.clip(row, 0, len(sent) - 1)] \
+            + own['bend'] * thrust[min(k // per, len(thrust) - 1)]
+        torque = np.clip(kp * (target - q) - kd * v, -effort, effort)
+        still = np.abs(v) < 1e-3
+        held = still & (np.abs(torque) < np.maximum(coulomb, stiction)) & (coulomb > 0)
+        rubbing = coulomb + np.maximum(stiction - coulomb, 0.0) * np.exp(-(v / own['fading'])**2)
+        torque = np.where(held, -v * JOINT.inertia / FINE, torque - rubbing * np.sign(
+            np.where(still, torque, v)))
+        v = np.clip(v + FINE * torque / JOINT.inertia, -speed, speed)
+        q = q + FINE * v
+    return np.array(out)
 
 
 @pytest.mark.parametrize('true, expected, start, within', CASES,

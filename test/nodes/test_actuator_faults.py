@@ -15,6 +15,8 @@ from witness import PATIENT, READY, Witness
 from beetle_omni_ros.nodes.actuators import bridged, BRIDGES
 from beetle_omni_ros.nodes.graph import BRIDGES_COMPOSED, Graph
 
+pytestmark = pytest.mark.alone
+
 FLYING = 'flying:nmpc'
 DEVICES = 'sim_node: devices'
 

@@ -137,6 +137,7 @@ def test_topics_of_any_controller_are_told_from_those_of_a_robot():
     assert topic_of('own/command') == topic_of('nmpc/command') == topics_with(['x'])['x/command']
 
 
+@pytest.mark.simulated_time
 def test_a_class_of_a_file_flies_the_whole_graph_and_is_read_back(tmp_path):
     task, bag, result = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'result.json'
     task.write_text(HEADER + '0.3,0,1,20,0,30\n')

@@ -55,6 +55,7 @@ def logged(graph, name):
     return graph.log(name).read_text()
 
 
+@pytest.mark.simulated_time
 def test_the_loss_of_recorder_reference_controller_and_estimator(flight):
     graph, witness, bag = flight
     witness.spin(2)
@@ -89,6 +90,7 @@ def test_the_loss_of_recorder_reference_controller_and_estimator(flight):
     assert 'SIGKILL' in graph.dead()['ekf_node']
 
 
+@pytest.mark.simulated_time
 def test_the_loss_of_the_supervisor_stops_the_rotors_within_100_ms(flight):
     graph, witness, bag = flight
     witness.spin(1)
@@ -181,6 +183,7 @@ def children(pid):
     return found
 
 
+@pytest.mark.alone
 def test_one_call_flies_and_the_bag_gives_the_printed_numbers(tmp_path):
     process, bag, result = fly(tmp_path, '0.3,0,1,20,0,0\n', 'composed')
     output, error = process.communicate(timeout=READY)
@@ -197,6 +200,7 @@ def test_one_call_flies_and_the_bag_gives_the_printed_numbers(tmp_path):
     assert read_bag(bag).meta['task'] == str(tmp_path / 'poses.csv')
 
 
+@pytest.mark.simulated_time
 def test_a_death_in_flight_is_named_and_nothing_is_left_behind(tmp_path):
     process, bag, _ = fly(tmp_path, '0,0,1.2,0,0,0\n' * 10, 'separate', 'simulated')
     deadline, nodes = time.monotonic() + READY, {}
@@ -223,6 +227,7 @@ def newest(bag):
     return b''.join(file.read_bytes() for file in bag.glob('*.mcap'))
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize('arrangement', ['composed', 'separate'])
 def test_an_interrupt_stops_every_process(tmp_path, arrangement):
     process, _, _ = fly(tmp_path, '0,0,1,0,0,0\n', arrangement)

@@ -53,6 +53,7 @@ def test_a_signal_while_a_flight_that_is_over_is_cleaned_up_waits():
     assert cleaned
 
 
+@pytest.mark.simulated_time
 @pytest.mark.parametrize('moment', ['start', 'flight'])
 def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path, moment):
     bag, temporary = tmp_path / 'bag', tmp_path / 'tmp'

@@ -11,6 +11,8 @@ from beetle_omni_ros.nodes import convert
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus, ServoFaults
 
+pytestmark = pytest.mark.real_time
+
 JOINTS = RobotParameters.load().joints
 GOAL = [0.5, -1.0, 3.5, -3.5]
 HOME = [0.0] * 4

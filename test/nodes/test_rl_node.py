@@ -203,6 +203,7 @@ def flight(request, ros_domain, tmp_path):
     assert not stubborn
 
 
+@pytest.mark.simulated_time
 def test_twenty_switches_through_the_parameter_in_a_real_flight(flight):
     graph, pilot = flight
     names = ['rl', 'nmpc'] * (SWITCHES // 2)
@@ -232,6 +233,7 @@ def is_smooth(commands, targets):
                                                                <= limits.thrust_rate * steps)
 
 
+@pytest.mark.simulated_time
 def test_one_call_flies_the_policy_and_the_bag_holds_both_controllers(tmp_path):
     policy = write_hover_policy(tmp_path / 'hover.onnx', memory=True)
     task, bag, result = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'result.json'

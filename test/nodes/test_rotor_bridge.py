@@ -18,6 +18,8 @@ from beetle_omni_ros.nodes import qos
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
 
+pytestmark = pytest.mark.real_time
+
 
 @pytest.fixture(scope='module')
 def shared(tmp_path_factory):

@@ -53,6 +53,7 @@ def flown(nodes, **options):
         Flight(nodes, nodes, make_task('hover'), bars, **options).fly()
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize(('nodes', 'named'), [
     ({'load': 0.99}, '99% of a core before the start'),
     ({'lost': 0.5}, 'the simulator fell 0.5 s behind in 2 s')])
@@ -64,6 +65,7 @@ def test_a_computer_that_is_too_slow_is_found_out_before_arming(nodes, named):
     assert raised.type is FlightError
 
 
+@pytest.mark.real_time
 def test_a_fast_one_tries_and_a_failed_flight_says_what_the_simulator_lost():
     with pytest.raises(FlightError, match='refuses to arm: not level$') as raised:
         flown(Nodes(), may_be_slow=False)
@@ -72,6 +74,7 @@ def test_a_fast_one_tries_and_a_failed_flight_says_what_the_simulator_lost():
         flown(Nodes(lost=0.1), may_be_slow=False)
 
 
+@pytest.mark.real_time
 def test_a_fault_that_keeps_it_on_the_ground_ends_the_attempt_at_once():
     class Jammed(Nodes):
         states, waited = [], 0

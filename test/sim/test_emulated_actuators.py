@@ -155,6 +155,7 @@ def devices():
         yield made
 
 
+@pytest.mark.real_time
 def test_every_level_reaches_its_device_and_can_be_taken_back(devices):
     servo = ServoFaultSwitches(
         bad_crc=0.1, dropped=0.2, delayed=0.3, delay=0.04, silent=np.array([2.0]),
@@ -173,6 +174,7 @@ def test_every_level_reaches_its_device_and_can_be_taken_back(devices):
     assert devices.faults == []
 
 
+@pytest.mark.real_time
 def test_events_happen_each_time_they_are_set(devices):
     servo = devices.bus.servos[2]
     servo['Torque Enable'] = 1
@@ -186,6 +188,7 @@ def test_events_happen_each_time_they_are_set(devices):
     assert servo.torque
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize(('servo', 'board', 'text'), [
     ({'silent': np.array([7.0])}, {}, r'servo_faults.silent: no servo has the id 7; ids are'),
     ({'overload': np.array([1.5])}, {}, r'servo_faults.overload: no servo has the id 1.5'),
@@ -199,6 +202,7 @@ def test_a_fault_of_nothing_is_refused_and_changes_nothing(devices, servo, board
     assert not devices.board.faults.mute
 
 
+@pytest.mark.real_time
 def test_unplugging_takes_the_ports_away_and_brings_them_back(devices):
     ports = [Path(devices.bus.port), Path(devices.board.port)]
     there = [port.exists() for port in ports]

@@ -23,6 +23,8 @@ from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 from beetle_omni_ros.sim.emulated_actuators import EmulatedActuators
 from beetle_omni_ros.sim.simulator import Simulator
 
+pytestmark = pytest.mark.real_time
+
 HOVER = np.full(4, ROBOT.hover_thrust)
 TICK = 0.005
 

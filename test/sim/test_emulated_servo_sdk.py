@@ -11,6 +11,8 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.emulated import servo_table as table
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
+pytestmark = pytest.mark.real_time
+
 sdk = pytest.importorskip('dynamixel_sdk')
 ALL = (1, 2, 3, 4)
 
