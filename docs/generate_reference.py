@@ -345,19 +345,33 @@ def _wrapped(text: str) -> str:
 
 def effects() -> str:
     """The catalogue of effects."""
+    from beetle_omni_ros.robot.consumers import CONSUMERS, stand
     from beetle_omni_ros.robot.effects import CATALOGUE
-    from beetle_omni_ros.sim.effects import BUILT_IN, FORCES
+    stands = {(name, key): stand(key, name) for name in CATALOGUE for key in CONSUMERS}
+    apart: dict[tuple, list] = {}
+    for (name, key), found in stands.items():
+        if not found.acts:
+            apart.setdefault((CONSUMERS[key], 'refuses' if found.error else 'leaves',
+                              found.reason), []).append(f'[{name}](#{name})')
     text = [f'# Effects\n\n{MADE}\n'
             'An effect is a term that reality may add to the model. A robot file switches an '
             'effect on by naming\nit under `effects:`, for example `effects: {thrust_coefficient: '
-            '{scale: 0.93}}`. [The gap\nfinder](../gap.md) searches the same entries.\n\n'
+            '{scale: 0.93}}`. [The gap\nfinder](../gap.md) searches the same entries. [Add an '
+            'effect](../how-to/add_an_effect.md) shows how\na new one is declared.\n\n'
             '*Typical* is a realistic deviation from the neutral value. *Smallest* is the '
             'smallest deviation\nworth naming. Where the neutral value is the number of the robot '
-            'file, both are fractions of it.\n\n'
-            + table(['effect', 'layer', 'acts through', 'the MuJoCo plant'],
-                    [[f'[{name}](#{name})', entry.layer, _acts(name, entry),
-                      'has it' if name in BUILT_IN + FORCES else 'refuses it']
-                     for name, entry in CATALOGUE.items()])]
+            'file, both are fractions of it.\n\n## Who acts on what\n\n'
+            'A consumer acts on an effect, leaves it to another, or refuses a robot file that has '
+            'it. The test\n`test/gap/test_consumers.py` tries every pair. The reasons stand '
+            'below the table.\n\n'
+            + table(['effect', 'layer', 'acts through', *CONSUMERS.values()],
+                    [[f'[{name}](#{name})', entry.layer, _acts(entry),
+                      *('acts' if (found := stands[name, key]).acts
+                        else 'refuses' if found.error else 'leaves' for key in CONSUMERS)]
+                     for name, entry in CATALOGUE.items()])
+            + '\n' + table(['consumer', '', 'effects', 'why'],
+                           [[who, what, ', '.join(names), reason]
+                            for (who, what, reason), names in sorted(apart.items())])]
     for name, entry in CATALOGUE.items():
         rows = [[f'`{key}`', spec.unit, _neutral(spec.neutral),
                  f'{_number(spec.low)} to {_number(spec.high)}', _known(spec.typical),
@@ -369,6 +383,7 @@ def effects() -> str:
         text.append(f'\n## {name}\n\n'
                     + table(['', ''], [['equation, source', entry.source],
                                        ['shows in', entry.excited_by],
+                                       ['channels', _channels(entry)],
                                        ['confused with', ', '.join(
                                            f'[{other}](#{other})'
                                            for other in entry.confused_with)],
@@ -378,15 +393,18 @@ def effects() -> str:
     return ''.join(text)
 
 
-def _acts(name, entry) -> str:
-    ways = [('the body equations', entry.apply), ('the servo equation', entry.servo),
-            ('a number of the robot file', entry.settings)]
-    acting = [way for way, there in ways if there]
-    if acting:
-        return ' and '.join(acting)
-    return 'the delay of commands' if name in ('command_latency', 'joint_command_latency',
-                                               'rotor_dead_time') \
-        else 'a value that the gap finder fits'
+def _channels(entry) -> str:
+    names = {'B': 'force and torque', 'J': 'joints', 'A': 'acceleration of the MoCap',
+             'W': 'rate of turn of the MoCap'}
+    return ', '.join(names[channel] for channel in entry.channels)
+
+
+def _acts(entry) -> str:
+    ways = {'body': 'the body equations', 'servo': 'the servo equation',
+            'number': 'a number of the robot file', 'command': 'the delay of commands',
+            'sensor': 'readings', 'feedback': 'readings of the encoders', 'play': 'play'}
+    both = ' and the servo equation' if entry.kind == 'body' and entry.servo else ''
+    return ways[entry.kind] + both
 
 
 def _neutral(value) -> str:

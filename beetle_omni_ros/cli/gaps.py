@@ -27,6 +27,9 @@ def gap(runs: Annotated[list[Path], typer.Argument(
         fix: Annotated[bool, typer.Option(
             '--fix', help='Correct damaged recordings where the correction is certain; the bags '
                           'stay as they are.')] = False,
+        tolerances: Annotated[bool, typer.Option(
+            '--tolerances', help="With --apply: also write this robot's own mass, inertia, gains, "
+                                 'lags and rotor positions, as fitted within tolerance.')] = False,
         json_path: JsonOption = None):
     """
     Find where model and measurement disagree, name the effect, add it, show the gap shrink.
@@ -35,7 +38,7 @@ def gap(runs: Annotated[list[Path], typer.Argument(
     """
     from beetle_omni_ros.identify.gap.command import run_gap
     raise typer.Exit(run_gap(runs, holdout or [], robot, apply, json_path, page,
-                             parameters=parameters, fix=fix))
+                             parameters=parameters, fix=fix, tolerances=tolerances))
 
 
 def spread(arguments: list[str]) -> list[str]:

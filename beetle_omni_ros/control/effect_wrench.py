@@ -10,9 +10,6 @@ from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-ALLOCATED = ('mass', 'wind', 'thrust_coefficient', 'rotor_thrust_coefficient',
-             'torque_coefficient')      # in the allocation already
-
 
 class EffectWrench:
     """
@@ -33,7 +30,7 @@ class EffectWrench:
 
     def __init__(self, robot: RobotParameters, allocator: Allocator, nodes: int):
         """Build the function; nothing is compiled."""
-        self.needed = any(CATALOGUE[name].apply is not None and name not in ALLOCATED
+        self.needed = any(CATALOGUE[name].apply is not None and not CATALOGUE[name].allocated
                           for name in robot.effects)
         if not self.needed:
             return

@@ -14,6 +14,7 @@ from beetle_omni_ros.control.disturbance import DisturbanceEstimator
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.references import ReferencePlanner
 from beetle_omni_ros.control.rti import CompiledRti, InterpretedRti
+from beetle_omni_ros.robot import consumers
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.native import CompilerError
@@ -47,7 +48,8 @@ class NmpcController:
 
     def __init__(self, robot: RobotParameters, parameters: NmpcParameters | None = None):
         """Build or load the solver; the first time takes some seconds of compilation."""
-        p = _with_delays(robot, parameters or NmpcParameters.load())
+        consumers.check('nmpc', robot)
+        p = with_delays(robot, parameters or NmpcParameters.load())
         self._parameters, self.reach = p, p.reach
         self._robot = robot
         problem = ocp.build(robot, p.model.servo_lag, p.model.rotor_lag, p.horizon.change_time)
@@ -130,6 +132,7 @@ class NmpcController:
         if self._started and not _finite(state):
             self._rejected += 1
             return self._command(state.stamp)
+        state = redated(state, self._robot)
         full = self._estimator.update(state)
         x0 = full[:13]
         x0 = np.concatenate([x0, full[model.TILT], full[model.THRUST]])[:self._state_size]
@@ -172,7 +175,13 @@ class NmpcController:
                 'servo_offset_rad': float(np.max(np.abs(d[model.TILT_OFFSET])))}
 
 
-def _with_delays(robot, parameters):
+def redated(state: State, robot: RobotParameters) -> State:
+    """State with the capture time of its tilts, which may be older than their stamp says."""
+    delay = robot.sensors.encoder_delay
+    return replace(state, tilt_stamp=state.tilt_stamp - delay) if delay else state
+
+
+def with_delays(robot: RobotParameters, parameters: NmpcParameters) -> NmpcParameters:
     """
     Take the robot file's command delays and servo gains into the controller's model.
 

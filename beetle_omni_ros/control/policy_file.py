@@ -16,6 +16,7 @@ from math import isfinite
 import numpy as np
 
 from beetle_omni_ros.control.observation import Block, blocks, DISTURBANCES, size
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.yaml_file import quoted, shortened
@@ -156,7 +157,10 @@ class PolicyContract:
 
     def _other_robot(self, robot):
         """'' when trained for ``robot``, else what differs."""
-        if self.robot_hash == robot.hash():
+        # What the estimator corrects is none of the policy's business.
+        flown = replace(robot, effects={name: values for name, values in robot.effects.items()
+                                        if CATALOGUE[name].kind != 'sensor'})
+        if self.robot_hash == flown.hash():
             return ''
         text = f'robot_hash: trained for {self.robot!r} ({self.robot_hash}), this is ' \
                f'{robot.name!r} ({robot.hash()})'

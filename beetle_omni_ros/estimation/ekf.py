@@ -101,8 +101,7 @@ class ErrorStateEkf:
         if checked is None:
             return False
         stamp = checked[0]
-        reading = (stamp, self._mounting.aligned(checked[1]), self._mounting.aligned(checked[2]),
-                   self._guard.shaken)
+        reading = (stamp, *self._mounting.aligned(*checked[1:3]), self._guard.shaken)
         self._estimate = None
         if self._guard.clock_jumped:
             self._restart(reading)

@@ -111,7 +111,7 @@ class ErrorStateModel:
         covariance[ATTITUDE, ATTITUDE] = noise[3:, 3:]
         covariance[VELOCITY, VELOCITY] = first.velocity_std ** 2 * np.eye(3)
         if biases is None:
-            known = np.zeros(3), np.zeros(3), 0.0
+            known = np.zeros(3), np.zeros(3), first.time_offset
             covariance[9:, 9:] = np.diag([first.accelerometer_bias_std ** 2] * 3
                                          + [first.gyroscope_bias_std ** 2] * 3 + [0.0])
         else:

@@ -27,7 +27,7 @@ SIGNIFICANT = 4.0  # standard deviations by which a time offset must differ from
 
 
 class Mounting:
-    """The IMU's rotation and lever arm in base_link."""
+    """The IMU's rotation and lever arm in base_link, and its known biases."""
 
     def __init__(self, imu: ImuParameters, gravity: float, trend_samples: int = 1):
         """
@@ -44,11 +44,15 @@ class Mounting:
         turned = np.any(imu.rotation)
         self._axes = rotations.matrix(rotations.exp(imu.rotation)) if turned else None
         self._arm = imu.position.copy() if np.any(imu.position) else None
+        self._force_bias, self._rate_bias = imu.accelerometer_bias, imu.gyroscope_bias
+        self._biased = bool(np.any(self._force_bias) or np.any(self._rate_bias))
         self._rate_noise = imu.gyroscope_noise ** 2
 
-    def aligned(self, vector: np.ndarray) -> np.ndarray:
-        """Express a vector (3,) of the IMU in base_link axes."""
-        return vector if self._axes is None else self._axes @ vector
+    def aligned(self, force: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Specific force and rate (3,) without their known biases, in base_link axes."""
+        if self._biased:
+            force, rate = force - self._force_bias, rate - self._rate_bias
+        return (force, rate) if self._axes is None else (self._axes @ force, self._axes @ rate)
 
     def estimate(self, node: Node, readings: Sequence = ()) -> Estimate:
         """

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
 
@@ -33,6 +34,12 @@ class ImuParameters:
     rotation: np.ndarray = parameter(
         [0.0, 0.0, 0.0], doc="rotation vector of the IMU's axes seen from base_link", unit='rad',
         shape=(3,), low=-3.2, high=3.2)
+    accelerometer_bias: np.ndarray = parameter(
+        [0.0, 0.0, 0.0], doc='known part of the bias, in the axes of the IMU', unit='m/s^2',
+        shape=(3,), low=-10, high=10)
+    gyroscope_bias: np.ndarray = parameter(
+        [0.0, 0.0, 0.0], doc='known part of the bias, in the axes of the IMU', unit='rad/s',
+        shape=(3,), low=-1, high=1)
     specific_force_limit: float = parameter(
         160.0, doc='larger readings are refused', unit='m/s^2', low=10, high=2000)
     angular_velocity_limit: float = parameter(
@@ -99,6 +106,9 @@ class InitialParameters:
         0.2, doc='standard deviation of the accelerometer bias', unit='m/s^2', low=1e-6, high=10)
     gyroscope_bias_std: float = parameter(
         0.05, doc='standard deviation of the gyroscope bias', unit='rad/s', low=1e-6, high=1)
+    time_offset: float = parameter(
+        0.0, doc='by how much the stamps of the IMU are later than those of the MoCap', unit='s',
+        low=-0.2, high=0.2)
     time_offset_std: float = parameter(
         0.01, doc='standard deviation of the offset between the clocks; 0 if there is none',
         unit='s', low=0, high=0.1)
@@ -194,6 +204,28 @@ class EkfParameters:
             raise schema.ParameterError(
                 f'imu.gap_limit ({self.imu.gap_limit:g} s) is shorter than one sample at imu.rate '
                 f'({self.imu.rate:g} Hz)')
+
+    def of_robot(self, robot: RobotParameters):
+        """
+        Parameters with what the robot file's effects say of IMU and MoCap.
+
+        Mountings replace those given here; biases and delays add to them. A late MoCap is early
+        by its stamps; a late IMU is carried on to now, as a latency that is found in flight.
+        """
+        e, imu, mocap = robot.sensors, self.imu, self.mocap
+
+        def mounted(own, effect):
+            return np.array(effect) if any(effect) else own
+
+        return replace(
+            self, imu=replace(
+                imu, rotation=mounted(imu.rotation, e.imu_rotation),
+                position=mounted(imu.position, e.imu_position),
+                accelerometer_bias=imu.accelerometer_bias + np.array(e.accelerometer_bias),
+                gyroscope_bias=imu.gyroscope_bias + np.array(e.gyroscope_bias)),
+            mocap=replace(mocap, rotation=mounted(mocap.rotation, e.mocap_rotation),
+                          time_offset=mocap.time_offset - e.mocap_delay),
+            initial=replace(self.initial, time_offset=self.initial.time_offset + e.imu_delay))
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> EkfParameters:

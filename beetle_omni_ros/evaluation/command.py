@@ -73,7 +73,7 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
                 bag, meta=meta, topics=tuple(topics_with([name])), compression=compression,
                 description=description(), epoch=int(time())))
             recorder = Tee(memory, writer)
-        estimator = EkfParameters.load()
+        estimator = EkfParameters.load().of_robot(robot)
         supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
                                 tuple(dict.fromkeys((*registry.names(), name))))
         simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed)

@@ -55,7 +55,8 @@ class Flight:
 
         """
         believed = RobotParameters.load()
-        estimator, safety = EkfParameters.load(), SupervisorParameters.load()
+        estimator = EkfParameters.load().of_robot(believed)
+        safety = SupervisorParameters.load()
         aboard = {entry.name: entry.make(believed) for entry in map(
             registry.find, dict.fromkeys([controller, registry.pilot()]))}
         name = next(iter(aboard))

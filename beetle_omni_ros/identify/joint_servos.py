@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.identify.servo_model import INDEX, OFF, TERMS
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.effects_actuator import per_joint
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import SLIDING_RATE
 
-GROUPS = {'joint_friction': ('coulomb',), 'joint_command_latency': ('delay',),
-          'joint_bandwidth': ('kp', 'kd'), 'joint_offset': ('offset',),
-          'joint_backlash': ('gap',), 'joint_velocity_limit': ('velocity_limit',),
-          'joint_torque_limit': ('effort_limit',)}
+# Entries of the catalogue that a response log shows, with those of their parameters.
+GROUPS = {name: parameters for name, effect in CATALOGUE.items() if (parameters := tuple(
+    parameter for parameter, spec in effect.parameters.items() if spec.log))}
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,15 @@ class Number:
 
 
 def _numbers(count):
-    made = [Number('kp', None, 0.05, 1e-3, 1e2, True), Number('kd', None, 0.05, 1e-5, 1e1, True),
-            Number('delay', None, 0.002, 0.0, 0.12),
-            Number('velocity_limit', None, 0.05, 0.2, 1e3, True),
-            Number('effort_limit', None, 0.05, 1e-3, 1e3, True),
-            Number('gap', None, 0.002, 0.0, 0.3), Number('stiction', None, 0.002, 0.0, 0.4),
-            Number('dead_band_held', None, 1.0, 0.0, 1.0)]
-    made += [Number('coulomb', j, 0.002, 0.0, 0.4) for j in range(count)]
-    return made + [Number('offset', j, 0.002, -0.5, 0.5) for j in range(count)]
+    shared, own = [], []
+    for name, parameters in GROUPS.items():
+        for parameter in parameters:
+            log = CATALOGUE[name].parameters[parameter].log
+            for joint in range(count) if log.each else (None,):
+                (own if log.each else shared).append(Number(
+                    parameter, joint, log.scale, log.low, log.high, log.logarithmic))
+    return [*shared, Number('stiction', None, 0.002, 0.0, 0.4),
+            Number('dead_band_held', None, 1.0, 0.0, 1.0), *own]
 
 
 class Servos:
@@ -130,7 +131,8 @@ class Servos:
         count, joint = len(self.joints), self.robot.joints
         shared = {n.name: values[:, k, None] for k, n in enumerate(self.numbers)
                   if n.joint is None}
-        coulomb, offset = values[:, -2 * count:-count], values[:, -count:]
+        coulomb, offset = (values[:, [self.index(name, j) for j in range(count)]]
+                           for name in ('coulomb', 'offset'))
         softer = (joint.kp / shared['kp'])**(1 - shared['dead_band_held'])
         made = {'natural_frequency': np.sqrt(shared['kp'] / joint.inertia),
                 'damping_ratio': shared['kd'] / (2 * np.sqrt(shared['kp'] * joint.inertia)),

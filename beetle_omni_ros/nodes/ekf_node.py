@@ -38,7 +38,7 @@ class EkfNode(FlightNode):
         """Wait for the first poses."""
         super().__init__('ekf_node', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')
         robot = RobotParameters.load(self.parameters.robot_file or None)
-        self._ekf = ErrorStateEkf(self.parameters, robot.gravity)
+        self._ekf = ErrorStateEkf(self.parameters.of_robot(robot), robot.gravity)
         self._status = self._ekf.status
         self._publisher = self.create_publisher(Odometry, 'odom', qos.ESTIMATE)
         self.listen(Imu, 'imu/data_raw', convert.imu_sample, self._on_imu, max_age=SENSOR_AGE)

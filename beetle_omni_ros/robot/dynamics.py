@@ -127,6 +127,39 @@ def _given(value, size):
     return ca.DM.zeros(size) if value is None else value
 
 
+def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
+    """
+    Force in world [N] and torque in base_link [N m] at base_link that some effects add.
+
+    The robot without them has the mass and inertia of its file. The effect of the torque
+    coefficient counts on both sides, for added thrusts turn the body, too.
+
+    Returns:
+        f(quaternion, velocity, rate, tilt, tilt_rate, tilt_acceleration, thrust, thrust_rate,
+        position, voltage_ratio) -> force, torque.
+
+    """
+    sizes = {'quaternion': 4, 'velocity': 3, 'rate': 3, 'tilt': 4, 'tilt_rate': 4,
+             'tilt_acceleration': 4, 'thrust': 4, 'thrust_rate': 4, 'position': 3,
+             'voltage_ratio': 1}
+    x = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+    both = {name: robot.effects[name] for name in ('torque_coefficient',) if name in robot.effects}
+
+    def wrench(effects):
+        acceleration, turning = rigid_body(
+            robot, x['velocity'], x['quaternion'], x['rate'], x['tilt'], x['thrust'],
+            tilt_acceleration=x['tilt_acceleration'], effects=effects,
+            **{name: x[name] for name in ('tilt_rate', 'thrust_rate', 'position',
+                                          'voltage_ratio')})
+        return robot.mass * acceleration, ca.DM(robot.inertia) * turning
+
+    without = wrench(both)
+    acting = wrench(both | {name: robot.effects[name] for name in names})
+    return ca.Function('added_wrench', list(x.values()), [
+        ca.cse(a - b) for a, b in zip(acting, without, strict=True)], list(x),
+        ['force', 'torque'])
+
+
 def gyroscopic_load(robot: RobotParameters, angular_velocity, tilt, thrust, joint: int):
     """Torque of a spinning rotor on its tilt joint for each N m s of its momentum in hover."""
     n = thrust_direction(robot.rotors.arm_yaw[joint], tilt)
@@ -163,7 +196,8 @@ def tilt_servo(robot: RobotParameters, joint: int, target, thrust=0.0,
     for name, values in robot.effects.items():
         if CATALOGUE[name].servo is not None:
             CATALOGUE[name].servo(terms, joint, **values)
-    return Servo.of(robot.joints, coulomb=terms.coulomb, stiction=terms.stiction), terms
+    stiction = None if terms.coulomb is None else max(terms.coulomb, terms.stiction)
+    return Servo.of(robot.joints, coulomb=terms.coulomb, stiction=stiction), terms
 
 
 def derivative(robot: RobotParameters, x, u, d):

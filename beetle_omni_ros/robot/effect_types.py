@@ -12,6 +12,29 @@ LAYERS = ('body', 'rotor', 'joint', 'timing', 'sensor')
 
 
 @dataclass(frozen=True)
+class LogNumber:
+    """
+    A parameter as a fit of a servo's response log has it.
+
+    Attributes:
+        scale: a change that matters; of the logarithm where ``logarithmic``.
+        low: smallest value; of friction as a dead band [rad].
+        high: largest value.
+        logarithmic: whether the logarithm is fitted.
+        each: whether each joint has its own.
+        better: name and unit of a number that a log determines better, or nothing.
+
+    """
+
+    scale: float
+    low: float
+    high: float
+    logarithmic: bool = False
+    each: bool = False
+    better: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
 class EffectParameter:
     """
     One number, or vector, of an effect.
@@ -25,6 +48,15 @@ class EffectParameter:
         smallest: deviation below which nobody would act on it; likewise.
         default: value where a file leaves it out; None: it must be there.
         of_each: whether a file may have a list of four in place of the number, one for each joint.
+        number: dotted key of the robot file's own number that it stands for.
+        sensor: number of a sensor that it stands for, as in :class:`SensorErrors`.
+        tolerance: kind of tolerance by which robots of one type differ in it, a number
+            ``tolerance_...`` of params/gap.yaml.
+        least: smallest ratio to the robot file's own number that a fit may reach.
+        step: change by which a fit takes derivatives; of the logarithm for the file's own numbers.
+        curved: whether those derivatives change along a fit.
+        form: whether it only chooses between forms of the effect and is not fitted.
+        log: how a servo's response log shows it, or None.
 
     """
 
@@ -36,6 +68,58 @@ class EffectParameter:
     smallest: float = float('nan')
     default: float | None = None
     of_each: bool = False
+    number: str = ''
+    sensor: str = ''
+    tolerance: str = ''
+    least: float = 0.02
+    step: float = 1e-3
+    curved: bool = False
+    form: bool = False
+    log: LogNumber | None = None
+
+
+@dataclass(frozen=True)
+class Asked:
+    """
+    Start values of a limit: where it begins to cut what a flight asks for.
+
+    Attributes:
+        of: 'tilt_rate', 'torque' or 'thrust'.
+        parts: of the most that the flight asks for, one start each.
+        below: part of the limit, below which a start must lie.
+
+    """
+
+    of: str
+    parts: tuple[float, ...]
+    below: float
+
+
+@dataclass(frozen=True)
+class SensorErrors:
+    """
+    What a robot's sensors say beside the truth, as effects of the robot file have it.
+
+    Attributes:
+        accelerometer_bias: (3,) measured minus true [m/s^2].
+        gyroscope_bias: (3,) [rad/s].
+        imu_rotation: (3,) rotation vector of the IMU's axes seen from base_link [rad].
+        imu_position: (3,) of the IMU in base_link [m].
+        mocap_rotation: (3,) rotation vector of the markers' axes seen from base_link [rad].
+        imu_delay: by which readings are older than their stamps [s].
+        mocap_delay: likewise [s].
+        encoder_delay: likewise [s].
+
+    """
+
+    accelerometer_bias: tuple[float, ...] = (0.0,) * 3
+    gyroscope_bias: tuple[float, ...] = (0.0,) * 3
+    imu_rotation: tuple[float, ...] = (0.0,) * 3
+    imu_position: tuple[float, ...] = (0.0,) * 3
+    mocap_rotation: tuple[float, ...] = (0.0,) * 3
+    imu_delay: float = 0.0
+    mocap_delay: float = 0.0
+    encoder_delay: float = 0.0
 
 
 @dataclass
@@ -127,6 +211,23 @@ class ServoTerms:
 
 
 @dataclass(frozen=True)
+class Stand:
+    """
+    What a consumer makes of an effect.
+
+    Attributes:
+        acts: whether a change of its parameters changes what the consumer computes.
+        reason: why not.
+        error: whether a robot file with the effect is refused.
+
+    """
+
+    acts: bool
+    reason: str = ''
+    error: bool = False
+
+
+@dataclass(frozen=True)
 class Effect:
     """
     One catalogue entry.
@@ -140,8 +241,21 @@ class Effect:
         separated_by: experiment that tells them apart.
         apply: body: changes :class:`Terms` in place, called as apply(terms, **values).
         servo: joint: changes :class:`ServoTerms` in place, servo(terms, joint, **values).
-        settings: parameter -> dotted key of the robot file whose number it replaces.
         each: 'rotor' or 'joint' where the parameters are (4,), one for each.
+        delays: what comes late, 'tilt' and 'thrust' commands or readings of 'imu', 'mocap' and
+            'encoders'.
+        own_clock: whether a clock of its own stamps those readings, which may then seem early.
+        channels: where it shows. B: forces and torques, J: joints, A: MoCap's acceleration,
+            W: MoCap's rate of turn; A and W against the IMU.
+        starts: values from which a fit starts, where the effect has no slope at its neutral value.
+        forms: deviations of the parameters that choose a form, one mapping for each form.
+        one_regime: whether it acts in one regime alone, such as near the ground.
+        same_response: entry that is another form of the same response.
+        log_rival: entry that a servo's response log can hardly tell from this one.
+        allocated: whether the allocation of thrusts has it.
+        plant: how the simulated plant has a body effect: 'model' as numbers of its bodies and
+            rotors, 'own' by equations of its own, else by this entry's.
+        stands: consumer -> its stand, where that does not follow from the kind of effect.
 
     """
 
@@ -153,8 +267,50 @@ class Effect:
     separated_by: str = ''
     apply: Callable | None = None
     servo: Callable | None = None
-    settings: dict[str, str] = field(default_factory=dict)
     each: str = ''
+    delays: tuple[str, ...] = ()
+    own_clock: bool = False
+    channels: str = 'B'
+    starts: tuple[tuple[float, ...], ...] | Asked = ()
+    forms: tuple[dict[str, float], ...] = ({},)
+    one_regime: bool = False
+    same_response: str = ''
+    log_rival: str = ''
+    allocated: bool = False
+    plant: str = ''
+    stands: dict[str, Stand] = field(default_factory=dict)
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """Parameter -> dotted key of the number that it replaces when a robot file is read."""
+        return {} if self.apply else {name: spec.number for name, spec in self.parameters.items()
+                                      if spec.number}
+
+    def in_readings(self, parameter: str) -> bool:
+        """Whether a parameter only shows in what sensors read, not in the model's equations."""
+        return bool(self.parameters[parameter].sensor) or self.kind == 'play'
+
+    @property
+    def kind(self) -> str:
+        """
+        How it acts.
+
+        'body' or 'servo' by its equation, 'number' in place of one of the robot file, 'command'
+        as a delay of commands, 'sensor' in readings of IMU and MoCap, 'feedback' in those of the
+        encoders, and 'play' between encoder and rotor.
+        """
+        if self.apply or self.servo:
+            return 'body' if self.apply else 'servo'
+        if self.settings:
+            return 'number'
+        if any(spec.sensor for spec in self.parameters.values()):
+            return 'feedback' if 'encoders' in self.delays else 'sensor'
+        return 'command' if self.delays else 'play'
+
+    @property
+    def numbers(self) -> list[str]:
+        """Names of the parameters that a fit determines."""
+        return [name for name, spec in self.parameters.items() if not spec.form]
 
 
 def vector(values):

@@ -20,7 +20,14 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from beetle_omni_ros.robot.effect_types import Effect, EffectParameter, ServoTerms, Terms
+from beetle_omni_ros.robot.effect_types import (
+    Asked,
+    Effect,
+    EffectParameter,
+    SensorErrors,
+    ServoTerms,
+    Terms,
+)
 from beetle_omni_ros.robot.effects_actuator import ACTUATOR, SENSOR
 from beetle_omni_ros.robot.effects_body import BODY
 from beetle_omni_ros.robot.schema import ParameterError
@@ -32,8 +39,8 @@ CATALOGUE: dict[str, Effect] = {'joint_offset': ACTUATOR['joint_offset'], **BODY
 
 MEMBERS = 4         # joints of this kind of robot
 
-__all__ = ['CATALOGUE', 'command_delays', 'Effect', 'EffectParameter', 'ServoTerms', 'settings',
-           'Terms', 'validated']
+__all__ = ['Asked', 'CATALOGUE', 'command_delays', 'delaying', 'Effect', 'EffectParameter',
+           'sensor_errors', 'SensorErrors', 'ServoTerms', 'settings', 'Terms', 'validated']
 
 
 def settings(effects: dict[str, dict]) -> dict[str, float]:
@@ -42,11 +49,23 @@ def settings(effects: dict[str, dict]) -> dict[str, float]:
             for parameter, key in CATALOGUE[name].settings.items()}
 
 
+def delaying(*what: str) -> tuple[str, ...]:
+    """Names of the effects that delay any of ``what``; see :attr:`Effect.delays`."""
+    return tuple(name for name, entry in CATALOGUE.items() if set(what) & set(entry.delays))
+
+
 def command_delays(effects: dict[str, dict]) -> tuple[float, float]:
     """Delays of tilt and of thrust commands [s] that checked effects add."""
-    common, tilt, thrust = (effects.get(name, {}).get('delay', 0.0) for name in (
-        'command_latency', 'joint_command_latency', 'rotor_dead_time'))
-    return common + tilt, common + thrust
+    tilt, thrust = (sum(effects.get(name, {}).get('delay', 0.0) for name in delaying(what))
+                    for what in ('tilt', 'thrust'))
+    return tilt, thrust
+
+
+def sensor_errors(effects: dict[str, dict]) -> SensorErrors:
+    """What checked effects say of the sensors."""
+    return SensorErrors(**{spec.sensor: values[parameter] for name, values in effects.items()
+                           for parameter, spec in CATALOGUE[name].parameters.items()
+                           if spec.sensor})
 
 
 def validated(effects: dict | None) -> dict[str, dict]:

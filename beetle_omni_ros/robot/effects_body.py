@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from beetle_omni_ros.robot.effect_types import Effect, EffectParameter, vector
+from beetle_omni_ros.robot.effect_types import Effect, EffectParameter, Stand, vector
 
 NAN = float('nan')
 UP = ca.DM([0, 0, 1])
@@ -137,63 +137,77 @@ def _rotor_acceleration_torque(terms, angular_momentum_at_hover):
 
 BODY: dict[str, Effect] = {
     'mass': Effect(
-        'body', {'mass': EffectParameter('kg', NAN, 0.05, 200, 0.05, 0.01)},
+        'body', {'mass': EffectParameter('kg', NAN, 0.05, 200, 0.05, 0.01, number='mass',
+                                         tolerance='mass')},
         "m v' = F, Newton; INTERFACES: total mass", 'any flight',
         ('thrust_coefficient', 'voltage_sag', 'wind'),
-        'weigh the robot, or fly fast turns: thrust scales torques too, mass does not', _mass),
+        'weigh the robot, or fly fast turns: thrust scales torques too, mass does not', _mass,
+        allocated=True, plant='model'),
     'inertia': Effect(
-        'body', {'inertia': EffectParameter('kg m^2', (NAN,) * 3, 1e-5, 50, 0.2, 0.05)},
+        'body', {'inertia': EffectParameter('kg m^2', (NAN,) * 3, 1e-5, 50, 0.2, 0.05,
+                                            number='inertia', tolerance='inertia')},
         "I w' = tau - w x I w, Euler", 'fast turns about every axis',
         ('rotor_lag', 'propeller_gyroscopic_torque', 'thrust_coefficient'),
-        'flips by 90 and 180 deg about each axis', _inertia),
+        'flips by 90 and 180 deg about each axis', _inertia, plant='model'),
     'centre_of_mass': Effect(
         'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2, 0.005, 0.0015)},
         'forces turn the body about its centre of mass; base_link moves with it',
         'hover in several attitudes', ('rotor_thrust_coefficient', 'module_reaction'),
-        'hover at roll 0, 90, 180 deg and pitch 90 deg', _centre_of_mass),
+        'hover at roll 0, 90, 180 deg and pitch 90 deg', _centre_of_mass, plant='model'),
     'module_reaction': Effect(
-        'body', {'module_inertia': EffectParameter('kg m^2', 0.0, 0.0, 0.1, 1e-4, 2e-5),
-                 'mass_moment': EffectParameter('kg m', 0.0, 0.0, 1.0, 2e-3, 3e-4, 0.0)},
+        'body', {'module_inertia': EffectParameter('kg m^2', 0.0, 0.0, 0.1, 1e-4, 2e-5,
+                                                   step=2e-5),
+                 'mass_moment': EffectParameter('kg m', 0.0, 0.0, 1.0, 2e-3, 3e-4, 0.0,
+                                                step=2e-4)},
         "servo torque J q'' on the body; centre of mass moved by -moment / m (t(q) - t(0)), "
         "moment (n'' + 2 w x n') pushed back; "
         'multibody section of the robot file', 'fast tilting, turned attitudes',
         ('centre_of_mass', 'inertia'), 'the same attitude with tilts turned by 180 deg',
-        _module_reaction),
+        _module_reaction, channels='BJ', plant='model', stands={'plant': Stand(
+            False, 'its modules turn and swing as bodies of their own, as the multibody section '
+                   'has them; without that section it acts')}),
     'thrust_coefficient': Effect(
-        'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0, 0.05, 0.01)},
+        'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0, 0.05, 0.01, tolerance='thrust')},
         'f = scale f*, all rotors', 'any flight', ('mass', 'voltage_sag', 'tilt_thrust_loss'),
-        'weigh the robot; flights at two states of charge', _thrust_coefficient),
+        'weigh the robot; flights at two states of charge', _thrust_coefficient, allocated=True,
+        plant='model'),
     'rotor_thrust_coefficient': Effect(
-        'body', {'scale': EffectParameter('1', (1.0,) * 4, 0.0, 2.0, 0.08, 0.015)},
+        'body', {'scale': EffectParameter('1', (1.0,) * 4, 0.0, 2.0, 0.08, 0.015,
+                                          tolerance='thrust')},
         'f_i = scale_i f*_i: a damaged propeller, a speed controller of its own',
         'hover in several attitudes', ('centre_of_mass', 'rotor_thrust_coefficient'),
-        'tilted attitudes; exchange propellers 1 and 2', _rotor_thrust_coefficient, each='rotor'),
+        'tilted attitudes; exchange propellers 1 and 2', _rotor_thrust_coefficient, each='rotor',
+        allocated=True, plant='model'),
     'torque_coefficient': Effect(
-        'body', {'torque_to_thrust_ratio': EffectParameter('m', NAN, 0.0, 0.2, 0.2, 0.03)},
+        'body', {'torque_to_thrust_ratio': EffectParameter(
+            'm', NAN, 0.0, 0.2, 0.2, 0.03, number='rotors.torque_to_thrust_ratio',
+            tolerance='torque_ratio')},
         'tau_i = -spin_i ratio f_i about the thrust axis', 'yaw steps, differential thrust',
         ('joint_offset', 'rotor_acceleration_torque'), 'yaw steps at zero tilt',
-        _torque_coefficient),
+        _torque_coefficient, allocated=True, plant='model'),
     'ground_effect': Effect(
         'body', {'gain_at_0.25m': EffectParameter('1', 0.0, 0.0, 1.0, 0.08, 0.01),
-                 'exponential_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0)},
+                 'exponential_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
         'f_i (1 + g s(h) n_z^2), s = (0.25 m / h)^2 after Cheeseman and Bennett 1955, or '
         'exp((0.25 m - h) / 0.25 m); h: rotor above the floor', 'hover below 0.6 m',
         ('thrust_coefficient', 'mass', 'tilt_thrust_loss'),
-        'hover ladder at 0.2, 0.3, 0.5, 1.0 and 1.5 m at one state of charge', _ground_effect),
+        'hover ladder at 0.2, 0.3, 0.5, 1.0 and 1.5 m at one state of charge', _ground_effect,
+        forms=({'exponential_share': 0.0}, {'exponential_share': 1.0}), one_regime=True,
+        plant='own'),
     'rotor_drag': Effect(
         'body', {'coefficient': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.06)},
         'H-force of Faessler et al. 2018, in the rotor plane, grows with rotor speed '
         'sqrt(f / f_h)', 'translation above 1 m/s', ('body_drag', 'wind'),
-        'passes at three speeds with two rotor tilts', _rotor_drag),
+        'passes at three speeds with two rotor tilts', _rotor_drag, plant='own'),
     'body_drag': Effect(
         'body', {'coefficient': EffectParameter('N s^2/m^2', 0.0, 0.0, 5.0, 0.05, 0.02)},
         'F = -c |v| v', 'translation above 2 m/s', ('rotor_drag', 'wind'),
-        'passes above 4 m/s', _body_drag),
+        'passes above 4 m/s', _body_drag, plant='own'),
     'axial_inflow': Effect(
         'body', {'per_rotor': EffectParameter('N s/m', 0.0, 0.0, 5.0, 0.4, 0.04)},
         'f_i - k sqrt(f_i / f_h) v.n: momentum theory, linear part (Leishman 2006, ch. 2)',
         'climb and descent', ('rotor_lag', 'rotor_drag'),
-        'steady climb and descent at 1 m/s beside thrust steps', _axial_inflow),
+        'steady climb and descent at 1 m/s beside thrust steps', _axial_inflow, plant='own'),
     'translational_lift': Effect(
         'body', {'per_rotor': EffectParameter('N s^2/m^2', 0.0, 0.0, 1.0, 0.03, 0.01)},
         'f_i + k |v_in_plane|^2: induced velocity falls with the flow through the disc '
@@ -201,25 +215,28 @@ BODY: dict[str, Effect] = {
         'level passes at 1, 2 and 3 m/s', _translational_lift),
     'tilt_thrust_loss': Effect(
         'body', {'loss_at_60deg': EffectParameter('1', 0.0, 0.0, 0.9, 0.06, 0.01),
-                 'cosine_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0)},
+                 'cosine_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
         'f_i (1 - L s(q)), s = sin^2 q / 0.75 or 2 (1 - cos q): arm and body in the wake',
         'large tilts', ('thrust_coefficient', 'mass', 'ground_effect'),
-        'one attitude with tilts changed by internal force', _tilt_thrust_loss),
+        'one attitude with tilts changed by internal force', _tilt_thrust_loss,
+        forms=({'cosine_share': 0.0}, {'cosine_share': 1.0}), one_regime=True, plant='own'),
     'wind': Effect(
         'body', {'force': EffectParameter('N', (0.0,) * 3, -100, 100, 1.0, 0.1)},
         'constant force in world', 'any flight; yaw turns', ('mass', 'imu_misalignment',
                                                             'mocap_misalignment'),
-        'hover at yaw 0 and 180 deg; fan off', _wind),
+        'hover at yaw 0 and 180 deg; fan off', _wind, allocated=True, plant='own'),
     'propeller_gyroscopic_torque': Effect(
         'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0, 0.066,
-                                                              0.008),
-                 'spin_up_share': EffectParameter('1', 1.0, 0.0, 1.0, default=1.0),
-                 'joint_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0)},
+                                                              0.008, step=5e-3),
+                 'spin_up_share': EffectParameter('1', 1.0, 0.0, 1.0, default=1.0, form=True),
+                 'joint_share': EffectParameter('1', 0.0, 0.0, 1.0, default=0.0, form=True)},
         "-(w + q' e) x h s n - h' s n with h ~ sqrt(f): the propellers' angular momentum; the "
         'part about the tilt axis loads the servo where joint_share is 1',
         'fast turns and fast tilting', ('inertia', 'rotor_acceleration_torque', 'rotor_lag'),
         'fast tilting by internal force at rest', _propeller_gyroscopic_torque,
-        _gyroscopic_load),
+        _gyroscopic_load, channels='BJ',
+        forms=({'spin_up_share': 0.0}, {'spin_up_share': -1.0}, {'joint_share': 1.0}),
+        one_regime=True),
     'rotor_acceleration_torque': Effect(
         'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0, 0.066,
                                                               0.008)},

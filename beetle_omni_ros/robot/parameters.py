@@ -230,6 +230,11 @@ class RobotParameters:
         return catalogue.command_delays(self.effects)
 
     @property
+    def sensors(self) -> catalogue.SensorErrors:
+        """What the effects say of the sensors."""
+        return catalogue.sensor_errors(self.effects)
+
+    @property
     def hover_thrust(self) -> float:
         """Thrust of each rotor in level hover [N]."""
         return self.mass * self.gravity / 4

@@ -1,40 +1,18 @@
 """
-The named effects as the plant feels them: plain numpy, written apart from the CasADi terms.
+The forces of named effects as the plant feels them.
 
 Effects that only change a number of the model (mass, thrust and torque coefficients) are
-built into it by :mod:`beetle_omni_ros.sim.mjcf`; here are the forces that depend on motion.
+built into it by :mod:`beetle_omni_ros.sim.mjcf`. The common ones that depend on motion are
+written apart from the CasADi terms, in plain numpy; all others are the catalogue's equations.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot import dynamics, native, rotations
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
-
-# The plant's modules turn and swing as bodies of their own, whatever the file says of them.
-BUILT_IN = ('mass', 'inertia', 'centre_of_mass', 'module_reaction', 'thrust_coefficient',
-            'rotor_thrust_coefficient', 'torque_coefficient',
-            # numbers of the robot file that are replaced when it is read, and delays
-            'rotor_lag', 'thrust_saturation', 'joint_bandwidth', 'joint_velocity_limit',
-            'joint_torque_limit', 'command_latency', 'joint_command_latency', 'rotor_dead_time')
-FORCES = ('wind', 'body_drag', 'rotor_drag', 'tilt_thrust_loss', 'axial_inflow',
-          'ground_effect')
-
-
-def check_supported(robot: RobotParameters) -> None:
-    """
-    Refuse a robot with an effect that this plant cannot simulate.
-
-    Raises:
-        ParameterError: naming the effect.
-
-    """
-    for name in robot.effects:
-        if name not in BUILT_IN + FORCES:
-            raise ParameterError(f'effects.{name}: the simulated plant does not have this effect; '
-                                 f"it has {', '.join(BUILT_IN + FORCES)}")
 
 
 class MotionForces:
@@ -115,3 +93,30 @@ class MotionForces:
         lost = self.inflow * np.sqrt(np.maximum(thrust, 0) / self._hover_thrust) * (
             hub * normal).sum(axis=1)
         return (part - 1) * thrust - lost
+
+
+class CatalogueForces:
+    """
+    Forces of the effects that have no description of their own here, by the catalogue's equations.
+
+    Attributes:
+        names: of those effects in the robot file.
+
+    """
+
+    def __init__(self, robot: RobotParameters):
+        """Compile the equations, if there are any."""
+        self.names = [name for name in robot.effects
+                      if CATALOGUE[name].apply and not CATALOGUE[name].plant]
+        if self.names:
+            self._function = native.compiled(dynamics.added_wrench(robot, self.names))
+
+    def __call__(self, quaternion: np.ndarray, velocity: np.ndarray, rate: np.ndarray,
+                 tilt: np.ndarray, tilt_rate: np.ndarray, tilt_acceleration: np.ndarray,
+                 thrust: np.ndarray, thrust_rate: np.ndarray, position: np.ndarray,
+                 voltage_ratio: float) -> tuple[np.ndarray, np.ndarray]:
+        """Force (3,) in world [N], torque (3,) in base_link [N m]; SI arguments, xyzw."""
+        force, torque = self._function(quaternion, velocity, rate, tilt, tilt_rate,
+                                       tilt_acceleration, thrust, thrust_rate, position,
+                                       voltage_ratio)
+        return np.array(force).ravel(), np.array(torque).ravel()

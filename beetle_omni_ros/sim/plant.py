@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot import consumers, dynamics, rotations
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.sim.effects import check_supported, MotionForces
+from beetle_omni_ros.sim.effects import CatalogueForces, MotionForces
 from beetle_omni_ros.sim.mass_properties import Variation
 from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, set_base_part, thrust_scale
 from beetle_omni_ros.sim.parameters import PlantParameters
@@ -41,9 +42,11 @@ class Plant:
             ParameterError: an effect that the plant lacks, or impossible mass properties.
 
         """
-        check_supported(robot)
+        consumers.check('plant', robot)
         self._robot, self._parameters, self._variation = robot, parameters, variation
-        self._forces = MotionForces(robot)
+        self._forces, self._others = MotionForces(robot), CatalogueForces(robot)
+        self._moved = self._forces.depends_on_motion or bool(self._others.names)
+        self._loaded = any(CATALOGUE[name].servo for name in robot.effects)
         self._scale = thrust_scale(robot)
         self.model = build_model(robot, parameters, variation)
         self.data = mujoco.MjData(self.model)
@@ -57,6 +60,8 @@ class Plant:
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
         self._ground_height: float | None = None
+        self._asked = np.zeros(4)
+        self.voltage_ratio = 1.0    # of the pack to a full one; whoever has a battery sets it
         self._wrench = np.zeros(6)
         self._payload: float | None = None      # not yet set
         self._servos = (True,) * 4, (False,) * 4
@@ -118,6 +123,7 @@ class Plant:
         """Tilt targets (4,) [rad] and thrust commands (4,) [N], both within their limits."""
         self.data.ctrl[:4] = thrust
         self.data.ctrl[4:] = tilt
+        self._asked = np.array(tilt)
 
     def set_powered(self, powered: Sequence[bool],
                    jammed: Sequence[bool] = (False,) * 4) -> None:
@@ -165,6 +171,8 @@ class Plant:
 
         """
         model, data = self.model, self.data
+        if self._loaded:
+            self._load_servos()
         touching = self._may_touch()
         model.opt.disableflags = self._flags if touching else self._flags | NO_CONSTRAINT
         fast = not self._may_reach_rate_limit()
@@ -226,23 +234,41 @@ class Plant:
         """
         data = self.data
         applied = data.qfrc_applied
-        if not self._forces.depends_on_motion:
+        if not self._moved:
             applied[:6] = self._wrench
             applied[:3] += self._forces.wind
             return
         change = data.ctrl[:4] - data.act
         thrust = data.act - np.expm1(-ahead / self._robot.rotors.time_constant) * change
         turn = rotations.exp(ahead * self._qvel[3:6])
+        quaternion = rotations.multiply(self._qpos[XYZW], turn)
+        motion = self._qvel + ahead * data.qacc
+        tilt = self._tilt + ahead * self._rate
         force, torque = self._forces(
-            rotations.matrix(rotations.multiply(self._qpos[XYZW], turn)),
-            self._qvel[:3] + ahead * data.qacc[:3], self._qvel[3:6] + ahead * data.qacc[3:6],
-            self._tilt + ahead * self._rate, self._scale * thrust, float(self._qpos[2]))
+            rotations.matrix(quaternion), motion[:3], motion[3:6], tilt, self._scale * thrust,
+            float(self._qpos[2]))
+        if self._others.names:
+            beside = self._others(
+                quaternion, motion[:3], motion[3:6], tilt, motion[6:], data.qacc[6:],
+                self._scale * thrust, self._scale * (data.ctrl[:4] - thrust)
+                / self._robot.rotors.time_constant, self._qpos[:3], self.voltage_ratio)
+            force, torque = force + beside[0], torque + beside[1]
         applied[:3] = self._wrench[:3] + force
         applied[3:6] = self._wrench[3:] + torque
 
+    def _load_servos(self):
+        """Targets and joint torques as effects on the servos make them of what is asked."""
+        thrust = self._scale * self.data.act
+        for i in range(4):
+            load = dynamics.gyroscopic_load(self._robot, self._qvel[3:6], self._tilt[i],
+                                            thrust[i], i)
+            _, terms = dynamics.tilt_servo(self._robot, i, self._asked[i], thrust[i], float(load))
+            self._target[i] = terms.target
+            self.data.qfrc_applied[6 + i] = terms.load
+
     def _update(self):
         """Accelerations and contacts of the state just reached."""
-        if self._forces.depends_on_motion:
+        if self._moved:
             self._apply_forces()
         mujoco.mj_forward(self.model, self.data)
 

@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.effects import SensorErrors
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.battery import Battery
 from beetle_omni_ros.sim.conditions import Conditions
@@ -49,7 +50,8 @@ class Sensors:
     """All sensors of one robot in one flight."""
 
     def __init__(self, parameters: SimulatorParameters, conditions: Conditions,
-                 seeds: list[np.random.SeedSequence], first: Truth, effort: np.ndarray):
+                 seeds: list[np.random.SeedSequence], first: Truth, effort: np.ndarray,
+                 errors: SensorErrors = SensorErrors()):
         """
         Start with a robot that has been at rest in its ``first`` state.
 
@@ -60,20 +62,27 @@ class Sensors:
                 noise does not depend on another's rate.
             first: the state at reset.
             effort: (4,) servo torques there [N m].
+            errors: what the robot file's effects say of the sensors.
 
         Raises:
             ParameterError: a period or latency is no multiple of the tick.
 
         """
-        self._tick = parameters.plant.tick
+        self._tick, self._errors = parameters.plant.tick, errors
+        self._turned = rotations.matrix(rotations.exp(errors.imu_rotation)) \
+            if any(errors.imu_rotation) else None
+        self._arm = np.array(errors.imu_position) if any(errors.imu_position) else None
         generators = [np.random.Generator(np.random.PCG64(seed)) for seed in seeds]
         imu, mocap, pack = parameters.imu, parameters.mocap, parameters.battery
         self._imu_noise = Noise(
-            generators[0], conditions.imu_bias,
+            generators[0],
+            conditions.imu_bias + np.array([*errors.accelerometer_bias, *errors.gyroscope_bias]),
             np.repeat([imu.specific_force_noise, imu.angular_velocity_noise], 3),
             conditions.imu_uniform_noise)
         self._mocap_noise = Noise(
-            generators[1], np.concatenate([conditions.position_bias, conditions.orientation_bias]),
+            generators[1], np.concatenate([
+                conditions.position_bias,
+                conditions.orientation_bias + np.array(errors.mocap_rotation)]),
             np.repeat([mocap.position_noise, mocap.orientation_noise], 3),
             conditions.mocap_uniform_noise)
         self._tilt_noise = Noise(generators[2], conditions.tilt_bias, np.zeros(4),
@@ -89,9 +98,14 @@ class Sensors:
         self._battery_period = self._ticks('battery.period', pack.period, least=1)
         self._count = 2 * np.pi / parameters.encoders.counts_per_turn
         self._velocity_step = parameters.encoders.velocity_step
-        self._imu = _delay_line(self._ticks('imu latency', conditions.imu_latency))
-        self._joints = _delay_line(self._ticks('encoder latency', conditions.tilt_latency))
-        self._mocap = _delay_line(self._ticks('mocap.latency', mocap.latency))
+        self._imu = _delay_line(self._ticks('imu latency', conditions.imu_latency)
+                                + self._late(errors.imu_delay))
+        self._joints = _delay_line(self._ticks('encoder latency', conditions.tilt_latency)
+                                   + self._late(errors.encoder_delay))
+        self._mocap = _delay_line(self._ticks('mocap.latency', mocap.latency)
+                                  + self._late(errors.mocap_delay))
+        # An IMU's readings are as old as whole ticks; their stamps make the rest of the delay.
+        self._imu_shift = errors.imu_delay - self._tick * self._late(errors.imu_delay)
         at_rest = np.zeros(6)
         for _ in range(self._imu.maxlen):
             self._imu.append(at_rest)
@@ -109,11 +123,29 @@ class Sensors:
                                  f'{self._tick:g} s' + (', one or more' if least else ''))
         return ticks
 
+    def _late(self, delay):
+        """Ticks by which a reading arrives later whose stamp hides a delay [s]."""
+        return max(0, int(np.ceil(delay / self._tick - 1e-9)))
+
+    def _motion(self, before, truth, gravity):
+        """(6,) what the IMU shows: the motion of its place in its axes."""
+        motion = mean_motion(before, truth, gravity)
+        if self._arm is not None:
+            rate = motion[3:]
+            turning = (truth.angular_velocity - before.angular_velocity) / self._tick
+            motion[:3] += np.cross(turning, self._arm) + np.cross(rate, np.cross(rate, self._arm))
+        if self._turned is not None:
+            motion = np.concatenate([motion[:3] @ self._turned, motion[3:] @ self._turned])
+        return motion
+
     def start_imu(self, truth: Truth, specific_force: np.ndarray) -> None:
         """Fill the IMU's latency with the reading at reset."""
         self._before = truth
+        motion = np.concatenate([specific_force, truth.angular_velocity])
+        if self._turned is not None:
+            motion = np.concatenate([motion[:3] @ self._turned, motion[3:] @ self._turned])
         for _ in range(self._imu.maxlen):
-            self._imu.append(np.concatenate([specific_force, truth.angular_velocity]))
+            self._imu.append(motion)
 
     def read(self, tick: int, truth: Truth, plant: Plant, battery: Battery,
              devices: bool = False) -> tuple:
@@ -131,11 +163,11 @@ class Sensors:
             (imu, mocap, joints, battery), None where there is none.
 
         """
-        self._imu.append(mean_motion(self._before, truth, plant.gravity))
+        self._imu.append(self._motion(self._before, truth, plant.gravity))
         self._before = truth
         imu = self._imu[0] + self._imu_noise.next()
         self._mocap.append(self._capture(truth) if tick % self._mocap_period == 0 else None)
-        motion = ImuReading(truth.stamp, imu[:3], imu[3:])
+        motion = ImuReading(truth.stamp + self._imu_shift, imu[:3], imu[3:])
         effort = plant.effort
         self._joints.append((truth.stamp, truth.tilt, truth.tilt_velocity, effort))
         if devices:
@@ -165,7 +197,7 @@ class Sensors:
 
     def _capture(self, truth):
         noise = self._mocap_noise.next()
-        return PoseReading(truth.stamp, truth.position + noise[:3],
+        return PoseReading(truth.stamp + self._errors.mocap_delay, truth.position + noise[:3],
                            rotations.multiply(truth.quaternion, rotations.exp(noise[3:])))
 
     def _joint_reading(self):
@@ -173,7 +205,7 @@ class Sensors:
         tilt = np.rint((tilt + self._tilt_noise.next()) / self._count) * self._count
         if self._velocity_step:
             velocity = np.rint(velocity / self._velocity_step) * self._velocity_step
-        return JointReading(stamp, tilt, velocity, effort)
+        return JointReading(stamp + self._errors.encoder_delay, tilt, velocity, effort)
 
     def _pack_reading(self, stamp, battery):
         voltage, current = self._battery_noise.next().tolist()

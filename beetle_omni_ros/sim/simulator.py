@@ -100,7 +100,7 @@ class Simulator:
         *seeds, fault_seed = np.random.SeedSequence(self._seed).spawn(7)[1:]
         self._schedule = Schedule(self.tick, fault_seed)
         self._sensors = Sensors(self._parameters, self.conditions, seeds, self.truth,
-                                self._plant.effort)
+                                self._plant.effort, self._robot.sensors)
         self._sensors.start_imu(self.truth, self._plant.specific_force)
 
     def set_body(self, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray,
@@ -246,6 +246,7 @@ class Simulator:
             wear = self._actuate(link.tilt, np.minimum(link.thrust, battery.thrust_limit), POWERED)
         else:
             wear = self._actuate(drive.tilt, drive.thrust, drive.powered)
+        plant.voltage_ratio = battery.voltage / self._robot.battery.full_voltage
         plant.step()
         self._ticks += 1
         self.time = self._ticks * self.tick

@@ -14,6 +14,7 @@ from tensordict import TensorDict
 import torch
 
 from beetle_omni_ros.control.policy_file import PolicyContract
+from beetle_omni_ros.robot import consumers
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train import batch, rewards, starts
@@ -48,6 +49,9 @@ class TiltableQuadrotorEnv(VecEnv):
         device: torch device.
         compiled: whether to compile the step (pays on a GPU only).
 
+    Raises:
+        ParameterError: an effect of the robot file that training refuses.
+
     Attributes:
         state: name -> (N, ...) tensor, everything that lasts from step to step.
         weights: (R,) reward weights in the order of ``rewards.TERMS``, on the device; may be
@@ -59,6 +63,7 @@ class TiltableQuadrotorEnv(VecEnv):
 
     def __init__(self, parameters: TrainParameters, robot: RobotParameters,
                  device: torch.device | str = 'cpu', compiled: bool | None = None):
+        consumers.check('training', robot)
         self.cfg, self.robot, self.device = parameters, robot, torch.device(device)
         self.num_envs, self.num_actions = parameters.ppo.robots, model.INPUT_SIZE
         self.max_episode_length = round(parameters.episode.duration / parameters.episode.period)

@@ -7,13 +7,36 @@ import torch
 
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.train import batch
 from beetle_omni_ros.train.model import nominal_body
 from beetle_omni_ros.train.parameters import TrainParameters
 
 STRATA = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
+MEMORY = 2      # periods for which the environment remembers commands and tilts
 PAYLOAD_DEPTH = 0.08                   # [m] below base_link, as the simulated plant hangs it
+
+
+def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[float]]:
+    """
+    Ranges of the delays of tilt and thrust commands, of the velocity and of the tilts [s].
+
+    Raises:
+        ParameterError: the robot file's delays make one longer than the environment remembers.
+
+    """
+    r, (tilt, thrust) = parameters.random, robot.command_delays
+    made, most = [], MEMORY * parameters.episode.period
+    for name, span, more in (('tilt commands', r.command_latency, tilt),
+                             ('thrust commands', r.command_latency, thrust),
+                             ('velocity', r.velocity_latency, 0.0),
+                             ('joint feedback', r.tilt_latency, robot.sensors.encoder_delay)):
+        made.append([max(float(t) + more, 0.0) for t in span])
+        if more and made[-1][1] > most + 1e-9:
+            raise ParameterError(f'effects: {name} are up to {1e3 * made[-1][1]:g} ms late, '
+                                 f'training remembers {1e3 * most:g} ms')
+    return made
 
 
 class Starts:
@@ -57,8 +80,7 @@ class Starts:
         self._target_time = [float(t) / parameters.episode.period
                              for t in parameters.episode.target_time]
         r = parameters.random
-        self._latencies = [[float(t) for t in span] for span in (
-            r.command_latency, r.command_latency, r.velocity_latency, r.tilt_latency)]
+        self._latencies = latencies(parameters, robot)
         self._thrust_limit = [float(t) for t in r.thrust_limit]
 
     def draw(self, d: batch.Draw) -> dict[str, torch.Tensor]:

@@ -1,5 +1,7 @@
 """The estimator on the multibody simulator, from the drop at the start to large turns."""
 
+from dataclasses import replace
+
 from ekf_flights import feed
 import numpy as np
 import pytest
@@ -15,14 +17,15 @@ from beetle_omni_ros.sim.simulator import Simulator
 DURATION, HEIGHT, POSE_TIME = 8.0, 2.0, 2.0
 
 
-def fly(conditions, seed, drop=lambda time: False):
+def fly(conditions, seed, drop=lambda time: False, true=None, believed=None):
     """Fly random poses on the true state; the estimator listens. Yield it with the truth."""
-    robot = RobotParameters.load()
+    robot = true or RobotParameters.load()
     simulator = Simulator(robot, conditions=conditions, seed=seed)
     hover = HoverController(robot, HoverParameters.load())
     hover.reset()
     simulator.reset(np.array([0.0, 0.0, HEIGHT + 1]))
-    ekf, rng = ErrorStateEkf(EkfParameters.load(), robot.gravity), np.random.default_rng(seed)
+    parameters = EkfParameters.load().of_robot(believed or RobotParameters.load())
+    ekf, rng = ErrorStateEkf(parameters, robot.gravity), np.random.default_rng(seed)
     target, command = PoseTarget(np.array([0, 0, HEIGHT]), np.array([0, 0, 0, 1.0])), None
     for k in range(round(DURATION / simulator.tick)):
         frame = simulator.step()
@@ -89,3 +92,46 @@ def test_its_covariance_is_honest_on_the_multibody_plant():
                                                      truth.quaternion))])
                 nees.append(error @ np.linalg.solve(estimate.covariance[:9, :9], error))
     assert 5.5 < np.mean(nees) < 12.5   # 9 for an exact filter; point-sampled IMU: 24
+
+
+HIDDEN = {     # values, seconds of flight that count, columns of the errors, how much better
+    'imu_misalignment': ({'rotation': (0.03, -0.02, 0.025)}, (0.5, 4.0), (0, 1, 2), 2.0),
+    'mocap_misalignment': ({'rotation': (0.02, -0.02, 0.01)}, (0.5, 4.0), (0, 1, 2), 3.0),
+    'imu_lever_arm': ({'offset': (0.06, -0.04, 0.05)}, (0.5, 4.0), (0, 1, 2), 1.5),
+    'mocap_time_offset': ({'delay': 0.02}, (0.5, 4.0), (0, 1, 2), 1.2),
+    # what the filter finds by itself helps at the start
+    'imu_filter_lag': ({'delay': 0.015}, (0.0, 1.0), (1,), 1.2)}
+
+
+def flown(true, believed, duration):
+    """Rows of time and errors in units of what a sound flight has, and the last estimate."""
+    rows = []
+    for ekf, truth in fly('nominal', 3, true=true, believed=believed):
+        if ekf.status == 'tracking':
+            rows.append([truth.stamp, *errors(ekf, truth) / np.array([0.001, 0.01, 0.002])])
+        if truth.stamp > duration:
+            return np.array(rows), ekf.estimate
+
+
+@pytest.mark.parametrize('name', HIDDEN)
+def test_what_the_robot_file_says_of_a_sensor_makes_the_estimate_better(name):
+    values, (first, last), columns, better = HIDDEN[name]
+    true = replace(RobotParameters.load(), effects={name: values})
+
+    def error(believed):
+        rows, _ = flown(true, believed, last)
+        rows = rows[rows[:, 0] > first, 1:]
+        return float(np.sqrt(np.mean(np.square(rows[:, columns]))))
+
+    blind, told = error(None), error(true)
+    assert told < blind / better, f'{told:.2f} against {blind:.2f}'
+
+
+@pytest.mark.parametrize('name, bias, found', [
+    ('imu_accelerometer_bias', (0.4, -0.3, 0.3), 'accelerometer_bias'),
+    ('imu_gyroscope_bias', (0.08, -0.06, 0.05), 'gyroscope_bias')])
+def test_a_bias_that_the_robot_file_knows_is_not_left_to_find(name, bias, found):
+    true = replace(RobotParameters.load(), effects={name: {'bias': bias}})
+    left = [np.linalg.norm(getattr(flown(true, believed, 2.0)[1], found)) / np.linalg.norm(bias)
+            for believed in (None, true)]
+    assert left[0] == pytest.approx(1.0, abs=0.1) and left[1] < 0.1

@@ -1,5 +1,7 @@
 """Modules load their joints, whether the robot file describes them or an effect does."""
 
+from dataclasses import replace
+
 from flights import Motion, P, ROBOT
 import numpy as np
 import pytest
@@ -46,7 +48,7 @@ def test_a_servo_sags_under_a_module_that_hangs_beside_its_axis(sets, base, mome
     zero, one = np.zeros((k, 1, 4)), np.ones((k, 1, 4))
     windows = Windows(zero[0], zero[0], zero, zero, zero, P.servo_step, 0, 8,
                       (gravity * one, zero))
-    shown = simulate(ROBOT.joints, windows, np.zeros((1, k, 1, 4)), [sets], {
-        'coulomb': 0.0, 'stiction': 0.0, 'deflection': 0.0, 'modules': 0.0, 'momentum': 0.0,
-        'joint_share': 0.0, 'mass_moment': base, 'module_inertia': 0.0})[0, -1, 0]
+    robot = replace(ROBOT, effects={'module_reaction': {'module_inertia': 0.0,
+                                                        'mass_moment': base}})
+    shown = simulate(robot, windows, np.zeros((1, k, 1, 4)), [sets], 0.0)[0, -1, 0]
     assert shown == pytest.approx(moment * gravity / ROBOT.joints.kp, rel=1e-3)

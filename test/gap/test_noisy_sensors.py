@@ -97,13 +97,9 @@ def test_inertia_of_a_servo_is_the_inverse_of_its_gains():
     zero = np.zeros((k, 1, 4))
     windows = Windows(zero[0], zero[0], zero, zero, zero, P.servo_step, 0, 8)
     target = np.full((2, k, *shape[1:]), 0.3)
-    heavy, soft = simulate(ROBOT.joints, windows, target, [
-        {'swing.ratio': 0.2}, {'joint_bandwidth.kp': -0.2, 'joint_bandwidth.kd': -0.2}],
-        {'coulomb': 0.0, 'stiction': 0.0, 'deflection': 0.0, 'modules': 0.0, 'momentum': 0.0,
-         'joint_share': 0.0})
-    same = simulate(ROBOT.joints, windows, target[:1], [{}], {
-        'coulomb': 0.0, 'stiction': 0.0, 'deflection': 0.0, 'modules': 0.0, 'momentum': 0.0,
-        'joint_share': 0.0})[0]
+    heavy, soft = simulate(ROBOT, windows, target, [
+        {'swing.ratio': 0.2}, {'joint_bandwidth.kp': -0.2, 'joint_bandwidth.kd': -0.2}], 0.0)
+    same = simulate(ROBOT, windows, target[:1], [{}], 0.0)[0]
     assert heavy == pytest.approx(soft, abs=1e-12)
     assert np.abs(heavy - same).max() > 0.005
 
@@ -157,10 +153,8 @@ def test_a_servo_stiffer_than_the_others_sags_less_under_its_load():
     k, load = 800, 0.02
     zero, held = np.zeros((k, 1, 4)), np.full((k, 1, 4), load)
     windows = Windows(zero[0], zero[0], zero, held, zero, P.servo_step, 0, 8)
-    shown = simulate(ROBOT.joints, windows, np.zeros((1, k, 1, 4)),
-                     [{'servo.kp[1]': np.log(1.25), 'servo.kd[2]': 0.3}],
-                     {'coulomb': 0.0, 'stiction': 0.0, 'deflection': 0.0, 'modules': 1.0,
-                      'momentum': 0.0, 'joint_share': 0.0})[0, -1, 0]
+    shown = simulate(ROBOT, windows, np.zeros((1, k, 1, 4)),
+                     [{'servo.kp[1]': np.log(1.25), 'servo.kd[2]': 0.3}], 1.0)[0, -1, 0]
     sag = load / ROBOT.joints.kp        # of a spring
     assert shown == pytest.approx([sag, sag / 1.25, sag, sag], rel=1e-3)
 

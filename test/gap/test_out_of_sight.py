@@ -10,7 +10,7 @@ from beetle_omni_ros.identify.gap.analysis import Analysis
 from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.certainty import visibility
 from beetle_omni_ros.identify.gap.fit import Problem
-from beetle_omni_ros.identify.gap.keys import SHAPES, tolerances
+from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.verdict import hidden, not_met
 
 
@@ -20,7 +20,7 @@ def test_the_ground_shows_near_the_ground_alone(higher, seen):
     motion.position[:, 2] += higher
     made = model(motion.flight())
     problem = Problem([made], KEYS, tolerances(P), P)
-    state = problem.state({}, [name for name, key in KEYS.items() if key.parameter not in SHAPES])
+    state = problem.state({}, [name for name, key in KEYS.items() if not key.form])
     visible = visibility(problem, state, list(problem.beliefs), candidates(KEYS, [made]))
     assert {'ground_effect', 'tilt_thrust_loss', 'propeller_gyroscopic_torque'} <= set(visible)
     a = Analysis(visible=visible)

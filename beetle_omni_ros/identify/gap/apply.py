@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
+import numpy as np
+
 from beetle_omni_ros import __version__
+from beetle_omni_ros.identify.gap.keys import names_of, number_of
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -30,8 +34,6 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
     parts += [(effect, name, found) for effect in named
               for name, found in effect.get('also', {}).items()]
     for effect, name, parameters in parts:
-        if not is_read(name):
-            continue
         entry = CATALOGUE[name]
         member = effect.get('rotor') or effect.get('joint')
         values = effects.setdefault(name, {})
@@ -48,6 +50,42 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
             values[parameter] = [rounded(min(max(v, low), high)) for v in value] \
                 if isinstance(value, (list, tuple)) else rounded(min(max(value, low), high))
     return effects
+
+
+def own_numbers(robot: RobotParameters, tolerances: dict[str, dict],
+                named: Iterable[str] = ()) -> dict:
+    """
+    Numbers of the robot file as these flights found them within manufacturing tolerances.
+
+    Args:
+        robot: as believed.
+        tolerances: ``tolerances`` of the results.
+        named: effects that replace a number and go first.
+
+    Returns:
+        nested as in a robot file; mass, inertia, gains, lags and rotor positions.
+
+    """
+    made: dict = {}
+    for name, effect in CATALOGUE.items():
+        for parameter, spec in effect.parameters.items():
+            found = [tolerances[key]['deviation'] for key in names_of(name, parameter)
+                     if key in tolerances]
+            if spec.number and found and name not in {*robot.effects, *named}:
+                _put(made, spec.number, number_of(robot, spec.number) * np.exp(
+                    found if len(found) > 1 else found[0]))
+    moved = [tolerances.get(f'position.offset[{k}]', {'deviation': 0.0})['deviation']
+             for k in range(12)]
+    if any(moved):
+        _put(made, 'rotors.positions', robot.rotors.positions + np.reshape(moved, (4, 3)))
+    return made
+
+
+def _put(content, key, value):
+    *parts, last = key.split('.')
+    for part in parts:
+        content = content.setdefault(part, {})
+    content[last] = np.asarray(value).tolist()
 
 
 def _of_each(own, found):
@@ -67,25 +105,19 @@ def _of_each(own, found):
     return [each.get(str(k + 1), before[k]) for k in range(MEMBERS)]
 
 
-def is_read(name: str) -> bool:
-    """Whether anything reads the effect from a robot file; sensors' own are for their drivers."""
-    entry = CATALOGUE[name]
-    return bool(entry.apply or entry.servo or entry.settings) or name in (
-        'command_latency', 'joint_command_latency', 'rotor_dead_time', 'joint_backlash')
-
-
 def write_corrected(path: Path, results: dict, robot: RobotParameters,
-                    base: Path | None) -> None:
+                    base: Path | None, tolerances: bool = False) -> None:
     """
     Write a robot file that extends the believed one by the named effects.
 
-    Effects of sensors, which nothing reads from a robot file, stand under ``provenance`` only.
+    Effects of sensors stand there too: the estimator reads them.
 
     Args:
         path: to write.
         results: of the analysis.
         robot: as believed.
         base: its file; None: the shipped one.
+        tolerances: whether this robot's own numbers within tolerance take the place of the file's.
 
     Raises:
         ParameterError: the file cannot be written, or would not be a robot.
@@ -104,7 +136,8 @@ def write_corrected(path: Path, results: dict, robot: RobotParameters,
                                    'unit': entry['unit']}
                              for key, entry in effect['parameters'].items()}}
              for effect in results['effects']]
-    content = {'effects': _plain(effects), 'provenance': _plain({
+    numbers = own_numbers(robot, results.get('tolerances') or {}, effects) if tolerances else {}
+    content = {**_plain(numbers), 'effects': _plain(effects), 'provenance': _plain({
         'written_by': f'beetle_omni gap {__version__}',
         'date': datetime.now(timezone.utc).strftime('%Y-%m-%d'),
         'runs': results['meta']['runs'], 'holdout': results['meta']['holdout'],

@@ -6,21 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.keys import Key, SHAPES
+from beetle_omni_ros.identify.gap.keys import Key, MODULES
 from beetle_omni_ros.identify.gap.residual import FlightModel
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.effects import Asked, CATALOGUE
 from beetle_omni_ros.robot.servo import NUMPY, Servo
 
 # Without a slope at their neutral value: they need a start where they already act.
-LIMITS = ('thrust_saturation', 'joint_velocity_limit', 'joint_torque_limit', 'joint_friction',
-          'joint_backlash')
-FORMS = {'tilt_thrust_loss': [{'tilt_thrust_loss.cosine_share': 0.0},
-                              {'tilt_thrust_loss.cosine_share': 1.0}],
-         'ground_effect': [{'ground_effect.exponential_share': 0.0},
-                           {'ground_effect.exponential_share': 1.0}],
-         'propeller_gyroscopic_torque': [{'propeller_gyroscopic_torque.spin_up_share': 0.0},
-                                         {'propeller_gyroscopic_torque.spin_up_share': -1.0},
-                                         {'propeller_gyroscopic_torque.joint_share': 1.0}]}
+LIMITS = tuple(name for name, effect in CATALOGUE.items() if effect.starts)
 
 
 @dataclass(frozen=True)
@@ -51,7 +43,7 @@ class Candidate:
 
     def large_enough(self, keys: dict[str, Key], theta: dict[str, float]) -> bool:
         """Whether anyone would act on it."""
-        if self.name in ('joint_velocity_limit', 'joint_torque_limit', 'thrust_saturation'):
+        if isinstance(CATALOGUE[self.name].starts, Asked):
             return True
         return any(abs(theta.get(name, 0.0)) >= keys[name].smallest for name in self.keys)
 
@@ -61,46 +53,35 @@ def candidates(keys: dict[str, Key], models: list[FlightModel]) -> list[Candidat
     made = []
     for name, effect in CATALOGUE.items():
         own = tuple(key.name for key in keys.values() if key.effect == name
-                    and key.parameter not in SHAPES)
+                    and not key.form)
         if not own:
             continue
         if effect.each:
             made += [Candidate(name, (key,), label=f'{name}[{k + 1}]', member=k + 1)
                      for k, key in enumerate(own)]
-        elif name == 'module_reaction':
+        elif name == MODULES:
             made += [Candidate(name, own[:1], label=f'{name} (inertia)'),
                      Candidate(name, own, label=name)]
-        elif name == 'joint_bandwidth':
-            made.append(Candidate(name, own, label=name))
         else:
-            starts = _starts(name, keys, models) if name in LIMITS else ()
-            if name in LIMITS and not starts:
+            starts = _started(keys[own[0]], effect.starts, models) \
+                if isinstance(effect.starts, Asked) else effect.starts
+            if effect.starts and not starts:
                 continue
-            made += [Candidate(name, own, form, starts, name + (f' ({k + 1})' if k else ''))
-                     for k, form in enumerate(FORMS.get(name, [{}]))]
+            made += [Candidate(name, own, {f'{name}.{part}': x for part, x in form.items()},
+                               starts, name + (f' ({k + 1})' if k else ''))
+                     for k, form in enumerate(effect.forms)]
     return made
 
 
-def _starts(name, keys, models):
-    """Values at which a limit, friction or play begins to show."""
-    if name == 'joint_backlash':
-        return ((0.005,), (0.02,))
-    if name == 'joint_friction':
-        return ((0.004, 0.004), (0.012, 0.015))
-    if name == 'joint_velocity_limit':
-        met = max(np.abs(m.signals.joints({})[1]).max() for m in models)
-        base = keys['joint_velocity_limit.velocity_limit'].base
-        return tuple((float(np.log(part * met / base)),) for part in (0.95, 0.8)
-                     if part * met < 0.95 * base)
-    if name == 'joint_torque_limit':
-        asked = max(np.quantile(np.abs(_torques(m)), 0.999) for m in models)
-        base = keys['joint_torque_limit.effort_limit'].base
-        return tuple((float(np.log(part * asked / base)),) for part in (1.1, 0.8, 0.5)
-                     if part * asked < 0.98 * base)
-    asked = max(np.quantile(m.flight.command[:, 4:], 0.999) for m in models)
-    base = keys['thrust_saturation.thrust_max'].base
-    return tuple((float(np.log(part * asked / base)),) for part in (0.95, 0.8)
-                 if part * asked < 1.2 * base)
+def _started(key, asked, models):
+    """Values of a limit at which it begins to show."""
+    most = max(float({
+        'tilt_rate': lambda m: np.abs(m.signals.joints({})[1]).max(),
+        'torque': lambda m: np.quantile(np.abs(_torques(m)), 0.999),
+        'thrust': lambda m: np.quantile(m.flight.command[:, 4:], 0.999)}[asked.of](m))
+        for m in models)
+    return tuple((float(np.log(part * most / key.base)),) for part in asked.parts
+                 if part * most < asked.below * key.base)
 
 
 def _torques(model):

@@ -31,7 +31,7 @@ LEAST_FITTED = 2    # flights, above which the last one judges where nobody name
 def run_gap(runs: list[Path], holdout: list[Path] = (), robot: Path | None = None,
             apply: Path | None = None, json_path: Path | None = None, page: Path | None = None,
             console: Console | None = None, parameters: Path | None = None,
-            fix: bool = False) -> int:
+            fix: bool = False, tolerances: bool = False) -> int:
     """
     Find where model and measurement disagree.
 
@@ -45,6 +45,7 @@ def run_gap(runs: list[Path], holdout: list[Path] = (), robot: Path | None = Non
         console: where to print.
         parameters: file with changes to params/gap.yaml.
         fix: whether damage whose correction is certain is corrected in what was read.
+        tolerances: whether ``apply`` also gets the numbers that were fitted within tolerance.
 
     Returns:
         3 for the verdict `bad_data`; 0 for any other, which is no error.
@@ -54,12 +55,13 @@ def run_gap(runs: list[Path], holdout: list[Path] = (), robot: Path | None = Non
         ParameterError, LogError: unusable robot file, log or output, or the same run twice.
 
     """
-    made = gap_results(runs, holdout, robot, apply, json_path, page, console, parameters, fix)
+    made = gap_results(runs, holdout, robot, apply, json_path, page, console, parameters, fix,
+                       tolerances)
     return BAD_DATA if made['verdict'] == 'bad_data' else 0
 
 
 def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=None,
-                console=None, parameters=None, fix=False) -> dict:
+                console=None, parameters=None, fix=False, tolerances=False) -> dict:
     """Do as :func:`run_gap`, and return what it writes to JSON."""
     console = console or Console()
     runs, holdout = [Path(r) for r in runs], [Path(h) for h in holdout]
@@ -87,7 +89,7 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
         write_text(page, html, 'page')
     if apply:
         if made['effects']:
-            write_corrected(apply, made, believed, robot)
+            write_corrected(apply, made, believed, robot, tolerances)
             console.print(f'corrected robot: {apply}', highlight=False)
         else:
             console.print('nothing is named: no robot file is written', highlight=False)

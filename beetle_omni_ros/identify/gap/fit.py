@@ -15,8 +15,6 @@ from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.identify.gap.workers import Workers
 
-CURVED = ('delay', 'rotation', 'time_constant', 'kp', 'kd', 'velocity_limit',
-          'effort_limit', 'coulomb', 'stiction', 'gap', 'thrust_max', 'deflection_per_newton')
 HALVINGS = 4
 RIDGE = 1e-9
 # Deviations, residual, columns that changed and their slopes: what a state is beside another.
@@ -286,7 +284,7 @@ class Problem:
         theta, r = dict(state.theta), state.r
         slopes, cost = state.slopes, float(r @ r) + self.prior(theta, free)
         timing = any(self.keys[name].parameter == 'delay' for name in free)
-        curved = [name for name in names if self.keys[name].parameter in CURVED and (
+        curved = [name for name in names if self.keys[name].curved and (
             name not in self.beliefs or name in free
             or timing and self.keys[name].parameter == 'delay')]
         smooth = [name for name in names if not (

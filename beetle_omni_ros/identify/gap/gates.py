@@ -7,15 +7,12 @@ import numpy as np
 from beetle_omni_ros.identify.gap.bands import aside, in_part_alone
 from beetle_omni_ros.identify.gap.candidates import LIMITS
 from beetle_omni_ros.identify.gap.fit import HALVINGS, Problem, State
-from beetle_omni_ros.identify.gap.keys import Key
+from beetle_omni_ros.identify.gap.keys import delays_of, Key
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.trial import Found, Trial
+from beetle_omni_ros.robot.effects import CATALOGUE
 
-AGES = ('imu_filter_lag.delay', 'joint_feedback_delay.delay')   # of readings at their stamps
-COMMANDS = ('command_latency.delay', 'joint_command_latency.delay', 'rotor_dead_time.delay')
-# Two forms of one response: where one is joined and the other still gains beside it, the response
-# has a shape that neither holds, such as a lag of second order, and which number is wrong is open.
-ONE_RESPONSE = {'rotor_lag', 'rotor_dead_time'}
+COMMANDS = delays_of('tilt', 'thrust')
 
 
 def enough(p: GapParameters, gain: float, of_beliefs: float, price: float = 0.0) -> bool:
@@ -70,7 +67,9 @@ def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = (),
     for name in trial.candidate.keys:
         x, key = trial.theta.get(name, 0.0), keys[name]
         below = x <= key.low and not key.ends_at_none
-        if x >= key.high or below or name in AGES and key.value(x) < 0:
+        effect = CATALOGUE[key.effect]
+        aged = set(effect.delays) & {'imu', 'encoders'} and not effect.own_clock
+        if x >= key.high or below or aged and key.value(x) < 0:
             return True
     return False
 
@@ -90,6 +89,9 @@ def neither_holds(found: Found, own: str, other: str, least: float) -> bool:
     """
     Whether two entries are forms of one response, whose shape is neither's.
 
+    Where one is joined and the other still gains beside it, the response has a shape that neither
+    holds, such as a lag of second order, and which number is wrong is open.
+
     Args:
         found: with the trials beside what is accepted.
         own: name of an accepted entry.
@@ -98,7 +100,7 @@ def neither_holds(found: Found, own: str, other: str, least: float) -> bool:
 
     """
     beside = found.trials.get(other)
-    return ONE_RESPONSE == {own, other} and beside is not None and beside.gain > least \
+    return CATALOGUE[own].same_response == other and beside is not None and beside.gain > least \
         and beside not in found.accepted
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.keys import THRUST_BUS, TILT_BUS
+from beetle_omni_ros.identify.gap.keys import delays_of, THRUST_BUS, TILT_BUS
+from beetle_omni_ros.robot.effects import CATALOGUE
 
-COMMANDS = ('command_latency', 'joint_command_latency', 'rotor_dead_time')
-SENSORS = ('imu_filter_lag.delay', 'mocap_time_offset.delay', 'joint_feedback_delay.delay')
+SENSORS = delays_of('imu', 'mocap', 'encoders')
 
 
 def handed_over(theta, candidate):
@@ -22,16 +22,18 @@ def handed_over(theta, candidate):
     stay there, for the data cannot tell the two apart.
 
     """
-    key = f'{candidate.name}.delay'
-    if candidate.name not in COMMANDS or theta.get(key):
+    key, late = f'{candidate.name}.delay', CATALOGUE[candidate.name].delays
+    if not {'tilt', 'thrust'} & set(late) or theta.get(key):
         return theta
     # All sensors late by the same is all commands early by it: an exact gauge.
-    late = float(np.mean([theta.get(name, 0.0) for name in SENSORS]))
-    made = {**theta, **{name: theta.get(name, 0.0) - late for name in SENSORS}}
-    tilt, thrust = (theta.get(name, 0.0) + late for name in (TILT_BUS, THRUST_BUS))
-    both = (tilt + thrust) / 2
-    own, tilt, thrust = {
-        'command_latency': (both, tilt - both, thrust - both),
-        'joint_command_latency': (tilt - thrust, thrust, thrust),
-        'rotor_dead_time': (thrust - tilt, tilt, tilt)}[candidate.name]
+    common = float(np.mean([theta.get(name, 0.0) for name in SENSORS]))
+    made = {**theta, **{name: theta.get(name, 0.0) - common for name in SENSORS}}
+    tilt, thrust = (theta.get(name, 0.0) + common for name in (TILT_BUS, THRUST_BUS))
+    if len(late) == 2:
+        own = (tilt + thrust) / 2
+        tilt, thrust = tilt - own, thrust - own
+    elif late == ('tilt',):
+        own, tilt = tilt - thrust, thrust
+    else:
+        own, thrust = thrust - tilt, tilt
     return {**made, key: own, TILT_BUS: tilt, THRUST_BUS: thrust}

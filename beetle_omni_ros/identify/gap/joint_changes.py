@@ -15,20 +15,22 @@ from beetle_omni_ros.identify.fitting import encode, Fitter, Noise, Prior, Probl
 from beetle_omni_ros.identify.gap.joint_search import FIRST_NOISE, SETTLING
 from beetle_omni_ros.identify.joint import COMMON_DEVIATION
 from beetle_omni_ros.identify.joint_log import JointLog
-from beetle_omni_ros.identify.joint_servos import Servos
+from beetle_omni_ros.identify.joint_servos import GROUPS, Servos
 from beetle_omni_ros.identify.selection import block_masks
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
 from beetle_omni_ros.identify.uncertainty import DIFFERENT, gradient_scatter
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.table import Grid
 
 FITTED = ('natural_frequency', 'damping_ratio', 'delay', 'coulomb_friction', 'offset')
 # Catalogue entry, parameter, unit. A log without a torque determines friction over stiffness (the
 # dead band) better than either, and the lag behind a ramp better than its parts.
-ROWS = (('joint_offset', 'offset', 'rad'), ('joint_bandwidth', 'kp', 'N m/rad'),
-        ('joint_bandwidth', 'kd', 'N m s/rad'), ('joint_friction', 'coulomb', 'N m'),
-        ('joint_friction', 'dead_band', 'rad'), ('joint_command_latency', 'delay', 's'),
-        ('joint_command_latency', 'ramp_lag', 's'))
+ROWS = tuple(
+    row for name, parameters in GROUPS.items() for parameter in parameters
+    for spec in [CATALOGUE[name].parameters[parameter]]
+    if spec.log.each or not CATALOGUE[name].starts
+    for row in ((name, parameter, spec.unit), *((name, *more) for more in spec.log.better)))
 WRONG = 0.05            # probability that any row of two logs is called significant by chance
 # One standard deviation of frequency and damping about the median joint: a factor, which keeps a
 # fit in place and says nothing beside a log.
@@ -139,8 +141,10 @@ def _physical(points, covariance, sets, free, servos):
         frequency, damping = (np.exp(chosen[n]) for n in ('natural_frequency', 'damping_ratio'))
         kp = servos.robot.joints.inertia * frequency**2
         band, delay = chosen['coulomb_friction'], chosen['delay'] - servos.delays
-        return np.array([-chosen['offset'], kp, 2 * damping * kp / frequency, kp * band, band,
-                         delay, delay + 2 * damping / frequency])
+        made = {'offset': -chosen['offset'], 'kp': kp, 'kd': 2 * damping * kp / frequency,
+                'coulomb': kp * band, 'dead_band': band, 'delay': delay,
+                'ramp_lag': delay + 2 * damping / frequency}
+        return np.array([made[parameter] for _, parameter, _ in ROWS])
 
     made = np.array([values(point) for point in points])
     for j in range(count):

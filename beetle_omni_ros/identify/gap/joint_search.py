@@ -45,11 +45,8 @@ LEAST_FRICTION = 0.2                    # of the believed
 LEAST_DEAD_BAND = 2 * np.pi / 4096      # [rad] one count
 # Delay and stiffness of a pair are told apart where both are known better than the smallest
 # change of each that matters; else they are one set.
-PAIR = ('joint_command_latency', 'joint_bandwidth')
-RIVALS = {'joint_command_latency': 'joint_bandwidth', 'joint_bandwidth': 'joint_command_latency',
-          'joint_friction': 'joint_backlash', 'joint_backlash': 'joint_friction',
-          'joint_velocity_limit': 'joint_torque_limit',
-          'joint_torque_limit': 'joint_velocity_limit'}
+LATENCY = 'joint_command_latency'
+PAIR = (LATENCY, CATALOGUE[LATENCY].log_rival)
 
 
 @dataclass(frozen=True)
@@ -218,7 +215,7 @@ class Search:
             if entry.name == 'joint_friction':
                 mask = self.servos.mask(entry.name, entry.joint)
                 point[mask] = np.maximum(point[mask], 2.0)
-            elif entry.name == 'joint_command_latency':
+            elif entry.name == LATENCY:
                 at = self.servos.index('delay')
                 point[at] = max(point[at] + (4.0, -2.0)[k], 0.5)
             elif entry.name == 'joint_bandwidth':
@@ -435,7 +432,7 @@ class Search:
                 del sets[second.entry]
             return sets
         for entry in accepted:
-            rival = Entry(RIVALS.get(entry.name, ''))
+            rival = Entry(CATALOGUE[entry.name].log_rival)
             if rival in self.entries and rival not in accepted:
                 own, other = self._alone(accepted, point, [entry, rival])
                 near = own.gain - other.gain < chi_square.isf(CHANCE, 1)

@@ -15,24 +15,11 @@ import math
 import numpy as np
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.effects import CATALOGUE, delaying
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-GYROSCOPIC, MODULES = 'propeller_gyroscopic_torque', 'module_reaction'
-SHAPES = ('cosine_share', 'exponential_share', 'spin_up_share', 'joint_share')
-SMALLEST = 0.02         # ratio to the file's own number ...
-# ... but of a limit so far above all that is asked for that a real one is hundreds of times less:
-# the file's 3 N m against the 0.05 N m of quick poses.
-SMALLEST_OF = {'effort_limit': 1e-3}
+MODULES = 'module_reaction'
 TILT_BUS, THRUST_BUS = 'base.tilt_delay', 'base.thrust_delay'   # of commands on their way
-GROUPS = {  # signal-layer entries -> channel groups in which they show
-    'rotor_lag': 'B', 'rotor_dead_time': 'B', 'thrust_saturation': 'B', 'command_latency': 'BJ',
-    'joint_command_latency': 'J', 'joint_bandwidth': 'J', 'joint_velocity_limit': 'J',
-    'joint_torque_limit': 'J', 'joint_friction': 'J', 'joint_deflection': 'J',
-    'joint_backlash': 'B', 'joint_feedback_delay': 'BJ', 'mocap_time_offset': 'AW',
-    'imu_filter_lag': 'BAWJ', 'imu_accelerometer_bias': 'BA', 'imu_gyroscope_bias': 'BW',
-    'imu_misalignment': 'BAW', 'imu_lever_arm': 'BA', 'mocap_misalignment': 'AW',
-    'base': 'BJ', 'modules': 'BJ', 'swing': 'J', 'rotor': 'B', 'servo': 'J'}
 
 
 @dataclass(frozen=True)
@@ -51,8 +38,11 @@ class Key:
         high: largest.
         typical: realistic deviation.
         smallest: worth naming.
+        groups: channel groups that depend on it.
         body: whether the body's equations hold it, else a signal does.
-        turns: whether it also loads the joints.
+        step: change by which its derivatives are taken.
+        curved: whether they change along a fit.
+        form: whether it chooses between forms and is not fitted.
 
     """
 
@@ -66,8 +56,11 @@ class Key:
     high: float
     typical: float
     smallest: float
-    body: bool
-    turns: bool = False
+    groups: str
+    body: bool = False
+    step: float = 1e-3
+    curved: bool = False
+    form: bool = False
 
     def value(self, deviation: float) -> float:
         """Catalogue value of a deviation."""
@@ -82,21 +75,24 @@ class Key:
         """Whether the smallest value is an effect that is not there, as of drag or friction."""
         return not self.relative and self.value(self.low) == 0.0
 
-    @property
-    def groups(self) -> str:
-        """Channel groups that depend on it."""
-        if self.body:
-            return 'BJ' if self.turns else 'B'
-        return GROUPS[self.effect]
+
+def number_of(robot: RobotParameters, key: str) -> float | np.ndarray:
+    """Number of the robot file at a dotted key."""
+    value = robot
+    for part in key.split('.'):
+        value = getattr(value, part)
+    return value
 
 
-def _own(robot: RobotParameters) -> dict[str, float | np.ndarray]:
-    joints, rotors = robot.joints, robot.rotors
-    return {'mass': robot.mass, 'inertia': robot.inertia,
-            'torque_to_thrust_ratio': rotors.torque_to_thrust_ratio,
-            'time_constant': rotors.time_constant, 'thrust_max': rotors.thrust_max,
-            'kp': joints.kp, 'kd': joints.kd, 'velocity_limit': joints.velocity_limit,
-            'effort_limit': joints.effort_limit}
+def names_of(effect: str, parameter: str) -> list[str]:
+    """Names of the scalars of a parameter."""
+    neutral, text = CATALOGUE[effect].parameters[parameter].neutral, f'{effect}.{parameter}'
+    return [f'{text}[{k}]' for k in range(len(neutral))] if isinstance(neutral, tuple) else [text]
+
+
+def delays_of(*what: str) -> tuple[str, ...]:
+    """Names of the scalars that delay any of ``what``; see :attr:`Effect.delays`."""
+    return tuple(f'{name}.delay' for name in delaying(*what))
 
 
 def friction(robot: RobotParameters) -> tuple[np.ndarray, np.ndarray]:
@@ -108,32 +104,29 @@ def friction(robot: RobotParameters) -> tuple[np.ndarray, np.ndarray]:
 
 def all_keys(robot: RobotParameters) -> dict[str, Key]:
     """Every scalar of the catalogue around what ``robot`` has, by name."""
-    own, keys = _own(robot), {}
-    effects = dict(robot.effects)
+    keys, effects = {}, dict(robot.effects)
     if 'joint_friction' in effects:
         # a flight judges what all joints share; differences between them stay as the file has them
-        effects['joint_friction'] = dict(zip(('coulomb', 'stiction'), (
-            float(np.mean(value)) for value in friction(robot))))
-    # described modules load the joints with their share, and this entry is what goes beyond
-    turning = {GYROSCOPIC} if robot.multibody else {GYROSCOPIC, MODULES}
+        effects['joint_friction'] = {name: float(np.mean(value)) for name, value in zip(
+            CATALOGUE['joint_friction'].parameters, friction(robot), strict=True)}
     for name, effect in CATALOGUE.items():
+        # described modules load the joints with their share, and this entry is what goes beyond
+        groups = 'B' if name == MODULES and robot.multibody else effect.channels
         for parameter, spec in effect.parameters.items():
-            neutral = np.atleast_1d(np.array(spec.neutral, dtype=float))
-            absent = bool(np.isnan(neutral).any())
+            absent = bool(np.isnan(spec.neutral).any())
             relative = absent or parameter == 'scale'
-            base = np.atleast_1d(np.array(effects.get(name, {}).get(
-                parameter, own.get(parameter) if absent else spec.neutral), dtype=float))
-            scalar = np.ndim(spec.neutral) == 0
-            for k, value in enumerate(base):
-                least = SMALLEST_OF.get(parameter, SMALLEST)
-                low, high = (math.log(max(b / value, least)) if relative else b - value
+            own = number_of(robot, spec.number) if absent else spec.neutral
+            base = np.atleast_1d(np.array(effects.get(name, {}).get(parameter, own), dtype=float))
+            texts = names_of(name, parameter)
+            for k, (text, value) in enumerate(zip(texts, base, strict=True)):
+                low, high = (math.log(max(b / value, spec.least)) if relative else b - value
                              for b in (spec.low, spec.high))
-                text = f'{name}.{parameter}' + ('' if scalar else f'[{k}]')
-                keys[text] = Key(text, name, parameter, None if scalar else k, float(value),
-                                 relative, low, high,
+                keys[text] = Key(text, name, parameter, k if len(texts) > 1 else None,
+                                 float(value), relative, low, high,
                                  0.5 if math.isnan(spec.typical) else spec.typical,
                                  0.0 if math.isnan(spec.smallest) else spec.smallest,
-                                 effect.apply is not None, name in turning)
+                                 groups, effect.apply is not None, spec.step, spec.curved,
+                                 spec.form)
     return keys
 
 
@@ -176,22 +169,12 @@ def tolerances(p: GapParameters, coarse: bool = False,
         swing: logarithm by which a servo's inertia may be larger than it says.
 
     """
-    made = {'mass.mass': p.tolerance_mass, 'thrust_coefficient.scale': p.tolerance_thrust,
-            'torque_coefficient.torque_to_thrust_ratio': p.tolerance_torque_ratio,
-            'rotor_lag.time_constant': p.tolerance_lag, 'joint_bandwidth.kp': p.tolerance_lag,
-            'joint_bandwidth.kd': p.tolerance_lag, 'mocap_time_offset.delay': p.tolerance_delay,
-            'imu_filter_lag.delay': p.tolerance_delay,
-            'joint_feedback_delay.delay': p.tolerance_delay, 'modules.share': p.modules_tolerance}
-    for k in range(3):
-        made |= {f'inertia.inertia[{k}]': p.tolerance_inertia,
-                 f'imu_accelerometer_bias.bias[{k}]': p.tolerance_bias_accelerometer,
-                 f'imu_gyroscope_bias.bias[{k}]': p.tolerance_bias_gyroscope,
-                 f'imu_misalignment.rotation[{k}]': p.tolerance_angle,
-                 f'mocap_misalignment.rotation[{k}]': p.tolerance_angle}
+    made = {key: getattr(p, f'tolerance_{spec.tolerance}')
+            for name, effect in CATALOGUE.items() for parameter, spec in effect.parameters.items()
+            if spec.tolerance for key in names_of(name, parameter)}
+    made['modules.share'] = p.modules_tolerance
     for k in range(4):
-        made |= {f'rotor_thrust_coefficient.scale[{k}]': p.tolerance_thrust,
-                 f'joint_offset.offset[{k}]': p.tolerance_angle,
-                 f'rotor.lag[{k}]': p.tolerance_lag, f'servo.kp[{k}]': p.tolerance_lag,
+        made |= {f'rotor.lag[{k}]': p.tolerance_lag, f'servo.kp[{k}]': p.tolerance_lag,
                  f'servo.kd[{k}]': p.tolerance_lag}
     for k in range(12):
         made[f'position.offset[{k}]'] = p.tolerance_position
@@ -214,19 +197,20 @@ def tolerances(p: GapParameters, coarse: bool = False,
 def extra_keys() -> dict[str, Key]:
     """Keys of what is no catalogue entry: rotor positions, modules, servos, delays of the bus."""
     keys = {}
+
+    def add(name, index, reach, typical, groups, **more):
+        effect, parameter = name.split('[')[0].split('.')
+        keys[name] = Key(name, effect, more.pop('parameter', parameter), index, 0.0, False,
+                         -reach, reach, typical, 0.0, groups, **more)
+
     for k in range(12):
-        name = f'position.offset[{k}]'
-        keys[name] = Key(name, 'position', 'offset', k, 0.0, False, -0.05, 0.05, 0.001, 0.0, True)
-    keys['modules.share'] = Key('modules.share', 'modules', 'share', None, 0.0, False, -2, 2,
-                                0.05, 0.0, False)
-    keys['swing.ratio'] = Key('swing.ratio', 'swing', 'ratio', None, 0.0, False, -1, 1, 0.1, 0.0,
-                              False)
+        add(f'position.offset[{k}]', k, 0.05, 0.001, 'B', body=True)
+    add('modules.share', None, 2, 0.05, 'BJ', step=0.05)
+    add('swing.ratio', None, 1, 0.1, 'J', step=0.01)
     for k in range(4):
-        name = f'rotor.lag[{k}]'
-        keys[name] = Key(name, 'rotor', 'lag', k, 0.0, False, -1, 1, 0.1, 0.0, False)
+        add(f'rotor.lag[{k}]', k, 1, 0.1, 'B', step=0.02)
         for gain in ('kp', 'kd'):
-            name = f'servo.{gain}[{k}]'
-            keys[name] = Key(name, 'servo', gain, k, 0.0, False, -1, 1, 0.3, 0.0, False)
+            add(f'servo.{gain}[{k}]', k, 1, 0.3, 'J', step=0.01, curved=True)
     for name in (TILT_BUS, THRUST_BUS):
-        keys[name] = Key(name, 'base', 'delay', None, 0.0, False, -0.05, 0.05, 0.005, 0.0, False)
+        add(name, None, 0.05, 0.005, 'BJ', curved=True, parameter='delay')
     return keys

@@ -56,8 +56,9 @@ def gap_page(a: Analysis, made: dict) -> str:
                         f'is most like. Below {a.problem.p.decidable:g} it would not be named.',
                         html(_visible(made))),
                 section('Tolerances', 'How this robot differs from the file within what any '
-                        'robot of its type does. Fitted with everything else, not named, not '
-                        'written to a robot file.', html(_tolerances(made)))]
+                        'robot of its type does. Fitted with everything else and not named; '
+                        '--tolerances writes masses, gains, lags and '
+                        'rotor positions to the robot file.', html(_tolerances(made)))]
     tables = [grid for grid in grids(made) if grid.title != CANDIDATES]
     return page('Gap', _about(a, made['meta']), tables, notes, sections, head(made, _picture(a)))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
-from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
+from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.gauge import handed_over
 from beetle_omni_ros.identify.gap.trial import Trial
 
@@ -110,7 +110,7 @@ def _promising(problem, trials):
     best = max(trials[0].gain, 1.0) if trials else 1.0
     chosen, p = [], problem.p
     for k, trial in enumerate(trials):
-        curved = any(problem.keys[n].parameter in CURVED for n in trial.candidate.keys)
+        curved = any(problem.keys[n].curved for n in trial.candidate.keys)
         if trial.gain < (p.promising_curved if curved else p.promising) * best \
                 or trial.gain < p.looked_at * p.least_gain \
                 or len(chosen) >= p.refined + 3:

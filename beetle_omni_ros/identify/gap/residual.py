@@ -16,7 +16,7 @@ import numpy as np
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.filters import channel_filters, THIN
 from beetle_omni_ros.identify.gap.ingest import Flight
-from beetle_omni_ros.identify.gap.keys import friction, GYROSCOPIC, Key, MODULES
+from beetle_omni_ros.identify.gap.keys import delays_of, Key
 from beetle_omni_ros.identify.gap.loads import module_load, spin_load, undescribed_load
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import matrices
@@ -30,17 +30,11 @@ CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torq
             'J': ('joint_1', 'joint_2', 'joint_3', 'joint_4')}
 UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate': 'rad/s',
          'joint': 'rad'}
-TIMING = ('imu_filter_lag.delay', 'joint_feedback_delay.delay')     # of what loads the joints
-# By which an encoder's reading is taken later for each second of a delay.
-SHIFTS = {'imu_filter_lag.delay': -1.0, 'joint_feedback_delay.delay': 1.0}
+# By which an encoder's reading is taken later for each second of a delay of what loads the joints.
+SHIFTS = dict.fromkeys(delays_of('imu'), -1.0) | dict.fromkeys(delays_of('encoders'), 1.0)
 # Taken to both sides, by the same shift of a command: one-sided, delays that data cannot tell
 # apart would differ by the second derivative, and a straight line through all would fit that.
 BOTH_SIDES = 'delay'
-STEPS = {'delay': 1e-3, 'rotation': 1e-3, 'offset': 1e-3, 'bias': 1e-3, 'time_constant': 0.02,
-         'kp': 0.01, 'kd': 0.01, 'velocity_limit': 0.01, 'effort_limit': 0.01, 'coulomb': 5e-4,
-         'stiction': 5e-4, 'deflection_per_newton': 1e-4, 'gap': 1e-3, 'thrust_max': 0.01,
-         'share': 0.05, 'ratio': 0.01, 'lag': 0.02, 'mass_moment': 2e-4, 'module_inertia': 2e-5,
-         'angular_momentum_at_hover': 5e-3}
 
 
 class FlightModel:
@@ -74,15 +68,6 @@ class FlightModel:
         self._made: dict[tuple, tuple] = {}
         self._last: tuple = (None, {})      # point of the last residual, and that by group
         self._mask = self._trusted()
-        own, hanging = robot.effects, robot.effects.get(MODULES, {})
-        coulomb, stiction = friction(robot)
-        self._own = {'coulomb': coulomb, 'stiction': stiction,
-                     'deflection': own.get('joint_deflection', {}).get(
-                         'deflection_per_newton', 0.0),
-                     'momentum': own.get(GYROSCOPIC, {}).get('angular_momentum_at_hover', 0.0),
-                     'joint_share': own.get(GYROSCOPIC, {}).get('joint_share', 0.0),
-                     'mass_moment': hanging.get('mass_moment', 0.0),
-                     'module_inertia': hanging.get('module_inertia', 0.0)}
 
     def _trusted(self):
         """(M,) 0 for body samples at the rotors' limit for the voltage, or on the floor."""
@@ -179,7 +164,7 @@ class FlightModel:
         """Encoders less simulated servos, [(M, 4)] for each set."""
         groups: dict[tuple, list[int]] = {}
         for k, theta in enumerate(sets):
-            groups.setdefault(tuple(theta.get(name, 0.0) for name in TIMING), []).append(k)
+            groups.setdefault(tuple(theta.get(name, 0.0) for name in SHIFTS), []).append(k)
         residuals: list = [None] * len(sets)
         for members in groups.values():
             runs = self._servos([sets[k] for k in members], sets[members[0]])
@@ -218,8 +203,7 @@ class FlightModel:
             # One more edge than steps in each window: the mean across windows is dropped.
             targets.append(np.concatenate([t, t[-1:]]).reshape(*edges.shape, 4)[
                 :, :-1].transpose(1, 0, 2))
-        runs = simulate(self.robot.joints, windows, np.array(targets), sets,
-                        {**self._own, 'modules': self.modules})
+        runs = simulate(self.robot, windows, np.array(targets), sets, self.modules)
         return runs.transpose(0, 2, 1, 3)
 
     def _joint_slopes(self, theta, names):
@@ -234,7 +218,7 @@ class FlightModel:
         sources = [f'joint_bandwidth.{self.keys[name].parameter}'
                    if self.keys[name].effect == 'servo' else name for name in names]
         moved = list(dict.fromkeys(sources))
-        sizes = [STEPS[self.keys[name].parameter] for name in moved]
+        sizes = [self.keys[name].step for name in moved]
         sets = [theta, *({**theta, name: theta.get(name, 0.0) + h}
                          for name, h in zip(moved, sizes, strict=True))]
         runs = self._servos(sets, theta)
@@ -247,7 +231,7 @@ class FlightModel:
                 for name, source in zip(names, sources, strict=True)]
 
     def _windows(self, theta):
-        timing = {name: theta.get(name, 0.0) for name in TIMING}
+        timing = {name: theta.get(name, 0.0) for name in SHIFTS}
         key = tuple(timing.values())
         if key not in self._made:
             if len(self._made) > 3:
@@ -288,7 +272,7 @@ class FlightModel:
                   if not self.keys[name].body}
         now = self.residual(theta, ''.join(dict.fromkeys(''.join(signal.values()))))
         for name, groups in signal.items():
-            h = STEPS[self.keys[name].parameter]
+            h = self.keys[name].step
             h = -h if theta.get(name, 0.0) + h > self.keys[name].high else h
             if groups:
                 here, other, width = theta.get(name, 0.0), now, h

@@ -112,7 +112,9 @@ def _tilts(model, theta, starts, steps):
     s, p = model.signals, model.p
     per = round(p.grid / p.servo_step)
     count = (steps + 1) * per
-    tilt, rate, _, _ = s.joints({**theta, PLAY: 0.0})
+    own = s.file.get(PLAY, 0.0)
+    tilt, rate, _, _ = s.joints({**theta, PLAY: -own})
+    gap = own + theta.get(PLAY, 0.0)
     edges = s.t[starts][:, None] + p.servo_step * np.arange(count + 1)
     index = np.clip(np.rint((edges[:, :-1] - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
     windows = Windows(tilt[starts], rate[starts], s.thrust(theta)[0][index].transpose(1, 0, 2),
@@ -121,10 +123,9 @@ def _tilts(model, theta, starts, steps):
                       tuple(each[index].transpose(1, 0, 2) for each in undescribed_load(s, theta)))
     targets = s.tilt_targets(edges.ravel(), s.delays(theta)[0])
     targets = np.concatenate([targets, targets[-1:]]).reshape(*edges.shape, 4)[:, :-1]
-    run = simulate(model.robot.joints, windows, targets.transpose(1, 0, 2)[None], [theta],
-                   {**model._own, 'modules': model.modules})[0]             # (K + 1, S, 4)
-    behind = play(run, theta[PLAY] / 2, s.joints(theta)[0][starts]) \
-        if theta.get(PLAY, 0.0) > 0 else run
+    run = simulate(model.robot, windows, targets.transpose(1, 0, 2)[None], [theta],
+                   model.modules)[0]                                        # (K + 1, S, 4)
+    behind = play(run, gap / 2, s.joints(theta)[0][starts]) if gap > 0 else run
     return tilt, run.transpose(1, 0, 2), behind.transpose(1, 0, 2)
 
 

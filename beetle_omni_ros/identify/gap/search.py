@@ -9,7 +9,7 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.certainty import liveliness
-from beetle_omni_ros.identify.gap.fit import CURVED, Problem, State
+from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.gates import (
     at_bound,
     believed,
@@ -20,7 +20,6 @@ from beetle_omni_ros.identify.gap.gates import (
     holds,
     neither_holds,
 )
-from beetle_omni_ros.identify.gap.keys import SHAPES
 from beetle_omni_ros.identify.gap.proposals import Proposals
 from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, IMPOSSIBLE, NOT_HELD, TOO_SMALL
 
@@ -41,7 +40,7 @@ class Search:
         """See the class."""
         self.problem, self.candidates, self.progress = problem, candidates, progress
         self.p = problem.p
-        self.names = [name for name, key in problem.keys.items() if key.parameter not in SHAPES]
+        self.names = [name for name, key in problem.keys.items() if not key.form]
         self.wide = {name: problem.p.wide * problem.keys[name].typical for name in self.names}
         self.always = [name for name in problem.beliefs if name in problem.keys]
 
@@ -142,7 +141,7 @@ class Search:
     def _far(self, a, b):
         """Whether slopes taken at one point are of little use at the other."""
         return any(abs(a.get(name, 0.0) - b.get(name, 0.0)) > self.p.far * self.problem.keys[
-            name].typical for name in {*a, *b} if self.problem.keys[name].parameter in CURVED)
+            name].typical for name in {*a, *b} if self.problem.keys[name].curved)
 
     def _floor(self, state):
         """Objective of a straight-line fit of everything at once."""

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.keys import GYROSCOPIC, MODULES
-from beetle_omni_ros.robot.parameters import JointParameters
+from beetle_omni_ros.identify.gap.keys import friction, MODULES
+from beetle_omni_ros.robot.effects import CATALOGUE, ServoTerms
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
 
 
@@ -48,18 +49,17 @@ class Windows:
     undescribed: tuple[np.ndarray, ...] = ()
 
 
-def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
-             sets: list[dict[str, float]], base: dict[str, float]) -> np.ndarray:
+def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
+             sets: list[dict[str, float]], modules: float) -> np.ndarray:
     """
     Free runs.
 
     Args:
-        joint: the servo as believed.
+        robot: as believed; its effects count.
         windows: of one flight.
         targets: (P, K, W, 4) [rad] for each set.
         sets: of deviations by key name.
-        base: values of the robot file's own effects: coulomb, stiction, deflection, mass_moment,
-            module_inertia, momentum and joint_share; share of its modules.
+        modules: share of the file's tilting modules.
 
     Returns:
         (P, M, W, 4) positions [rad] after the run-in.
@@ -71,42 +71,52 @@ def simulate(joint: JointParameters, windows: Windows, targets: np.ndarray,
     def each(name):
         return np.concatenate([column(f'{name}[{k}]', np.exp) for k in range(4)], axis=2)
 
-    h = windows.step
-    kp = joint.kp * column('joint_bandwidth.kp', np.exp) * each('servo.kp')
-    kd = joint.kd * column('joint_bandwidth.kd', np.exp) * each('servo.kd')
-    speed = joint.velocity_limit * column('joint_velocity_limit.velocity_limit', np.exp)
-    effort = joint.effort_limit * column('joint_torque_limit.effort_limit', np.exp)
-    coulomb = base['coulomb'] + column('joint_friction.coulomb', lambda x: max(x, 0.0))
-    stiction = base['stiction'] + column('joint_friction.stiction', lambda x: max(x, 0.0))
-    soft = base['deflection'] + column('joint_deflection.deflection_per_newton')
-    share = base['modules'] + column('modules.share')
-    momentum = (base['momentum'] + column(f'{GYROSCOPIC}.angular_momentum_at_hover')) * (
-        base['joint_share'] + column(f'{GYROSCOPIC}.joint_share'))
-    hanging = [(torque, base[name] + column(f'{MODULES}.{name}')) for torque, name in
-               zip(windows.undescribed, ('mass_moment', 'module_inertia'), strict=False)]
-    hanging = [(torque, size) for torque, size in hanging if size.any()]
-    rubs, loaded = coulomb.any() or (stiction - coulomb).any(), share.any()
+    own = {'joint_friction': dict(zip(('coulomb', 'stiction'), friction(robot), strict=True))}
+    numbers, acting = {}, []
+    for name, effect in CATALOGUE.items():
+        numbers |= {key.partition('.')[2]: column(f'{name}.{parameter}', np.exp)
+                    for parameter, key in effect.settings.items() if key.startswith('joints.')}
+        if effect.servo is not None:
+            base = {**robot.effects, **own}.get(name, {})
+            values = {p: np.asarray(base.get(p, spec.neutral)) + column(f'{name}.{p}')
+                      for p, spec in effect.parameters.items()}
+            if effect.apply is None:    # the body's equations bear what a servo does not
+                values = {p: np.maximum(x, effect.parameters[p].low) for p, x in values.items()}
+            if any(values[p].any() for p in effect.numbers):
+                acting.append((effect.servo, values))
+    joint, hanging = robot.joints, robot.effects.get(MODULES, {})
+    kp = joint.kp * numbers['kp'] * each('servo.kp')
+    kd = joint.kd * numbers['kd'] * each('servo.kd')
+    speed = joint.velocity_limit * numbers['velocity_limit']
+    effort = joint.effort_limit * numbers['effort_limit']
+    loads = [(windows.load, modules + column('modules.share'))]
+    loads += [(torque, hanging.get(name, 0.0) + column(f'{MODULES}.{name}')) for torque, name in
+              zip(windows.undescribed, ('mass_moment', 'module_inertia'), strict=False)]
+    loads = [(torque, size) for torque, size in loads if size.any()]
+
+    def terms_at(k):
+        made = ServoTerms(targets[:, k], windows.thrust[k], windows.spin[k])
+        for act, values in acting:
+            act(made, None, **values)
+        for torque, size in loads:
+            made.load = made.load + size * torque[k]
+        return made
+
     # The clip of the torque matters only where the largest error could meet it.
     reach = kp * np.abs(targets - windows.start).max() * 1.5 + kd * speed
+    first = terms_at(0)
     step = Step(NUMPY, Servo(
         joint.inertia * column('swing.ratio', np.exp), kp, kd, speed,
-        effort if (effort < reach).any() else None,
-        coulomb=coulomb if rubs else None, stiction=stiction), h)
-    loads = [(windows.load, share)] if loaded else []
-    loads += hanging + ([(windows.spin, momentum)] if momentum.any() else [])
-    count = targets.shape[1]
+        effort if (effort < reach).any() else None, coulomb=first.coulomb,
+        stiction=first.stiction), windows.step)
     q = np.broadcast_to(windows.start, (len(sets), *windows.start.shape)).copy()
     v = np.broadcast_to(windows.start_rate, q.shape).copy()
-    shown = np.empty(((count - windows.skip) // windows.every, *q.shape))
-    for k in range(count):
+    shown = np.empty(((targets.shape[1] - windows.skip) // windows.every, *q.shape))
+    for k in range(targets.shape[1]):
         if k >= windows.skip and (k - windows.skip) % windows.every == 0:
             index = (k - windows.skip) // windows.every
             if index < len(shown):
                 shown[index] = q
-        target = targets[:, k]
-        if soft.any():
-            target = target + soft * windows.thrust[k]
-        load = sum((size * torque[k] for torque, size in loads[1:]),
-                   loads[0][1] * loads[0][0][k]) if loads else None
-        q, v = step(target, q, v, load)
+        terms = terms_at(k)
+        q, v = step(terms.target, q, v, None if np.isscalar(terms.load) else terms.load)
     return shown.transpose(1, 0, 2, 3)

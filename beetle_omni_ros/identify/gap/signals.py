@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.filters import EDGE, low_pass
 from beetle_omni_ros.identify.gap.ingest import Flight
-from beetle_omni_ros.identify.gap.keys import THRUST_BUS, TILT_BUS
+from beetle_omni_ros.identify.gap.keys import names_of, THRUST_BUS, TILT_BUS
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import (
     derivatives,
@@ -23,6 +23,7 @@ from beetle_omni_ros.identify.gap.series import (
     turned,
     within,
 )
+from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import play
 
@@ -73,6 +74,11 @@ class Signals:
             if len(flight.battery_t) > 1 else np.ones(len(self.t))
         if not (0.5 < self.voltage.min() and self.voltage.max() < 1.5):
             self.voltage = np.ones(len(self.t))
+        # what the robot file already knows of sensors and play; numbers of a fit come on top
+        self.file = {key: float(value) for name, values in robot.effects.items()
+                     for parameter, given in values.items()
+                     if CATALOGUE[name].in_readings(parameter)
+                     for key, value in zip(names_of(name, parameter), np.atleast_1d(given))}
         self._kept: dict = {}
         third = np.abs(np.diff(flight.joint, 3, axis=0))
         self.reading_noise = float(np.median(np.sqrt((np.minimum(third, np.quantile(
@@ -85,6 +91,9 @@ class Signals:
         """Take the tilts (N, 4) [rad] of a servo model where encoders say only noise."""
         self.guide, self._expected = guide, derivatives(guide, self.p.smooth_joint, self.p.grid)
         self._kept = {key: value for key, value in self._kept.items() if key[0] != 'joints'}
+
+    def _beyond_file(self, theta):
+        return {**theta, **{name: theta.get(name, 0.0) + own for name, own in self.file.items()}}
 
     def _cached(self, what, theta, names, make):
         key = (what, tuple(theta.get(name, 0.0) for name in names))
@@ -112,6 +121,7 @@ class Signals:
 
     def imu(self, theta):
         """Specific force, rates and their derivative (N, 3) each, of base_link."""
+        theta = self._beyond_file(theta)
         names = [f'{e}[{k}]' for e in (
             'imu_accelerometer_bias.bias', 'imu_gyroscope_bias.bias',
             'imu_misalignment.rotation', 'imu_lever_arm.offset') for k in range(3)]
@@ -131,6 +141,7 @@ class Signals:
 
     def pose(self, theta):
         """Position (N, 3) raw, quaternion (N, 4), velocity (N, 3) in world."""
+        theta = self._beyond_file(theta)
         names = ['mocap_time_offset.delay', IMU_LAG, *(f'mocap_misalignment.rotation[{k}]'
                                               for k in range(3))]
         values = [theta.get(name, 0.0) for name in names]
@@ -167,6 +178,7 @@ class Signals:
 
     def joints(self, theta):
         """Angle, rate, acceleration (N, 4) of the tilts, and the raw reading (N, 4)."""
+        theta = self._beyond_file(theta)
         names = ['joint_feedback_delay.delay', 'joint_backlash.gap', IMU_LAG]
         delay, gap, late = (theta.get(name, 0.0) for name in names)
 
@@ -194,6 +206,7 @@ class Signals:
 
     def delays(self, theta):
         """Delays of tilt and thrust commands [s]."""
+        theta = self._beyond_file(theta)
         common = self.p.command_delay + theta.get('command_latency.delay', 0.0) \
             + theta.get(IMU_LAG, 0.0)
         tilt, thrust = self.robot.command_delays

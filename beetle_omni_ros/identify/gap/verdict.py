@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from beetle_omni_ros.identify.gap.candidates import FORMS
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.patterns import SWINGING
 from beetle_omni_ros.identify.gap.trial import FOUGHT, NOT_HELD, TOO_SMALL
@@ -20,12 +19,12 @@ def hidden(a: Analysis, p: GapParameters) -> list[str]:
 
     Without those that act in one regime alone, near the ground say; see :func:`not_met`.
     """
-    return [name for name in _out_of_sight(a, p) if name not in FORMS]
+    return [name for name in _out_of_sight(a, p) if not CATALOGUE[name].one_regime]
 
 
 def not_met(a: Analysis, p: GapParameters) -> list[str]:
     """Names of entries whose regime these flights did not meet, and so could not show."""
-    return [name for name in _out_of_sight(a, p) if name in FORMS]
+    return [name for name in _out_of_sight(a, p) if CATALOGUE[name].one_regime]
 
 
 def _out_of_sight(a, p):
@@ -49,8 +48,8 @@ def decide(a: Analysis, p: GapParameters) -> None:
     left = max(after - floor - small, 0.0)
     explained = (before - after) / max(before - after + left, 1e-9)
     out_of_sight = hidden(a, p)
-    share = len(out_of_sight) / max(len({label.partition(' ')[0].partition('[')[0]
-                                         for label in a.visible} - set(FORMS)), 1)
+    seen = {label.partition(' ')[0].partition('[')[0] for label in a.visible}
+    share = len(out_of_sight) / max(sum(not CATALOGUE[name].one_regime for name in seen), 1)
     repeats = _repeats(a.rest, p)
     strange = _strange(a, before - after, p)
     sets = [[t, *found.rivals.get(t.candidate.label, [])] for t in found.accepted]

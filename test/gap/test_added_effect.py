@@ -1,0 +1,55 @@
+"""The how-to page on adding an effect: its code, as it stands in the text."""
+
+from dataclasses import replace
+from pathlib import Path
+import re
+
+from flights import KEYS, Motion, P, solved
+from flights import ROBOT as FLOWN
+import numpy as np
+import pytest
+from test_consumers import OUTPUTS, plain, with_effect
+
+from beetle_omni_ros.identify.gap.body import BodyModel
+from beetle_omni_ros.identify.gap.candidates import candidates
+from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
+from beetle_omni_ros.identify.gap.residual import FlightModel
+from beetle_omni_ros.robot import consumers
+from beetle_omni_ros.robot.effects import CATALOGUE
+
+PAGE = Path(__file__).resolve().parents[2] / 'docs/how-to/add_an_effect.md'
+ENTRY, TEST = re.findall(r'```python\n(.*?)```', PAGE.read_text(), flags=re.S)
+NAME = 'battery_heat'
+
+
+@pytest.fixture(autouse=True)
+def added(monkeypatch):
+    """The catalogue with the page's entry."""
+    made = {}
+    exec(compile(ENTRY, str(PAGE), 'exec'), made)
+    monkeypatch.setitem(CATALOGUE, NAME, made['BODY'][NAME])
+
+
+def test_the_pages_own_test_passes():
+    made = {}
+    exec(compile(TEST, str(PAGE), 'exec'), made)
+    made['test_a_pack_of_50_degrees_takes_a_tenth_of_the_thrust']()
+
+
+@pytest.mark.parametrize('consumer', ['nmpc', 'training', 'plant'])
+def test_what_flies_acts_on_it(consumer):
+    assert consumers.stand(consumer, NAME).acts
+    found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](with_effect(NAME))])
+    assert not np.array_equal(found, plain(consumer))
+
+
+def test_the_gap_finder_looks_for_it_and_finds_its_size(monkeypatch):
+    robot = replace(FLOWN, effects={NAME: {'loss_per_kelvin': 0.0, 'temperature': 50.0}})
+    keys, key = {**all_keys(robot), **extra_keys()}, f'{NAME}.loss_per_kelvin'
+    monkeypatch.setitem(KEYS, key, keys[key])
+    made = FlightModel(Motion(duration=10.0).flight(), robot, BodyModel(robot, keys, (0.0, 0.0)),
+                       keys, P)
+    warm = made.residual({key: 0.004}, 'B')
+    assert np.abs(warm['B'] - made.residual({}, 'B')['B']).max() > 0.5
+    assert solved(made, [key], 'B', base=warm)[key] == pytest.approx(0.004, rel=1e-6)
+    assert [c.keys for c in candidates(keys, [made]) if c.name == NAME] == [(key,)]

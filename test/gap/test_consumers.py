@@ -1,0 +1,191 @@
+"""Each consumer acts on each effect, leaves it with a reason, or refuses it: all of them tried."""
+
+from dataclasses import replace
+from functools import cache
+
+from flights import KEYS, model, Motion
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.base import Command, State
+from beetle_omni_ros.control.nmpc import redated, with_delays
+from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
+from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuSample, PoseSample
+from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.robot import consumers, dynamics
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.effects import Asked, CATALOGUE
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim.command_link import CommandLink
+from beetle_omni_ros.sim.conditions import draw
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.simulator import Simulator
+
+ROBOT, WORLD = RobotParameters.load(), SimulatorParameters.load()
+
+
+def number(robot, key):
+    """Number of a robot file at a dotted key."""
+    for part in key.split('.'):
+        robot = getattr(robot, part)
+    return np.array(robot, dtype=float)
+
+
+def with_effect(name):
+    """The robot with an effect of realistic size; numbers of the file shrink by that."""
+    values = {}
+    for parameter, spec in CATALOGUE[name].parameters.items():
+        if spec.form:
+            values[parameter] = spec.neutral
+        elif spec.number:
+            values[parameter] = (1 - spec.typical) * number(ROBOT, spec.number)
+        else:
+            values[parameter] = np.array(spec.neutral) + spec.typical
+    return replace(ROBOT, effects={name: {
+        key: tuple(value.tolist()) if np.ndim(value) else float(value)
+        for key, value in values.items()}})
+
+
+def states(count=30):
+    """(count, 25) states and (count, 8) commands, some at the limits of the servos."""
+    rng = np.random.default_rng(1)
+    x = np.hstack([rng.normal(size=(count, 3)) * 0.3 + [0, 0, 0.5], rng.normal(size=(count, 3)),
+                   np.tile([0.1, 0.2, 0.0, np.sqrt(0.95)], (count, 1)),
+                   rng.normal(size=(count, 3)), rng.uniform(-1, 1, (count, 4)),
+                   rng.uniform(-12, 12, (count, 4)), rng.uniform(4, 12, (count, 4))])
+    u = np.hstack([x[:, 13:17] + rng.uniform(-9, 9, (count, 4)), rng.uniform(2, 25, (count, 4))])
+    return x, u
+
+
+def nmpc(robot):
+    """Model, limits and delays of the NMPC, what it makes of the tilts, and the allocation."""
+    consumers.check('nmpc', robot)
+    x, u = states()
+    derivative = dynamics.full_model(robot)
+    settings = with_delays(robot, NmpcParameters.load()).model
+    state = State(0.0, np.zeros(3), np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3),
+                  np.zeros(4), np.ones(4), 0.0)
+    allocator = Allocator(robot)
+    return [np.array([derivative(a, b, np.zeros(10)) for a, b in zip(x, u)]).ravel(),
+            [settings.command_delay, settings.servo_lag],
+            [redated(state, robot).tilt_stamp],
+            allocator.matrix.ravel(), np.array(allocator.weight).ravel()]
+
+
+def training(robot):
+    """A step of the training's model, and its delays."""
+    pytest.importorskip('torch')
+    from beetle_omni_ros.train.model import nominal_body, substep
+    from beetle_omni_ros.train.parameters import TrainParameters
+    from beetle_omni_ros.train.starts import latencies
+    consumers.check('training', robot)
+    x, u = states()
+    step, body, parameters = substep(robot, 0.0025), nominal_body(robot), TrainParameters()
+    parameters = replace(parameters, random=replace(
+        parameters.random, command_latency=np.array([0.0, 0.0]),
+        tilt_latency=np.array([0.0, 0.0])))
+    return [np.array([step(a, b, np.zeros(6), body) for a, b in zip(x, u)]).ravel(),
+            np.array(latencies(parameters, robot)).ravel()]
+
+
+def plant(robot):
+    """Readings of the simulated robot after some tilting and thrusting near the floor."""
+    made = Simulator(robot, WORLD, seed=2)
+    made.reset([0.0, 0.0, 0.6], [0.1, 0.05, 0.0, 1.0])
+    read = []
+    for k in range(60):
+        wave = np.sin(0.35 * k + np.arange(4))
+        made.command(Command(made.time, 0.3 * wave if k < 40 else np.full(4, 3.8), 9 + 12 * wave))
+        frame = made.step()
+        read += [frame.truth.position, frame.truth.tilt, frame.imu.specific_force,
+                 frame.imu.angular_velocity, [frame.imu.stamp]]
+        read += [[frame.joints.stamp], frame.joints.position] if frame.joints else []
+        read += [[frame.mocap.stamp], frame.mocap.quaternion] if frame.mocap else []
+    return read
+
+
+@cache
+def samples():
+    """Stamps, specific forces, rates and poses of a second of turning and shaking."""
+    t = np.arange(0.005, 1.0, 0.005)
+    angle = 0.5 * np.sin(3 * t)
+    force = np.stack([np.sin(9 * t), 9.8 * np.sin(angle), 9.8 * np.cos(angle)], axis=1)
+    rate = np.stack([1.5 * np.cos(3 * t), 0 * t, 0 * t], axis=1)
+    pose = np.stack([np.sin(angle / 2), 0 * t, 0 * t, np.cos(angle / 2)], axis=1)
+    return t, force, rate, pose
+
+
+def estimator(robot):
+    """The estimate after those samples."""
+    ekf = ErrorStateEkf(EkfParameters.load().of_robot(robot), robot.gravity)
+    for k, (t, force, rate, pose) in enumerate(zip(*samples(), strict=True)):
+        ekf.imu(ImuSample(t, force, rate))
+        if k % 2:
+            ekf.pose(PoseSample(t, np.zeros(3), pose))
+    found = ekf.estimate
+    return [found.position, found.velocity, found.quaternion, found.angular_velocity]
+
+
+def buses(robot):
+    """When tilts and thrusts of one command act."""
+    link = CommandLink(robot, WORLD.actuators, draw('nominal', WORLD, np.random.default_rng(0)))
+    link.push(Command(0.0, np.ones(4), np.full(4, 5.0)), 0.0)
+    acting = []
+    for k in range(20):
+        link.update(0.005 * k)
+        acting += [link.tilt.copy(), link.thrust.copy()]
+    return acting
+
+
+@cache
+def flight_model():
+    return model(Motion(duration=10.0).flight())
+
+
+def gap(name):
+    """Whether a fit's number of the effect changes the residual."""
+    made = flight_model()
+    limit = isinstance(CATALOGUE[name].starts, Asked)     # far above this calm flight
+    theta = {key.name: np.log(0.05 if limit else 1 - key.typical) if key.relative
+             else key.typical for key in KEYS.values() if key.effect == name and not key.form}
+    before, after = made.residual({}), made.residual(theta)
+    return any(not np.array_equal(before[group], after[group]) for group in before)
+
+
+OUTPUTS = {'nmpc': nmpc, 'training': training, 'plant': plant, 'estimator': estimator,
+           'buses': buses}
+
+
+@cache
+def plain(consumer):
+    return np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](ROBOT)])
+
+
+@pytest.mark.parametrize('name', CATALOGUE)
+@pytest.mark.parametrize('consumer', OUTPUTS)
+def test_a_consumer_acts_on_an_effect_or_says_why_not(consumer, name):
+    stand, robot = consumers.stand(consumer, name), with_effect(name)
+    if stand.error:
+        with pytest.raises(ParameterError, match=f'effects.{name}: the .* refuses') as error:
+            OUTPUTS[consumer](robot)
+        assert stand.reason in str(error.value) and '\n' not in str(error.value)
+        return
+    found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](robot)])
+    changed = found.shape != plain(consumer).shape or not np.array_equal(found, plain(consumer))
+    assert changed == stand.acts, stand.reason or f'{name} changes nothing'
+    assert stand.acts or stand.reason
+
+
+@pytest.mark.parametrize('name', CATALOGUE)
+def test_the_gap_finder_acts_on_every_effect(name):
+    assert gap(name) and consumers.stand('gap', name).acts
+
+
+def test_training_refuses_delays_that_it_cannot_remember():
+    pytest.importorskip('torch')
+    from beetle_omni_ros.train.parameters import TrainParameters
+    from beetle_omni_ros.train.starts import latencies
+    late = replace(ROBOT, effects={'command_latency': {'delay': 0.015}})
+    with pytest.raises(ParameterError, match='tilt commands are up to 30 ms late'):
+        latencies(TrainParameters(), late)
