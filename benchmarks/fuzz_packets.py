@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 from pathlib import Path
 import sys
@@ -18,7 +19,6 @@ import time
 import traceback
 
 import numpy as np
-from sensor_msgs.msg import Imu
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.drivers.mavlink_receiver import MavlinkReceiver
@@ -26,7 +26,18 @@ from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.motor_board_watch import BoardWatch, restarted
 from beetle_omni_ros.drivers.servo_link import ServoLink
 from beetle_omni_ros.drivers.servo_port import ServoPort
-from beetle_omni_ros.nodes import convert, targets
+from beetle_omni_ros.estimation.samples import ImuSample
+from beetle_omni_ros.messages import conversions
+from beetle_omni_ros.messages.topics import ALL
+from beetle_omni_ros.messages.values import (
+    Battery,
+    Joints,
+    MessageError,
+    Odom,
+    RotorSpeeds,
+    Wrench,
+)
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.sim.emulated import mavlink
@@ -145,29 +156,29 @@ class Messages:
     def __init__(self):
         zero = np.zeros(3)
         self._checks = TargetChecks(RobotParameters.load())
-        track = targets.target_message(TrajectoryTarget(
+        track = wire.message('target_trajectory', TrajectoryTarget(
             np.arange(3.0), np.ones((3, 3)), np.tile(LEVEL, (3, 1)), np.zeros((3, 3)),
             np.zeros((3, 3))))
+        pose, joints = PoseTarget(zero, LEVEL, 1.0), Joints(1.0, np.zeros(4), np.zeros(4))
+        values = {'mocap/pose': pose, 'odom': Odom(1.0, zero, zero, LEVEL, zero),
+                  'command': Command(1.0, np.zeros(4), np.ones(4)), 'joint_states': joints,
+                  'rotor_states': RotorSpeeds(1.0, np.ones(4)),
+                  'battery_state': Battery(1.0, 24.0, -9.0, 6),
+                  'disturbance': Wrench(1.0, zero, zero),
+                  'imu/data_raw': ImuSample(0.0, zero, zero)}
         self._kinds: list[tuple[Callable, Callable]] = [
-            (lambda: convert.pose_message(1.0, zero, LEVEL), convert.pose_sample),
-            (lambda: convert.pose_message(1.0, zero + 1, LEVEL), self._target),
+            (lambda: wire.message('target_pose', PoseTarget(zero + 1, LEVEL, 1.0)), self._target),
             (lambda: track, self._track),
-            (lambda: convert.odometry_message(1.0, zero, zero, LEVEL, zero), convert.odom),
-            (lambda: convert.command_message(Command(1.0, np.zeros(4), np.ones(4))),
-             convert.command),
-            (lambda: convert.joint_message(1.0, np.zeros(4), np.zeros(4)), convert.joints),
-            (lambda: convert.joint_message(1.0, np.zeros(4), np.zeros(4)), convert.known_joints),
-            (lambda: convert.rotor_message(1.0, np.ones(4)), convert.rotors),
-            (lambda: convert.battery_message(1.0, 24.0, -9.0, 6), convert.battery),
-            (lambda: convert.wrench_message(1.0, zero, zero), convert.wrench),
-            (Imu, convert.imu_sample)]
+            (lambda: wire.message('joint_states', joints), conversions.take_known_joints),
+            *((partial(wire.message, topic, value), ALL[topic].take)
+              for topic, value in values.items())]
 
     def _target(self, message):
-        target: PoseTarget = targets.pose_target(message)
+        target: PoseTarget = conversions.take_pose_target(message)
         self._judge(target)
 
     def _track(self, message):
-        self._judge(targets.trajectory_target(message))
+        self._judge(conversions.take_trajectory(message))
 
     def _judge(self, target):
         if not self._checks.why_not(target, 5.0):
@@ -185,7 +196,7 @@ class Messages:
             spoil(rng, message)
         try:
             read(message)
-        except convert.MessageError as error:
+        except MessageError as error:
             if '\n' in str(error) or len(str(error)) > LONGEST_TEXT:
                 raise AssertionError(f'a refusal of {len(str(error))} characters') from None
 

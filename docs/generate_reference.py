@@ -24,6 +24,8 @@ import sys
 
 import numpy as np
 
+from beetle_omni_ros.messages import topics as message_topics
+from beetle_omni_ros.messages.topics import requester, TABLE
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import PACKAGE
 
@@ -62,45 +64,18 @@ FILES = {
 
 # Nodes whose code is not in a file of their own name; '' is no node of its own.
 SHARED = {'controller_node': 'nmpc_node, rl_node', 'health': 'every node', 'operator': '',
-          'listener': '', 'node': '', 'recorder_node': '', 'command_source': '', 'graph': ''}
+          'listener': '', 'node': '', 'recorder_node': '', 'command_source': '', 'graph': '',
+          'process_faults': '', 'wire': ''}
 
-MEANINGS = {
-    'mocap/pose': 'pose of base_link in world, stamped at capture, 100 Hz',
-    'imu/data_raw': 'specific force and angular rate in base_link, without orientation '
-                    '(REP-145), 200 Hz',
-    'joint_states': 'position, velocity and effort of `gimbal1..4`',
-    'battery_state': 'pack voltage and current, negative when discharging',
-    'rotor_states': '`velocity` of `rotor1..4` [rad/s], positive for both spins, NaN where '
-                    'unknown',
-    'odom': 'estimate: pose in world, twist in base_link, both covariances',
-    'target_pose': 'target pose in world; `reference_node` or a user publishes it',
-    'target_trajectory': 'time-parameterised reference; `reference_node` or a user publishes it',
-    '<controller>/command': 'command that a controller asks for: `nmpc/command`, `rl/command`',
-    'command': 'the selected and checked command that the actuators execute',
-    'supervisor/state': 'state, a colon, and the active controller or the last fault',
-    'supervisor/identity': 'identity of the supervisor; actuators obey its commands alone',
-    'supervisor/target': 'what controllers fly to in place of the target of the operator; '
-                         'nothing where it has no points',
-    'supervisor/actuators': '`gimbal1..4`, `rotor1..4`, `gimbal1_zero..4_zero`: `position` holds '
-                            'true angles of stuck joints (NaN: the joint moves) and the zeros of '
-                            'encoders that jumped, reading minus true tilt; `effort` is NaN for '
-                            'a rotor that obeys, 0 for a lost one, else the thrust that it holds',
-    'reference/state': '`waiting`, `flying 3/15`, `done`, `done: control lost at level 60`, or '
-                       '`aborted` when the flight ended before the task',
-    'joint_bridge/state': '`ready`, `waiting: WHY` or `lost: WHY`',
-    'rotor_bridge/state': '`ready`, `waiting: WHY`, `silent: WHY` or `lost: WHY`',
-    'disturbance': 'external wrench on the simulated robot until the next message: force in '
-                   'world, torque in base_link; a user or an experiment publishes it',
-    'ground_truth/odom': 'the simulated truth',
-    'diagnostics': 'health, rates, ages, timing and faults of each node',
-    '/clock': 'simulated time, where it is simulated',
-    '/tf': 'frames that move: `world`, `base_link`, each tilting module; 50 Hz, in each bag',
-    '/tf_static': 'frames that stay: rotors, main body, end effector, IMU',
-    'robot_description': 'URDF for viewers',
-    'markers': 'targets and thrusts for viewers'}
-QOS = {'SENSOR': 'best effort, depth 5', 'COMMAND': 'reliable, depth 1',
-       'ESTIMATE': 'reliable, depth 1', 'EVENT': 'reliable, depth 10',
-       'LATCHED': 'reliable, latched'}
+# Topics that viewers and clocks need, which no other part of the package reads.
+OTHERS = {
+    '/clock': ('rosgraph_msgs/Clock', 'SENSOR', 'simulated time, where it is simulated'),
+    '/tf': ('tf2_msgs/TFMessage', 'EVENT', 'frames that move: `world`, `base_link`, each '
+            'tilting module; 50 Hz, in each bag'),
+    '/tf_static': ('tf2_msgs/TFMessage', 'LATCHED',
+                   'frames that stay: rotors, main body, end effector, IMU'),
+    'robot_description': ('std_msgs/String', 'LATCHED', 'URDF for viewers'),
+    'markers': ('visualization_msgs/MarkerArray', 'EVENT', 'targets and thrusts for viewers')}
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -194,73 +169,76 @@ def _anchor(heading: str) -> str:
     return re.sub(r'[^\w\- ]', '', heading.lower()).strip().replace(' ', '-')
 
 
-def _names(tree: ast.AST) -> tuple[dict[str, str], dict[str, str]]:
-    """(message class -> ROS type, module constant -> text) of a node's file."""
-    types, constants = {}, {}
-    for item in ast.walk(tree):
-        if isinstance(item, ast.ImportFrom) and (item.module or '').endswith('.msg'):
-            types |= {alias.asname or alias.name: f"{item.module.split('.')[0]}/{alias.name}"
-                      for alias in item.names}
-        elif isinstance(item, ast.Assign) and isinstance(item.value, ast.Constant) \
-                and isinstance(item.value.value, str) and isinstance(item.targets[0], ast.Name):
-            constants[item.targets[0].id] = item.value.value
-    return types, constants
-
-
 def _topic(value, constants) -> list[str]:
     """Topic names of an argument: text, a constant, or text with the name of a part in it."""
     if isinstance(value, ast.Constant):
         return [value.value]
     if isinstance(value, ast.Name):
-        return [constants[value.id]] if value.id in constants else []
+        return constants.get(value.id, [])
     if isinstance(value, ast.JoinedStr):
         end = ''.join(part.value for part in value.values if isinstance(part, ast.Constant))
         return ['joint_bridge/state', 'rotor_bridge/state'] if end.endswith('bridge/state') \
-            or end == '/state' else [f'<controller>{end}']
+            else [f'<controller>{end}']
     return []
 
 
-def _graph() -> dict[str, dict]:
-    """Topic -> type, qos, from and to, as the files of the nodes say."""
-    found: dict[str, dict] = {}
+def _constants(tree: ast.AST) -> dict[str, list[str]]:
+    """Names of a file that stand for topics: constants, and what a loop runs over."""
+    found = {}
+    for item in ast.walk(tree):
+        if isinstance(item, ast.Assign) and isinstance(item.targets[0], ast.Name):
+            found[item.targets[0].id] = _topic(item.value, {})
+        elif isinstance(item, ast.For) and isinstance(item.target, ast.Name) \
+                and isinstance(item.iter, ast.Tuple):
+            found[item.target.id] = [name for one in item.iter.elts for name in _topic(one, {})]
+    return found
+
+
+def _ends() -> dict[str, dict[str, list[str]]]:
+    """Topic -> nodes that publish it and that subscribe it, as the files of the nodes say."""
+    found: dict[str, dict[str, list[str]]] = {}
     nodes = ROOT / PACKAGE / 'nodes'
-    shared = _names(ast.parse((nodes / 'command_source.py').read_text(encoding='utf-8')))[1]
+    shared = _constants(ast.parse((nodes / 'command_source.py').read_text(encoding='utf-8')))
+    ways = {'publisher': ('from', 0), 'Publisher': ('from', 1), 'create_publisher': ('from', 1),
+            'listen': ('to', 0), 'follow': ('to', 0)}
     for path in sorted(nodes.glob('*.py')):
         node = SHARED.get(path.stem, path.stem)
         tree = ast.parse(path.read_text(encoding='utf-8'))
-        types, constants = _names(tree)
         for call in ast.walk(tree):
-            if not node or not isinstance(call, ast.Call) or len(call.args) < 2 \
-                    or not isinstance(call.func, ast.Attribute):
+            if not node or not isinstance(call, ast.Call) \
+                    or not isinstance(call.func, ast.Attribute) or call.func.attr not in ways:
                 continue
-            way = {'create_publisher': 'from', 'create_subscription': 'to',
-                   'listen': 'to'}.get(call.func.attr)
-            kind = getattr(call.args[0], 'id', getattr(call.args[0], 'attr', None))
-            if not way or kind not in types and kind != '_transform_message':
-                continue
-            profile = next((part.attr for part in ast.walk(call)
-                            if isinstance(part, ast.Attribute) and part.attr in QOS
-                            and isinstance(part.value, ast.Name) and part.value.id == 'qos'), '')
-            for topic in _topic(call.args[1], {**shared, **constants}):
-                entry = found.setdefault(topic, {'type': types.get(kind, 'tf2_msgs/TFMessage'),
-                                                 'qos': '', 'from': [], 'to': []})
+            way, place = ways[call.func.attr]
+            given = call.args[place] if len(call.args) > place else None
+            for topic in _topic(given, {**shared, **_constants(tree)}):
+                entry = found.setdefault(topic, {'from': [], 'to': []})
                 entry[way] += [one for one in node.split(', ') if one not in entry[way]]
-                entry['qos'] = profile if way == 'from' else entry['qos']
-    for topic in ('command',):      # read through the class that checks the publisher
-        found['supervisor/identity']['to'] = list(found[topic]['to'])
+    # Read through the class that checks the publisher.
+    found['supervisor/identity']['to'] = list(found['command']['to'])
     return found
+
+
+def _qos(qos) -> str:
+    return ('reliable' if qos.reliable else 'best effort') + (
+        ', latched' if qos.latched else f', depth {qos.depth}')
 
 
 def topics() -> str:
     """Topics with types, quality of service, publishers and subscribers."""
-    graph = _graph()
-    missing = sorted(set(graph) ^ set(MEANINGS))
+    known = {}
+    for topic in TABLE:
+        name = '<controller>/command' if requester(topic.name) else topic.name
+        known.setdefault(name, (topic.type.replace('/msg/', '/'), _qos(topic.qos), topic.meaning))
+    for name, (kind, profile, meaning) in OTHERS.items():
+        known[name] = kind, _qos(getattr(message_topics, profile)), meaning
+    nodes = _ends()
+    missing = sorted(set(nodes) ^ set(known))
     if missing:
-        raise SystemExit(f'MEANINGS and the nodes differ in {", ".join(missing)}')
-    said = [[f'`{topic}`', graph[topic]['type'], meaning] for topic, meaning in MEANINGS.items()]
+        raise SystemExit(f'the table of topics and the nodes differ in {", ".join(missing)}')
+    said = [[f'`{topic}`', kind, meaning] for topic, (kind, _, meaning) in known.items()]
     ends = [[f'`{topic}`', *(', '.join(f'`{node}`' if node != 'every node' else node
-                                       for node in graph[topic][way]) for way in ('from', 'to')),
-             QOS.get(graph[topic]['qos'], '')] for topic in MEANINGS]
+                                       for node in nodes[topic][way]) for way in ('from', 'to')),
+             qos if nodes[topic]['from'] else ''] for topic, (_, qos, _) in known.items()]
     return (f'# Topics\n\n{MADE}\n'
             'Names are relative; a launch argument sets a namespace. On the robot the drivers of '
             'MoCap and IMU\npublish what `sim_node` publishes in the simulation. `recorder_node` '

@@ -7,7 +7,7 @@ A new topic is one entry. Names are relative; a robot may have a namespace.
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from beetle_omni_ros.control import registry
@@ -41,6 +41,9 @@ SENSOR = Qos(5, reliable=False)
 COMMAND = ESTIMATE = Qos(1)
 EVENT = Qos(10)
 LATCHED = Qos(1, latched=True)
+# For a recorder: whatever the publisher offers matches, and bursts fit.
+LOG = Qos(200, reliable=False)
+LATCHED_LOG = Qos(50, latched=True)
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class Topic:
 
     """
 
-    name: str
+    name: str = field(compare=False)    # two controllers' requests are of one kind
     type: str
     qos: Qos
     value: type

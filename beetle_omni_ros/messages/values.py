@@ -122,6 +122,11 @@ class Wish:
     stamp: float
     target: TrajectoryTarget | None
 
+    @classmethod
+    def of(cls, target: TrajectoryTarget | None) -> Wish:
+        """Make one of a target."""
+        return cls(target.stamp if target else 0.0, target)
+
 
 @dataclass(frozen=True)
 class Diagnostic:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import secrets
-
-from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from typing import Any
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.nodes import convert, qos
+from beetle_omni_ros.messages.conversions import take_command
+from beetle_omni_ros.messages.values import MessageError
+from beetle_omni_ros.nodes import wire
 
 TOPIC = 'supervisor/identity'
 TEXT_LIMIT = 40     # characters of somebody else's text in ours
@@ -31,17 +31,17 @@ class CommandSource:
     def __init__(self, node):
         """Listen to the identity, which is latched, for ``node``."""
         self._identity = ''
-        node.create_subscription(String, TOPIC, self._on_identity, qos.LATCHED)
+        wire.subscribe(node, TOPIC, self._on_identity)
 
-    def _on_identity(self, message):
-        self._identity = message.data
+    def _on_identity(self, identity):
+        self._identity = identity
 
-    def read(self, message: JointState) -> Command:
+    def read(self, message: Any) -> Command:
         """Read a command; MessageError when it is malformed or somebody else's."""
         source = message.header.frame_id
         if self._identity and source != self._identity:
             name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'
-            raise convert.MessageError(
+            raise MessageError(
                 f"2nd publisher: frame_id has {name}, expected '{self._identity[:TEXT_LIMIT]}'",
                 KIND)
-        return convert.command(message)
+        return take_command(message)

@@ -5,18 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, make_dataclass, replace
 import math
 
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
-from std_msgs.msg import String
-from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import checked, corrected, guidance_of, PoseTarget, tell_health
+from beetle_omni_ros.control.base import (
+    checked,
+    corrected,
+    guidance_of,
+    PoseTarget,
+    State,
+    tell_health,
+)
 from beetle_omni_ros.control.reach import reach_of
 from beetle_omni_ros.control.registry import ControllerEntry
-from beetle_omni_ros.nodes import convert, health, qos, runner, targets
+from beetle_omni_ros.messages.values import MessageError
+from beetle_omni_ros.nodes import health, runner
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.actuator_health import ALL_WELL
@@ -66,25 +69,17 @@ class ControllerNode(FlightNode):
         self._checks = TargetChecks(RobotParameters.load(self.parameters.robot_file or None))
         self._mode, self._own_mode = '', f'flying:{entry.name}'
         self._last_step = 0.0
-        self._publisher = self.create_publisher(JointState, f'{entry.name}/command',
-                                                qos.COMMAND)
-        self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.ESTIMATE,
-                    max_age=ODOM_AGE)
-        self.listen(JointState, 'joint_states', convert.joints, self._on_joints,
-                    max_age=JOINT_AGE)
-        self.listen(JointState, 'command', CommandSource(self).read, self._on_command, qos.COMMAND,
-                    stale_after=None)
+        self._publisher = self.publisher(f'{entry.name}/command')
+        self.listen('odom', self._on_odom, max_age=ODOM_AGE)
+        self.listen('joint_states', self._on_joints, max_age=JOINT_AGE)
+        self.listen('command', self._on_command, read=CommandSource(self).read, stale_after=None)
         # Latched by those who follow INTERFACES, volatile from a quick tool: both are heard.
-        self.listen(PoseStamped, 'target_pose', targets.pose_target, self._on_target,
-                    None, stale_after=None, published=True, check=self._check_target)
-        self.listen(MultiDOFJointTrajectory, 'target_trajectory', targets.trajectory_target,
-                    self._on_target, None, stale_after=None, published=True,
-                    check=self._check_target)
-        self.create_subscription(String, 'supervisor/state', self._on_mode, qos.LATCHED)
-        self.listen(MultiDOFJointTrajectory, 'supervisor/target', targets.wished_target,
-                    self._on_wish, qos.LATCHED, stale_after=None)
-        self.listen(JointState, 'supervisor/actuators', convert.actuator_health,
-                    self._on_actuators, qos.LATCHED, stale_after=None)
+        for topic in ('target_pose', 'target_trajectory'):
+            self.listen(topic, self._on_target, every_offer=True, stale_after=None,
+                        published=True, check=self._check_target)
+        self.follow('supervisor/state', self._on_mode)
+        self.listen('supervisor/target', self._on_wish, stale_after=None)
+        self.listen('supervisor/actuators', self._on_actuators, stale_after=None)
         self.health.track_compute(self._controller.period)
         self.health.report('controller', self._controller_status)
 
@@ -105,7 +100,7 @@ class ControllerNode(FlightNode):
         reason = self._checks.why_not(target, then) or (
             self._too_far(target) if self._mode == self._own_mode else '')
         if reason:
-            raise convert.MessageError(reason, 'cannot be flown')
+            raise MessageError(reason, 'cannot be flown')
 
     def _too_far(self, target):
         """Why a target cannot be flown from here, '' where it can."""
@@ -136,13 +131,13 @@ class ControllerNode(FlightNode):
         self._actuators = told.health
         tell_health(self._controller, told.health)
 
-    def _on_mode(self, message):
-        state = message.data.partition(':')[0]
+    def _on_mode(self, mode):
+        state = mode.partition(':')[0]
         if state in ('disarmed', 'emergency_stop') and self._mode.partition(':')[0] != state:
             self._controller.reset()
             self._command = self._hold = self._wish = None
-        took_over = message.data == self._own_mode != self._mode
-        self._mode = message.data
+        took_over = mode == self._own_mode != self._mode
+        self._mode = mode
         if took_over and self._target is not None and (reason := self._too_far(self._target)):
             # Another controller was on its way there, or the operator asked in vain.
             self.health.rejected('target_pose', f'{reason}; the present pose is held',
@@ -154,13 +149,13 @@ class ControllerNode(FlightNode):
         if self._joints is None or not self._is_due(odom.stamp):
             return
         self._last_step = odom.stamp
-        state = corrected(convert.state(odom, self._joints, self._command), self._actuators)
+        state = corrected(State.join(odom, self._joints, self._command), self._actuators)
         if self._target is None:
             if self._hold is None or not self._mode.startswith('flying'):
                 self._hold = PoseTarget(odom.position, odom.quaternion, odom.stamp)
         target = self._wish or self._target or self._hold
         command = self.timed(self._controller.step, state, target)
-        self._publisher.publish(convert.command_message(checked(self._entry.name, command)))
+        self._publisher.publish(checked(self._entry.name, command))
 
     def _is_due(self, stamp):
         period = self._controller.period

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import Imu
-
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.nodes import convert, health, qos, runner
+from beetle_omni_ros.messages.values import Odom
+from beetle_omni_ros.nodes import health, runner
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
@@ -40,10 +37,9 @@ class EkfNode(FlightNode):
         robot = RobotParameters.load(self.parameters.robot_file or None)
         self._ekf = ErrorStateEkf(self.parameters.of_robot(robot), robot.gravity)
         self._status = self._ekf.status
-        self._publisher = self.create_publisher(Odometry, 'odom', qos.ESTIMATE)
-        self.listen(Imu, 'imu/data_raw', convert.imu_sample, self._on_imu, max_age=SENSOR_AGE)
-        self.listen(PoseStamped, 'mocap/pose', convert.pose_sample, self._on_pose,
-                    max_age=SENSOR_AGE)
+        self._publisher = self.publisher('odom')
+        self.listen('imu/data_raw', self._on_imu, max_age=SENSOR_AGE)
+        self.listen('mocap/pose', self._on_pose, max_age=SENSOR_AGE)
         self.health.track_compute(1 / self.parameters.imu.rate)
         self.health.report('estimator', self._estimator_status)
 
@@ -61,9 +57,8 @@ class EkfNode(FlightNode):
             self._publish(self._ekf.estimate)
 
     def _publish(self, estimate):
-        self._publisher.publish(convert.odometry_message(
-            estimate.stamp, estimate.position, estimate.velocity, estimate.quaternion,
-            estimate.angular_velocity, pose_covariance(estimate),
+        self._publisher.publish(Odom.of(
+            estimate, pose_covariance(estimate),
             twist_covariance(estimate, self.parameters.imu.gyroscope_noise)))
 
     def _estimator_status(self):

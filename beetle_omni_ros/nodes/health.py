@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from beetle_omni_ros.nodes import qos
+from beetle_omni_ros.messages.values import Diagnostic
+from beetle_omni_ros.nodes import wire
 
-OK, WARN, ERROR, STALE = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR,
-                          DiagnosticStatus.STALE)
+OK, WARN, ERROR, STALE = range(4)   # of diagnostic_msgs/DiagnosticStatus
 PERIOD = 1.0            # s between two diagnostics
 REPEAT = 1.0            # s between two lines of the log about refusals of one kind
 KINDS = 20              # of refusals that are told apart for each topic
@@ -76,7 +75,7 @@ class Health:
         self._misses = 0
         self._wall_max = 0.0
         self._extra = []
-        self._publisher = node.create_publisher(DiagnosticArray, 'diagnostics', qos.EVENT)
+        self._publisher = wire.Publisher(node, 'diagnostics')
         self._timer = node.create_timer(PERIOD, self._publish,
                                         clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._last = node.elapsed()
@@ -141,18 +140,12 @@ class Health:
 
     def _publish(self):
         now = self._node.elapsed()
-        message = DiagnosticArray()
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        if self._inputs:
-            message.status.append(self._input_status(now))
+        told = [self._input_status(now)] if self._inputs else []
         if self._compute is not None:
-            message.status.append(self._compute_status())
-        for name, source in self._extra:
-            message.status.append(self._status(name, *source()))
-        if not message.status:
-            message.status.append(self._status('node', OK, 'running', {}))
+            told.append(self._compute_status())
+        told += [self._status(name, *source()) for name, source in self._extra]
         self._last = now
-        self._publisher.publish(message)
+        self._publisher.publish(told or [self._status('node', OK, 'running', {})])
 
     def _input_status(self, now):
         level, faults, values = OK, [], {}
@@ -170,7 +163,7 @@ class Health:
                 level = ERROR
                 faults.append(f'{topic} silent for {now - entry.seen:.1f} s')
             if entry.rejected.total() > entry.rejected_reported:
-                level = max(level, WARN, key=ord)
+                level = max(level, WARN)
                 new = entry.rejected.total() - entry.rejected_reported
                 faults.append(f'{topic}: {new} rejected' + (
                     f', {entry.last_refusal}' if entry.last_refusal else ''))
@@ -189,11 +182,11 @@ class Health:
         return self._status('compute', level, f'{self._misses} deadline misses', values)
 
     def _status(self, name, level, text, values):
-        return DiagnosticStatus(
-            level=level, name=f'{self._node.get_name()}: {name}', message=text,
-            hardware_id='beetle_omni',
-            values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()])
+        return Diagnostic(self._node.get_clock().now().nanoseconds * 1e-9,
+                          f'{self._node.get_name()}: {name}', level, text, texts(values))
 
 
-def _text(value):
-    return f'{value:.6g}' if isinstance(value, float) else str(value)
+def texts(values: dict) -> dict[str, str]:
+    """Values of a status as text, numbers with six digits."""
+    return {key: f'{value:.6g}' if isinstance(value, float) else str(value)
+            for key, value in values.items()}

@@ -6,15 +6,14 @@ from dataclasses import dataclass
 import math
 import time
 
-from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import Goal, ServoLoop
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
-from beetle_omni_ros.nodes import convert, health, qos, runner
+from beetle_omni_ros.messages.values import Joints
+from beetle_omni_ros.nodes import health, runner
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.joint_bridge_status import bus_status, servo_status
 from beetle_omni_ros.nodes.lifecycle_node import (
@@ -58,10 +57,10 @@ class JointBridgeNode(LifecycleFlightNode):
         self._bus = self._loop = None
         self._was_active = ''
         self._latency, self._since = health.Distribution(), 'publication'
-        self._state = self.create_publisher(String, 'joint_bridge/state', qos.LATCHED)
+        self._state = self.publisher('joint_bridge/state')
         self._told = ''
-        self._joints = self.create_publisher(JointState, 'joint_states', qos.SENSOR)
-        self.listen(JointState, 'command', CommandSource(self).read, self._on_command, qos.COMMAND,
+        self._joints = self.publisher('joint_states')
+        self.listen('command', self._on_command, read=CommandSource(self).read,
                     max_age=COMMAND_AGE, stale_after=None, published=True)
         self._bus_status = bus_status()
         self.health.report('bus', lambda: self._bus_status(self.stage, self._told, self._bus,
@@ -165,10 +164,10 @@ class JointBridgeNode(LifecycleFlightNode):
 
     def _publish(self, readings, good):
         if good.all():
-            self._joints.publish(convert.joint_message(
+            self._joints.publish(Joints(
                 readings.stamp, readings.position, readings.velocity, readings.effort))
         elif good.any():
-            self._joints.publish(convert.joint_message(
+            self._joints.publish(Joints(
                 readings.stamp, readings.position[good], readings.velocity[good],
                 readings.effort[good], [n for n, is_good in zip(JOINT_NAMES, good) if is_good]))
 
@@ -185,7 +184,7 @@ class JointBridgeNode(LifecycleFlightNode):
             else:
                 self.get_logger().info(text)
             self._told = text
-            self._state.publish(String(data=text))
+            self._state.publish(text)
 
     def _log(self, loop):
         for line in loop.take_events():

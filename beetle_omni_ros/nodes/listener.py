@@ -5,26 +5,22 @@ from __future__ import annotations
 from functools import partial
 import time
 
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
 import numpy as np
 import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.signals import SignalHandlerOptions
-from sensor_msgs.msg import BatteryState, Imu, JointState
-from std_msgs.msg import String
 
 from beetle_omni_ros.bringup.heard import BRIDGES, Heard, Status, Stream
-from beetle_omni_ros.nodes import convert, qos, runner
+from beetle_omni_ros.messages.conversions import seconds as seconds_of
+from beetle_omni_ros.messages.topics import LOG, TOPICS
+from beetle_omni_ros.messages.values import MessageError
+from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.robot.schema import ParameterError
 
-# Topic -> type, how it is read, what of it no living sensor repeats.
-STREAMS = {
-    'mocap/pose': (PoseStamped, convert.pose_sample, lambda pose: pose.position),
-    'imu/data_raw': (Imu, convert.imu_sample, lambda imu: imu.specific_force),
-    'joint_states': (JointState, convert.joints, lambda joints: joints.position),
-    'battery_state': (BatteryState, convert.battery, lambda battery: battery.voltage)}
+# Topic -> what of its values no living sensor repeats.
+STREAMS = {'mocap/pose': 'position', 'imu/data_raw': 'specific_force',
+           'joint_states': 'position', 'battery_state': 'voltage'}
 
 
 def listen(seconds: float, namespace: str = '', discovery: str | None = None) -> Heard:
@@ -67,40 +63,35 @@ def _node(context, namespace):
 
 
 def _subscribe(node, heard):
-    for topic, (kind, read, of_it) in STREAMS.items():
-        node.create_subscription(kind, topic, partial(_take, node, heard.streams[topic], read,
-                                                      of_it), qos.LOG)
+    for topic, part in STREAMS.items():
+        node.create_subscription(
+            wire.message_class(TOPICS[topic].type), topic,
+            partial(_take, node, heard.streams[topic], TOPICS[topic].take, part),
+            wire.profile(LOG))
     for bridge in BRIDGES:
-        node.create_subscription(String, f'{bridge}/state', partial(_take_state, heard, bridge),
-                                 qos.LATCHED)
-    node.create_subscription(DiagnosticArray, 'diagnostics', partial(_take_diagnostics, heard),
-                             qos.EVENT)
+        wire.subscribe(node, f'{bridge}/state', partial(heard.states.__setitem__, bridge))
+    wire.subscribe(node, 'diagnostics', partial(_take_diagnostics, heard))
 
 
-def _take(node, stream, read, of_it, message):
+def _take(node, stream, take, part, message):
     now = node.get_clock().now().nanoseconds * 1e-9
     stream.arrivals.append(time.monotonic())
-    stream.ages.append(now - convert.seconds(message.header.stamp))
+    stream.ages.append(now - seconds_of(message.header.stamp))
     try:
-        stream.sizes.append(float(np.linalg.norm(of_it(read(message)))))
-    except convert.MessageError as error:
+        stream.sizes.append(float(np.linalg.norm(getattr(take(message), part))))
+    except MessageError as error:
         stream.refused[str(error)] += 1
 
 
-def _take_state(heard, bridge, message):
-    heard.states[bridge] = message.data
-
-
-def _take_diagnostics(heard, message):
-    for status in message.status:
-        heard.diagnostics[status.name] = Status(
-            ord(status.level), status.message, {pair.key: pair.value for pair in status.values})
+def _take_diagnostics(heard, statuses):
+    for status in statuses:
+        heard.diagnostics[status.name] = Status(status.level, status.message, status.values)
 
 
 def _look_at_publishers(node, heard):
     """Who publishes the topics, and who something else under their name."""
-    for topic, (kind, _, _) in STREAMS.items():
-        wanted = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
+    for topic in STREAMS:
+        wanted = TOPICS[topic].type
         for publisher in node.get_publishers_info_by_topic(topic):
             if publisher.topic_type == wanted:
                 heard.streams[topic].publishers.append(publisher.node_name)

@@ -7,9 +7,10 @@ import time
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 
-from beetle_omni_ros.nodes import arrival, convert, instance, parameters, qos
+from beetle_omni_ros.messages.topics import Qos, topic_of
+from beetle_omni_ros.messages.values import MessageError
+from beetle_omni_ros.nodes import arrival, instance, parameters, wire
 from beetle_omni_ros.nodes.every_offer import EveryOffer
 from beetle_omni_ros.nodes.health import Health
 
@@ -73,28 +74,38 @@ class FlightNode(Node):
         """Time that nobody sets [s]: steady, or simulated where that is used."""
         return self.now() if self.simulated else time.monotonic()
 
-    def listen(self, message_type: type, topic: str, read: Callable, handle: Callable,
-               profile: QoSProfile | None = qos.SENSOR, max_age: float | None = None,
+    def publisher(self, topic: str) -> wire.Publisher:
+        """Make a publisher of a topic's values."""
+        return wire.Publisher(self, topic)
+
+    def follow(self, topic: str, handle: Callable[[str], None]) -> None:
+        """Pass the latched text of a topic to ``handle``, whenever it changes."""
+        wire.subscribe(self, topic, handle)
+
+    def listen(self, topic: str, handle: Callable, *, read: Callable | None = None,
+               qos: Qos | None = None, every_offer: bool = False, max_age: float | None = None,
                stale_after: float | None = 0.5, published: bool = False,
                check: Callable | None = None) -> None:
         """
-        Subscribe ``topic``: convert with ``read``, refuse what is bad, pass to ``handle``.
+        Subscribe ``topic``: read its values, refuse what is bad, pass on to ``handle``.
 
         Args:
-            message_type: ROS message class.
-            topic: relative name.
-            read: message -> dataclass with a ``stamp``; raises MessageError.
-            handle: called with the dataclass.
-            profile: quality of service; None: whatever publishers offer, see
+            topic: relative name, of the table of topics.
+            handle: called with the value.
+            read: message -> value with a ``stamp``, other than the table's ``take``; raises
+                MessageError.
+            qos: other than what the topic's publisher offers.
+            every_offer: hear publishers of any quality of service, see
                 :class:`~beetle_omni_ros.nodes.every_offer.EveryOffer`.
             max_age: refuse stamps older than this, or ahead of the clock [s]; None: any.
             stale_after: silence that is an error, once the topic came [s]; None: none.
             published: pass the time of publication [s, system time, or nan] to ``check`` and
                 ``handle`` too.
-            check: called with the dataclass before ``handle``; raises MessageError.
+            check: called with the value before ``handle``; raises MessageError.
 
         """
-        health = self.health
+        entry, health = topic_of(topic), self.health
+        read = read or entry.take
         health.watch(topic, stale_after)
 
         def callback(message, *publication):
@@ -104,18 +115,19 @@ class FlightNode(Node):
                 _check_age(age, max_age)
                 if check is not None:
                     check(value, *publication)
-            except convert.MessageError as error:
+            except MessageError as error:
                 health.rejected(topic, str(error), error.kind)
                 return
             health.received(topic, age)
             handle(value, *publication)
 
-        if profile is None:
-            EveryOffer(self, message_type, topic, callback if published else
+        kind = wire.message_class(entry.type)
+        if every_offer:
+            EveryOffer(self, kind, topic, callback if published else
                        lambda message, _: callback(message))
             return
         taken = arrival.with_publication(callback) if published else callback
-        self.create_subscription(message_type, topic, taken, profile)
+        self.create_subscription(kind, topic, taken, wire.profile(qos or entry.qos))
 
     def timed(self, function: Callable, *args):
         """Call ``function`` and count its CPU and wall time."""
@@ -154,6 +166,6 @@ class FlightNode(Node):
 
 def _check_age(age, limit):
     if limit is not None and age > limit:
-        raise convert.MessageError('stale stamp')
+        raise MessageError('stale stamp')
     if limit is not None and age < -FUTURE:
-        raise convert.MessageError('stamp in the future')
+        raise MessageError('stamp in the future')

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import time
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.nodes import convert, qos, runner
+from beetle_omni_ros.messages.conversions import seconds
+from beetle_omni_ros.messages.topics import request, SENSOR
+from beetle_omni_ros.messages.values import Diagnostic
+from beetle_omni_ros.nodes import health, runner, wire
 from beetle_omni_ros.nodes.actuators import READY, STATES
 from beetle_omni_ros.nodes.discovery import confine
 
@@ -37,7 +37,7 @@ class Operator:
         progress: the reference's progress, '' before it is known.
         bridges: bridge node -> its state, of those that told one.
         commands: messages of the watched controller so far.
-        diagnostics: status name -> newest DiagnosticStatus.
+        diagnostics: status name -> newest :class:`Diagnostic`.
 
     """
 
@@ -54,47 +54,47 @@ class Operator:
         self.states: list[str] = []
         self.bridges: dict[str, str] = {}
         self.commands = 0
-        self.diagnostics: dict[str, DiagnosticStatus] = {}
+        self.diagnostics: dict[str, Diagnostic] = {}
         self._simulated: float | None = None
         node = self._node
-        node.create_subscription(Clock, '/clock', self._on_clock, qos.SENSOR)
-        node.create_subscription(String, 'supervisor/state', self._on_state, qos.LATCHED)
-        node.create_subscription(String, 'reference/state', self._on_progress, qos.LATCHED)
+        node.create_subscription(Clock, '/clock', self._on_clock, wire.profile(SENSOR))
+        wire.subscribe(node, 'supervisor/state', self._on_state)
+        wire.subscribe(node, 'reference/state', self._on_progress)
         for bridge, topic in STATES.items():
-            node.create_subscription(String, topic, self._on_bridge(bridge), qos.LATCHED)
-        node.create_subscription(JointState, f'{controller}/command', self._on_command,
-                                 qos.SENSOR, raw=True)
-        node.create_subscription(DiagnosticArray, 'diagnostics', self._on_diagnostics, qos.EVENT)
-        self._diagnostics = node.create_publisher(DiagnosticArray, 'diagnostics', qos.EVENT)
+            wire.subscribe(node, topic, self._on_bridge(bridge))
+        node.create_subscription(wire.message_class(request(controller).type),
+                                 f'{controller}/command', self._on_command, wire.profile(SENSOR),
+                                 raw=True)
+        wire.subscribe(node, 'diagnostics', self._on_diagnostics)
+        self._diagnostics = wire.Publisher(node, 'diagnostics')
         self._clients = {name: node.create_client(Trigger, f'supervisor_node/{name}')
                          for name in SERVICES}
 
     def _on_clock(self, message):
-        self._simulated = convert.seconds(message.clock)
+        self._simulated = seconds(message.clock)
 
     def time(self) -> float:
         """Seconds of the flight from some moment on, as far as they are known."""
         return time.monotonic() if self._simulated is None else self._simulated
 
-    def _on_state(self, message):
-        state = message.data.partition(':')[0]
-        self.state = message.data if state == 'flying' else state
-        self.states.append(message.data)
+    def _on_state(self, told):
+        state = told.partition(':')[0]
+        self.state = told if state == 'flying' else state
+        self.states.append(told)
 
-    def _on_progress(self, message):
-        self.progress = message.data
+    def _on_progress(self, progress):
+        self.progress = progress
 
     def _on_bridge(self, name):
-        def handle(message):
-            self.bridges[name] = message.data
+        def handle(state):
+            self.bridges[name] = state
         return handle
 
     def _on_command(self, _):
         self.commands += 1
 
-    def _on_diagnostics(self, message):
-        for status in message.status:
-            self.diagnostics[status.name] = status
+    def _on_diagnostics(self, statuses):
+        self.diagnostics.update((status.name, status) for status in statuses)
 
     @property
     def ready(self) -> bool:
@@ -154,16 +154,13 @@ class Operator:
     def values(self, status: str) -> dict[str, str]:
         """Values of a diagnostic status by key; empty when it never came."""
         found = self.diagnostics.get(status)
-        return {pair.key: pair.value for pair in found.values} if found else {}
+        return found.values if found else {}
 
     def report(self, name: str, text: str, values: dict) -> None:
         """Put a status of the operator's own into ``diagnostics``, and so into the bag."""
-        message = DiagnosticArray(status=[DiagnosticStatus(
-            level=DiagnosticStatus.OK, name=name, message=text, hardware_id='beetle_omni',
-            values=[KeyValue(key=k, value=f'{v:.6g}' if isinstance(v, float) else str(v))
-                    for k, v in values.items()])])
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+        self._diagnostics.publish([Diagnostic(
+            self._node.get_clock().now().nanoseconds * 1e-9, name, health.OK, text,
+            health.texts(values))])
 
     def close(self) -> None:
         """Leave the graph."""

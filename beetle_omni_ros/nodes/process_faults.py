@@ -9,14 +9,13 @@ import signal
 import tempfile
 import time
 
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.parameter_client import AsyncParameterClient
-from sensor_msgs.msg import JointState
 
-from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.nodes import convert, domain, qos
+from beetle_omni_ros.control.base import Command, PoseTarget
+from beetle_omni_ros.messages.conversions import read_command, read_odom
+from beetle_omni_ros.messages.topics import EVENT, SENSOR
+from beetle_omni_ros.nodes import domain, wire
 from beetle_omni_ros.nodes.actuators import BRIDGES
 from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.graph import Graph
@@ -45,12 +44,12 @@ class Observer(Operator):
         self._floor: float | None = None
         self.touched: float | None = None
         self.client = lambda node: AsyncParameterClient(self._node, node)
-        self._node.create_subscription(Odometry, 'ground_truth/odom', self._on_truth, qos.SENSOR)
-        self._node.create_subscription(JointState, 'command', self._on_asked, qos.SENSOR)
+        wire.subscribe(self._node, 'ground_truth/odom', self._on_truth, qos=SENSOR, read=read_odom)
+        wire.subscribe(self._node, 'command', self._on_asked, qos=SENSOR, read=read_command)
 
-    def publisher(self, kind, topic):
+    def publisher(self, topic):
         """Make a publisher that is heard."""
-        made = self._node.create_publisher(kind, topic, qos.EVENT)
+        made = wire.Publisher(self._node, topic, EVENT)
         self.wait(lambda: made.get_subscription_count() > 0, 5.0)
         self.spin(0.3)
         return made
@@ -60,8 +59,8 @@ class Observer(Operator):
         self.takeoffs, self._floor, self.touched, self._down_since = 0, None, None, np.inf
         self.states.clear()
 
-    def _on_truth(self, message):
-        now, self.height = time.monotonic(), message.pose.pose.position.z
+    def _on_truth(self, truth):
+        now, self.height = time.monotonic(), float(truth.position[2])
         if self.height > LYING:
             self._down_since = np.inf
         else:
@@ -73,8 +72,8 @@ class Observer(Operator):
             self.takeoffs += 1
             self._floor = None
 
-    def _on_asked(self, message):
-        if np.nansum(message.effort) > self._limits.idle_thrust:
+    def _on_asked(self, command):
+        if np.nansum(command.thrust) > self._limits.idle_thrust:
             self.thrust_at = time.monotonic()
 
 
@@ -128,21 +127,20 @@ def _count(observer, node, topic):
 
 
 def _second_publisher(_, observer):
-    publisher, before = observer.publisher(JointState, 'command'), _count(
-        observer, 'sim_node', 'command')
+    publisher, before = observer.publisher('command'), _count(observer, 'sim_node', 'command')
     end = time.monotonic() + 1.0
     while time.monotonic() < end:
-        publisher.publish(convert.command_message(
-            Command(time.time(), np.zeros(4), np.zeros(4))))
+        publisher.publish(Command(time.time(), np.zeros(4), np.zeros(4)))
         observer.spin(0.01)
     return _refused(observer, 'sim_node', 'command', before)
 
 
 def _target(height, x=0.0, stamp=0.0):
     def strike(_, observer):
-        publisher, before = observer.publisher(PoseStamped, 'target_pose'), _count(
+        publisher, before = observer.publisher('target_pose'), _count(
             observer, 'nmpc_node', 'target_pose')
-        publisher.publish(convert.pose_message(stamp, [x, 0.0, height], [0.0, 0.0, 0.0, 1.0]))
+        publisher.publish(PoseTarget(np.array([x, 0.0, height]), np.array([0.0, 0.0, 0.0, 1.0]),
+                                     stamp))
         return _refused(observer, 'nmpc_node', 'target_pose', before)
     return strike
 

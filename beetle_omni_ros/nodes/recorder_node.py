@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
 import sys
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.messages.topics import ALL, topics_with
-from beetle_omni_ros.nodes import health, qos, runner
+from beetle_omni_ros.messages.topics import ALL, LATCHED_LOG, LOG, topics_with
+from beetle_omni_ros.nodes import health, runner, wire
 from beetle_omni_ros.nodes.every_offer import EveryOffer
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
@@ -56,12 +55,13 @@ class RecorderNode(FlightNode):
         self._failure = None
         prefix = self.get_namespace().rstrip('/') + '/'
         for name, topic in {**ALL, **topics}.items():
-            kind, write = _message_class(topic.type), self._writer(prefix + name, topic.type)
+            kind, write = wire.message_class(topic.type), self._writer(prefix + name, topic.type)
             if name in TARGETS:
                 EveryOffer(self, kind, name, write, depth=50, raw=True, on_lost=self._on_lost)
                 continue
+            profile = wire.profile(LATCHED_LOG if topic.qos.latched else LOG)
             self.create_subscription(
-                kind, name, write, qos.LATCHED_LOG if topic.qos.latched else qos.LOG, raw=True,
+                kind, name, write, profile, raw=True,
                 event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost))
         self.health.report('bag', self._bag_status)
         self.create_timer(FLUSH_PERIOD, self._flush, clock=self.steady_clock)
@@ -112,11 +112,6 @@ class RecorderNode(FlightNode):
                 bag.close()
         except BagError as error:
             print(f'recorder_node: error: {error}', file=sys.stderr)
-
-
-def _message_class(name):
-    package, _, message = name.split('/')
-    return getattr(import_module(f'{package}.msg'), message)
 
 
 def main(args=None):

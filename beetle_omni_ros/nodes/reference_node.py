@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from geometry_msgs.msg import PoseStamped, WrenchStamped
-from nav_msgs.msg import Odometry
 import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
-from std_msgs.msg import String
-from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
-from beetle_omni_ros.nodes import convert, health, qos, runner, targets
+from beetle_omni_ros.messages.topics import SENSOR
+from beetle_omni_ros.messages.values import Wrench
+from beetle_omni_ros.nodes import health, runner
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import parameter
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer
@@ -48,17 +46,16 @@ class ReferenceNode(FlightNode):
         self._player = self._odom = self._trajectory = None
         self._window_end = 0.0
         self._state = ''
-        self._poses = self.create_publisher(PoseStamped, 'target_pose', qos.LATCHED)
-        self._trajectories = self.create_publisher(MultiDOFJointTrajectory, 'target_trajectory',
-                                                   qos.LATCHED)
-        self._wrenches = self.create_publisher(WrenchStamped, 'disturbance', qos.EVENT)
-        self._states = self.create_publisher(String, 'reference/state', qos.LATCHED)
+        self._poses = self.publisher('target_pose')
+        self._trajectories = self.publisher('target_trajectory')
+        self._wrenches = self.publisher('disturbance')
+        self._states = self.publisher('reference/state')
         self._payload = self.create_client(SetParameters, 'sim_node/set_parameters')
         self._set_state('waiting')
-        self.create_subscription(String, 'supervisor/state', self._on_supervisor, qos.LATCHED)
+        self.follow('supervisor/state', self._on_supervisor)
         disturbed = self._task.kind in ('force', 'torque')
         if disturbed:       # the loss of control ends these tasks
-            self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.SENSOR)
+            self.listen('odom', self._on_odom, qos=SENSOR)
         self.health.report('task', lambda: (health.OK, self._state, {'task': self._task.name}))
         self.create_timer(IMPULSE_PERIOD if disturbed else PERIOD, self._on_timer,
                           clock=self.flight_clock)
@@ -70,16 +67,16 @@ class ReferenceNode(FlightNode):
     def _set_state(self, state):
         if state != self._state:
             self._state = state
-            self._states.publish(String(data=state))
+            self._states.publish(state)
 
     def _on_odom(self, odom):
         self._odom = odom
 
-    def _on_supervisor(self, message):
-        if self._state == 'waiting' and message.data.startswith('flying'):
+    def _on_supervisor(self, state):
+        if self._state == 'waiting' and state.startswith('flying'):
             self._player = TaskPlayer(self._task, self.now())
             self.get_logger().info(f"task '{self._task.name}', {self._task.ends[-1]:g} s")
-        elif self._player and message.data.partition(':')[0] in (
+        elif self._player and state.partition(':')[0] in (
                 'landing', 'disarmed', 'emergency_stop'):
             self._player = None
             self._set_state('aborted')
@@ -107,7 +104,7 @@ class ReferenceNode(FlightNode):
     def _start_target(self, target):
         self._trajectory = None
         if isinstance(target, PoseTarget):
-            self._poses.publish(targets.target_message(target))
+            self._poses.publish(target)
         else:
             self._trajectory, self._window_end = target, target.times[0]
 
@@ -122,13 +119,12 @@ class ReferenceNode(FlightNode):
             np.array([getattr(sample, name) for sample in samples])
             for name in ('position', 'quaternion', 'velocity', 'angular_velocity')),
             stamp=float(times[0]))
-        self._trajectories.publish(targets.target_message(window))
+        self._trajectories.publish(window)
         self._window_end = end if end < path.times[-1] else float('inf')
 
     def _disturb(self, now, moment):
         if self._task.kind in ('force', 'torque'):
-            self._wrenches.publish(convert.wrench_message(now, moment.force_world,
-                                                          moment.torque_body))
+            self._wrenches.publish(Wrench(now, moment.force_world, moment.torque_body))
         if self._task.kind == 'payload':
             value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE,
                                    double_value=float(moment.payload))

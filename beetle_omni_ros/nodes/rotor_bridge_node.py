@@ -6,14 +6,12 @@ from dataclasses import dataclass
 import math
 import time
 
-from sensor_msgs.msg import BatteryState, JointState
-from std_msgs.msg import String
-
 from beetle_omni_ros.drivers.motor_board import MotorBoard
 from beetle_omni_ros.drivers.motor_board_arming import Arming, FLIES
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.serial_port import SerialPortError
-from beetle_omni_ros.nodes import convert, qos, runner
+from beetle_omni_ros.messages.values import Battery, RotorSpeeds
+from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.nodes.rotor_bridge_report import RotorBridgeReport
@@ -61,13 +59,13 @@ class RotorBridgeNode(FlightNode):
         self._state = self._absent = ''
         self._looked = self._next_try = time.monotonic()
         self._cycle, self._sent = 0, 0.0
-        self._states = self.create_publisher(String, 'rotor_bridge/state', qos.LATCHED)
-        self._batteries = self.create_publisher(BatteryState, 'battery_state', qos.SENSOR)
-        self._rotors = self.create_publisher(JointState, 'rotor_states', qos.SENSOR)
+        self._states = self.publisher('rotor_bridge/state')
+        self._batteries = self.publisher('battery_state')
+        self._rotors = self.publisher('rotor_states')
         self._report = RotorBridgeReport(self.health, self._arming, self._stream)
-        self.listen(JointState, 'command', CommandSource(self).read, self._on_command, qos.COMMAND,
+        self.listen('command', self._on_command, read=CommandSource(self).read,
                     max_age=given.stamp_age_limit, stale_after=None, published=True)
-        self.create_subscription(String, 'supervisor/state', self._on_supervisor, qos.LATCHED)
+        self.follow('supervisor/state', self._on_supervisor)
         self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
 
     def waits_for(self):
@@ -86,8 +84,8 @@ class RotorBridgeNode(FlightNode):
         else:
             self._stream.answered(time.time() - published, 'the publication of the command', age)
 
-    def _on_supervisor(self, message):
-        self._arming.follow(message.data)
+    def _on_supervisor(self, state):
+        self._arming.follow(state)
         self._tell()
 
     def _on_timer(self):
@@ -137,10 +135,10 @@ class RotorBridgeNode(FlightNode):
         self._report.update(update)
         if update.battery is not None:
             battery = update.battery
-            self._batteries.publish(convert.battery_message(
+            self._batteries.publish(Battery(
                 battery.stamp, battery.voltage, battery.current, self._cells))
         if update.rotors is not None:
-            self._rotors.publish(convert.rotor_message(
+            self._rotors.publish(RotorSpeeds(
                 update.rotors.stamp, RPM * update.rotors.rpm))
         for event in update.events:
             self._log(*event)
@@ -163,12 +161,12 @@ class RotorBridgeNode(FlightNode):
             if not text.startswith('waiting'):
                 self._log('error' if text.startswith('lost') else 'info', f'motor board: {text}')
             self._state = text
-            self._states.publish(String(data=text))
+            self._states.publish(text)
 
     def close(self):
         """Disarm."""
         self._arming.end()
-        self._states.publish(String(data=self._arming.text))
+        self._states.publish(self._arming.text)
         self._board.close()
 
 

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from math import degrees
 import time
 
-from geometry_msgs.msg import PoseStamped, WrenchStamped
-from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import BatteryState, Imu, JointState
 
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
-from beetle_omni_ros.nodes import convert, health, qos, runner
+from beetle_omni_ros.messages.conversions import set_time
+from beetle_omni_ros.messages.topics import SENSOR
+from beetle_omni_ros.messages.values import Battery, Joints, Odom, RotorSpeeds
+from beetle_omni_ros.nodes import health, runner, wire
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.nodes.pacing import Pacing, Waiting
@@ -96,11 +96,9 @@ class SimNode(FlightNode):
         self._pacing = self._make_pacing(given)
         self._latency = health.Distribution()
         self._publish_to = {
-            'mocap': self.create_publisher(PoseStamped, 'mocap/pose', qos.SENSOR),
-            'imu': self.create_publisher(Imu, 'imu/data_raw', qos.SENSOR),
-            'truth': self.create_publisher(Odometry, 'ground_truth/odom', qos.ESTIMATE)}
-        self.listen(WrenchStamped, 'disturbance', convert.wrench, self._on_wrench, qos.EVENT,
-                    stale_after=None)
+            'mocap': self.publisher('mocap/pose'), 'imu': self.publisher('imu/data_raw'),
+            'truth': self.publisher('ground_truth/odom')}
+        self.listen('disturbance', self._on_wrench, stale_after=None)
         self.health.track_compute(self._simulator.tick)
         self.health.report('pacing', self._pacing_status)
         self.health.report('robot', self._robot_status)
@@ -117,9 +115,8 @@ class SimNode(FlightNode):
             raise ParameterError("key 'clock': simulated: serial devices keep real time; start "
                                  'with actuators:=direct')
         pacing = Waiting(self._simulator.tick, time.monotonic, super().now())
-        self._clock_publisher = self.create_publisher(Clock, '/clock', qos.SENSOR)
-        self.listen(Odometry, 'odom', convert.odom,
-                    lambda odom: pacing.heard('odom', odom.stamp), qos.ESTIMATE)
+        self._clock_publisher = self.create_publisher(Clock, '/clock', wire.profile(SENSOR))
+        self.listen('odom', lambda odom: pacing.heard('odom', odom.stamp))
         return pacing
 
     def now(self) -> float:
@@ -130,11 +127,10 @@ class SimNode(FlightNode):
         """Let the topic move the plant, and publish what the devices would measure."""
         self._refuse_faults(self.parameters)
         self._step = self._simulator.step
-        self._publish_to['joints'] = self.create_publisher(JointState, 'joint_states', qos.SENSOR)
-        self._publish_to['battery'] = self.create_publisher(BatteryState, 'battery_state',
-                                                            qos.SENSOR)
-        self._publish_to['rotors'] = self.create_publisher(JointState, 'rotor_states', qos.SENSOR)
-        self.listen(JointState, 'command', CommandSource(self).read, self._on_command, qos.COMMAND,
+        self._publish_to['joints'] = self.publisher('joint_states')
+        self._publish_to['battery'] = self.publisher('battery_state')
+        self._publish_to['rotors'] = self.publisher('rotor_states')
+        self.listen('command', self._on_command, read=CommandSource(self).read,
                     max_age=COMMAND_AGE)
         self.health.report('latency', self._latency_status)
 
@@ -217,7 +213,9 @@ class SimNode(FlightNode):
         for _ in range(self._pacing.due()):
             frame = self.timed(self._step)
             if self._clock_publisher is not None:
-                self._clock_publisher.publish(Clock(clock=convert.time_message(self._pacing.now)))
+                message = Clock()
+                set_time(message.clock, self._pacing.now)
+                self._clock_publisher.publish(message)
                 if frame.imu is not None:
                     self._pacing.sent(self._pacing.epoch + frame.imu.stamp)
             self._publish(frame)
@@ -226,24 +224,19 @@ class SimNode(FlightNode):
         epoch, publish_to = self._pacing.epoch, self._publish_to
         # What is old already goes first, so that the estimate that the IMU sample triggers has it.
         if frame.mocap is not None:
-            publish_to['mocap'].publish(convert.pose_message(
-                epoch + frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion))
+            publish_to['mocap'].publish(replace(frame.mocap, stamp=epoch + frame.mocap.stamp))
         if self._devices is None and frame.joints is not None:
-            publish_to['joints'].publish(convert.joint_message(
+            publish_to['joints'].publish(Joints(
                 epoch + frame.joints.stamp, frame.joints.position, frame.joints.velocity,
                 frame.joints.effort))
         if frame.imu is not None:
-            publish_to['imu'].publish(convert.imu_message(
-                replace(frame.imu, stamp=epoch + frame.imu.stamp)))
-        truth = frame.truth
-        publish_to['truth'].publish(convert.odometry_message(
-            epoch + truth.stamp, truth.position, truth.velocity, truth.quaternion,
-            truth.angular_velocity))
+            publish_to['imu'].publish(replace(frame.imu, stamp=epoch + frame.imu.stamp))
+        publish_to['truth'].publish(Odom.of(frame.truth, stamp=epoch + frame.truth.stamp))
         if self._devices is None and frame.rotors is not None:
-            publish_to['rotors'].publish(convert.rotor_message(
+            publish_to['rotors'].publish(RotorSpeeds(
                 epoch + frame.rotors.stamp, frame.rotors.speed))
         if self._devices is None and frame.battery is not None:
-            publish_to['battery'].publish(convert.battery_message(
+            publish_to['battery'].publish(Battery(
                 epoch + frame.battery.stamp, frame.battery.voltage, frame.battery.current,
                 self._robot.battery.cells))
 

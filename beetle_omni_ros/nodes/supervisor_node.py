@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
 import numpy as np
-from sensor_msgs.msg import BatteryState, Imu, JointState
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
-from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.control.hover import HoverController
-from beetle_omni_ros.nodes import convert, health, qos, runner, targets
+from beetle_omni_ros.messages.conversions import take_known_joints
+from beetle_omni_ros.messages.values import ToldHealth, Wish
+from beetle_omni_ros.nodes import health, runner
 from beetle_omni_ros.nodes.command_source import new_identity, TOPIC
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.actuator_health import ALL_WELL
@@ -68,14 +65,13 @@ class SupervisorNode(FlightNode):
         self._joints = None
         self._sent = (None, '')     # stamp and source of the last command
         self._state = ''
-        self._publisher = self.create_publisher(JointState, 'command', qos.COMMAND)
+        self._publisher = self.publisher('command')
         self._identity = new_identity('supervisor_node')
-        self._identities = self.create_publisher(String, TOPIC, qos.LATCHED)
-        self._identities.publish(String(data=self._identity))
-        self._states = self.create_publisher(String, 'supervisor/state', qos.LATCHED)
-        self._targets = self.create_publisher(MultiDOFJointTrajectory, 'supervisor/target',
-                                              qos.LATCHED)
-        self._actuators = self.create_publisher(JointState, 'supervisor/actuators', qos.LATCHED)
+        self._identities = self.publisher(TOPIC)
+        self._identities.publish(self._identity)
+        self._states = self.publisher('supervisor/state')
+        self._targets = self.publisher('supervisor/target')
+        self._actuators = self.publisher('supervisor/actuators')
         self._wish, self._healthy = None, ALL_WELL
         self._listen()
         for name in ('arm', 'disarm', 'land', 'emergency_stop'):
@@ -90,23 +86,19 @@ class SupervisorNode(FlightNode):
 
     def _listen(self):
         supervisor = self._supervisor
-        self.listen(Odometry, 'odom', convert.odom, self._on_odom, qos.ESTIMATE)
-        self.listen(JointState, 'joint_states', convert.known_joints, self._on_joints,
-                    max_age=SENSOR_AGE)
-        self.listen(Imu, 'imu/data_raw', convert.imu_sample, lambda s: supervisor.on_imu(
+        self.listen('odom', self._on_odom)
+        self.listen('joint_states', self._on_joints, read=take_known_joints, max_age=SENSOR_AGE)
+        self.listen('imu/data_raw', lambda s: supervisor.on_imu(
             s.stamp, s.specific_force, s.angular_velocity), max_age=SENSOR_AGE)
-        self.listen(PoseStamped, 'mocap/pose', convert.pose_sample, lambda s: supervisor.on_mocap(
+        self.listen('mocap/pose', lambda s: supervisor.on_mocap(
             s.stamp, s.position, s.quaternion), max_age=SENSOR_AGE)
-        self.listen(JointState, 'rotor_states', convert.rotors,
-                    lambda told: supervisor.on_rotors(told.stamp, told.speed), stale_after=None)
-        self.listen(BatteryState, 'battery_state', convert.battery,
-                    lambda b: supervisor.on_battery(b.voltage))
+        self.listen('rotor_states', lambda told: supervisor.on_rotors(told.stamp, told.speed),
+                    stale_after=None)
+        self.listen('battery_state', lambda battery: supervisor.on_battery(battery.voltage))
         for name in self._controllers:
-            self.listen(JointState, f'{name}/command', convert.command, self._on_command(name),
-                        qos.COMMAND, stale_after=None)
+            self.listen(f'{name}/command', self._on_command(name), stale_after=None)
         for name in ('joint', 'rotor'):
-            self.create_subscription(String, f'{name}_bridge/state', self._on_bridge(name),
-                                     qos.LATCHED)
+            self.follow(f'{name}_bridge/state', self._on_bridge(name))
 
     def _changed(self, new):
         answer = self._supervisor.select(new.controller, self.now())
@@ -128,12 +120,9 @@ class SupervisorNode(FlightNode):
         self._supervisor.on_joints(joints.stamp, joints.position, joints.velocity)
 
     def _on_odom(self, odom):
-        joints = self._joints
-        if joints is None:
+        if self._joints is None:
             return
-        self._supervisor.on_state(State(
-            odom.stamp, odom.position, odom.velocity, odom.quaternion, odom.angular_velocity,
-            joints.position, joints.velocity, joints.stamp))
+        self._supervisor.on_state(State.join(odom, self._joints))
         if self._supervisor.state not in (DISARMED, FLYING):
             self._update()      # hover answers each estimate, as a controller does
 
@@ -146,8 +135,8 @@ class SupervisorNode(FlightNode):
         return handle
 
     def _on_bridge(self, name):
-        def handle(message):
-            self._supervisor.on_actuators(name, message.data, self.now())
+        def handle(text):
+            self._supervisor.on_actuators(name, text, self.now())
             self._update()
         return handle
 
@@ -157,7 +146,7 @@ class SupervisorNode(FlightNode):
         # The same command is not repeated: its age tells the actuators that nothing new came.
         if command is not None and (command.stamp, supervisor.source) != self._sent:
             self._sent = (command.stamp, supervisor.source)
-            self._publisher.publish(convert.command_message(command, self._identity))
+            self._publisher.publish(command, self._identity)
         self._tell()
 
     def _tell(self):
@@ -165,13 +154,13 @@ class SupervisorNode(FlightNode):
         state = supervisor.told
         if state != self._state:
             self._state = state
-            self._states.publish(String(data=state))
+            self._states.publish(state)
         if supervisor.wish is not self._wish:
             self._wish = supervisor.wish
-            self._targets.publish(targets.wish_message(self._wish))
+            self._targets.publish(Wish.of(self._wish))
         if supervisor.health is not self._healthy:
             self._healthy = supervisor.health
-            self._actuators.publish(convert.health_message(self.now(), self._healthy))
+            self._actuators.publish(ToldHealth(self.now(), self._healthy))
         for event in supervisor.events:
             self._log(event)
         supervisor.events.clear()

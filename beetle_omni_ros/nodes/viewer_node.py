@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from geometry_msgs.msg import Point, PoseStamped, TransformStamped
-from nav_msgs.msg import Odometry
+from geometry_msgs.msg import Point, TransformStamped
 import numpy as np
-from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA, String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from beetle_omni_ros.nodes import convert, qos, runner, targets
+from beetle_omni_ros.messages.conversions import BODY, set_time, set_xyz, set_xyzw, WORLD
+from beetle_omni_ros.messages.topics import EVENT, LATCHED, SENSOR
+from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.nodes.transform_message import transform_message
 from beetle_omni_ros.robot import rotations
@@ -52,17 +52,16 @@ class ViewerNode(FlightNode):
         if given.links:
             self._describe(description(given.urdf_file))
         if self._transform_message:
-            self._transforms = self.create_publisher(self._transform_message, '/tf', qos.EVENT)
+            self._transforms = self.create_publisher(self._transform_message, '/tf',
+                                                     wire.profile(EVENT))
             self.create_timer(1 / given.frame_rate, self._move, clock=self.steady_clock)
-        self._markers = self.create_publisher(MarkerArray, 'markers', qos.EVENT)
+        self._markers = self.create_publisher(MarkerArray, 'markers', wire.profile(EVENT))
         self._odom = self._joints = self._command = self._target = None
         self._moved = None      # stamp of the estimate that the frames show
-        self.listen(Odometry, 'odom', convert.odom, self._keep('_odom'), qos.SENSOR)
-        self.listen(JointState, 'joint_states', convert.joints, self._keep('_joints'))
-        self.listen(JointState, 'command', convert.command, self._keep('_command'), qos.SENSOR,
-                    stale_after=None)
-        self.listen(PoseStamped, 'target_pose', targets.pose_target, self._keep('_target'),
-                    None, stale_after=None)
+        self.listen('odom', self._keep('_odom'), qos=SENSOR)
+        self.listen('joint_states', self._keep('_joints'))
+        self.listen('command', self._keep('_command'), qos=SENSOR, stale_after=None)
+        self.listen('target_pose', self._keep('_target'), every_offer=True, stale_after=None)
         self.create_timer(1 / given.rate, self._draw, clock=self.steady_clock)
 
     def _changed(self, new):
@@ -75,10 +74,12 @@ class ViewerNode(FlightNode):
         """Publish what does not change: the description, and the frames that are fixed."""
         tree = joints(text)
         self._moving = [joint for joint in tree if joint.axis is not None]
-        self._description = self.create_publisher(String, 'robot_description', qos.LATCHED)
+        self._description = self.create_publisher(String, 'robot_description',
+                                                   wire.profile(LATCHED))
         self._description.publish(String(data=text))
         if self._transform_message:
-            self._fixed = self.create_publisher(self._transform_message, '/tf_static', qos.LATCHED)
+            self._fixed = self.create_publisher(self._transform_message, '/tf_static',
+                                                wire.profile(LATCHED))
             self._fixed.publish(self._transform_message(transforms=[
                 _transform(self.now(), joint.parent, joint.child, joint.position,
                            joint.quaternion) for joint in tree if joint.axis is None]))
@@ -90,7 +91,7 @@ class ViewerNode(FlightNode):
                 not self._transforms.get_subscription_count():
             return
         self._moved = odom.stamp
-        frames = [_transform(odom.stamp, convert.WORLD, convert.BODY, odom.position,
+        frames = [_transform(odom.stamp, WORLD, BODY, odom.position,
                              odom.quaternion)]
         if angles is not None and self._moving:
             angle = dict(zip(JOINT_NAMES, angles.position))
@@ -124,8 +125,8 @@ class ViewerNode(FlightNode):
 
     def _marker(self, name, kind, points, width, colour):
         marker = Marker(ns=name, type=kind, action=Marker.ADD)
-        marker.header.frame_id = convert.WORLD
-        marker.header.stamp = convert.time_message(self._odom.stamp)
+        marker.header.frame_id = WORLD
+        set_time(marker.header.stamp, self._odom.stamp)
         marker.scale.x = width
         marker.scale.y = marker.scale.z = 2 * width
         marker.pose.orientation.w = 1.0
@@ -137,10 +138,10 @@ class ViewerNode(FlightNode):
 
 def _transform(stamp, parent, child, position, quaternion):
     frame = TransformStamped(child_frame_id=child)
-    frame.header.stamp = convert.time_message(stamp)
+    set_time(frame.header.stamp, stamp)
     frame.header.frame_id = parent
-    frame.transform.translation = convert.vector(position)
-    frame.transform.rotation = convert.quaternion(quaternion)
+    set_xyz(frame.transform.translation, position)
+    set_xyzw(frame.transform.rotation, quaternion)
     return frame
 
 

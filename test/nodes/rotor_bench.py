@@ -7,10 +7,10 @@ import time
 
 import numpy as np
 from sensor_msgs.msg import BatteryState, JointState
-from std_msgs.msg import String
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.nodes import convert, domain, qos
+from beetle_omni_ros.messages.topics import SENSOR
+from beetle_omni_ros.nodes import domain, wire
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
@@ -41,12 +41,13 @@ class Commander(Operator):
         self.told, self.batteries, self.rotors = [], [], []
         self.thrust, self.period, self.age, self.stamps = None, 0.01, 0.0, []
         self.supervised = ''
-        self._supervisor = node.create_publisher(String, 'supervisor/state', qos.LATCHED)
-        self._commands = node.create_publisher(JointState, 'command', qos.COMMAND)
-        node.create_subscription(String, 'rotor_bridge/state',
-                                 lambda m: self.told.append(m.data), qos.LATCHED)
-        node.create_subscription(BatteryState, 'battery_state', self.batteries.append, qos.SENSOR)
-        node.create_subscription(JointState, 'rotor_states', self.rotors.append, qos.SENSOR)
+        self._supervisor = wire.Publisher(node, 'supervisor/state')
+        self._commands = wire.Publisher(node, 'command')
+        wire.subscribe(node, 'rotor_bridge/state', self.told.append)
+        node.create_subscription(BatteryState, 'battery_state', self.batteries.append,
+                                 wire.profile(SENSOR))
+        node.create_subscription(JointState, 'rotor_states', self.rotors.append,
+                                 wire.profile(SENSOR))
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._command, daemon=True)
         self._thread.start()
@@ -56,14 +57,13 @@ class Commander(Operator):
             thrust = self.thrust
             if thrust is not None:
                 stamp = time.time() - self.age
-                self._commands.publish(convert.command_message(
-                    Command(stamp, np.zeros(4), thrust)))
+                self._commands.publish(Command(stamp, np.zeros(4), thrust))
                 self.stamps.append(stamp)
 
     def supervise(self, state):
         """Say what the supervisor says."""
         self.supervised = state
-        self._supervisor.publish(String(data=state))
+        self._supervisor.publish(state)
 
     @property
     def bridge(self):

@@ -9,11 +9,11 @@ import numpy as np
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.nodes import convert, domain, qos
+from beetle_omni_ros.messages.topics import SENSOR
+from beetle_omni_ros.nodes import domain, wire
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
@@ -38,15 +38,12 @@ class ServoWitness(Operator):
         node = self._node
         self.told, self.joints, self.arrivals = [], [], []
         self.goal, self.age = None, 0.0
-        node.create_subscription(String, 'joint_bridge/state', self._on_told, qos.LATCHED)
-        node.create_subscription(JointState, 'joint_states', self._on_joints, qos.SENSOR)
-        self._command = node.create_publisher(JointState, 'command', qos.COMMAND)
+        wire.subscribe(node, 'joint_bridge/state', self.told.append)
+        node.create_subscription(JointState, 'joint_states', self._on_joints, wire.profile(SENSOR))
+        self._command = wire.Publisher(node, 'command')
         self._clients = {}
         self.parameters = AsyncParameterClient(node, NODE)
         node.create_timer(0.01, self._publish)
-
-    def _on_told(self, message):
-        self.told.append(message.data)
 
     def _on_joints(self, message):
         self.joints.append(message)
@@ -54,8 +51,8 @@ class ServoWitness(Operator):
 
     def _publish(self):
         if self.goal is not None:
-            self._command.publish(convert.command_message(
-                Command(time.time() - self.age, np.asarray(self.goal, float), np.zeros(4))))
+            self._command.publish(Command(
+                time.time() - self.age, np.asarray(self.goal, float), np.zeros(4)))
 
     @property
     def now(self):
@@ -113,14 +110,13 @@ class ServoWitness(Operator):
         """Values of a status that is told from now on."""
         self.diagnostics.pop(f'{NODE}: {name}', None)
         self.until(lambda: f'{NODE}: {name}' in self.diagnostics, f'no status {name}')
-        return {entry.key: entry.value
-                for entry in self.diagnostics[f'{NODE}: {name}'].values}
+        return self.diagnostics[f'{NODE}: {name}'].values
 
     def level(self, name):
         """Level and text of a status that is told from now on."""
         self.numbers(name)
         status = self.diagnostics[f'{NODE}: {name}']
-        return status.level[0], status.message
+        return status.level, status.message
 
     def angles(self):
         """Newest complete angles (4,), or None when the newest message is incomplete."""

@@ -9,7 +9,10 @@ from rclpy.parameter import Parameter
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.control.registry import ControllerEntry
-from beetle_omni_ros.nodes import convert, targets
+from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
+from beetle_omni_ros.messages import conversions
+from beetle_omni_ros.messages.values import Joints, Odom
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.ekf_node import EkfNode
 from beetle_omni_ros.nodes.reference_node import ReferenceNode
@@ -37,9 +40,15 @@ def make(ros_domain):
 
 
 class Sent(list):
-    """A publisher that keeps what it is given."""
+    """A publisher of a topic that keeps its messages."""
 
-    publish = list.append
+    def __init__(self, topic):
+        super().__init__()
+        self._topic = topic
+
+    def publish(self, value):
+        """Keep it."""
+        self.append(wire.message(self._topic, value))
 
 
 class Follower:
@@ -66,12 +75,12 @@ class FollowerNode(ControllerNode):
 
     def __init__(self):
         super().__init__(ControllerEntry(name='nmpc', controller=Follower))
-        self._publisher = Sent()
+        self._publisher = Sent('nmpc/command')
         self.follower = self._controller
 
 
 def odom_at(stamp, height=1.0):
-    return convert.Odom(stamp, np.array([0, 0, height]), np.zeros(3), LEVEL, np.zeros(3))
+    return Odom(stamp, np.array([0, 0, height]), np.zeros(3), LEVEL, np.zeros(3))
 
 
 def fly(node, stamps, height=1.0):
@@ -83,10 +92,10 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(make):
     node = make(FollowerNode)
     fly(node, 100 + 0.005 * np.arange(20))
     assert not node._publisher          # no joint angles yet
-    node._on_joints(convert.Joints(100.0, np.zeros(4), np.zeros(4)))
+    node._on_joints(Joints(100.0, np.zeros(4), np.zeros(4)))
     stamps = 101 + 0.005 * np.arange(200)
     fly(node, stamps)
-    sent = [convert.seconds(m.header.stamp) for m in node._publisher]
+    sent = [conversions.seconds(m.header.stamp) for m in node._publisher]
     assert len(sent) == 100
     assert np.allclose(sent, stamps[::2])
     fly(node, [95.0, 95.005, 95.01])    # the clock was set back: on with it
@@ -96,7 +105,7 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(make):
 @pytest.mark.parametrize('rate', [100, 200])
 def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(make, rate):
     node = make(FollowerNode)
-    node._on_joints(convert.Joints(100.0, np.zeros(4), np.zeros(4)))
+    node._on_joints(Joints(100.0, np.zeros(4), np.zeros(4)))
 
     def steps_from(begin):
         before = len(node._publisher)
@@ -104,31 +113,31 @@ def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(m
             if round((stamp - begin) * rate) % (rate // 100) == 0 and node._mode == 'flying:rl':
                 node._on_command(Command(stamp, np.zeros(4), np.full(4, 7.5)))
             fly(node, [stamp])
-        return np.array([convert.seconds(m.header.stamp) for m in node._publisher[before:]])
+        return np.array([conversions.seconds(m.header.stamp) for m in node._publisher[before:]])
 
     alone = steps_from(100.0)
     assert np.allclose(alone - 100.0, 0.01 * np.arange(100), atol=1e-6)
-    node._on_mode(SimpleNamespace(data='flying:rl'))
+    node._on_mode('flying:rl')
     standby = steps_from(101.0)[5:]
     if rate > 100:
         assert np.all(np.abs((standby - 101.0) / 0.01 % 1.0 - 0.5) < 0.26)
         assert np.allclose(np.diff(standby), 0.01, atol=1e-6)
     else:       # no estimate lies between: half as often, still in time for the supervisor
         assert np.allclose(np.diff(standby), 0.02, atol=1e-6)
-    node._on_mode(SimpleNamespace(data='flying:nmpc'))
+    node._on_mode('flying:nmpc')
     assert np.allclose(np.diff(steps_from(102.0)), 0.01, atol=1e-6)
 
 
 def test_without_a_target_it_holds_the_pose_of_the_hand_over(make):
     node = make(FollowerNode)
-    node._on_joints(convert.Joints(100.0, np.zeros(4), np.zeros(4)))
-    node._on_mode(SimpleNamespace(data='takeoff'))
+    node._on_joints(Joints(100.0, np.zeros(4), np.zeros(4)))
+    node._on_mode('takeoff')
     fly(node, [100.0], height=0.2)
-    node._on_mode(SimpleNamespace(data='flying:nmpc'))
+    node._on_mode('flying:nmpc')
     fly(node, [100.01], height=1.3)
     heights = [target.position[2] for _, target in node.follower.asked]
     assert heights == [0.2, 0.2]
-    node._on_mode(SimpleNamespace(data='disarmed'))
+    node._on_mode('disarmed')
     assert node.follower.resets == 1
     fly(node, [101.0], height=0.4)
     assert node.follower.asked[-1][1].position[2] == 0.4
@@ -136,7 +145,7 @@ def test_without_a_target_it_holds_the_pose_of_the_hand_over(make):
 
 def test_the_newest_target_counts_and_an_unset_stamp_means_now(make):
     node = make(FollowerNode)
-    node._on_joints(convert.Joints(100.0, np.zeros(4), np.zeros(4)))
+    node._on_joints(Joints(100.0, np.zeros(4), np.zeros(4)))
     for stamp, x in ((50.0, 1.0), (60.0, 2.0), (50.0, 3.0)):
         node._on_target(PoseTarget(np.array([x, 0, 0]), LEVEL, stamp))
     fly(node, [100.0])
@@ -178,23 +187,23 @@ def test_the_reference_waits_for_flight_then_plays_the_task(make, monkeypatch):
     node = make(ReferenceNode, 'task:=waypoints')
     clock = SimpleNamespace(now=2000.0)
     monkeypatch.setattr(node, 'now', lambda: clock.now)
-    node._poses, node._states = Sent(), Sent()
+    node._poses, node._states = Sent('target_pose'), Sent('reference/state')
     node._on_timer()
     assert not node._poses
-    node._on_supervisor(SimpleNamespace(data='flying:nmpc'))
+    node._on_supervisor('flying:nmpc')
     while clock.now < 2000 + 15 * 8 + 1:
         node._on_timer()
         clock.now += 0.02
-    stamps = [convert.seconds(m.header.stamp) for m in node._poses]
+    stamps = [conversions.seconds(m.header.stamp) for m in node._poses]
     assert np.allclose(stamps, 2000 + 8 * np.arange(15))
     assert node._states[0].data == 'flying 1/15' and node._states[-1].data == 'done'
 
 
 def test_a_landing_in_the_middle_aborts_the_task(make):
     node = make(ReferenceNode, 'task:=hover')
-    node._on_supervisor(SimpleNamespace(data='flying:nmpc'))
+    node._on_supervisor('flying:nmpc')
     node._on_timer()
-    node._on_supervisor(SimpleNamespace(data='landing'))
+    node._on_supervisor('landing')
     assert node._state == 'aborted'
 
 
@@ -202,31 +211,31 @@ def test_trajectory_windows_join_without_a_gap_and_keep_to_the_path(make, monkey
     node = make(ReferenceNode, 'task:=lemniscate')
     clock = SimpleNamespace(now=2000.0)
     monkeypatch.setattr(node, 'now', lambda: clock.now)
-    node._trajectories = Sent()
-    node._on_supervisor(SimpleNamespace(data='flying:nmpc'))
+    node._trajectories = Sent('target_trajectory')
+    node._on_supervisor('flying:nmpc')
     path = node._task.segments[-1].target(2008.0)
     while node._state != 'done':
         node._on_timer()
         clock.now += 0.02
         assert clock.now < 2200
         if node._trajectories and clock.now < path.times[-1] - 0.1:
-            window = targets.trajectory_target(node._trajectories[-1])
+            window = conversions.take_trajectory(node._trajectories[-1])
             assert window.times[0] <= clock.now and clock.now + 1.0 < max(
                 window.times[-1], path.times[-1] - 0.1 + 1.2)
             assert np.linalg.norm(window.at(clock.now).position
                                   - path.at(clock.now).position) < 1e-3
-    assert targets.trajectory_target(node._trajectories[0]).times[0] == pytest.approx(2008.0)
+    assert conversions.take_trajectory(node._trajectories[0]).times[0] == pytest.approx(2008.0)
 
 
 def test_the_estimator_publishes_only_what_it_believes(make):
     node = make(EkfNode)
-    node._publisher = Sent()
+    node._publisher = Sent('odom')
     at_rest = np.array([0, 0, 9.80665])
     for k in range(400):
         stamp = 100 + 0.005 * k
         if k % 2:
-            node._on_pose(convert.PoseSample(stamp - 0.01, np.array([0, 0, 0.3]), LEVEL))
-        node._on_imu(convert.ImuSample(stamp, at_rest, np.zeros(3)))
+            node._on_pose(PoseSample(stamp - 0.01, np.array([0, 0, 0.3]), LEVEL))
+        node._on_imu(ImuSample(stamp, at_rest, np.zeros(3)))
         if k == 3:
             assert not node._publisher      # too few poses to believe
     message = node._publisher[-1]

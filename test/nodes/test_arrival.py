@@ -9,7 +9,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
-from beetle_omni_ros.nodes import qos, runner
+from beetle_omni_ros.messages.topics import COMMAND
+from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.arrival import with_publication
 
 PATIENCE = 20           # s
@@ -25,8 +26,8 @@ def test_a_callback_gets_the_time_at_which_its_message_was_published(make, ros_d
     executor.add_node(node)
     heard = []
     node.create_subscription(String, 'word', with_publication(
-        lambda message, published: heard.append((message.data, published))), qos.COMMAND)
-    publisher = node.create_publisher(String, 'word', qos.COMMAND)
+        lambda message, published: heard.append((message.data, published))), wire.profile(COMMAND))
+    publisher = node.create_publisher(String, 'word', wire.profile(COMMAND))
     try:
         deadline = time.monotonic() + PATIENCE
         while not heard and time.monotonic() < deadline:

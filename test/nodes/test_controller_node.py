@@ -16,7 +16,8 @@ from witness import HEADER, READY
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.messages.topics import split_topic, topic_of, topics_with
-from beetle_omni_ros.nodes import convert, plan
+from beetle_omni_ros.messages.values import Joints, MessageError, Odom
+from beetle_omni_ros.nodes import plan
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
@@ -73,15 +74,15 @@ def test_any_controller_sees_true_tilts_and_no_target_beyond_its_reach(make, mon
         state, target))
     health = ActuatorHealth(zeros=(0.1, 0.0, 0.0, -0.2))
     node._on_actuators(SimpleNamespace(health=health))
-    node._on_joints(convert.Joints(1.0, np.zeros(4), np.zeros(4)))
-    node._on_odom(convert.Odom(1.0, np.array([0.0, 0.0, 1.0]), np.zeros(3), LEVEL,
+    node._on_joints(Joints(1.0, np.zeros(4), np.zeros(4)))
+    node._on_odom(Odom(1.0, np.array([0.0, 0.0, 1.0]), np.zeros(3), LEVEL,
                                np.zeros(3)))
     assert seen[0].tilt == pytest.approx(health.true(np.zeros(4))) and seen[0].tilt.any()
     far = PoseTarget(np.array([9.0, 0.0, 1.0]), LEVEL, 1.0)
     node._mode = node._own_mode
     node._check_target(far, math.nan)       # it does not say how far it flies
     controller.reach = 3.0
-    with pytest.raises(convert.MessageError, match='expected at most 3 m'):
+    with pytest.raises(MessageError, match='expected at most 3 m'):
         node._check_target(far, math.nan)
 
 

@@ -8,7 +8,8 @@ import rclpy
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from beetle_omni_ros.nodes import qos, runner
+from beetle_omni_ros.messages.topics import EVENT, LATCHED
+from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.recorder_node import RecorderNode
 from beetle_omni_ros.runs.bag import read_bag
 
@@ -63,7 +64,7 @@ def bench(ros_domain, tmp_path):
 
 
 def test_a_volatile_target_is_recorded_without_an_incompatible_offer(bench, tmp_path):
-    assert bench.publish(bench.publisher(qos.EVENT), 1.25) == 1
+    assert bench.publish(bench.publisher(wire.profile(EVENT)), 1.25) == 1
     bench.spin(1.2)     # two looks at what is offered
     assert not bench.incompatible
     bench.recorder.close()
@@ -73,7 +74,7 @@ def test_a_volatile_target_is_recorded_without_an_incompatible_offer(bench, tmp_
 
 
 def test_a_latched_target_of_before_is_recorded(bench):
-    publisher = bench.publisher(qos.LATCHED)
+    publisher = bench.publisher(wire.profile(LATCHED))
     publisher.publish(PoseStamped())        # nobody can listen yet
     end = time.monotonic() + SOON
     while not bench.written() and time.monotonic() < end:
@@ -82,7 +83,7 @@ def test_a_latched_target_of_before_is_recorded(bench):
     assert bench.written() == 1 and not bench.incompatible
 
 
-@pytest.mark.parametrize('profile', [qos.EVENT, qos.LATCHED, BEST_EFFORT])
+@pytest.mark.parametrize('profile', [wire.profile(EVENT), wire.profile(LATCHED), BEST_EFFORT])
 def test_each_target_is_recorded_once_whatever_is_offered(bench, profile):
     publisher = bench.publisher(profile)
     bench.spin(1.2)     # the subscriptions that it needs are there

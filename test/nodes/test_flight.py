@@ -18,7 +18,10 @@ import pytest
 from sensor_msgs.msg import Imu, JointState
 from witness import HEADER, READY, Witness
 
-from beetle_omni_ros.nodes import convert, qos
+from beetle_omni_ros.control.base import Command
+from beetle_omni_ros.messages import conversions
+from beetle_omni_ros.messages.topics import COMMAND, SENSOR
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.runs.bag import read_bag
 from beetle_omni_ros.runs.metrics import metrics
@@ -118,18 +121,17 @@ def test_bad_messages_are_refused_counted_and_change_nothing(ros_domain, tmp_pat
     try:
         graph.start()
         witness = Witness(ros_domain)
-        poses = witness._node.create_publisher(Imu, 'imu/data_raw', qos.SENSOR)
-        commands = witness._node.create_publisher(JointState, 'command', qos.COMMAND)
+        poses = witness._node.create_publisher(Imu, 'imu/data_raw', wire.profile(SENSOR))
+        commands = witness._node.create_publisher(JointState, 'command', wire.profile(COMMAND))
         assert witness.wait(lambda: 'ekf_node: estimator' in witness.diagnostics
                             and poses.get_subscription_count() > 0
                             and commands.get_subscription_count() > 1, 20)
         broken = Imu()
-        broken.header.stamp = convert.time_message(time.time())
+        conversions.set_time(broken.header.stamp, time.time())
         broken.linear_acceleration.x = float('nan')
         stale = Imu()
-        stale.header.stamp = convert.time_message(time.time() - 30)
-        late = convert.command_message(
-            convert.Command(time.time() - 1, np.zeros(4), np.full(4, 20.0)))
+        conversions.set_time(stale.header.stamp, time.time() - 30)
+        late = wire.message('command', Command(time.time() - 1, np.zeros(4), np.full(4, 20.0)))
         for _ in range(5):
             poses.publish(broken)
             poses.publish(stale)

@@ -19,9 +19,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from beetle_omni_ros.control.base import Command, TrajectoryTarget
+from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.control.registry import ControllerEntry
-from beetle_omni_ros.nodes import command_source, convert, qos, targets
+from beetle_omni_ros.messages import conversions
+from beetle_omni_ros.messages.topics import COMMAND, EVENT, LATCHED
+from beetle_omni_ros.messages.values import MessageError
+from beetle_omni_ros.nodes import command_source, wire
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.ekf_node import EkfNode
 from beetle_omni_ros.nodes.joint_bridge_node import JointBridgeNode
@@ -66,7 +69,7 @@ class Bench:
         self.nodes.append(node)
         return node
 
-    def publisher(self, kind, topic, profile=qos.EVENT, readers=1):
+    def publisher(self, kind, topic, profile=wire.profile(EVENT), readers=1):
         """Make a publisher that is heard."""
         made = self.user.create_publisher(kind, topic, profile)
         assert self.wait(lambda: made.get_subscription_count() >= readers)
@@ -96,7 +99,7 @@ def bench(ros_domain):
 
 
 def pose(height=1.0, stamp=0.0, frame='world', x=0.0):
-    message = convert.pose_message(stamp, [x, 0, height], LEVEL)
+    message = wire.message('target_pose', PoseTarget([x, 0, height], LEVEL, stamp))
     message.header.frame_id = frame
     return message
 
@@ -139,11 +142,11 @@ def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
             (now, 1.5, False), (now, now + 1e5, False), (now, now - 60, True),
             (100.0, 1.5, True), (0.0, now, True), (100.0, now, False)):
         monkeypatch.setattr(node, 'now', lambda told=time_now: told)
-        target = targets.pose_target(pose(stamp=stamp))
+        target = conversions.take_pose_target(pose(stamp=stamp))
         if good:
             node._check_target(target, now)
         else:
-            with pytest.raises(convert.MessageError, match='the stamp is .* expected at most'):
+            with pytest.raises(MessageError, match='the stamp is .* expected at most'):
                 node._check_target(target, now)
 
 
@@ -151,7 +154,7 @@ def test_a_latched_target_stays_good_for_a_node_that_starts_later(bench, monkeyp
     node = bench.add(StillNode())
     late = time.time() + 60
     monkeypatch.setattr(node, 'now', lambda: late)
-    latched = bench.user.create_publisher(PoseStamped, 'target_pose', qos.LATCHED)
+    latched = bench.user.create_publisher(PoseStamped, 'target_pose', wire.profile(LATCHED))
     latched.publish(pose(1.2, time.time()))
     assert bench.wait(lambda: node._target is not None)
 
@@ -163,7 +166,7 @@ def test_a_target_beyond_the_reach_of_who_flies_is_refused_and_not_taken_over(be
     poses = bench.publisher(PoseStamped, 'target_pose')
     poses.publish(pose(x=12.0))
     assert bench.wait(lambda: node._target is not None)     # on standby: another may get there
-    node._on_mode(String(data='flying:nmpc'))
+    node._on_mode('flying:nmpc')
     assert node._target is None and 'the present pose is held' in node.said[-1]
     poses.publish(pose(x=3.0))
     assert bench.wait(lambda: node._target is not None)
@@ -176,7 +179,7 @@ def test_a_target_beyond_the_reach_of_who_flies_is_refused_and_not_taken_over(be
 def trajectory(heights, stamp):
     count = len(heights)
     positions = np.column_stack([np.zeros((count, 2)), heights])
-    return targets.target_message(TrajectoryTarget(
+    return wire.message('target_trajectory', TrajectoryTarget(
         stamp + np.arange(count), positions, np.tile(LEVEL, (count, 1)), np.zeros((count, 3)),
         np.zeros((count, 3)), stamp=stamp))
 
@@ -220,8 +223,8 @@ def _fly_with_an_intruder(bench, node):
     told = []
     bench.user.create_subscription(
         DiagnosticArray, 'diagnostics', lambda m: told.extend(s.message for s in m.status), 10)
-    commands = bench.publisher(JointState, 'command', qos.COMMAND)
-    identities = bench.publisher(String, command_source.TOPIC, qos.LATCHED)
+    commands = bench.publisher(JointState, 'command', wire.profile(COMMAND))
+    identities = bench.publisher(String, command_source.TOPIC, wire.profile(LATCHED))
     entry = node.health._inputs['command']
 
     def answer(source):
@@ -229,8 +232,8 @@ def _fly_with_an_intruder(bench, node):
         end = time.monotonic() + SOON
         # A message older than 0.1 s would be refused for that: send again where it was late.
         while (entry.received, entry.rejected.total()) == before and time.monotonic() < end:
-            commands.publish(convert.command_message(
-                Command(time.time(), np.zeros(4), np.full(4, 7.0)), source))
+            commands.publish(wire.message(
+                'command', Command(time.time(), np.zeros(4), np.full(4, 7.0)), source))
             bench.wait(lambda: (entry.received, entry.rejected.total()) != before, 0.5)
         return 'taken' if entry.received > before[0] else 'refused'
 
@@ -250,14 +253,14 @@ def _fly_with_an_intruder(bench, node):
 
 def test_the_supervisor_signs_its_commands_and_tells_its_identity(bench):
     heard, sent = [], []
-    bench.user.create_subscription(String, command_source.TOPIC, heard.append, qos.LATCHED)
+    wire.subscribe(bench.user, command_source.TOPIC, heard.append)
     node = bench.add(SupervisorNode())
     assert bench.wait(lambda: heard)
-    node._publisher = SimpleNamespace(publish=sent.append)
+    node._publisher._publisher = SimpleNamespace(publish=sent.append)
     node._supervisor.update = lambda now: Command(now, np.zeros(4), np.zeros(4))
     node._update()
-    assert sent[0].header.frame_id == heard[0].data
-    assert re.fullmatch('supervisor_node:[0-9a-f]{8}', heard[0].data)
+    assert sent[0].header.frame_id == heard[0]
+    assert re.fullmatch('supervisor_node:[0-9a-f]{8}', heard[0])
 
 
 @pytest.mark.parametrize('kind', [

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from servo_witness import COUNT, joint_bridge, NODE, WITHIN
 
-from beetle_omni_ros.nodes import convert
+from beetle_omni_ros.messages import conversions
+from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus, ServoFaults
 
@@ -99,7 +100,7 @@ def test_angles_come_at_200_hz_with_the_time_of_their_reading(bench):
     assert cycles + missed == pytest.approx(200 * seconds, rel=0.25)
     # Best effort: a busy reader loses some.
     assert 0.5 * cycles < heard <= cycles + 60
-    stamps = np.array([convert.seconds(message.header.stamp) for message in witness.joints])
+    stamps = np.array([conversions.seconds(message.header.stamp) for message in witness.joints])
     assert (np.diff(stamps) > 0).all()
     assert (stamps < witness.arrivals).all() and (stamps > np.array(witness.arrivals) - 1).all()
     whole = [message for message in witness.joints if list(message.name) == list(JOINT_NAMES)]
@@ -160,8 +161,8 @@ def test_a_silent_servo_leaves_joint_states_incomplete_and_is_named(active):
     assert 'gimbal3' in witness.now and 'silent; check its cable and power' in witness.now
     witness.until(lambda: list(witness.joints[-1].name) == ['gimbal1', 'gimbal2', 'gimbal4'])
     assert witness.level('bus')[0] == ERROR and witness.level('gimbal3')[0] == ERROR
-    with pytest.raises(convert.MessageError, match='gimbal3'):
-        convert.joints(witness.joints[-1])
+    with pytest.raises(MessageError, match='gimbal3'):
+        conversions.take_joints(witness.joints[-1])
     emulated.faults.silent = set()
     witness.until(lambda: torque_is_back(emulated, witness, HOME), 'not back')
 

@@ -14,7 +14,9 @@ from std_msgs.msg import String
 
 from beetle_omni_ros.bringup.limits import CheckLimits
 from beetle_omni_ros.bringup.topics import check_topics
-from beetle_omni_ros.nodes import convert, qos
+from beetle_omni_ros.estimation.samples import PoseSample
+from beetle_omni_ros.messages.topics import EVENT, LATCHED, SENSOR
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.listener import listen
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -39,13 +41,14 @@ class Drivers:
                    signal_handler_options=SignalHandlerOptions.NO)
         self.node = node = rclpy.create_node('vrpn', context=self.context)
         self.twin = rclpy.create_node('sim_node', context=self.context)
-        self.mocap = node.create_publisher(PoseStamped, 'mocap/pose', qos.SENSOR)
-        self.other = self.twin.create_publisher(PoseStamped, 'mocap/pose', qos.SENSOR)
-        self.imu = node.create_publisher(Imu, 'imu/data_raw', qos.SENSOR)
-        self.wrong = node.create_publisher(String, 'battery_state', qos.SENSOR)
-        self.joints = node.create_publisher(JointState, 'joint_states', qos.SENSOR)
-        self.state = node.create_publisher(String, 'joint_bridge/state', qos.LATCHED)
-        self.diagnostics = node.create_publisher(DiagnosticArray, 'diagnostics', qos.EVENT)
+        self.mocap = node.create_publisher(PoseStamped, 'mocap/pose', wire.profile(SENSOR))
+        self.other = self.twin.create_publisher(PoseStamped, 'mocap/pose', wire.profile(SENSOR))
+        self.imu = node.create_publisher(Imu, 'imu/data_raw', wire.profile(SENSOR))
+        self.wrong = node.create_publisher(String, 'battery_state', wire.profile(SENSOR))
+        self.joints = node.create_publisher(JointState, 'joint_states', wire.profile(SENSOR))
+        self.state = node.create_publisher(String, 'joint_bridge/state', wire.profile(LATCHED))
+        self.diagnostics = node.create_publisher(DiagnosticArray, 'diagnostics',
+                                                 wire.profile(EVENT))
         self.state.publish(String(data='ready'))
         self.stop = threading.Event()
         self.thread = threading.Thread(target=self.run, daemon=True)
@@ -57,9 +60,10 @@ class Drivers:
             if self.stop.is_set():
                 return
             now = time.time()
-            self.imu.publish(convert.imu_message(Reading(now + 0.05, rng)))
+            self.imu.publish(wire.message('imu/data_raw', Reading(now + 0.05, rng)))
             if k % 2 == 0:
-                self.mocap.publish(convert.pose_message(now - 0.008, rng.normal(size=3), UPRIGHT))
+                self.mocap.publish(wire.message('mocap/pose', PoseSample(
+                    now - 0.008, rng.normal(size=3), UPRIGHT)))
                 self.joints.publish(JointState(name=['gimbal1'], position=[0.0]))
             if k % 100 == 0:
                 self.diagnostics.publish(DiagnosticArray(status=[DiagnosticStatus(

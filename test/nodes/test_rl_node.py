@@ -16,9 +16,12 @@ from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import JointState
 from witness import HEADER, READY, Witness
 
-from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.policy import DEFAULT, PolicyController, PolicyParameters
-from beetle_omni_ros.nodes import convert, qos
+from beetle_omni_ros.messages import conversions
+from beetle_omni_ros.messages.topics import COMMAND, ESTIMATE, LATCHED, SENSOR
+from beetle_omni_ros.messages.values import Joints, Odom
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.plan import controller_nodes, unfit
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -55,33 +58,31 @@ def process(ros_domain, tmp_path):
 def test_the_node_answers_as_the_controller_does(process):
     graph, witness, policy = process
     node = witness._node
-    odom = node.create_publisher(Odometry, 'odom', qos.ESTIMATE)
-    joints = node.create_publisher(JointState, 'joint_states', qos.SENSOR)
-    targets = node.create_publisher(PoseStamped, 'target_pose', qos.LATCHED)
+    odom = node.create_publisher(Odometry, 'odom', wire.profile(ESTIMATE))
+    joints = node.create_publisher(JointState, 'joint_states', wire.profile(SENSOR))
+    targets = node.create_publisher(PoseStamped, 'target_pose', wire.profile(LATCHED))
     answers = []
     node.create_subscription(JointState, 'rl/command', lambda m: answers.append(
-        convert.command(m)), qos.COMMAND)
+        conversions.take_command(m)), wire.profile(COMMAND))
     assert witness.wait(lambda: odom.get_subscription_count() and joints.get_subscription_count()
                         and targets.get_subscription_count() > 1, 30), graph.dead()
     tilt = np.array([0.1, -0.2, 0.3, 0.0])
     controller = PolicyController(RobotParameters.load(), replace(
         PolicyParameters.load(), policy=str(policy)))
     target = PoseTarget(np.array([0.2, 0.0, 1.5]), LEVEL)
-    message = convert.pose_message(time.time(), target.position, target.quaternion)
-    targets.publish(message)
+    targets.publish(wire.message('target_pose', replace(target, stamp=time.time())))
     witness.spin(0.3)
 
     def ask(k):
         now = time.time()
-        state = convert.Odom(now, np.array([0.0, 0.1 * k, 1.0]), np.array([0.1, 0.2, -0.3]),
-                             np.array([0.5, 0.5, 0.5, 0.5]), np.array([0.3, 0.0, -0.1]))
-        joints.publish(convert.joint_message(now - 0.01, tilt, np.zeros(4)))
+        state = Odom(now, np.array([0.0, 0.1 * k, 1.0]), np.array([0.1, 0.2, -0.3]),
+                     np.array([0.5, 0.5, 0.5, 0.5]), np.array([0.3, 0.0, -0.1]))
+        joints.publish(wire.message('joint_states', Joints(now - 0.01, tilt, np.zeros(4))))
         witness.spin(0.01)
-        odom.publish(convert.odometry_message(
-            now, state.position, state.velocity, state.quaternion, state.angular_velocity))
+        odom.publish(wire.message('odom', state))
         witness.spin(0.02)
         expected = controller.step(
-            convert.state(state, convert.Joints(now, tilt, np.zeros(4)), None), target)
+            State.join(state, Joints(now, tilt, np.zeros(4)), None), target)
         return round(now, 4), np.concatenate((expected.tilt, expected.thrust))
 
     def answered(asked):
@@ -145,14 +146,11 @@ class Pilot(Witness):
         super().__init__(domain)
         self.client = AsyncParameterClient(self._node, 'supervisor_node')
         self.taken, self.marks, self.targets = [], [], []
-        self._node.create_subscription(PoseStamped, 'target_pose', self._on_target, qos.LATCHED)
+        wire.subscribe(self._node, 'target_pose', lambda target: self.targets.append(target.stamp))
 
-    def _on_target(self, message):
-        self.targets.append(convert.seconds(message.header.stamp))
-
-    def _on_state(self, message):
-        super()._on_state(message)
-        self.marks.append((message.data, len(self.taken)))
+    def _on_state(self, told):
+        super()._on_state(told)
+        self.marks.append((told, len(self.taken)))
 
     def _on_actuators(self, message):
         super()._on_actuators(message)

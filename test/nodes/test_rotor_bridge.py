@@ -12,9 +12,8 @@ pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
 from rotor_bench import bench, HOVER, NODE, QUICK, SOON, START
-from std_msgs.msg import String
 
-from beetle_omni_ros.nodes import qos
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
 
@@ -212,8 +211,8 @@ def test_diagnostics_tell_link_clock_latency_and_a_failed_esc(flying):
     board, commander = flying.board, flying.commander
     board.faults.failed_escs = (3,)
     assert commander.told_in_diagnostics('rotor3', 'failures', lambda text: 'offline' in text)
-    assert commander.diagnostics[f'{NODE}: rotor3'].level == b'\x02'
-    assert commander.diagnostics[f'{NODE}: rotor1'].level == b'\x00'
+    assert commander.diagnostics[f'{NODE}: rotor3'].level == 2
+    assert commander.diagnostics[f'{NODE}: rotor1'].level == 0
     assert commander.told_in_diagnostics('latency', 'count', lambda n: n and int(n) > 20)
     assert commander.diagnostics[f'{NODE}: latency'].message.startswith(
         'from the publication of the command')
@@ -282,8 +281,7 @@ def test_supervisor_node_refuses_to_arm_in_the_words_of_the_bridges(ros_domain, 
     try:
         graph.start()
         operator = Operator(ros_domain)
-        bridges = {name: operator._node.create_publisher(String, f'{name}_bridge/state',
-                                                         qos.LATCHED)
+        bridges = {name: wire.Publisher(operator._node, f'{name}_bridge/state')
                    for name in ('joint', 'rotor')}
         assert operator.wait(lambda: operator.state == 'disarmed', START), graph.dead()
         for name, text, answer in (
@@ -291,10 +289,10 @@ def test_supervisor_node_refuses_to_arm_in_the_words_of_the_bridges(ros_domain, 
                 ('joint', 'lost: gimbal3 silent', 'joint_bridge_node lost: gimbal3 silent; '
                                                   'rotor_bridge_node waiting: battery low'),
                 ('rotor', 'ready', 'joint_bridge_node lost: gimbal3 silent')):
-            bridges[name].publish(String(data=text))
+            bridges[name].publish(text)
             assert operator.wait(lambda answer=answer: operator.call('arm') == (
                 False, f'arm refused: {answer}'), SOON), operator.call('arm')
-        bridges['joint'].publish(String(data='ready'))
+        bridges['joint'].publish('ready')
         assert operator.wait(lambda: 'no fresh state estimate' in operator.call('arm')[1], SOON)
     finally:
         graph.stop()

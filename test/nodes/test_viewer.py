@@ -10,7 +10,10 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
 
 from beetle_omni_ros.control.base import Command, PoseTarget
-from beetle_omni_ros.nodes import convert, qos
+from beetle_omni_ros.messages import conversions
+from beetle_omni_ros.messages.topics import EVENT, LATCHED
+from beetle_omni_ros.messages.values import Joints, Odom
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.transform_message import transform_message
 from beetle_omni_ros.nodes.viewer_node import ViewerNode
 from beetle_omni_ros.robot import rotations
@@ -40,8 +43,8 @@ def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     position, tilt = np.array([1.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, 0.0, -0.3])
     viewer._draw()
     assert not viewer._markers              # nothing known yet
-    viewer._odom = convert.Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
-    viewer._joints = convert.Joints(5.0, tilt, np.zeros(4))
+    viewer._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
+    viewer._joints = Joints(5.0, tilt, np.zeros(4))
     viewer._command = Command(5.0, tilt, np.array([8.0, 4.0, 0.0, 20.0]))
     viewer._target = PoseTarget(position, rotation)
     viewer._draw()
@@ -67,17 +70,17 @@ def test_the_frames_of_all_links_form_one_tree_and_stand_where_the_rotors_are(ro
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(listener)
     heard = {'/tf': [], '/tf_static': [], 'robot_description': []}
-    for topic, profile in (('/tf', qos.EVENT), ('/tf_static', qos.LATCHED)):
+    for topic, profile in (('/tf', wire.profile(EVENT)), ('/tf_static', wire.profile(LATCHED))):
         listener.create_subscription(transform_message(), topic, heard[topic].append, profile)
     listener.create_subscription(String, 'robot_description', heard['robot_description'].append,
-                                 qos.LATCHED)
+                                 wire.profile(LATCHED))
     rclpy.init(domain_id=ros_domain)
     node = ViewerNode()
     try:
         rotation = rotations.from_rpy(0.4, -0.2, 1.0)
         position, tilt = np.array([1.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, 0.0, -0.3])
-        node._odom = convert.Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
-        node._joints = convert.Joints(4.9, tilt, np.zeros(4))
+        node._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
+        node._joints = Joints(4.9, tilt, np.zeros(4))
         end = time.monotonic() + 20
         while not all(heard.values()) and time.monotonic() < end:
             node._moved = None
@@ -92,8 +95,8 @@ def test_the_frames_of_all_links_form_one_tree_and_stand_where_the_rotors_are(ro
             at, turn, name = np.zeros(3), np.array([0, 0, 0, 1.0]), f'rotor{k + 1}'
             while name != 'world':
                 frame = frames[name]
-                here = convert.xyzw(frame.transform.rotation)
-                at = rotations.matrix(here) @ at + convert.xyz(frame.transform.translation)
+                here = conversions.xyzw(frame.transform.rotation)
+                at = rotations.matrix(here) @ at + conversions.xyz(frame.transform.translation)
                 turn, name = rotations.multiply(here, turn), frame.header.frame_id
             axes = rotations.matrix(rotation)
             assert at == pytest.approx(position + axes @ node._robot.rotors.positions[k])
@@ -109,7 +112,7 @@ def test_the_frames_of_all_links_form_one_tree_and_stand_where_the_rotors_are(ro
 
 
 def test_nothing_is_drawn_where_nobody_looks(viewer):
-    viewer._odom = convert.Odom(5.0, np.zeros(3), np.zeros(3), np.array([0, 0, 0, 1.0]),
+    viewer._odom = Odom(5.0, np.zeros(3), np.zeros(3), np.array([0, 0, 0, 1.0]),
                                 np.zeros(3))
     for publisher in (viewer._markers, viewer._transforms):
         publisher.get_subscription_count = lambda: 0

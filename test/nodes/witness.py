@@ -2,12 +2,11 @@
 
 import time
 
-from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
-from sensor_msgs.msg import JointState
 
-from beetle_omni_ros.nodes import convert, qos
+from beetle_omni_ros.messages.topics import SENSOR
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.operator import Operator
 
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
@@ -27,15 +26,15 @@ class Witness(Operator):
     def __init__(self, domain):
         super().__init__(domain)
         self.truth, self.last_command, self.height_min = None, None, np.inf
-        self._node.create_subscription(Odometry, 'ground_truth/odom', self._on_truth, qos.SENSOR)
-        self._node.create_subscription(JointState, 'command', self._on_actuators, qos.SENSOR)
+        wire.subscribe(self._node, 'ground_truth/odom', self._on_truth, qos=SENSOR)
+        wire.subscribe(self._node, 'command', self._on_actuators, qos=SENSOR)
 
-    def _on_truth(self, message):
-        self.truth = convert.odom(message)
-        self.height_min = min(self.height_min, self.truth.position[2])
+    def _on_truth(self, truth):
+        self.truth = truth
+        self.height_min = min(self.height_min, truth.position[2])
 
-    def _on_actuators(self, message):
-        self.last_command = time.monotonic(), convert.command(message)
+    def _on_actuators(self, command):
+        self.last_command = time.monotonic(), command
 
     def stays_in_the_air(self, seconds):
         """Watch for so long; whether the robot never went below half a metre."""
