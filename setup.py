@@ -136,7 +136,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
-        *shared('params', 'policies', 'launch', 'description'),
+        *shared('params', 'policies', 'launch', 'description', 'viewers'),
     ],
     zip_safe=False,
     install_requires=REQUIREMENTS,

@@ -32,10 +32,16 @@ class Arming:
         self._board = board
         self._command: ArmCommand | None = None
         self._supervisor = ''
-        self._lost = self._deaf = ''
+        self._lost = self._deaf = self._barred = ''
         self._gone = 0.0
         self._disarm = False        # whether the board has yet to confirm it
         self.phase = RESTS
+
+    def bar(self, why: str) -> None:
+        """Keep the board disarmed for a reason, also in flight; '' lets it be armed again."""
+        self._barred = why
+        if why and self.phase in (ARMS, FLIES):
+            self._lose(why)
 
     def follow(self, state: str) -> None:
         """Take the supervisor's ``state``, perhaps with a fault's name, and act on it at once."""
@@ -47,12 +53,12 @@ class Arming:
             if before != state:
                 self._start_disarm()
         elif before in RESTING or not before:
-            if before == DISARMED:
+            if before == DISARMED and not self._barred:
                 self.phase, self._disarm, self._gone = ARMS, False, 0.0
                 self._command = self._board.start_arm()
                 self._look_at_answer(0.0)
             else:
-                self._lose('the supervisor was not disarmed before')
+                self._lose(self._barred or 'the supervisor was not disarmed before')
 
     def update(self, elapsed: float) -> None:
         """Look at the board; ``elapsed`` [s] since the last look."""
@@ -95,6 +101,8 @@ class Arming:
     @property
     def missing(self) -> str:
         """What would keep the board from arming now, on either side; '' when nothing."""
+        if self._barred:
+            return self._barred
         missing = self._board.ready or self._disarm and 'disarming is not confirmed yet'
         blocking = missing or ', '.join(text for text in self._board.status.conditions
                                         if text in BLOCKS_ARMING)

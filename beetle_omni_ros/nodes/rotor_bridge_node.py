@@ -13,13 +13,14 @@ from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.messages.values import Battery, RotorSpeeds
 from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.command_source import CommandSource
-from beetle_omni_ros.nodes.node import FlightNode
+from beetle_omni_ros.nodes.lifecycle_node import AUTOSTART, LifecycleFlightNode
 from beetle_omni_ros.nodes.rotor_bridge_report import RotorBridgeReport
 from beetle_omni_ros.nodes.target_stream import TargetStream
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
 
 RPM = math.pi / 30      # [rad/s]
+UNCONFIGURED, INACTIVE = 'not configured', 'not activated'
 POLL_CYCLES = 2         # the board tells its rotors' speeds 100 times a second
 
 
@@ -31,14 +32,17 @@ class RotorBridgeNodeParameters(MotorBoardParameters):
         '', doc='robot file with the rotor map; empty: the shipped one', read_only=True)
     motor_board_file: str = parameter(
         '', doc='file to start from; empty: the shipped params/motor_board.yaml', read_only=True)
+    autostart: str = parameter('activate', choices=tuple(AUTOSTART), read_only=True,
+                               doc='transition to make without being asked')
 
 
-class RotorBridgeNode(FlightNode):
+class RotorBridgeNode(LifecycleFlightNode):
     """
     Executes the thrusts of command; publishes battery_state, rotor_states and its own state.
 
-    It arms the motor board when the supervisor takes off, and disarms it when the supervisor does,
-    stops, or when this process ends. rotor_bridge/state (latched) is 'ready', 'waiting: WHY' or
+    A lifecycle node: configure looks for the board, activate lets it be armed. Then it arms the
+    motor board when the supervisor takes off, and disarms it when the supervisor does, stops, or
+    when this process ends. rotor_bridge/state (latched) is 'ready', 'waiting: WHY' or
     'lost: WHY'.
     """
 
@@ -54,9 +58,10 @@ class RotorBridgeNode(FlightNode):
         self._period = 1 / given.target_rate
         self._board = MotorBoard(given, robot, clock=self.now)
         self._arming = Arming(self._board)
+        self._arming.bar(UNCONFIGURED)
         self._stream = TargetStream(self._period)
         self._command = None
-        self._state = self._absent = ''
+        self._state, self._absent = '', None    # why the port is away; None: nobody looks for it
         self._looked = self._next_try = time.monotonic()
         self._cycle, self._sent = 0, 0.0
         self._states = self.publisher('rotor_bridge/state')
@@ -67,6 +72,36 @@ class RotorBridgeNode(FlightNode):
                     max_age=given.stamp_age_limit, stale_after=None, published=True)
         self.follow('supervisor/state', self._on_supervisor)
         self._timer = self.create_timer(self._period, self._on_timer, clock=self.steady_clock)
+        self.start_by_itself(given.autostart)
+        if given.autostart != 'none':
+            self._try_to_start()    # at once; nothing is refused here
+
+    # --- lifecycle ----------------------------------------------------------------------------
+
+    def configure(self):
+        """Look for the board, and keep looking; tell battery and rotors from then on."""
+        self._absent, self._next_try = '', time.monotonic()
+        self._arming.bar(INACTIVE)
+
+    def activate(self):
+        """Let the board be armed, which the supervisor does."""
+        self._arming.bar('')
+
+    def deactivate(self):
+        """Disarm, also in flight."""
+        self._arming.bar(INACTIVE)
+
+    def release(self):
+        """Disarm and close the port."""
+        self._arming.bar(UNCONFIGURED)
+        self._absent = None
+        self._board.close()
+
+    def changed(self):
+        """Tell the state."""
+        self._tell()
+
+    # --- the stream ---------------------------------------------------------------------------
 
     def waits_for(self):
         """The board, or what it lacks."""

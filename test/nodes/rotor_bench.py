@@ -5,6 +5,7 @@ from dataclasses import replace
 import threading
 import time
 
+from lifecycle_msgs.srv import ChangeState
 import numpy as np
 from sensor_msgs.msg import BatteryState, JointState
 
@@ -64,6 +65,17 @@ class Commander(Operator):
         """Say what the supervisor says."""
         self.supervised = state
         self._supervisor.publish(state)
+
+    def change(self, transition, timeout=SOON):
+        """Ask the bridge for a transition; whether it made it."""
+        client = self._node.create_client(ChangeState, f'{NODE}/change_state')
+        try:
+            assert self.wait(client.service_is_ready, timeout)
+            future = client.call_async(ChangeState.Request(transition=transition))
+            assert self.wait(future.done, timeout)
+            return future.result().success
+        finally:
+            self._node.destroy_client(client)
 
     @property
     def bridge(self):

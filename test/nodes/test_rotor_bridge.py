@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
+from lifecycle_msgs.msg import Transition
 from rotor_bench import bench, HOVER, NODE, QUICK, SOON, START
 
 from beetle_omni_ros.nodes import wire
@@ -298,3 +299,40 @@ def test_supervisor_node_refuses_to_arm_in_the_words_of_the_bridges(ros_domain, 
         graph.stop()
         if operator:
             operator.close()
+
+
+CONFIGURE, ACTIVATE, DEACTIVATE, CLEAN_UP = (
+    Transition(id=number) for number in (
+        Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE,
+        Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP))
+
+
+def test_told_to_wait_it_arms_only_after_it_was_configured_and_activated(tmp_path):
+    with bench(tmp_path, autostart='none') as bridge:
+        board, commander = bridge.board, bridge.commander
+        assert commander.reaches('waiting: not configured', START), bridge.log
+        assert not commander.batteries and not commander.change(ACTIVATE)
+        assert commander.change(CONFIGURE)
+        assert commander.reaches('waiting: not activated')
+        assert commander.wait(lambda: commander.batteries, SOON)       # it is heard, not armed
+        commander.supervise('takeoff')
+        assert commander.reaches('lost: not activated')
+        commander.supervise('disarmed')
+        assert commander.reaches('waiting: not activated') and not board.armed
+        assert commander.change(ACTIVATE)
+        bridge.take_off()
+        assert commander.change(DEACTIVATE)                             # in flight
+        assert commander.wait(lambda: not board.armed, SOON)
+        assert commander.reaches('lost: not activated')
+        assert commander.change(ACTIVATE)
+        commander.spin(0.3)
+        assert not board.armed                                          # not in this flight
+        commander.supervise('disarmed')
+        assert commander.reaches('ready')
+        assert commander.change(DEACTIVATE) and commander.change(CLEAN_UP)
+        assert commander.reaches('waiting: not configured')
+        heard = len(commander.batteries)
+        commander.spin(0.5)
+        assert len(commander.batteries) <= heard + 1
+        assert commander.change(CONFIGURE) and commander.change(ACTIVATE)
+        bridge.take_off()                                               # the port opens again
