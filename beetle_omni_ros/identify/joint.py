@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from beetle_omni_ros.identify.candidates import CANDIDATES, free_mask, LINEAR
-from beetle_omni_ros.identify.fitting import decode, encode, Fits, Fitter, Noise, Prior, Problems
 from beetle_omni_ros.identify.joint_log import JointLog
-from beetle_omni_ros.identify.selection import BEYOND, Choice, Selector
-from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, published_set, simulate, TERMS
+from beetle_omni_ros.identify.selection import Choice, Selector
+from beetle_omni_ros.identify.servo_fit import (
+    BEYOND,
+    decode,
+    encode,
+    first_noise,
+    FITTED_PART,
+    fitted_samples,
+    NEARLY,
+    noise_around,
+    prior_of,
+    Problems,
+    ServoFitter,
+)
+from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, published_set, simulate
 from beetle_omni_ros.identify.uncertainty import (
     Experiment,
     separating_experiments,
@@ -20,12 +32,9 @@ from beetle_omni_ros.identify.uncertainty import (
 )
 from beetle_omni_ros.robot.parameters import JointParameters
 
-FITTED_PART = 0.6       # of the log; the rest judges
-FIRST_NOISE = 0.002     # [rad] white, until the residuals tell
-MOST_PASSES, NEARLY = 3, 0.8    # of selection, while the noise falls below this part of itself
-SETTLING = 0.25         # [s] of a log that are not fitted: its first velocity is only a guess
-# Belief beside the data, as standard deviations. The published frequency and damping are right
-# within a factor of 1.6; servos of one type and one bus differ by 10 % and 3 ms.
+MOST_PASSES = 3         # of selection, while the noise falls
+# Priors, as standard deviations. The published frequency and damping are right within a factor of
+# 1.6; servos of one type and one bus differ by 10 % and 3 ms.
 PUBLISHED_DEVIATION = {'natural_frequency': 0.5, 'damping_ratio': 0.5}
 COMMON_DEVIATION = {'natural_frequency': 0.1, 'damping_ratio': 0.1, 'delay': 0.003}
 MOST_ROUNDS, RESTING = 10, 0.2    # of refits; change of the median, in scales, that ends them
@@ -74,67 +83,56 @@ def identify_joints(log: JointLog, published: JointParameters,
     """
     log = log.first(fitted)
     start = published_set(published)
-    weight = np.tile((log.t >= log.t[0] + SETTLING).astype(float), (len(log.joints), 1))
+    weight = np.tile(fitted_samples(log), (len(log.joints), 1))
     noise = _first_noise(log, start, weight)
-    belief = _prior(start, PUBLISHED_DEVIATION)
+    prior = prior_of(encode(start), PUBLISHED_DEVIATION)
     for _ in range(MOST_PASSES):
-        choices = Selector(Fitter(log, noise, belief), weight[0]).run(_unlimited(start))
-        problems = _problems(log, choices, weight)
-        fits = _best(Fitter(log, noise, belief), problems)
-        before, noise = noise, _noise(log, fits.sets, weight)
+        fitter = ServoFitter(log, noise, prior=prior)
+        choices = Selector(fitter, weight[0]).run(_unlimited(start))
+        problems = Problems.apart(
+            np.arange(len(log.joints)), np.array([choice.values for choice in choices]),
+            np.array([free_mask(choice.kept) for choice in choices]), weight)
+        points = _best(fitter, problems)
+        before, noise = noise, noise_around(log, decode(points), weight[0])
         if (noise.sigma > NEARLY * before.sigma).all():
             break       # else the terms found let see more than the first model did
-    sets = _alike(log, noise, problems, fits.sets)
+    sets = decode(_alike(log, noise, problems, points))
     return _models(log, noise, choices, sets, weight, start)
 
 
 def _best(fitter, problems):
     """Fit each joint from several starts, for chi2 may have more than one valley."""
-    count, starts = len(problems.joint), [problems]
+    count, starts = len(problems.joints), [problems]
     for frequency, delay in RESTARTS:
-        sets = problems.sets.copy()
+        sets = decode(problems.points)
         sets[:, INDEX['natural_frequency']] = frequency
         sets[:, INDEX['delay']] = np.where(problems.free[:, INDEX['delay']], delay, 0.0)
-        starts.append(Problems(problems.joint, sets, problems.free, problems.weight))
+        starts.append(replace(problems, points=encode(sets)))
     fits = fitter.solve(Problems.join(starts))
     choice = fits.chi2.reshape(-1, count).argmin(axis=0) * count + np.arange(count)
-    return Fits(fits.sets[choice], fits.chi2[choice])
+    return fits.points[choice]
 
 
-def _alike(log, noise, problems, sets):
+def _alike(log, noise, problems, points):
     """
     Fit again, each joint with the median of all as a prior, until the median rests.
 
     A joint whose log decides stays where it is; one whose log does not, follows.
     """
-    if len(sets) < LEAST_COMMON:
-        return sets
+    if len(points) < LEAST_COMMON:
+        return points
     for _ in range(MOST_ROUNDS):
-        common = decode(np.median(encode(sets), axis=0))
-        fits = Fitter(log, noise, _prior(common, COMMON_DEVIATION)).solve(
-            Problems(problems.joint, sets, problems.free, problems.weight), 8)
-        change = np.median(encode(fits.sets), axis=0) - encode(common)
-        sets = fits.sets
+        common = np.median(points, axis=0)
+        points = ServoFitter(log, noise, prior=prior_of(common, COMMON_DEVIATION)).solve(
+            replace(problems, points=points), 8).points
+        change = np.median(points, axis=0) - common
         if np.abs(change[[INDEX[name] for name in COMMON_DEVIATION]]).max() < RESTING:
             break
-    return sets
+    return points
 
 
 def _unlimited(start):
     return np.where(free_mask(()), start, OFF)
-
-
-def _prior(centre, deviations):
-    precision = np.zeros(len(NAMES))
-    for name, deviation in deviations.items():
-        precision[INDEX[name]] = (TERMS[name].scale / deviation)**2
-    return Prior(encode(centre), precision)
-
-
-def _problems(log, choices, weight):
-    free = np.array([free_mask(choice.kept) for choice in choices])
-    return Problems(np.arange(len(log.joints)), np.array([c.values for c in choices]), free,
-                    weight)
 
 
 def _first_noise(log, start, weight):
@@ -146,15 +144,10 @@ def _first_noise(log, start, weight):
     beyond = log.asked_speed() > BEYOND * log.speed()
     limit = INDEX['velocity_limit']
     sets[beyond, limit], free[beyond, limit] = log.speed()[beyond], True
-    fits = Fitter(log, Noise.white(len(joints), FIRST_NOISE), _prior(
-        start, PUBLISHED_DEVIATION)).solve(Problems(joints, sets, free, weight))
-    return _noise(log, fits.sets, weight)
-
-
-def _noise(log, sets, weight):
-    error = simulate(log, np.arange(len(sets)), sets) - log.measured
-    return Noise.of(error[:, weight[0] > 0], max(log.quantum, 1e-4) / np.sqrt(12),
-                    log.period)
+    fitter = ServoFitter(log, first_noise(log),
+                         prior=prior_of(encode(start), PUBLISHED_DEVIATION))
+    fits = fitter.solve(Problems.apart(joints, sets, free, weight))
+    return noise_around(log, decode(fits.points), weight[0])
 
 
 def _models(log, noise, choices: list[Choice], sets, weight, start):
@@ -168,8 +161,8 @@ def _models(log, noise, choices: list[Choice], sets, weight, start):
             values = sets[j].copy()
             for member in CANDIDATES[name].members if name else ():
                 values[INDEX[member]] = choice.tried[name][INDEX[member]]
-            rows.append(Problems(np.array([j]), values[None], free_mask(kept)[None],
-                                 weight[j:j + 1]))
+            rows.append(Problems.apart([j], values[None], free_mask(kept)[None],
+                                       weight[j:j + 1]))
             owner.append((j, name))
     problems = Problems.join(rows)
     profiled = np.array([name in (None, 'delay') for _, name in owner])

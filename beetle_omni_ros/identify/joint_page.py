@@ -6,10 +6,11 @@ import matplotlib
 from matplotlib.figure import Figure
 import numpy as np
 
-from beetle_omni_ros.identify.joint import FITTED_PART, JointModel
+from beetle_omni_ros.identify.joint import JointModel
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.joint_servos import FileServos
 from beetle_omni_ros.identify.page import page
+from beetle_omni_ros.identify.servo_fit import FITTED_PART
 from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.runs.figures import COLOURS, FAINT, INK, legend, line, panels, STYLE, svg
 from beetle_omni_ros.runs.report_page import section

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from beetle_omni_ros.identify.inference.coordinates import Coordinates
+from beetle_omni_ros.identify.inference.least_squares import Steps
 from beetle_omni_ros.identify.servo_model import INDEX, OFF, TERMS
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.effects_actuator import per_joint
@@ -71,23 +73,17 @@ class Servos:
 
     """
 
+    # Numbers that all joints share are stiff against those of each: shorter steps, more damping.
+    steps = Steps(2e-4, 8.0, (0.2, 20.0), 5.0, 50.0)
+
     def __init__(self, robot: RobotParameters, joints: tuple[int, ...]):
         """Lay out the numbers; see the class."""
         self.robot, self.joints = robot, joints
         self.numbers = _numbers(len(joints))
-        self.scale = np.array([n.scale for n in self.numbers])
-        self._log = np.array([n.logarithmic for n in self.numbers])
-        self.low, self.high = (self._encode(np.array([getattr(n, side) for n in self.numbers]))
-                               for side in ('low', 'high'))
-        self.believed = self._encode(self._believed())
-
-    def _encode(self, values):
-        return np.where(self._log, np.log(np.where(self._log, values, 1.0)), values) / self.scale
-
-    def values(self, points: np.ndarray) -> np.ndarray:
-        """(..., P) numbers of points in their units."""
-        values = points * self.scale
-        return np.where(self._log, np.exp(np.where(self._log, values, 0.0)), values)
+        self.coordinates = Coordinates(self.numbers)
+        self.values, self.scale = self.coordinates.decode, self.coordinates.scale
+        self.owner = np.array([-1 if n.joint is None else n.joint for n in self.numbers])
+        self.believed = self.coordinates.encode(self._believed())
 
     def _believed(self):
         servo, effects = self.robot.joints, self.robot.effects

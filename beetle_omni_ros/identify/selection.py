@@ -8,18 +8,18 @@ blocks and by more than its scatter over them, and if the term is large enough t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from beetle_omni_ros.identify.candidates import CANDIDATES, free_mask, RIVALS, TIERS
-from beetle_omni_ros.identify.fitting import Fitter, Problems
+from beetle_omni_ros.identify.inference.blocks import block_masks, HeldOut
+from beetle_omni_ros.identify.servo_fit import BEYOND, decode, Problems, ServoFitter
 from beetle_omni_ros.identify.servo_model import INDEX, OFF, TERMS
 
 BLOCKS = 5
 LEAST_GAIN = 10.0       # of chi2 on unseen data for each number, all blocks together
 LEAST_DELAY = 0.001     # [s]
-BEYOND = 1.15           # a limit counts only if the command went so far beyond it
 MOST_PASSES = 3
 QUICK, THOROUGH = 6, 15  # iterations
 
@@ -43,15 +43,6 @@ class Choice:
     gain: dict[str, float]
 
 
-def block_masks(weight: np.ndarray, blocks: int = BLOCKS) -> np.ndarray:
-    """(blocks, N) 1 within each of the blocks of the samples that have a weight (N,)."""
-    used = np.flatnonzero(weight)
-    edges = np.linspace(used[0], used[-1] + 1, blocks + 1).astype(int)
-    index = np.arange(len(weight))
-    return np.array([(index >= a) & (index < b)
-                     for a, b in zip(edges[:-1], edges[1:], strict=True)], dtype=float)
-
-
 class Selector:
     """
     Forward selection, all joints side by side.
@@ -63,11 +54,11 @@ class Selector:
 
     """
 
-    def __init__(self, fitter: Fitter, weight: np.ndarray,
+    def __init__(self, fitter: ServoFitter, weight: np.ndarray,
                  allowed: tuple[str, ...] = tuple(CANDIDATES)):
         """Cut the blocks; see the class."""
         self.fitter, self.log, self.allowed = fitter, fitter.log, allowed
-        self.blocks = block_masks(weight)
+        self.blocks = block_masks(weight, BLOCKS)
         self.all = self.blocks.sum(axis=0)
 
     def run(self, start: np.ndarray) -> list[Choice]:
@@ -196,8 +187,8 @@ class Selector:
         for key, (model, new) in asked.items():
             for start in self._starts(key[0], new, self.values[key[0]]):
                 start = np.where(free_mask(model), start, OFF)
-                parts.append(Problems(np.array([key[0]]), start[None], free_mask(model)[None],
-                                      self.all[None]))
+                parts.append(Problems.apart([key[0]], start[None], free_mask(model)[None],
+                                            self.all[None]))
                 owner.append(key)
         problems = Problems.join(parts)
         fits = self.fitter.solve(problems, THOROUGH)
@@ -207,11 +198,11 @@ class Selector:
                 best[key] = k
         rows = np.repeat([best[key] for key in asked], len(self.blocks))
         held = np.tile(self.blocks, (len(asked), 1))
-        folds = Problems(problems.joint[rows], fits.sets[rows], problems.free[rows],
+        folds = Problems(problems.joints[rows], fits.points[rows], problems.free[rows],
                          self.all - held)
-        folds = Problems(folds.joint, self.fitter.solve(folds, QUICK).sets, folds.free, held)
+        folds = replace(folds, points=self.fitter.solve(folds, QUICK).points, weight=held)
         cost = self.fitter.cost(folds).reshape(len(asked), len(self.blocks))
-        return {key: (fits.sets[best[key]], cost[k]) for k, key in enumerate(asked)}
+        return {key: (decode(fits.points[best[key]]), cost[k]) for k, key in enumerate(asked)}
 
     def _starts(self, joint, name, values):
         """Parameter sets to start from when a candidate is new."""
@@ -251,7 +242,5 @@ def _weight(name, kept):
 
 def _verdict(gains, weight):
     """Gain over all blocks, and whether it is real: above its scatter, in most blocks."""
-    total = float(gains.sum())
-    error = float(gains.std(ddof=1) * np.sqrt(len(gains)))
-    real = total > max(LEAST_GAIN * weight, error) and (gains > 0).sum() * 2 > len(gains)
-    return total, bool(real)
+    held = HeldOut(gains)
+    return held.total, held.total > max(LEAST_GAIN * weight, held.error) and held.positive > 0.5

@@ -9,31 +9,22 @@ scaled by how much the gradient of chi2 scatters over blocks of the log, which w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beetle_omni_ros.identify.fitting import (
-    decode,
-    encode,
-    Fitter,
-    HIGH,
-    LOW,
-    Noise,
-    Prior,
-    Problems,
-)
+from beetle_omni_ros.identify.inference.least_squares import covariance
+from beetle_omni_ros.identify.inference.noise import Noise
 from beetle_omni_ros.identify.joint_log import JointLog
-from beetle_omni_ros.identify.selection import block_masks
+from beetle_omni_ros.identify.servo_fit import APART, decode, encode, Problems, ServoFitter
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
 
 RISE = 3.84             # of chi2 with one degree of freedom, 95 %
 PROFILED = ('natural_frequency', 'damping_ratio', 'delay')
 LADDER = np.array([0.5, 1.2, 2.2, 3.6, 5.5, 8.0, 12.0, 18.0])  # in scales of a term
-DIFFERENT = 10          # blocks over which the gradient's scatter is taken
-SCATTER = 2.0, 6.0      # its range; below 2 made logs with slow drifts are covered too seldom
 TRADED = 0.6            # part of its interval through which another's interval drags a number
 LOOSE = 1.5             # half width of an interval, in scales, below which nothing is traded
+LOW, HIGH = APART.coordinates.low, APART.coordinates.high
 
 
 @dataclass(frozen=True)
@@ -69,62 +60,27 @@ def uncertainties(log: JointLog, noise: Noise, problems: Problems,
     Args:
         log: what they were fitted to.
         noise: its whitening.
-        problems: with the fitted sets; only ``free`` numbers are judged.
+        problems: fitted; only ``free`` numbers are judged.
         profiled: (B,) rows whose curved numbers are wanted; the others' have their local width.
 
     """
-    fitter = Fitter(log, noise, Prior.none())
-    points = encode(problems.sets)
-    base = fitter.residuals(points, problems.joint, problems.weight)
-    slopes = fitter.jacobian(points, problems, base)
-    results = []
-    for k, free in enumerate(problems.free):
-        information = slopes[k] @ slopes[k].T
-        covariance = _inverse(information, free)
-        scatter = gradient_scatter(slopes[k], base[k], free, covariance, block_masks(
-            problems.weight[k], DIFFERENT))
-        covariance *= scatter
-        size = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+    fitter, results = ServoFitter(log, noise), []
+    for point, free, (own, scatter) in zip(problems.points, problems.free,
+                                           fitter.certainty(problems), strict=True):
+        size = np.sqrt(np.maximum(scatter * np.diag(own), 1e-30))
         width = np.sqrt(RISE) * np.where(free, size, np.nan)
-        intervals = np.stack([decode(np.clip(points[k] + side * width, LOW, HIGH))
+        intervals = np.stack([decode(np.clip(point + side * width, LOW, HIGH))
                               for side in (-1, 1)], axis=1)
-        results.append(Uncertainty(intervals, covariance / np.outer(size, size), scatter))
+        results.append(Uncertainty(intervals, scatter * own / np.outer(size, size), scatter))
     wanted = np.flatnonzero(profiled)
     _profile(fitter, problems.pick(wanted), [results[k] for k in wanted])
     return results
 
 
-def _inverse(information, free):
-    covariance = np.zeros_like(information)
-    chosen = np.ix_(free, free)
-    # a direction that the data do not see at all gets a width of thousands of scales, not inf
-    covariance[chosen] = np.linalg.inv(information[chosen] + 1e-7 * np.eye(free.sum()))
-    return covariance
-
-
-def gradient_scatter(slopes: np.ndarray, residual: np.ndarray, free: np.ndarray,
-                     covariance: np.ndarray, blocks: np.ndarray) -> float:
-    """
-    Mean variance of the gradient over blocks, relative to what white residuals give.
-
-    Args:
-        slopes: (n, N) derivatives of the whitened residuals.
-        residual: (N,) whitened.
-        free: (n,) which numbers count.
-        covariance: (n, n) of the numbers, as white residuals would have it.
-        blocks: (blocks, N) 1 within each.
-
-    """
-    scores = np.array([(slopes[free] * block) @ residual for block in blocks])
-    found = scores.T @ scores
-    ratio = np.trace(covariance[np.ix_(free, free)] @ found) / free.sum()
-    return float(np.clip(ratio, *SCATTER))
-
-
 def _profile(fitter, problems, results):
     """Replace the intervals of curved numbers by where the refitted chi2 has risen."""
     parts, owner = [], []
-    for k in range(len(problems.joint)):
+    for k in range(len(problems.joints)):
         for name in PROFILED:
             index = INDEX[name]
             if not problems.free[k, index]:
@@ -134,20 +90,19 @@ def _profile(fitter, problems, results):
                     parts.append(_held(problems.pick([k]), index, side * move))
                     owner.append((k, index, side, move))
     fits = fitter.solve(Problems.join([problems, *parts]), 10)
-    best = fits.chi2[:len(problems.joint)].copy()
-    chi2 = fits.chi2[len(problems.joint):]
+    count, refitted = len(problems.joints), fits.points
+    best, chi2 = fits.chi2[:count].copy(), fits.chi2[count:]
     for (k, *_), value in zip(owner, chi2, strict=True):
         best[k] = min(best[k], value)
-    refitted = encode(fits.sets)
     paths: dict = {}
     for k, index, side in dict.fromkeys(entry[:3] for entry in owner):
-        rows = [k] + [len(problems.joint) + i for i, entry in enumerate(owner)
+        rows = [k] + [count + i for i, entry in enumerate(owner)
                       if entry[:3] == (k, index, side)]
         rise = np.maximum((fits.chi2[rows] - best[k]) / results[k].scatter, 0.0)
         if (rise > RISE).all():     # a better fit lies elsewhere: the local width must do
             continue
         place = _crossing(rise)
-        centre = encode(problems.sets[k:k + 1])[0]
+        centre = problems.points[k]
         ends = np.array([np.interp(place, np.arange(len(rows)), refitted[rows, n])
                          for n in range(len(NAMES))])
         ends[index] = np.clip(centre[index] + side * np.interp(
@@ -173,21 +128,19 @@ def _correlate(paths, results):
 
 def _held(problem, index, move):
     """The problem with one number moved and held, the delay giving way to the servo's lag."""
-    point = encode(problem.sets)
-    low, high = (encode(np.array([getattr(term, side) for term in TERMS.values()]))
-                 for side in ('low', 'high'))
-    point[0, index] = np.clip(point[0, index] + move, low[index], high[index])
+    point = problem.points.copy()
+    point[0, index] = np.clip(point[0, index] + move, LOW[index], HIGH[index])
     free = problem.free.copy()
     free[0, index] = False
-    sets = decode(point)
+    before, sets = decode(problem.points), decode(point)
     frequency, damping, delay = (INDEX[name] for name in PROFILED)
-    lag = [2 * s[0, damping] / s[0, frequency] for s in (problem.sets, sets)]
+    lag = [2 * s[0, damping] / s[0, frequency] for s in (before, sets)]
     if index == delay:
-        change = sets[0, delay] - problem.sets[0, delay]
+        change = sets[0, delay] - before[0, delay]
         sets[0, frequency] *= lag[0] / max(lag[0] - change, 0.1 * lag[0])
     elif problem.free[0, delay]:
         sets[0, delay] = max(0.0, sets[0, delay] + lag[0] - lag[1])
-    return Problems(problem.joint, sets, free, problem.weight)
+    return replace(problem, points=encode(sets), free=free)
 
 
 def _crossing(rise):
@@ -271,23 +224,24 @@ def _plans(sets, free, noise, scatter):
     amplitude = np.minimum(LARGEST_AMPLITUDE, LARGEST_SPEED / omega)
     command = amplitude[:, None] * np.sin(omega[:, None] * t)
     sets, free = np.tile(sets, (many, 1)), np.tile(free, (many, 1))
-    noise = Noise(np.tile(noise.filter, (many, 1)), np.tile(noise.sigma, many))
+    noise = Noise(np.tile(noise.taps, (many, 1)), np.tile(noise.sigma, many))
     rows = np.arange(count * many)
     blank = JointLog('', t, tuple(rows.tolist()), np.zeros_like(command), command)
     log = JointLog('', t, blank.joints, simulate(blank, rows, sets), command)
     weight = np.tile((t >= 1.0).astype(float), (len(rows), 1))
-    information = Fitter(log, noise, Prior.none()).information(
-        Problems(rows, sets, free, weight))
+    fitter, problems = ServoFitter(log, noise), Problems.apart(rows, sets, free, weight)
+    slopes = fitter.jacobian(problems, fitter.residuals(problems.points, problems.joints, weight))
+    information = slopes @ slopes.transpose(0, 2, 1)
     f, d = INDEX['natural_frequency'], INDEX['delay']
     scale = np.array([term.scale for term in TERMS.values()])
     plans = []
     for row, factor in zip(rows, np.tile(scatter, many), strict=True):
-        width = np.sqrt(RISE * factor * np.diag(_inverse(information[row], free[row]))) * scale
+        width = np.sqrt(RISE * factor * np.diag(covariance(information[row], free[row]))) * scale
         plans.append(Experiment(float(omega[row] / 2 / np.pi), float(amplitude[row]),
                                 EXCITATION_TIME, float(width[d]),
                                 float(width[f] * sets[row, f])))
     return [plans[k:k + count] for k in range(0, len(plans), count)]
 
 
-__all__ = ['Experiment', 'gradient_scatter', 'NAMES', 'separating_experiments', 'traded',
+__all__ = ['Experiment', 'NAMES', 'separating_experiments', 'traded',
            'uncertainties', 'Uncertainty']

@@ -10,16 +10,16 @@ import pytest
 from servo_logs import log_of, servo, sweep, write
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.identify.fitting import Noise
 from beetle_omni_ros.identify.gap.apply import effects_with
 from beetle_omni_ros.identify.gap.joint_changes import changes, line
-from beetle_omni_ros.identify.gap.joint_fit import StackFitter
 from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log, gap_of
 from beetle_omni_ros.identify.gap.joint_search import Search
 from beetle_omni_ros.identify.gap.keys import all_keys
 from beetle_omni_ros.identify.gap.keys import friction as friction_of
+from beetle_omni_ros.identify.inference.noise import Noise
 from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
 from beetle_omni_ros.identify.joint_servos import believed_sets, Servos
+from beetle_omni_ros.identify.servo_fit import Problems, ServoFitter
 from beetle_omni_ros.identify.servo_model import INDEX, simulate
 from beetle_omni_ros.robot import dynamics
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -101,15 +101,16 @@ def test_a_servo_with_an_offset_turns_its_thrust_where_it_is_told_to():
 
 def test_points_and_their_shared_slopes_agree_with_single_simulations():
     servos, log = Servos(robot(), (1, 2)), made(2)
-    fitter = StackFitter(log, Noise.white(2), servos)
+    fitter = ServoFitter(log, Noise.white(2), servos)
     free = servos.mask('joint_bandwidth') | servos.mask('joint_offset', 1)
-    point, weight = servos.believed, np.ones((1, len(T)))
-    base = fitter.residuals(point[None], weight)
-    slopes = fitter.jacobian(point[None], free[None], weight, base)[0]
+    point, weight, joints = servos.believed, np.ones((1, len(T))), np.array([[0, 1]])
+    base = fitter.residuals(point[None], joints, weight)
+    slopes = fitter.jacobian(Problems(joints, point[None], free[None], weight), base)[0]
     for k in range(len(point)):
         moved = point.copy()
         moved[k] += 0.05
-        expected = (fitter.residuals(moved[None], weight) - base)[0] / 0.05 if free[k] else 0.0
+        expected = (fitter.residuals(moved[None], joints, weight) - base)[0] / 0.05 \
+            if free[k] else 0.0
         assert np.allclose(slopes[k], expected, atol=1e-9)
 
 

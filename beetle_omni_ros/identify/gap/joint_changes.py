@@ -8,17 +8,24 @@ delay against stiffness, the other joints help.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.stats import norm
 
-from beetle_omni_ros.identify.fitting import encode, Fitter, Noise, Prior, Problems
-from beetle_omni_ros.identify.gap.joint_search import FIRST_NOISE, SETTLING
 from beetle_omni_ros.identify.joint import COMMON_DEVIATION
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.joint_servos import GROUPS, Servos
-from beetle_omni_ros.identify.selection import block_masks
-from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
-from beetle_omni_ros.identify.uncertainty import DIFFERENT, gradient_scatter
+from beetle_omni_ros.identify.servo_fit import (
+    decode,
+    first_noise,
+    fitted_samples,
+    noise_around,
+    prior_of,
+    Problems,
+    ServoFitter,
+)
+from beetle_omni_ros.identify.servo_model import INDEX, NAMES, TERMS
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.table import Grid
@@ -84,43 +91,30 @@ def estimate(log: JointLog, robot: RobotParameters) -> tuple[np.ndarray, np.ndar
     servos = Servos(robot, log.joints)
     start = servos.sets(servos.believed[None])[0]
     count, free = len(log.joints), np.array([name in FITTED for name in NAMES])
-    weight = np.tile((log.t >= log.t[0] + SETTLING).astype(float), (count, 1))
+    weight = np.tile(fitted_samples(log), (count, 1))
     start[:, INDEX['coulomb_friction']] = np.maximum(start[:, INDEX['coulomb_friction']], 0.005)
     start[:, INDEX['delay']] = np.maximum(start[:, INDEX['delay']], 0.008)
-    noise, joints = Noise.white(count, FIRST_NOISE), np.arange(count)
+    noise = first_noise(log)
+    problems = Problems.apart(np.arange(count), start, np.tile(free, (count, 1)), weight)
     for _ in range(2):
-        fitter = Fitter(log, noise, _prior(start))
-        solved = fitter.solve(Problems(joints, start, np.tile(free, (count, 1)), weight), 15)
-        start = solved.sets
-        error = simulate(log, joints, start) - log.measured
-        noise = Noise.of(error[:, weight[0] > 0], max(log.quantum, 1e-4) / np.sqrt(12),
-                         log.period)
-    problems = Problems(joints, start, np.tile(free, (count, 1)), weight)
-    points, covariance = _pooled(Fitter(log, noise, Prior.none()), problems, free)
-    return _physical(points, covariance, start, free, servos)
-
-
-def _prior(start):
-    """Frequency and damping within a factor of the median joint's, which keeps a fit in place."""
-    precision = np.zeros(len(NAMES))
-    for name in ('natural_frequency', 'damping_ratio'):
-        precision[INDEX[name]] = (TERMS[name].scale / np.log(FACTOR))**2
-    return Prior(np.median(encode(start), axis=0), precision)
+        # Frequency and damping within a factor of the median joint's keep a fit in place.
+        prior = prior_of(np.median(problems.points, axis=0), dict.fromkeys(
+            ('natural_frequency', 'damping_ratio'), np.log(FACTOR)))
+        fits = ServoFitter(log, noise, prior=prior).solve(problems, 15)
+        problems = replace(problems, points=fits.points)
+        noise = noise_around(log, decode(problems.points), weight[0])
+    points, covariance = _pooled(ServoFitter(log, noise), problems, free)
+    return _physical(points, covariance, free, servos)
 
 
 def _pooled(fitter, problems, free):
     """(J, n) encoded numbers drawn to the mean of all joints, and (J n, J n) their covariance."""
-    points = encode(problems.sets)
-    base = fitter.residuals(points, problems.joint, problems.weight)
-    slopes = fitter.jacobian(points, problems, base)[:, free]
-    count, size = slopes.shape[:2]
-    blocks, every = block_masks(problems.weight[0], DIFFERENT), np.ones(size, dtype=bool)
+    count, size = len(problems.points), int(free.sum())
     precision = np.zeros((count * size, count * size))
-    for j in range(count):
-        information = slopes[j] @ slopes[j].T + 1e-7 * np.eye(size)
-        scatter = gradient_scatter(slopes[j], base[j], every, np.linalg.inv(information), blocks)
-        precision[j * size:(j + 1) * size, j * size:(j + 1) * size] = information / scatter
-    own = points[:, free].ravel()
+    for j, (own, scatter) in enumerate(fitter.certainty(problems)):
+        part = slice(j * size, (j + 1) * size)
+        precision[part, part] = np.linalg.inv(scatter * own[np.ix_(free, free)])
+    own = problems.points[:, free].ravel()
     apart = np.eye(count) - 1 / count
     names = [name for name, chosen in zip(NAMES, free, strict=True) if chosen]
     common = np.diag([(TERMS[n].scale / COMMON_DEVIATION[n])**2 if n in COMMON_DEVIATION else 0.0
@@ -129,7 +123,7 @@ def _pooled(fitter, problems, free):
     return (covariance @ precision @ own).reshape(count, size), covariance
 
 
-def _physical(points, covariance, sets, free, servos):
+def _physical(points, covariance, free, servos):
     """Values and standard errors in the units of the catalogue, by finite differences."""
     count, size = points.shape
     scale = np.array([term.scale for term in TERMS.values()])[free]

@@ -11,7 +11,6 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.gap.joint_changes import change_grids, changes, sentences
 from beetle_omni_ros.identify.gap.joint_search import (
     Entry,
-    FITTED_PART,
     Found,
     Search,
     Trial,
@@ -25,6 +24,7 @@ from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
 from beetle_omni_ros.identify.joint_page import joint_page
 from beetle_omni_ros.identify.joint_results import joint_results
 from beetle_omni_ros.identify.joint_servos import file_servos
+from beetle_omni_ros.identify.servo_fit import FITTED_PART
 from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -184,12 +184,11 @@ def _closure(before, after, floor):
 
 def _evidence(trial: Trial):
     """Evidence of one entry beside the others; ``cv_gain``: on blocks that were not fitted."""
-    total = float(trial.blocks.sum())
-    error = float(trial.blocks.std(ddof=1) * np.sqrt(len(trial.blocks)))
+    held = trial.held
     return {'delta_bic': trial.gain - trial.numbers * float(np.log(trial.samples)),
-            'delta_chi2': trial.gain, 'cv_gain': total,
-            'cv_gain_se': total / error if error > 0 else 0.0,
-            'blocks_positive': int((trial.blocks > 0).sum())}
+            'delta_chi2': trial.gain, 'cv_gain': held.total,
+            'cv_gain_se': held.total / held.error if held.error > 0 else 0.0,
+            'blocks_positive': int((held.gains > 0).sum())}
 
 
 def _effects(found: Found):

@@ -15,28 +15,30 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2 as chi_square
 
-from beetle_omni_ros.identify.fitting import Noise
-from beetle_omni_ros.identify.gap.joint_fit import StackFitter
+from beetle_omni_ros.identify.inference.blocks import block_masks, HeldOut
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.joint_servos import GROUPS, Servos
-from beetle_omni_ros.identify.selection import block_masks
+from beetle_omni_ros.identify.servo_fit import (
+    BEYOND,
+    first_noise,
+    FITTED_PART,
+    fitted_samples,
+    NEARLY,
+    noise_around,
+    Problems,
+    ServoFitter,
+)
 from beetle_omni_ros.identify.servo_model import simulate
-from beetle_omni_ros.identify.uncertainty import DIFFERENT, gradient_scatter
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-SETTLING = 0.25         # [s] of a log that are not fitted: its first velocity is only a guess
-FITTED_PART = 0.6       # of the log; the rest judges
-FIRST_NOISE = 0.002     # [rad] white, until the residuals tell
 # Probability that chance gains as much, for each entry tried: about a dozen are, so that one log
 # in a hundred without a change gets a name.
 CHANCE = 0.001
 BLOCKS = 5
 MOST_EFFECTS = 8
 QUICK = 5               # iterations that show what an entry gains; the accepted are fitted again
-NEARLY = 0.8            # of the noise: below, what was found lets see more than before
 MOST_PASSES = 3
-BEYOND = 1.15           # a limit counts only if the command asks for so much more than it
 # Smallest changes that are named, where the catalogue's are not those of a response log. A zero:
 # three counts of a 12-bit encoder, 0.26 deg. Friction: gears and seals of one type differ by a
 # fifth, and change as much with wear and temperature.
@@ -74,7 +76,7 @@ class Trial:
         gain: fall of chi2 beside the accepted others, over the residuals' scatter.
         numbers: how many it has.
         samples: that were fitted.
-        blocks: (BLOCKS,) gain on each block of the log that was left out.
+        held: gains on blocks of the log that were left out.
         point: the fitted model with it.
         reason: why it is not accepted, or ''.
 
@@ -84,7 +86,7 @@ class Trial:
     gain: float
     numbers: int
     samples: int
-    blocks: np.ndarray
+    held: HeldOut
     point: np.ndarray
     reason: str = ''
 
@@ -101,7 +103,7 @@ class Trial:
     @property
     def agreed(self) -> bool:
         """Whether blocks that were left out gain, most of them and all together."""
-        return bool(self.blocks.sum() > 0 and 2 * (self.blocks > 0).sum() > len(self.blocks))
+        return self.held.total > 0 and self.held.positive > 0.5
 
 
 @dataclass
@@ -150,7 +152,7 @@ class Search:
         """Fit the usual numbers once, for the noise; see the class."""
         self.whole, self.log = log, log.first(FITTED_PART)
         self.servos = Servos(robot, log.joints)
-        self.weight = (self.log.t >= self.log.t[0] + SETTLING).astype(float)
+        self.weight = fitted_samples(self.log)
         self.blocks = block_masks(self.weight, BLOCKS)
         self.samples = int(self.weight.sum()) * len(log.joints)
         self.entries = self._entries()
@@ -168,41 +170,35 @@ class Search:
         """Noise around the best servos that a robot file can hold, from two starts."""
         usual = [e for e in self.entries if e.name == 'joint_offset' or (
             e.name in ('joint_friction', 'joint_velocity_limit', *PAIR) and e.joint is None)]
-        white = Noise.white(len(self.log.joints), FIRST_NOISE)
         starts = [self._started(self.servos.believed, usual, k) for k in range(2)]
-        for noise in (white, None):
-            self.fitter = StackFitter(self.log, noise or self._noise(self.full), self.servos)
+        for noise in (first_noise(self.log), None):
+            self.fitter = self._fitter(noise or self._noise(self.full))
             solved = self._solve(starts, [usual] * len(starts), 12)
             self.full = solved.points[solved.chi2.argmin()]
             starts = [self.full]
         self.noise = self._noise(self.full)
-        self.fitter = StackFitter(self.log, self.noise, self.servos)
-        self.scatter = self._scatter(self.full, usual)
+        self.fitter = self._fitter(self.noise)
+        self.scatter = self.fitter.certainty(self._problems([self.full], [usual]))[0][1]
+
+    def _fitter(self, noise):
+        return ServoFitter(self.log, noise, self.servos)
 
     def _noise(self, point):
-        sets = self.servos.sets(point[None])[0]
-        error = simulate(self.log, np.arange(len(sets)), sets) - self.log.measured
-        return Noise.of(error[:, self.weight > 0], max(self.log.quantum, 1e-4) / np.sqrt(12),
-                        self.log.period)
+        return noise_around(self.log, self.servos.sets(point[None])[0], self.weight)
 
-    def _scatter(self, point, entries):
-        information, slopes, base = self.fitter.information(point, self._free(entries),
-                                                            self.weight)
-        free, count = self._free(entries), len(base)
-        covariance = _inverse(information, free)
-        blocks = np.tile(block_masks(self.weight, DIFFERENT), (1, count))
-        return gradient_scatter(slopes.reshape(len(free), -1), base.ravel(), free, covariance,
-                                blocks)
+    def _problems(self, points, models, weights=None):
+        """Fits of points (M, P) with the entries of each model free."""
+        count = len(points)
+        return Problems(np.tile(np.arange(len(self.log.joints)), (count, 1)), np.array(points),
+                        np.array([self._free(entries) for entries in models]),
+                        np.tile(self.weight, (count, 1)) if weights is None else weights)
 
     def _free(self, entries):
         return np.any([self.servos.mask(e.name, e.joint) for e in entries], axis=0) \
             if entries else np.zeros(len(self.servos.numbers), dtype=bool)
 
     def _solve(self, points, models, iterations=8, weights=None):
-        free = np.array([self._free(entries) for entries in models])
-        if weights is None:
-            weights = np.tile(self.weight, (len(free), 1))
-        return self.fitter.solve(np.array(points), free, weights, iterations)
+        return self.fitter.solve(self._problems(points, models, weights), iterations)
 
     def _starts(self, entry):
         """How many starts an entry has: a stiffness with and without friction's torque."""
@@ -248,7 +244,7 @@ class Search:
             if (noise.sigma > NEARLY * self.noise.sigma).all():
                 break
             self.noise, self.full = noise, point
-            self.fitter = StackFitter(self.log, noise, self.servos)
+            self.fitter = self._fitter(noise)
         return self._found(kept, point, trials if kept == accepted else self._beside(kept, point))
 
     def _grown(self, accepted, point):
@@ -278,7 +274,7 @@ class Search:
             gain = (solved.chi2[0] - chi2) / self.scatter
             if entry not in best or gain > best[entry].gain:
                 best[entry] = Trial(entry, float(gain), self._count(entry), self.samples,
-                                    np.zeros(BLOCKS), p)
+                                    HeldOut(np.zeros(BLOCKS)), p)
         return list(best.values())
 
     def _within(self, entry, other):
@@ -354,7 +350,8 @@ class Search:
         solved = self._solve(points, models)
         unseen = self._unseen(solved.points, models)
         return [Trial(e, float((chi2 - solved.chi2[0]) / self.scatter), self._count(e),
-                      self.samples, (cost - unseen[0]) / self.scatter, solved.points[0])
+                      self.samples, HeldOut((cost - unseen[0]) / self.scatter),
+                      solved.points[0])
                 for e, chi2, cost in zip(each, solved.chi2[1:], unseen[1:], strict=True)]
 
     def _unseen(self, points, models):
@@ -363,7 +360,7 @@ class Search:
         rows = np.repeat(np.arange(len(models)), BLOCKS)
         left = np.tile(self.blocks, (len(models), 1))
         fitted = self._solve(points[rows], [models[r] for r in rows], 4, every - left).points
-        cost = (self.fitter.residuals(fitted, left)**2).sum(axis=(1, 2))
+        cost = self.fitter.cost(self._problems(fitted, [models[r] for r in rows], left))
         return cost.reshape(len(models), BLOCKS)
 
     def _found(self, accepted, point, others):
@@ -394,15 +391,16 @@ class Search:
                 elif number.name == 'coulomb':
                     size /= kp
                 moved[k] += size / servos.scale[k]
-            points.append(np.clip(moved, servos.low, servos.high))
-        r = self.fitter.residuals(np.array(points), np.tile(self.weight, (len(points), 1)))
-        changes = ((r[1:] - r[0])**2).sum(axis=(1, 2)) / self.scatter
+            points.append(np.clip(moved, servos.coordinates.low, servos.coordinates.high))
+        problems = self._problems(points, [[]] * len(points))
+        r = self.fitter.residuals(problems.points, problems.joints, problems.weight)
+        changes = ((r[1:] - r[0])**2).sum(axis=1) / self.scatter
         return [name for name, change in zip(GROUPS, changes, strict=True)
                 if change < self._needed(Entry(name))]
 
     def _needed(self, entry):
-        return Trial(entry, 0.0, self._count(entry), self.samples, np.zeros(BLOCKS),
-                     self.servos.believed).needed
+        return Trial(entry, 0.0, self._count(entry), self.samples,
+                     HeldOut(np.zeros(BLOCKS)), self.servos.believed).needed
 
     def _reason(self, trial):
         if not trial.unlikely:
@@ -415,9 +413,8 @@ class Search:
         free = self._free(accepted)
         if not free.any():
             return np.zeros(len(free))
-        information = self.fitter.information(point, free, self.weight)[0]
-        covariance = _inverse(information, free) * self.scatter
-        return np.where(free, 1.96 * np.sqrt(np.maximum(np.diag(covariance), 0.0)), 0.0)
+        own, _ = self.fitter.certainty(self._problems([point], [accepted]))[0]
+        return 1.96 * np.sqrt(self.scatter * np.diag(own))
 
     def _sets(self, accepted, point, trials, widths):
         """Accepted entry -> what may stand in its place; a pair that is not told apart is one."""
@@ -494,9 +491,3 @@ def held_out_rms(log: JointLog, servos: Servos, point: np.ndarray) -> np.ndarray
     error = simulate(log, np.arange(len(sets)), sets) - log.measured
     return np.sqrt(np.mean(error[:, log.end_of(FITTED_PART):]**2, axis=1))
 
-
-def _inverse(information, free):
-    covariance = np.zeros_like(information)
-    chosen = np.ix_(free, free)
-    covariance[chosen] = np.linalg.inv(information[chosen] + 1e-7 * np.eye(free.sum()))
-    return covariance

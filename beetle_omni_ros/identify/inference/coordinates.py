@@ -1,0 +1,65 @@
+"""Parameters in units in which a fit moves alike in all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+
+class Coordinate(Protocol):
+    """
+    One fitted parameter.
+
+    Attributes:
+        low: smallest value of a fit.
+        high: largest.
+        scale: a change that matters; of the logarithm where ``logarithmic``.
+        logarithmic: whether it is fitted as its logarithm.
+
+    """
+
+    low: float
+    high: float
+    scale: float
+    logarithmic: bool
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """
+    Points (..., P): values in units of their scales, logarithms where fitted so.
+
+    Attributes:
+        each: declarations of the P parameters.
+        low, high: (P,) bounds of points.
+
+    """
+
+    each: Sequence[Coordinate]
+    scale: np.ndarray = field(init=False)
+    low: np.ndarray = field(init=False)
+    high: np.ndarray = field(init=False)
+
+    def __post_init__(self):
+        """Collect scales and bounds."""
+        logarithmic, scale = (np.array([getattr(one, name) for one in self.each])
+                              for name in ('logarithmic', 'scale'))
+        object.__setattr__(self, '_logarithmic', logarithmic)
+        object.__setattr__(self, 'scale', scale)
+        for side in ('low', 'high'):
+            object.__setattr__(self, side, self.encode(
+                np.array([getattr(one, side) for one in self.each])))
+
+    def encode(self, values: np.ndarray) -> np.ndarray:
+        """Points of values (..., P)."""
+        return np.where(self._logarithmic, np.log(np.where(self._logarithmic, values, 1.0)),
+                        values) / self.scale
+
+    def decode(self, points: np.ndarray) -> np.ndarray:
+        """Inverse of :meth:`encode`."""
+        values = points * self.scale
+        return np.where(self._logarithmic, np.exp(np.where(self._logarithmic, values, 0.0)),
+                        values)

@@ -1,0 +1,144 @@
+"""
+Nonlinear least squares with priors, many small problems side by side.
+
+A problem's chi2 is the sum of its squared whitened residuals and of its prior's. It is minimised
+by Levenberg and Marquardt's method within bounds; a robust loss stands in the residual itself
+(:func:`huber`, :func:`soft_l1`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from beetle_omni_ros.identify.inference.prior import Prior
+
+HUBER = 3.0         # standard deviations from which a sample counts less
+
+
+@dataclass(frozen=True)
+class Steps:
+    """
+    How an iteration moves.
+
+    Attributes:
+        tolerance: relative fall of chi2 below which a problem is done.
+        longest: change of a parameter.
+        factors: of the damping, both tried at a time.
+        more: of the damping where the second one was better.
+        failed: of the damping where none was.
+
+    """
+
+    tolerance: float = 1e-4
+    longest: float = 12.0
+    factors: tuple[float, float] = (0.2, 5.0)
+    more: float = 3.0
+    failed: float = 30.0
+
+
+def huber(white: np.ndarray) -> np.ndarray:
+    """Residuals whose squares sum to Huber's cost."""
+    size = np.abs(white)
+    clipped = np.sqrt(np.maximum(2 * HUBER * size - HUBER**2, 0)) * np.sign(white)
+    return np.where(size > HUBER, clipped, white)
+
+
+def soft_l1(residual: np.ndarray, scale: float) -> np.ndarray:
+    """Residuals whose squares sum to 2 scale^2 (sqrt(1 + (r / scale)^2) - 1)."""
+    size = np.sqrt(2 * (np.sqrt(1 + (residual / scale)**2) - 1))
+    return scale * size * np.sign(residual)
+
+
+@dataclass(frozen=True)
+class Fits:
+    """
+    Answers to several problems.
+
+    Attributes:
+        points: (B, P) fitted.
+        chi2: (B,) with the prior's part.
+
+    """
+
+    points: np.ndarray
+    chi2: np.ndarray
+
+
+def minimise(points: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.ndarray,
+             residual: Callable[[np.ndarray, np.ndarray], np.ndarray],
+             jacobian: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+             prior: Prior, iterations: int, steps: Steps = Steps()) -> Fits:
+    """
+    Minimise the chi2 of each problem from its start.
+
+    Args:
+        points: (B, P) starts.
+        free: (B, P) what is fitted.
+        low: (P,) bounds.
+        high: (P,) bounds.
+        residual: (points (M, P), problems (M,)) -> (M, n).
+        jacobian: (points (M, P), problems (M,), residuals (M, n)) -> (M, P, n); 0 where not free.
+        prior: of all problems.
+        iterations: at most.
+        steps: how they move.
+
+    """
+    points = np.where(free, np.clip(points, low, high), points)
+    base = residual(points, np.arange(len(points)))
+    chi2 = (base**2).sum(axis=1) + prior.cost(points)
+    damping, busy = np.full(len(chi2), 0.01), free.any(axis=1)
+    for _ in range(iterations):
+        rows = np.flatnonzero(busy)
+        if not rows.size:
+            break
+        here, slopes = points[rows], jacobian(points[rows], rows, base[rows])
+        normal = slopes @ slopes.transpose(0, 2, 1)
+        slope = (slopes @ base[rows][..., None])[..., 0] \
+            + prior.slope(here) * prior.residual(here)
+        diagonal = np.arange(points.shape[1])
+        normal[:, diagonal, diagonal] += prior.slope(here)**2
+        moves = [_step(here, normal, slope, free[rows], low, high, damping[rows] * factor)
+                 for factor in steps.factors]
+        tried = np.concatenate([np.where(free[rows], np.clip(
+            here + np.clip(move, -steps.longest, steps.longest), low, high), here)
+            for move in moves])
+        new = residual(tried, np.tile(rows, 2))
+        cost = (new**2).sum(axis=1) + prior.cost(tried)
+        second = cost[len(rows):] < cost[:len(rows)]
+        choice = np.arange(len(rows)) + np.where(second, len(rows), 0)
+        better = cost[choice] < chi2[rows]
+        fall = (chi2[rows] - cost[choice]) / np.maximum(chi2[rows], 1e-12)
+        taken, source = rows[better], choice[better]
+        points[taken], base[taken], chi2[taken] = tried[source], new[source], cost[source]
+        damping[rows] = np.clip(np.where(
+            better, damping[rows] * np.where(second, steps.more, 0.2),
+            damping[rows] * steps.failed), 1e-6, 1e6)
+        busy[rows] = np.where(better, fall > steps.tolerance, damping[rows] < 1e4)
+    return Fits(points, chi2)
+
+
+def _step(points, normal, slope, free, low, high, damping):
+    """Damped steps (B, P); parameters at a bound that push outwards stay."""
+    stuck = ((points <= low + 1e-9) & (slope > 0)) | ((points >= high - 1e-9) & (slope < 0))
+    move = free & ~stuck
+    diagonal = np.arange(points.shape[1])
+    matrix = normal.copy()
+    matrix[:, diagonal, diagonal] = np.maximum(matrix[:, diagonal, diagonal], 1e-6) * (
+        1 + damping[:, None])
+    matrix = np.where(move[:, :, None] & move[:, None, :], matrix, np.eye(points.shape[1]))
+    return -np.linalg.solve(matrix, np.where(move, slope, 0.0)[..., None])[..., 0]
+
+
+def covariance(information: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """
+    (P, P) inverse of the information on the free parameters; 0 for the others.
+
+    A direction that the data do not see at all gets a width of thousands of scales, not inf.
+    """
+    made = np.zeros_like(information)
+    chosen = np.ix_(free, free)
+    made[chosen] = np.linalg.inv(information[chosen] + 1e-7 * np.eye(free.sum()))
+    return made

@@ -1,0 +1,96 @@
+"""Coloured noise: autoregressions of what a fit leaves, and the filters that whiten it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
+
+JITTER = 1e-6       # of the variance, added to it: a series may be predictable to the last digit
+
+
+def autoregression(series: list[np.ndarray], order: int,
+                   quantum: float = 0.0) -> tuple[np.ndarray, float]:
+    """
+    Fit one autoregression to several series (Yule-Walker equations).
+
+    Args:
+        series: each (N,), of the same process.
+        order: coefficients.
+        quantum: standard deviation of rounding, added to the series.
+
+    Returns:
+        prediction-error filter (order + 1,), first entry 1, and its error's standard deviation.
+
+    """
+    count = sum(len(x) for x in series)
+    correlation = np.array([sum(x[lag:] @ x[:len(x) - lag] for x in series)
+                            for lag in range(order + 1)]) / max(count, 1)
+    correlation[0] = correlation[0] * (1.0 + JITTER) + quantum**2
+    if correlation[0] < 1e-20:
+        return np.eye(1, order + 1)[0], 1e-10
+    taps = np.concatenate([[1.0], -solve_toeplitz(correlation[:-1], correlation[1:])])
+    return taps, float(np.sqrt(max(taps @ correlation, 1e-20)))
+
+
+def whitened(series: np.ndarray, taps: np.ndarray, sigma: float) -> np.ndarray:
+    """Filtered to unit variance along the first axis; samples without a past are left out."""
+    return lfilter(taps, 1.0, series, axis=0)[len(taps) - 1:] / sigma
+
+
+def gain(taps: np.ndarray) -> float:
+    """Variance of the coloured series for unit variance of what drives it."""
+    # Round the whole circle: half of it would count the slowest twice, of which colour is made.
+    response = np.fft.fft(taps, 4096)
+    return float(np.mean(1 / np.maximum(np.abs(response)**2, 1e-9)))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """
+    An autoregression for each of several channels.
+
+    Attributes:
+        taps: (n, order + 1) prediction-error filters; (n, 1) ones: white.
+        sigma: (n,) standard deviation of the whitened residual.
+
+    """
+
+    taps: np.ndarray
+    sigma: np.ndarray
+
+    @classmethod
+    def white(cls, channels: int, sigma: float = 1.0):
+        """No memory."""
+        return cls(np.ones((channels, 1)), np.full(channels, sigma))
+
+    @classmethod
+    def of(cls, residual: np.ndarray, order: int, floor: float):
+        """
+        Estimate from residuals (n, N); outliers are clipped.
+
+        Args:
+            residual: one row for each channel.
+            order: of the filters.
+            floor: below which no whitened residual of a quantised reading can be.
+
+        """
+        made = []
+        for row in residual:
+            middle = np.median(row)
+            reach = 6 * 1.4826 * np.median(np.abs(row - middle)) + 1e-9
+            made.append(autoregression([np.clip(row, middle - reach, middle + reach)], order,
+                                       1e-7))
+        taps, sigma = zip(*made, strict=True)
+        return cls(np.array(taps), np.maximum(sigma, floor))
+
+    def whiten(self, residual: np.ndarray, channel: np.ndarray) -> np.ndarray:
+        """(B, N) residuals of channels (B,) to unit variance; samples without a past become 0."""
+        white = np.zeros_like(residual)
+        for k in np.unique(channel):
+            rows = channel == k
+            white[rows, self.taps.shape[1] - 1:] = whitened(
+                residual[rows].T, self.taps[k], self.sigma[k]).T
+        return white

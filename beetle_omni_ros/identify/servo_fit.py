@@ -1,0 +1,208 @@
+"""
+Servo models fitted to one response log: the one model behind `identify joint` and `gap LOG.csv`.
+
+Residuals of a servo model are far from white: what the model misses lasts for tenths of seconds.
+They are whitened by an autoregressive filter (generalised least squares), so that chi2 counts
+independent pieces of information, and clipped (Huber) so that a bad sample cannot pull. A layout
+says which parameter sets a point stands for: those of one joint, or of joints that share some.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from beetle_omni_ros.identify.inference.blocks import block_masks, gradient_scatter
+from beetle_omni_ros.identify.inference.coordinates import Coordinates
+from beetle_omni_ros.identify.inference.least_squares import (
+    covariance,
+    Fits,
+    huber,
+    minimise,
+    Steps,
+)
+from beetle_omni_ros.identify.inference.noise import Noise
+from beetle_omni_ros.identify.inference.prior import Prior
+from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
+
+FITTED_PART = 0.6       # of a log; the rest judges
+SETTLING = 0.25         # [s] of a log that are not fitted: its first velocity is only a guess
+FIRST_NOISE = 0.002     # [rad] white, until the residuals tell
+NEARLY = 0.8            # of the noise: below, what was found lets see more than before
+MEMORY = 0.12           # [s] of the whitening filter
+ORDERS = 6, 40          # its range in samples
+DIFFERENCE = 0.05       # of a parameter's scale, for derivatives
+DIFFERENT = 10          # blocks over which the gradient's scatter is taken
+BEYOND = 1.15           # a limit counts only if the command asks for so much more than it
+UNKNOWN = Prior(np.inf)
+
+
+class Layout(Protocol):
+    """
+    What a point of a fit stands for.
+
+    Attributes:
+        coordinates: of a point (P,).
+        owner: (P,) place of the one joint that a parameter moves, -1 where it moves all.
+        steps: of its fits.
+
+    """
+
+    coordinates: Coordinates
+    owner: np.ndarray
+    steps: Steps
+
+    def sets(self, points: np.ndarray) -> np.ndarray:
+        """(M, J, len(NAMES)) parameter sets of points (M, P)."""
+
+
+class Apart:
+    """Each problem is one joint, and a point its parameter set."""
+
+    coordinates = Coordinates(tuple(TERMS.values()))
+    owner = np.full(len(NAMES), -1)
+    steps = Steps()
+
+    def sets(self, points: np.ndarray) -> np.ndarray:
+        """See :class:`Layout`."""
+        return decode(points)[:, None]
+
+
+APART = Apart()
+encode, decode = APART.coordinates.encode, APART.coordinates.decode
+
+
+@dataclass(frozen=True)
+class Problems:
+    """
+    Fits that run side by side.
+
+    Attributes:
+        joints: (B, J) indices of the log's joints.
+        points: (B, P) to start from, or fitted.
+        free: (B, P) which parameters are fitted.
+        weight: (B, N) weight of each sample, 0 where it is held out.
+
+    """
+
+    joints: np.ndarray
+    points: np.ndarray
+    free: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def apart(cls, joint: np.ndarray, sets: np.ndarray, free: np.ndarray, weight: np.ndarray):
+        """Problems of single joints (B,), from parameter sets (B, n)."""
+        return cls(np.asarray(joint)[:, None], encode(sets), free, weight)
+
+    def pick(self, rows) -> Problems:
+        """Some of them."""
+        return Problems(self.joints[rows], self.points[rows], self.free[rows], self.weight[rows])
+
+    @staticmethod
+    def join(parts: list[Problems]) -> Problems:
+        """All of them."""
+        return Problems(*(np.concatenate([getattr(part, name) for part in parts])
+                          for name in ('joints', 'points', 'free', 'weight')))
+
+
+def fitted_samples(log: JointLog) -> np.ndarray:
+    """(N,) weight of each sample: 0 where the log still settles."""
+    return (log.t >= log.t[0] + SETTLING).astype(float)
+
+
+def first_noise(log: JointLog) -> Noise:
+    """White, before anything is fitted."""
+    return Noise.white(len(log.joints), FIRST_NOISE)
+
+
+def noise_around(log: JointLog, sets: np.ndarray, weight: np.ndarray) -> Noise:
+    """Noise of each joint around its parameter set (J, n), of samples with a weight (N,)."""
+    error = simulate(log, np.arange(len(sets)), sets) - log.measured
+    order = int(np.clip(round(MEMORY / log.period), *ORDERS))
+    return Noise.of(error[:, weight > 0], order, max(log.quantum, 1e-4) / np.sqrt(12))
+
+
+class ServoFitter:
+    """
+    Solves :class:`Problems` on one log.
+
+    Args:
+        log: the measured data.
+        noise: how residuals are whitened.
+        layout: of the points.
+        prior: beside the data, of points (P,).
+
+    """
+
+    def __init__(self, log: JointLog, noise: Noise, layout: Layout = APART,
+                 prior: Prior = UNKNOWN):
+        """Keep the four; see the class."""
+        self.log, self.noise, self.layout, self.prior = log, noise, layout, prior
+        self._limits = layout.coordinates.low, layout.coordinates.high
+
+    def _simulated(self, sets, joints, weight):
+        """(K, N) weighted, whitened, clipped residuals of sets (K, n) of joints (K,)."""
+        error = simulate(self.log, joints, sets) - self.log.measured[joints]
+        return huber(self.noise.whiten(error, joints)) * np.sqrt(weight)
+
+    def residuals(self, points: np.ndarray, joints: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """(M, J N) weighted, whitened, clipped: their squares sum to Huber's cost."""
+        sets = self.layout.sets(points)
+        count = sets.shape[1]
+        return self._simulated(sets.reshape(-1, sets.shape[2]), joints.ravel(),
+                               np.repeat(weight, count, axis=0)).reshape(len(points), -1)
+
+    def jacobian(self, problems: Problems, base: np.ndarray) -> np.ndarray:
+        """(M, P, J N) derivatives of the residuals by differences; 0 where not free."""
+        rows, columns = np.nonzero(problems.free)
+        moved = problems.points[rows].copy()
+        at = np.arange(len(rows)), columns
+        step = np.where(moved[at] + DIFFERENCE > self._limits[1][columns], -DIFFERENCE, DIFFERENCE)
+        moved[at] += step
+        sets = self.layout.sets(moved)
+        # a parameter of one joint moves that joint alone: one simulation instead of four
+        owner, every = self.layout.owner[columns, None], np.arange(sets.shape[1])
+        index, place = np.nonzero((owner == -1) | (owner == every))
+        row, base = rows[index], base.reshape(len(base), len(every), -1)
+        found = self._simulated(sets[index, place], problems.joints[row, place],
+                                problems.weight[row])
+        slopes = np.zeros((*problems.points.shape, *base.shape[1:]))
+        slopes[row, columns[index], place] = (found - base[row, place]) / step[index, None]
+        return slopes.reshape(*problems.points.shape, -1)
+
+    def solve(self, problems: Problems, iterations: int = 20) -> Fits:
+        """Minimise the chi2 of each problem from its start, within the bounds."""
+        return minimise(
+            problems.points, problems.free, *self._limits,
+            lambda points, rows: self.residuals(points, problems.joints[rows],
+                                                problems.weight[rows]),
+            lambda points, rows, base: self.jacobian(Problems(
+                problems.joints[rows], points, problems.free[rows], problems.weight[rows]), base),
+            self.prior, iterations, self.layout.steps)
+
+    def cost(self, problems: Problems) -> np.ndarray:
+        """(B,) chi2 of points as they are, without the prior."""
+        return (self.residuals(problems.points, problems.joints, problems.weight)**2).sum(axis=1)
+
+    def certainty(self, problems: Problems) -> list[tuple[np.ndarray, float]]:
+        """Covariance (P, P) of each problem's point without the prior, and chi2's scatter."""
+        base = self.residuals(problems.points, problems.joints, problems.weight)
+        made = []
+        for slopes, r, free, weight in zip(self.jacobian(problems, base), base, problems.free,
+                                           problems.weight, strict=True):
+            own = covariance(slopes @ slopes.T, free)
+            blocks = np.tile(block_masks(weight, DIFFERENT), (1, problems.joints.shape[1]))
+            made.append((own, gradient_scatter(slopes, r, own, blocks)))
+        return made
+
+
+def prior_of(centre: np.ndarray, deviations: dict[str, float]) -> Prior:
+    """Prior of a joint's point: ``centre`` (n,) is a point, deviations are in units."""
+    spread = np.full(len(NAMES), np.inf)
+    for name, deviation in deviations.items():
+        spread[INDEX[name]] = deviation / TERMS[name].scale
+    return Prior(spread, centre)

@@ -1,0 +1,186 @@
+"""The inference engine against independent oracles; it knows no robot."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+from scipy.special import huber as huber_cost
+
+from beetle_omni_ros.identify import inference
+from beetle_omni_ros.identify.inference.blocks import block_masks, gradient_scatter, HeldOut
+from beetle_omni_ros.identify.inference.coordinates import Coordinates
+from beetle_omni_ros.identify.inference.least_squares import (
+    covariance,
+    HUBER,
+    huber,
+    minimise,
+    soft_l1,
+    Steps,
+)
+from beetle_omni_ros.identify.inference.noise import autoregression, gain, Noise, whitened
+from beetle_omni_ros.identify.inference.prior import Prior
+from beetle_omni_ros.identify.servo_model import TERMS
+
+FOLDER = Path(inference.__file__).parent
+OWN = 'beetle_omni_ros.identify.inference'
+T = np.linspace(0, 2, 60)
+LOW, HIGH = np.array([-5.0, 0.0]), np.array([5.0, 3.0])
+UNKNOWN = Prior(np.inf)
+
+
+@pytest.mark.parametrize('path', sorted(FOLDER.glob('*.py')), ids=lambda path: path.stem)
+def test_the_engine_imports_nothing_of_this_package_but_itself(path):
+    for item in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        names = [item.module or ''] if isinstance(item, ast.ImportFrom) else \
+            [alias.name for alias in item.names] if isinstance(item, ast.Import) else []
+        for name in names:
+            assert not name.startswith('beetle_omni_ros') or name.startswith(OWN), name
+        assert not isinstance(item, ast.ImportFrom) or item.level == 0
+
+
+def curve(points):
+    return points[:, :1] * np.exp(-points[:, 1:] * T)
+
+
+def problems(count, seed=0):
+    """Decays with noise: (measured, residual, jacobian)."""
+    rng = np.random.default_rng(seed)
+    truth = np.stack([rng.uniform(1, 3, count), rng.uniform(0.3, 2.5, count)], axis=1)
+    measured = curve(truth) + 0.05 * rng.standard_normal((count, len(T)))
+
+    def residual(points, rows):
+        return (curve(points) - measured[rows]) / 0.05
+
+    def jacobian(points, rows, base):
+        one = np.exp(-points[:, 1:] * T) / 0.05
+        return np.stack([one, -T * points[:, :1] * one], axis=1)
+
+    return measured, residual, jacobian
+
+
+def test_problems_side_by_side_end_where_single_ones_do():
+    measured, residual, jacobian = problems(12)
+    start = np.tile([2.0, 1.0], (12, 1))
+    fits = minimise(start, np.full((12, 2), True), LOW, HIGH, residual, jacobian, UNKNOWN, 60,
+                    Steps(1e-12))
+    for k in range(12):
+        alone = least_squares(lambda x, k=k: residual(x[None], [k])[0], start[k],
+                              bounds=(LOW, HIGH), xtol=1e-12, ftol=1e-12)
+        assert fits.points[k] == pytest.approx(alone.x, abs=1e-4)
+        assert fits.chi2[k] == pytest.approx(2 * alone.cost, rel=1e-8)
+
+
+def test_what_is_held_stays_and_bounds_are_kept():
+    _, residual, jacobian = problems(3)
+    free = np.array([[True, False], [False, True], [True, True]])
+    high = np.array([5.0, 0.2])
+    fits = minimise(np.tile([2.0, 1.0], (3, 1)), free, LOW, high, residual, jacobian, UNKNOWN, 30)
+    assert fits.points[0, 1] == 1.0 and fits.points[1, 0] == 2.0
+    assert fits.points[1, 1] == fits.points[2, 1] == 0.2
+
+
+def test_a_prior_weighs_like_data():
+    """A straight line through data of deviation 1 and a prior: the precision-weighted mean."""
+    value = np.array([3.0, -1.0])
+
+    def residual(points, rows):
+        return np.repeat(points - value[rows, None], 4, axis=1)
+
+    def jacobian(points, rows, base):
+        return np.ones((len(points), 1, 4))
+
+    fits = minimise(np.zeros((2, 1)), np.full((2, 1), True), np.array([-9.0]), np.array([9.0]),
+                    residual, jacobian, Prior(np.array([0.5]), np.array([1.0])), 30,
+                    Steps(1e-14))
+    assert fits.points[:, 0] == pytest.approx((4 * value + 4 * 1.0) / 8, abs=1e-6)
+
+
+@pytest.mark.parametrize('prior', [Prior(0.5), Prior(0.5, 2.0), Prior(0.1, 0.0, 0.3, 0.7, 5.0)])
+def test_the_slope_of_a_prior_is_its_residuals_derivative(prior):
+    x = np.linspace(-3.03, 3.02, 80)
+    numeric = (prior.residual(x + 1e-6) - prior.residual(x - 1e-6)) / 2e-6
+    assert prior.slope(x) == pytest.approx(numeric, rel=1e-5)
+    assert np.abs(prior.residual(prior.within(x, 2.0))).max() <= 2.0 + 1.0 / prior.inner * 4
+    assert prior.cost(x) == pytest.approx((prior.residual(x)**2).sum())
+
+
+def test_robust_residuals_square_to_their_cost():
+    x = np.linspace(-9, 9, 101)
+    assert huber(x)**2 == pytest.approx(2 * huber_cost(HUBER, x))
+    assert soft_l1(x, 2.0)**2 == pytest.approx(8 * (np.sqrt(1 + (x / 2)**2) - 1))
+    assert (np.sign([huber(x), soft_l1(x, 2.0)]) == np.sign(x)).all()
+
+
+def coloured(seed, count=20000):
+    return lfilter([0.3], [1.0, -1.2, 0.5], np.random.default_rng(seed).standard_normal(count))
+
+
+def test_an_autoregression_is_found_and_whitens():
+    series = [coloured(1), coloured(2)]
+    taps, level = autoregression(series, 2)
+    assert taps == pytest.approx([1.0, -1.2, 0.5], abs=0.02)
+    assert level == pytest.approx(0.3, rel=0.02)
+    white = whitened(series[0], taps, level)
+    assert white.std() == pytest.approx(1, abs=0.03)
+    assert abs(white[1:] @ white[:-1]) / len(white) < 0.03
+    assert level**2 * gain(taps) == pytest.approx(series[0].var(), rel=0.1)
+
+
+def test_each_channel_is_whitened_by_its_own_noise_whatever_outliers_are_in_it():
+    rows = np.stack([coloured(3), np.random.default_rng(4).standard_normal(20000)])
+    spoilt = rows.copy()
+    spoilt[:, ::4000] += 50.0
+    noise = Noise.of(spoilt, 4, 1e-3)
+    white = noise.whiten(rows[[1, 0, 1]], np.array([1, 0, 1]))
+    assert white[:, :4] == pytest.approx(0.0)
+    assert white.std(axis=1) == pytest.approx(1.0, abs=0.1)
+    for row, channel in zip(white, (1, 0, 1), strict=True):
+        expected = np.convolve(rows[channel], noise.taps[channel])[4:20000] / noise.sigma[channel]
+        assert row[4:] == pytest.approx(expected)
+    assert (Noise.of(np.zeros((2, 100)), 4, 0.01).sigma == 0.01).all()
+
+
+def test_coordinates_go_there_and_back_within_bounds():
+    all_of_them = Coordinates(tuple(TERMS.values()))
+    rng = np.random.default_rng(0)
+    low, high = (np.array([getattr(t, side) for t in TERMS.values()]) for side in ('low', 'high'))
+    values = low + (high - low) * rng.uniform(size=(20, len(low)))
+    points = all_of_them.encode(values)
+    assert all_of_them.decode(points) == pytest.approx(values)
+    assert (points >= all_of_them.low).all() and (points <= all_of_them.high).all()
+
+
+def test_blocks_share_the_weighted_samples():
+    weight = np.r_[np.zeros(7), np.ones(40), np.zeros(3)]
+    blocks = block_masks(weight, 5)
+    assert (blocks.sum(axis=0) == weight).all() and (blocks.sum(axis=1) == 8).all()
+
+
+def test_samples_that_repeat_count_once():
+    rng = np.random.default_rng(0)
+    slopes, r = rng.standard_normal((2, 3000)), rng.standard_normal(3000)
+    for times, expected in ((1, 2.0), (4, 4.0), (50, 6.0)):     # between its limits of 2 and 6
+        s, rest = np.repeat(slopes, times, axis=1), np.repeat(r, times)
+        own = covariance(s @ s.T, np.full(2, True))
+        scatter = gradient_scatter(s, rest, own, block_masks(np.ones(len(rest)), 100))
+        assert scatter == pytest.approx(expected, rel=0.25)
+
+
+def test_covariance_is_that_of_the_free_parameters_alone():
+    root = np.random.default_rng(0).standard_normal((3, 9))
+    free = np.array([True, False, True])
+    made = covariance(root @ root.T, free)
+    assert made[np.ix_(free, free)] == pytest.approx(np.linalg.inv(root[free] @ root[free].T),
+                                                     rel=1e-4)
+    assert (made[1] == 0).all() and (made[:, 1] == 0).all()
+
+
+def test_gains_on_blocks_left_out():
+    held = HeldOut(np.array([4.0, -1.0, 2.0, 3.0]))
+    assert (held.total, held.positive, held.without_best) == (8.0, 0.75, 4.0)
+    assert held.error == pytest.approx(4 * np.std([4, -1, 2, 3], ddof=1) / 2)
+    one = HeldOut(np.array([5.0]))
+    assert one.error == np.inf and one.without_best == 0.0
