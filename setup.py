@@ -114,10 +114,12 @@ DOCS = [
     'mkdocs-material==9.8.2',
 ]
 
+# playwright: pages are tried in a browser, where there is one (chromium on the PATH).
 DEVELOPMENT = [
     *TEST,
     'colcon-common-extensions>=0.3',
     'mypy>=1.15,<3',
+    'playwright>=1.49',
     'ruff>=0.9',
     'trimesh>=4',       # description/generate_meshes.py
 ]
@@ -132,7 +134,7 @@ setup(
     license='BSD-3-Clause',
     python_requires='>=3.10,<3.14',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={'': ['*.c', '*.css', '*.h', '*.html', '*.js']},
+    package_data={'': ['*.c', '*.css', '*.h', '*.html', '*.js', 'vendor/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

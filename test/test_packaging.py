@@ -37,7 +37,8 @@ HAS_ROS = importlib.util.find_spec('rclpy') is not None
 
 # Import name -> distribution on PyPI, where they differ; import name -> rosdep key.
 DISTRIBUTION = {'yaml': 'pyyaml', 'mcap_ros2': 'mcap-ros2-support', 'serial': 'pyserial',
-                'dynamixel_sdk': 'dynamixel-sdk', 'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow'}
+                'dynamixel_sdk': 'dynamixel-sdk', 'rsl_rl': 'rsl-rl-lib', 'PIL': 'pillow',
+                'imageio_ffmpeg': 'imageio-ffmpeg'}
 KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-ros2-support',
        'casadi': 'casadi-pip', 'serial': 'python3-serial', 'PIL': 'python3-pil'}
 PARAMETER_CLASSES = {
@@ -161,7 +162,7 @@ def test_data_files_are_where_ros_looks(setup_arguments):
 def test_every_import_is_a_declared_requirement(setup_arguments):
     extras = setup_arguments['extras_require']
     lines = [*setup_arguments['install_requires'],
-             *(line for extra in ('hardware', 'train', 'ray') for line in extras[extra])]
+             *(line for extra in ('hardware', 'train', 'ray', 'film') for line in extras[extra])]
     declared = {re.split(r'[\[<>=~;! ]', line)[0] for line in lines}
     keys = dependencies('exec_depend', 'depend')
     for module in third_party_imports():
@@ -169,8 +170,9 @@ def test_every_import_is_a_declared_requirement(setup_arguments):
             assert module in keys, f'{module}: not in package.xml'
             continue
         assert DISTRIBUTION.get(module, module) in declared, f'{module}: not in setup.py'
-        # The last goes unused where it is not there: slower.
-        if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'ray', 'threadpoolctl'):
+        # The last two go unused where they are not there: slower, and no MP4.
+        if module not in ('torch', 'tensordict', 'onnx', 'rsl_rl', 'ray', 'threadpoolctl',
+                          'imageio_ffmpeg'):
             candidates = {KEY.get(module), f'python3-{module}', f'python3-{module}-pip', module}
             assert keys & candidates, f'{module}: no rosdep key in package.xml'
 

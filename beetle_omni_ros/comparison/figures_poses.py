@@ -9,9 +9,9 @@ import numpy as np
 from beetle_omni_ros.comparison.plan import Flight
 from beetle_omni_ros.comparison.style import FAINT, INK, look
 from beetle_omni_ros.comparison.summary import PUBLISHED
+from beetle_omni_ros.pages.figures import panels
 from beetle_omni_ros.runs import published
 from beetle_omni_ros.runs.body import roll_pitch_yaw
-from beetle_omni_ros.runs.figures import panels
 from beetle_omni_ros.runs.metrics import (
     L_WINDOW,
     REACHED_ORIENTATION,

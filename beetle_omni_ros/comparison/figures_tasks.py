@@ -7,8 +7,8 @@ import numpy as np
 
 from beetle_omni_ros.comparison.figures_poses import label_once, of, STEP, UNITS
 from beetle_omni_ros.comparison.style import FAINT, INK, look
+from beetle_omni_ros.pages.figures import panels, WIDTH
 from beetle_omni_ros.runs import lemniscate as curve
-from beetle_omni_ros.runs.figures import panels, WIDTH
 from beetle_omni_ros.runs.tasks import make_task, POSE_DURATION
 
 BEFORE = 2.0  # [s] of hover shown before the first disturbance

@@ -15,7 +15,7 @@ from PIL import Image
 from beetle_omni_ros.comparison import figures_poses, figures_tasks, grid, grids, grids_other
 from beetle_omni_ros.comparison.grid import Grid
 from beetle_omni_ros.comparison.style import CONDITIONS, look, task_title
-from beetle_omni_ros.runs import figures
+from beetle_omni_ros.pages import figures
 
 DOTS = 180  # per inch
 COLOURS = 128  # of a picture; its lines are few and their edges smooth

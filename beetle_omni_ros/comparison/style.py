@@ -7,7 +7,7 @@ from pathlib import Path
 from zlib import crc32
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.runs.figures import FAINT, INK
+from beetle_omni_ros.pages.figures import FAINT, INK
 
 
 @dataclass(frozen=True)

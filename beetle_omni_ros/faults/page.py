@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-from beetle_omni_ros.runs.report_page import frame, section
+from beetle_omni_ros.pages.page import frame, section
 
 BEGIN = '<!-- faults: begin, written by beetle_omni faults --docs -->'
 END = '<!-- faults: end -->'

@@ -12,10 +12,10 @@ from beetle_omni_ros.film.files import FORMATS, write_film
 from beetle_omni_ros.film.frames import frames
 from beetle_omni_ros.film.free_runs import free_runs
 from beetle_omni_ros.film.scenes import model_scene, Scene, target_scene
+from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import BagError, read_bag
-from beetle_omni_ros.runs.figures import COLOURS
 from beetle_omni_ros.runs.log import FlightLog
 
 MOST_PANELS = 4

@@ -12,8 +12,8 @@ from beetle_omni_ros.identify.joint_servos import FileServos
 from beetle_omni_ros.identify.page import page
 from beetle_omni_ros.identify.servo_fit import FITTED_PART
 from beetle_omni_ros.identify.servo_model import simulate
-from beetle_omni_ros.runs.figures import COLOURS, FAINT, INK, legend, line, panels, STYLE, svg
-from beetle_omni_ros.runs.report_page import section
+from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, line, panels, STYLE, svg
+from beetle_omni_ros.pages.page import section
 from beetle_omni_ros.runs.table import Grid
 
 MILLI = 1e3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-from beetle_omni_ros.runs.report_page import frame
+from beetle_omni_ros.pages.page import frame
 from beetle_omni_ros.runs.table import Grid
 from beetle_omni_ros.runs.table import html as table_html
 
@@ -19,7 +19,7 @@ def page(title: str, subtitle: str, grids: list[Grid], notes: list[str],
         subtitle: below it.
         grids: tables.
         notes: sentences below the tables.
-        sections: HTML made by :func:`beetle_omni_ros.runs.report_page.section`.
+        sections: HTML made by :func:`beetle_omni_ros.pages.page.section`.
         head: HTML above the tables, such as :func:`verdict_head`.
 
     """

@@ -13,9 +13,9 @@ from beetle_omni_ros.identify.page import page
 from beetle_omni_ros.identify.robot_file import write_robot_file
 from beetle_omni_ros.identify.rotor import crossings, inverse, MapRow, Ratio
 from beetle_omni_ros.identify.rotor_log import RotorLog
+from beetle_omni_ros.pages.figures import FAINT, INK, legend, panels, STYLE, svg
+from beetle_omni_ros.pages.page import section
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.figures import FAINT, INK, legend, panels, STYLE, svg
-from beetle_omni_ros.runs.report_page import section
 from beetle_omni_ros.runs.table import Grid
 
 

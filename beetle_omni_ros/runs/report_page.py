@@ -1,93 +1,238 @@
-"""The report's HTML: structure and look, free of numbers."""
+"""The page of `beetle_omni report`: the outcome, tables, the flight in 3D, charts, faults."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from html import escape
+from pathlib import Path
 
-CSS = """
-:root { --ink: #22272e; --faint: #6b7580; --line: #e3e7ec; --paper: #ffffff; --wash: #f6f7f9; }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--wash); color: var(--ink);
-  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", sans-serif; }
-main { max-width: 1120px; margin: 0 auto; padding: 40px 28px 80px; }
-header h1 { font-size: 28px; font-weight: 650; letter-spacing: -0.01em; margin: 0; }
-header p { color: var(--faint); margin: 4px 0 24px; }
-h2 { font-size: 17px; font-weight: 650; margin: 0 0 2px; }
-section { background: var(--paper); border: 1px solid var(--line); border-radius: 8px;
-  padding: 20px 24px; margin: 0 0 18px; }
-section > p { color: var(--faint); margin: 0 0 10px; }
-img { width: 100%; height: auto; display: block; }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(250px, 1fr)); gap: 14px;
-  margin: 0 0 18px; }
-.card { background: var(--paper); border: 1px solid var(--line); border-top: 4px solid;
-  border-radius: 8px; padding: 12px 16px; font-size: 13px; overflow-wrap: anywhere; }
-.card strong { display: block; font-size: 15px; }
-.card span { color: var(--faint); }
-.card .warning { color: #a3470b; display: block; }
-figure { margin: 0 0 22px; } figure:last-child { margin-bottom: 0; }
-figcaption { font-weight: 600; margin: 0 0 6px; }
-.note { color: var(--faint); margin: 0 0 8px; font-size: 13px; }
-.verdict { border-left: 10px solid; }
-.verdict h2 { font-size: 26px; margin: 0 0 6px; }
-.verdict p.said { color: var(--ink); font-size: 17px; margin: 0 0 12px; overflow-wrap: anywhere; }
-@media (max-width: 600px) { main { padding: 20px 10px 40px; } section { padding: 14px 12px; }
-  .verdict h2 { font-size: 21px; } li { overflow-wrap: anywhere; } }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: 13.5px;
-  font-variant-numeric: tabular-nums; }
-th { color: var(--faint); font-weight: 500; border-bottom: 1px solid var(--ink); }
-th, td { padding: 5px 14px 5px 0; text-align: right; vertical-align: bottom; }
-th:first-child, td:first-child { text-align: left; }
-td { border-bottom: 1px solid var(--line); white-space: nowrap; }
-td.long { white-space: normal; min-width: 16em; }
-td.published, th.published { color: #98a1ab; }
-tr:hover td { background: var(--wash); }
-.faults td, .faults th { text-align: left; white-space: normal; }
-summary { cursor: pointer; font-size: 17px; font-weight: 650; }
-details[open] summary { margin-bottom: 12px; }
-@media print { body { background: none; } section, .card { break-inside: avoid; } }
-"""
+import numpy as np
+
+from beetle_omni_ros.pages import charts as kit
+from beetle_omni_ros.pages.page import frame, section
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.yaml_file import shortened
+from beetle_omni_ros.runs import charts, charts_summary, table
+from beetle_omni_ros.runs.shown import Run, target_poses, TimeAxis
+
+MOST_ROWS = 40      # of states, faults and warnings
+DISC_RADIUS = 0.4   # of the distance between neighbouring rotors
+BALL = 0.29         # [m] height of the end-effector where a robot file has none
+SPEEDS = (0.1, 0.25, 0.5, 1, 2, 4, 8)
+VIEWS = (('angle', 'Angle'), ('top', 'Top'), ('side', 'Side'), ('front', 'Front'))
+STATE_COLOURS = {'flying': '#9cc7a8', 'takeoff': '#b9cfe6', 'landing': '#f0d29a',
+                 'fallback': '#efb08a', 'emergency_stop': '#d9534f', 'disarmed': '#dfe3e8'}
 
 
-def card(title: str, colour: str, facts: list[str], warnings: list[str]) -> str:
-    """What one run is."""
-    lines = ''.join(f'<span class="warning">{escape(text)}</span>' for text in warnings)
-    return (f'<div class="card" style="border-top-color: {colour}"><strong>{escape(title)}'
-            f'</strong><span>{escape(" · ".join(facts))}</span>{lines}</div>')
-
-
-def section(title: str, text: str, content: str) -> str:
-    """One titled box."""
-    paragraph = f'<p>{escape(text)}</p>' if text else ''
-    return f'<section><h2>{escape(title)}</h2>{paragraph}{content}</section>\n'
-
-
-def page(title: str, subtitle: str, cards: list[str], tables: str, sections: list[str],
-         poses: list[str], faults: str) -> str:
-    """Put the whole page together; everything it needs is in it."""
-    folded = f'<section><details><summary>Every pose</summary>{"".join(poses)}</details></section>'
-    return frame(title, subtitle, f"""<div class="cards">{''.join(cards)}</div>
+def make_page(runs: list[Run], results: dict) -> str:
+    """Build the page."""
+    robot, axis = _robot(runs), TimeAxis.of(runs)
+    made: list[tuple[str, str, Callable]] = [
+        ('Errors', 'Distance from the target and angle to it; grey: L window, green: U window.',
+         lambda: charts.errors_over_time(runs, axis)),
+        ('Pose', 'Flown pose and target.', lambda: charts.pose(runs, axis)),
+        ('Errors of a pose', 'Median and 10 to 90 % band over all poses of a run.',
+         lambda: charts_summary.errors_of_a_pose(runs)),
+        ('Steady errors', 'Share of the poses with a U error below the value.',
+         lambda: charts_summary.steady_errors(runs)),
+        ('Disturbance', 'Largest error at each level.', lambda: charts_summary.disturbance(runs)),
+        ('Payload', 'Height while payloads are attached.', lambda: charts.payload(runs, axis)),
+        ('Commands', 'What the actuators were told: joints and rotors 1 to 4.',
+         lambda: charts.commands(runs, axis)),
+        ('Joint and thrust use', 'Share of the flight at each value; dashed: limits.',
+         lambda: charts_summary.use(runs, robot)),
+        ('Compute time', 'CPU time of one controller step since the start of the node.',
+         lambda: charts.compute(runs, axis)),
+        ('Estimate', 'Error of the state estimate against the truth.',
+         lambda: charts.estimate(runs, axis)),
+        ('Battery', '', lambda: charts.battery(runs, axis))]
+    specs: dict[str, dict] = {}
+    numbers = kit.Numbers()
+    sections = []
+    for title, text, draw in made:
+        places = []
+        for chart in draw():
+            name = f'chart{len(specs)}'
+            specs[name] = chart.spec(numbers)
+            places.append(kit.place(name, chart.wide))
+        if places:
+            sections.append(section(title, text,
+                                    f'<div class="charts">{"".join(places)}</div>'))
+    shown = table.grids(results, with_poses=True)
+    tables = ''.join(table.html(grid) for grid in shown if grid.title != 'Poses')
+    poses = ''.join(table.html(grid) for grid in shown if grid.title == 'Poses')
+    folded = f'<section><details><summary>Every pose</summary>{poses}</details></section>'
+    faults = ''.join(f'<div data-of-run="{number}">{table.html(grid)}</div>'
+                     for number, run in enumerate(runs)
+                     for grid in (*supervisor_grids(run), *fault_grids(run)))
+    content = f"""<div class="cards">{''.join(map(_card, range(len(runs)), runs))}</div>
+{_player()}
+<section><h2>Flight</h2><p>Solid: flown, ghost: target, arrows: thrust. Below: what the supervisor
+did, with faults. Drag to turn; tap a plot or a strip to go there, drag over a plot to zoom.</p>
+<div id="scene"><div id="errors"></div></div>
+<div class="views">{''.join(f'<button data-view="{name}">{text}</button>' for name, text in VIEWS)}
+</div>{''.join(_strip(number, run, axis) for number, run in enumerate(runs))}</section>
 <section>{tables}</section>
 {''.join(sections)}
 {folded if poses else ''}
-<section class="faults"><h2>Faults</h2>{faults}</section>""")
+<section class="faults"><h2>Faults</h2>{faults}</section>
+{kit.data_block(_data(runs, robot, axis, specs, numbers), numbers)}{kit.scripts()}"""
+    return frame('Flight report', _subtitle(results['meta']), content)
 
 
-def frame(title: str, subtitle: str, content: str) -> str:
-    """Return a whole page around ``content``, which is HTML."""
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}: {escape(subtitle)}</title>
-<style>{CSS}</style>
-</head>
-<body>
-<main>
-<header><h1>{escape(title)}</h1><p>{escape(subtitle)}</p></header>
-{content}
-</main>
-</body>
-</html>
-"""
+def _robot(runs):
+    """Dimensions and limits: those of the runs' robot where its file is there."""
+    file = runs[0].log.meta.get('robot') if runs else None
+    try:
+        return RobotParameters.load(file if file and Path(file).is_file() else None)
+    except ParameterError:
+        return RobotParameters.load()
+
+
+def _subtitle(meta):
+    known = [f'{key} {meta[key]}' for key in ('task', 'conditions', 'seed')
+             if meta.get(key) is not None]
+    return ', '.join([*known, f"beetle_omni_ros {meta['version']}"])
+
+
+def outcome(run: Run) -> str:
+    """How a flight went, in one sentence."""
+    said = []
+    for label, result in run.results.items():
+        name = '' if label == run.label else f'{label.removeprefix(run.label + ": ")}: '
+        poses = result.get('poses') or []
+        parts = ['crashed'] if result.get('crashed') else []
+        if poses:
+            parts.append(f"{sum(pose['reached'] for pose in poses)} of {len(poses)} poses reached")
+        median = result.get('median') or {}
+        if median.get('U_position_m') is not None:
+            parts.append(f"median error {1e3 * median['U_position_m']:.1f} mm and "
+                         f"{median['U_orientation_deg']:.2f}° at the target")
+        tracking = result.get('trajectory') or {}
+        if tracking.get('position_mean_m') is not None:
+            parts.append(f"mean error {1e3 * tracking['position_mean_m']:.1f} mm and "
+                         f"{tracking['orientation_mean_deg']:.2f}° on the trajectory")
+        said.append(name + (', '.join(parts) or 'no target'))
+    return '; '.join(said)
+
+
+def _card(number, run):
+    log, meta = run.log, run.log.meta
+    facts = [', '.join(log.controllers()), *(f'{key} {meta[key]}' for key in
+             ('task', 'conditions', 'seed', 'robot', 'plant') if meta.get(key) is not None),
+             f'{log.end - log.start:.0f} s', log.source]
+    named = [f'fault: {shortened(name)} at {at - run.start:.2f} s'
+             for name, at in log.named_faults().items()]
+    lines = ''.join(f'<span class="warning">{escape(text)}</span>'
+                    for text in (*named[:MOST_ROWS], *log.warnings))
+    text = escape(' · '.join(fact for fact in facts if fact))
+    return (f'<label class="card" style="border-top-color: {run.colour}">'
+            f'<input type="checkbox" checked data-run="{number}"><strong>{escape(run.label)}'
+            f'</strong><em>{escape(outcome(run))}</em><span>{text}</span>{lines}</label>')
+
+
+def _player():
+    speeds = ''.join(f'<option{" selected" if speed == 1 else ""} value="{speed}">{speed}×'
+                     '</option>' for speed in SPEEDS)
+    return (f'<div class="player"><button id="play">Play</button>'
+            f'<input type="range" id="slider" aria-label="time"><output id="time"></output>'
+            f'<select id="speed" aria-label="speed">{speeds}</select>'
+            '<span class="zoom"><button id="nearer" title="zoom in">+</button>'
+            '<button id="further" title="zoom out">−</button>'
+            '<button id="all" title="the whole flight">all</button></span></div>')
+
+
+def _strip(number, run, axis):
+    """What the supervisor did, along the time of the page, with the faults that it named."""
+    length = axis.step * (axis.count - 1) or 1.0
+
+    def place(t):
+        return min(100.0, max(0.0, 100 * (t - run.start - axis.start) / length))
+
+    states: list[tuple[float, str]] = []
+    for t, state in zip(run.log.state_t, run.log.states, strict=True):
+        if not states or states[-1][1] != state:
+            states.append((float(t), state))
+    ends = [t for t, _ in states[1:]] + [run.log.end]
+    parts = []
+    for (t, state), end in zip(states[:MOST_ROWS], ends):
+        colour = STATE_COLOURS.get(state.partition(':')[0], '#dfe3e8')
+        text = escape(shortened(state))
+        parts.append(f'<i style="left:{place(t):.2f}%;width:{place(end) - place(t):.2f}%;'
+                     f'background:{colour}" title="{text}">{text}</i>')
+    faults = [(shortened(name), at) for name, at in run.log.named_faults().items()][:MOST_ROWS]
+    parts += [f'<b style="left:{place(at):.2f}%" title="{escape(name)} at {at - run.start:.2f} s">'
+              '</b>' for name, at in faults]
+    return (f'<div data-of-run="{number}" class="lane"><span style="color:{run.colour}">'
+            f'{escape(run.label)}</span><div class="strip">{"".join(parts)}'
+            '<u class="pin"></u></div></div>')
+
+
+def _data(runs, robot, axis, specs, numbers):
+    rotors = robot.rotors.positions
+    parts = robot.parts
+    ball = BALL if parts is None else parts.end_effector.height
+    apart = min(np.linalg.norm(a - b) for k, a in enumerate(rotors) for b in rotors[:k])
+    return {
+        'time': {'start': axis.start, 'step': axis.step, 'count': axis.count},
+        'charts': specs,
+        'robot': {'rotors': np.asarray(rotors).tolist(),
+                  'axes': np.asarray(robot.tilt_axes).tolist(),
+                  'radius': DISC_RADIUS * float(apart), 'ball': [0.0, 0.0, ball],
+                  'ball_radius': 0.035},
+        'runs': [_scene(run, axis, numbers) for run in runs]}
+
+
+def _scene(run, axis, numbers):
+    body, log = run.body, run.log
+    tilt_t, tilt = (log.joint_t, log.joint_position) if len(log.joint_t) else \
+        (log.command_t, log.command_tilt)
+
+    def columns(t, values):
+        return [numbers.add(column) for column in axis.sampled(run, t, values).T]
+
+    t, position, quaternion = target_poses(run)
+    return {'label': run.label, 'colour': run.colour,
+            'position': columns(body.t, body.position),
+            'quaternion': columns(body.t, body.quaternion),
+            'tilt': columns(tilt_t, tilt), 'thrust': columns(log.command_t, log.command_thrust),
+            'targets': {'t': np.round(t, 4).tolist(),
+                        'pose': np.round(np.hstack([position, quaternion]), 5).ravel().tolist()}}
+
+
+def supervisor_grids(run: Run) -> list[table.Grid]:
+    """When the supervisor was in which state, and for which controller or fault."""
+    rows: list[list[str]] = []
+    for t, state in zip(run.log.state_t, run.log.states, strict=True):
+        kind, _, what = (shortened(part) for part in state.partition(':'))
+        if not rows or rows[-1][1:] != [kind, what]:
+            rows.append([f'{t - run.start:.2f}', kind, what])
+    return [table.Grid(f'{run.label}: states of the supervisor',
+                       ['at [s]', 'state', 'controller or fault'], rows[:MOST_ROWS])] * bool(rows)
+
+
+def fault_grids(run: Run) -> list[table.Grid]:
+    """Warnings and errors of the nodes, and the counters of what they rejected."""
+    faults: dict[tuple, list] = {}
+    last: dict[str, dict] = {}
+    for entry in run.log.diagnostics:
+        last[entry.name] = entry.values
+        if entry.level > 0:
+            faults.setdefault((entry.name, entry.level, entry.message), []).append(entry.t)
+    levels = {1: 'warning', 2: 'error', 3: 'stale'}
+    rows = [[name, levels.get(level, str(level)), message, f'{times[0] - run.start:.1f}',
+             str(len(times))] for (name, level, message), times in faults.items()]
+    rejected = [[name, key, value] for name, values in last.items()
+                for key, value in values.items()
+                if ('reject' in key or 'refused' in key) and value not in ('0', '0.0', '', '{}')]
+    made = []
+    if rows:
+        made.append(table.Grid(f'{run.label}: warnings and errors',
+                               ['node', 'level', 'text', 'first at [s]', 'reports'],
+                               rows[:MOST_ROWS]))
+    if rejected:
+        made.append(table.Grid(f'{run.label}: rejected', ['node', 'reason', 'count'], rejected))
+    if not made:
+        made.append(table.Grid(f'{run.label}: no fault, nothing rejected', [''], []))
+    return made

@@ -26,9 +26,9 @@ from beetle_omni_ros.identify.joint_results import joint_results
 from beetle_omni_ros.identify.joint_servos import file_servos
 from beetle_omni_ros.identify.servo_fit import FITTED_PART
 from beetle_omni_ros.identify.servo_model import simulate
+from beetle_omni_ros.pages.figures import legend, line, panels, STYLE, svg
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.figures import legend, line, panels, STYLE, svg
 
 # Error over that of the freest fit, up to which the file predicts what it did not see as well: a
 # log's last part differs from its first by as much where nothing has changed.

@@ -7,7 +7,7 @@ import numpy as np
 from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.recording.clocks import begin_of
 from beetle_omni_ros.identify.recording.damage import Damage
-from beetle_omni_ros.runs.figures import COLOURS, FAINT, legend, line, panels
+from beetle_omni_ros.pages.figures import COLOURS, FAINT, legend, line, panels
 
 APART = 5       # MoCap readings between two orientations that make a rate of turn
 

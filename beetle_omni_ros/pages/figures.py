@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass
 from io import BytesIO
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-
-from beetle_omni_ros.control.base import Target
-from beetle_omni_ros.runs.body import Motion, motion
-from beetle_omni_ros.runs.log import FlightLog
-from beetle_omni_ros.runs.tasks import Task
 
 COLOURS = ('#1f5fa8', '#d1432f', '#2f8f5b', '#d98a1c', '#7a52a3', '#5b6770')  # one for each run
 PARTS = ('#1f5fa8', '#d98a1c', '#2f8f5b', '#b0447a')  # one for each joint, rotor or axis
@@ -30,43 +24,6 @@ STYLE = {
     'xtick.color': INK, 'ytick.color': INK, 'xtick.major.size': 2.5, 'ytick.major.size': 2.5,
     'text.color': INK, 'legend.frameon': False, 'legend.fontsize': 8.5, 'lines.linewidth': 1.2,
     'svg.hashsalt': 'beetle_omni', 'svg.fonttype': 'path', 'figure.dpi': 100}
-
-
-@dataclass(frozen=True)
-class Run:
-    """
-    One flight of a report.
-
-    Attributes:
-        label: what it is called on the page.
-        colour: of its lines.
-        log: the flight.
-        task: what was flown, where the log says.
-        results: label -> metrics, one entry for each controller that flew.
-
-    """
-
-    label: str
-    colour: str
-    log: FlightLog
-    task: Task | None
-    results: dict[str, dict]
-
-    @property
-    def start(self) -> float:
-        """Time of the first target, from which the plots count [s]."""
-        return self.log.targets[0].stamp if self.log.targets else self.log.start
-
-    @property
-    def pursued(self) -> list[tuple[Target, float]]:
-        """(target, end of its time [s]) of each target; empty where none was recorded."""
-        targets = self.log.targets
-        return list(zip(targets, [t.stamp for t in targets[1:]] + [self.log.end], strict=False))
-
-    @property
-    def body(self) -> Motion:
-        """The motion that the metrics judge."""
-        return motion(self.log)
 
 
 def panels(rows: int, columns: int = 1, height: float = 1.5, **options):
@@ -103,13 +60,6 @@ def thinned(t: np.ndarray, values: np.ndarray, points: int = POINTS):
         axis=1), axis=1).ravel()
     index = np.unique(np.concatenate([index[index >= 0], np.arange(count, len(t))]))
     return t[index], values[index]
-
-
-def without_jumps(angles: np.ndarray) -> np.ndarray:
-    """Angles [deg] with a gap wherever they wrap round, so that no line crosses the plot."""
-    angles = np.array(angles, dtype=float)
-    angles[1:][np.abs(np.diff(angles)) > 180] = np.nan
-    return angles
 
 
 def legend(figure: Figure, axes: Axes) -> None:

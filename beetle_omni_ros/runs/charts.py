@@ -1,0 +1,156 @@
+"""Charts over time: pose, errors, commands, compute, estimate, battery."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.pages.charts import Chart, Series
+from beetle_omni_ros.pages.figures import INK, PARTS
+from beetle_omni_ros.robot.yaml_file import shortened
+from beetle_omni_ros.runs.body import EDGE, geodesic_angles, roll_pitch_yaw
+from beetle_omni_ros.runs.metrics import L_WINDOW, U_WINDOW
+from beetle_omni_ros.runs.shown import error_series, Run, target_poses, TimeAxis
+
+FEW_POSES = 20  # up to so many, the windows of each are shaded
+MOST_FAULTS = 12        # marked in a chart
+MILLI = 1e3
+TINY = {'m': 1e-4, 'deg': 1e-2}  # floor of logarithmic errors
+L_COLOUR, U_COLOUR = '#eef1f5', '#cfe3d4'
+PERIOD = 10.0           # [ms] of a controller's step
+AXES = ('x [m]', 'y [m]', 'z [m]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]')
+
+
+def pose(runs: list[Run], axis: TimeAxis) -> list[Chart]:
+    """Position and attitude of every run against its target; angles within a turn of that."""
+    wanted = [_wanted(run, axis) for run in runs]
+    lines: list[list[Series]] = [[] for _ in AXES]
+    tasks: list[object] = []
+    for number, (run, target) in enumerate(zip(runs, wanted, strict=True)):
+        body = run.body
+        flown = np.hstack([axis.sampled(run, body.t, body.position),
+                           axis.sampled(run, body.t, roll_pitch_yaw(body.quaternion))])
+        near = np.nan_to_num(target[:, 3:])
+        flown[:, 3:] = near + (flown[:, 3:] - near + 180) % 360 - 180
+        task = run.log.meta.get('task')
+        for k, (made, label) in enumerate(zip(lines, AXES, strict=True)):
+            if run.log.targets and task not in tasks:
+                made.append(Series('target', INK, target[:, k], style='dash'))
+            made.append(Series(run.label, run.colour, flown[:, k], number))
+        tasks.append(task)
+    return [Chart(label, made, wide=False) for label, made in zip(AXES, lines, strict=True)]
+
+
+def _wanted(run, axis):
+    """(count, 6) position [m] and angles [deg] asked for at the times of the axis."""
+    t, position, quaternion = target_poses(run)
+    if not len(t):
+        return np.full((axis.count, 6), np.nan)
+    row = np.searchsorted(t, axis.times + EDGE, side='right') - 1
+    values = np.hstack([position, roll_pitch_yaw(quaternion)])[np.maximum(row, 0)]
+    values[row < 0] = np.nan
+    return values
+
+
+def errors_over_time(runs: list[Run], axis: TimeAxis) -> list[Chart]:
+    """Both errors on a logarithmic scale; L and U windows shaded where they are few."""
+    series = [error_series(run) for run in runs]
+    if not any(len(t) for t, _, _ in series):
+        return []
+    stamps = [t.stamp - runs[0].start for t in runs[0].log.targets if isinstance(t, PoseTarget)]
+    windows = _windows(stamps) if len(stamps) <= FEW_POSES else []
+    faults = [(at - run.start, shortened(name)) for run in runs
+              for name, at in run.log.named_faults().items()][:MOST_FAULTS]
+    return [Chart(f'{name} [{unit}]', [
+        Series(run.label, run.colour,
+               axis.sampled(run, t, np.maximum(both[k], TINY[unit])), number)
+        for number, (run, (t, *both)) in enumerate(zip(runs, series, strict=True))],
+        log=(False, True), windows=windows, upright=faults)
+        for k, (name, unit) in enumerate((('position error', 'm'), ('orientation error', 'deg')))]
+
+
+def _windows(stamps):
+    return [(stamp + window[0], stamp + window[1], colour) for stamp in stamps
+            for window, colour in ((L_WINDOW, L_COLOUR), (U_WINDOW, U_COLOUR))]
+
+
+def commands(runs: list[Run], axis: TimeAxis) -> list[Chart]:
+    """Tilt and thrust commands of each run."""
+    made = []
+    for number, run in enumerate(runs):
+        log, name = run.log, f'{run.label}: ' if len(runs) > 1 else ''
+        for label, values in (('tilt command [rad]', log.command_tilt),
+                              ('thrust command [N]', log.command_thrust)):
+            sampled = axis.sampled(run, log.command_t, values)
+            made.append(Chart(name + label, [
+                Series(str(k + 1), PARTS[k], sampled[:, k], number) for k in range(4)],
+                wide=False))
+    return made
+
+
+def compute(runs: list[Run], axis: TimeAxis) -> list[Chart]:
+    """CPU time of the controllers' steps since their start, against the period."""
+    series = []
+    for number, run in enumerate(runs):
+        for label, name in _controllers(run):
+            history = run.log.compute_history[name]
+            t = np.array([entry[0] for entry in history])
+            for key, style in (('max', 'dot'), ('p99', 'dash'), ('median', 'line')):
+                values = np.array([entry[1][key] for entry in history], dtype=float)
+                series.append(Series(f'{label}, {key}', run.colour, axis.sampled(run, t, values),
+                                     number, style))
+    if not series:
+        return []
+    return [Chart('CPU time of a step [ms]', series, log=(False, True),
+                  level=[(PERIOD, 'period')])]
+
+
+def _controllers(run):
+    """(label, name) of each controller of a run whose compute times are known."""
+    names = [name for name in run.log.controllers() if run.log.compute_history.get(name)]
+    return [(run.label if len(names) == 1 else f'{run.label}: {name}', name) for name in names]
+
+
+def estimate(runs: list[Run], axis: TimeAxis) -> list[Chart]:
+    """Error of the estimate, where the truth is known."""
+    places, angles = [], []
+    for number, run in enumerate(runs):
+        log = run.log
+        if not (len(log.truth_t) and len(log.odom_t)):
+            continue
+        index = np.clip(np.searchsorted(log.truth_t, log.odom_t - 2.5e-3), 0,
+                        len(log.truth_t) - 1)
+        near = np.abs(log.truth_t[index] - log.odom_t) < 2.5e-3
+        t, index = log.odom_t[near], index[near]
+        distance = np.linalg.norm(log.odom_position[near] - log.truth_position[index], axis=1)
+        angle = np.degrees(geodesic_angles(log.odom_quaternion[near], log.truth_quaternion[index]))
+        for made, values in ((places, MILLI * distance), (angles, angle)):
+            made.append(Series(run.label, run.colour, axis.sampled(run, t, values), number))
+    return [Chart(label, series, wide=False) for label, series in
+            (('position [mm]', places), ('orientation [deg]', angles)) if series]
+
+
+def battery(runs: list[Run], axis: TimeAxis) -> list[Chart]:
+    """Pack voltage and current."""
+    known = [(number, run) for number, run in enumerate(runs) if len(run.log.battery_t)]
+    return [Chart(label, [Series(run.label, run.colour, axis.sampled(
+        run, run.log.battery_t, sign * getattr(run.log, name)), number) for number, run in known],
+        wide=False)
+        for label, name, sign in (('voltage [V]', 'battery_voltage', 1.0),
+                                  ('current drawn [A]', 'battery_current', -1.0)) if known]
+
+
+def payload(runs: list[Run], axis: TimeAxis) -> list[Chart]:
+    """Height while payloads are attached."""
+    known = [(number, run) for number, run in enumerate(runs)
+             if run.task and run.task.kind == 'payload' and run.log.targets]
+    if not known:
+        return []
+    begins = np.concatenate([[0.0], known[0][1].task.ends[:-1]])
+    return [Chart('height error [m]', [
+        Series(run.label, run.colour, axis.sampled(
+            run, run.body.t, run.body.position[:, 2] - run.log.targets[0].at(
+                run.start).position[2]), number) for number, run in known],
+        upright=[(float(begin), f'{segment.payload:g} kg') for begin, segment in
+                 zip(begins, known[0][1].task.segments, strict=True)])]
+
