@@ -67,8 +67,17 @@ def to_bytes(message: Any, name: str) -> memoryview:
 
 
 def from_bytes(data: bytes | memoryview, name: str) -> Any:
-    """Message of a type; whatever broken bytes provoke is raised."""
-    return TYPESTORE.deserialize_cdr(data, name)
+    """
+    Message of a type; whatever broken bytes provoke is raised.
+
+    Bytes behind the message are left alone: rclpy's serialize_message returns its whole buffer,
+    whose size is an upper bound.
+    """
+    if len(data) < 4 or data[0] or data[1] > 1:
+        raise ValueError('no CDR of this kind')
+    definition = TYPESTORE.get_msgdef(name)
+    read = definition.deserialize_cdr_le if data[1] else definition.deserialize_cdr_be
+    return read(memoryview(data)[4:], 0, definition.cls, TYPESTORE)[0]
 
 
 def offered(qos: Qos) -> interfaces.Qos:

@@ -1,0 +1,165 @@
+"""The table of topics: what nodes publish and what bags hold are the same bytes, read alike."""
+
+from dataclasses import fields, replace
+import itertools
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
+from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
+from beetle_omni_ros.messages import columns
+from beetle_omni_ros.messages.bag_types import BAG, from_bytes, to_bytes
+from beetle_omni_ros.messages.columns import read_all
+from beetle_omni_ros.messages.topics import ALL, TABLE, topic_of
+from beetle_omni_ros.messages.values import (
+    Battery,
+    Diagnostic,
+    Joints,
+    MessageError,
+    Odom,
+    RotorSpeeds,
+    ToldHealth,
+    Wish,
+    Wrench,
+)
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+
+STAMP = 1_790_000_000.25
+SERIES = ('mocap/pose', 'imu/data_raw', 'joint_states', 'battery_state', 'rotor_states', 'odom',
+          'command', 'nmpc/command', 'ground_truth/odom', 'disturbance')
+
+
+def value(topic, seed=0, stamp=STAMP):
+    """Some value of a topic."""
+    draw = np.random.default_rng(seed).normal
+    turn = rotations.normalized(draw(size=4))
+    path = TrajectoryTarget(stamp + np.arange(3.0), draw(size=(3, 3)), np.tile(turn, (3, 1)),
+                            draw(size=(3, 3)), draw(size=(3, 3)), stamp)
+    made = {
+        PoseSample: lambda: PoseSample(stamp, draw(size=3), turn),
+        ImuSample: lambda: ImuSample(stamp, draw(size=3), draw(size=3)),
+        Joints: lambda: Joints(stamp, draw(size=4), draw(size=4), draw(size=4)),
+        Battery: lambda: Battery(stamp, 24.5, -20.25, 6),
+        RotorSpeeds: lambda: RotorSpeeds(stamp, draw(size=4)),
+        Odom: lambda: Odom(stamp, draw(size=3), draw(size=3), turn, draw(size=3),
+                           draw(size=(6, 6)), draw(size=(6, 6))),
+        PoseTarget: lambda: PoseTarget(draw(size=3), turn, stamp),
+        TrajectoryTarget: lambda: path,
+        Command: lambda: Command(stamp, draw(size=4), draw(size=4)),
+        Wish: lambda: Wish.of(path),
+        ToldHealth: lambda: ToldHealth(stamp, ActuatorHealth(
+            (True, False, True, True), (None, 0.5, None, None))),
+        Wrench: lambda: Wrench(stamp, draw(size=3), draw(size=3)),
+        str: lambda: 'flying:nmpc',
+        Diagnostic: lambda: [Diagnostic(stamp, 'ekf_node: inputs', 2, 'silent', {'a': '1'}),
+                             Diagnostic(stamp, 'ekf_node: compute', 0, 'well')]}
+    return made[ALL[topic].value]()
+
+
+def cdr(topic, of):
+    return bytes(to_bytes(ALL[topic].write(BAG, of), ALL[topic].type))
+
+
+@pytest.mark.parametrize('topic', list(ALL))
+def test_what_a_node_publishes_is_what_a_bag_holds(topic):
+    serialization = pytest.importorskip('rclpy.serialization')
+    from beetle_omni_ros.nodes import wire
+    sent = serialization.serialize_message(wire.message(topic, value(topic)))
+    kept = cdr(topic, value(topic))
+    assert 0 <= len(sent) - len(kept) <= 8
+    # Between aligned fields and at the end a middleware leaves any bytes.
+    assert bytes(to_bytes(from_bytes(sent, ALL[topic].type), ALL[topic].type)) == kept
+
+
+@pytest.mark.parametrize('topic', list(ALL))
+def test_a_value_comes_back_from_its_message(topic):
+    entry, sent = ALL[topic], value(topic)
+    for read in (entry.read, entry.take):
+        back = read(from_bytes(cdr(topic, sent), entry.type))
+        if isinstance(sent, (str, list)):
+            assert back == sent
+            continue
+        assert isinstance(back, entry.value)
+        for field in fields(back):
+            mine, theirs = getattr(sent, field.name), getattr(back, field.name)
+            if isinstance(theirs, (float, np.ndarray)):
+                np.testing.assert_allclose(theirs, mine, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize('topic', SERIES)
+@pytest.mark.parametrize('one_by_one', [False, True])
+def test_messages_read_at_once_are_those_read_one_by_one(topic, one_by_one, monkeypatch):
+    if one_by_one:
+        monkeypatch.setattr(columns, 'LAYOUTS', 0)
+    entry = ALL[topic]
+    data = [cdr(topic, value(topic, seed, STAMP + 0.01 * seed)) for seed in range(40)]
+    rows, at_once, refused = read_all(entry, data)
+    assert rows.tolist() == list(range(40)) and not refused
+    for row, one in enumerate(data):
+        alone = entry.read(from_bytes(one, entry.type))
+        for field in fields(alone):
+            mine = getattr(alone, field.name)
+            if isinstance(mine, (float, np.ndarray)):
+                np.testing.assert_allclose(getattr(at_once, field.name)[row], mine,
+                                           rtol=1e-14, atol=1e-14)
+
+
+def test_messages_of_several_layouts_keep_their_order():
+    entry = ALL['joint_states']
+    whole = [value('joint_states', seed, STAMP + seed) for seed in range(12)]
+    sent = [replace(one, effort=None) if k % 3 == 1 else replace(one, velocity=None)
+            if k % 3 == 2 else one for k, one in enumerate(whole)]
+    data = [cdr('joint_states', one) for one in sent]
+    data.insert(5, data[0][:40])                # cut off
+    data.insert(9, b'\0\1')                     # nothing
+    data.insert(2, cdr('joint_states', Joints(STAMP, np.ones(1), np.ones(1), None, ['wheel'])))
+    rows, at_once, refused = read_all(entry, data)
+    assert refused.total() == 3 and len(rows) == 12
+    assert at_once.stamp.tolist() == [STAMP + k for k in range(12)]
+    for k, one in enumerate(sent):
+        assert np.array_equal(at_once.position[k], one.position)
+        for name in ('velocity', 'effort'):
+            mine = getattr(one, name)
+            assert np.array_equal(getattr(at_once, name)[k], np.full(4, np.nan)
+                                  if mine is None else mine, equal_nan=True)
+
+
+def test_a_length_that_the_message_does_not_hold_is_refused():
+    data = bytearray(cdr('command', value('command')))
+    at = 4 + 8 + 4 + 4      # behind stamp and the empty frame_id: the number of names
+    data[at:at + 4] = (0xFFFFFFF0).to_bytes(4, 'little')
+    rows, found, refused = read_all(ALL['command'], [bytes(data)])
+    assert not len(rows) and found is None and refused.total() == 1
+
+
+def test_big_endian_messages_are_read_too():
+    from beetle_omni_ros.messages.bag_types import TYPESTORE
+    sent = value('imu/data_raw')
+    data = bytes(TYPESTORE.serialize_cdr(ALL['imu/data_raw'].write(BAG, sent),
+                                         ALL['imu/data_raw'].type, little_endian=False))
+    _, back, _ = read_all(ALL['imu/data_raw'], [data, cdr('imu/data_raw', sent)])
+    assert np.array_equal(back.specific_force, [sent.specific_force] * 2)
+
+
+@pytest.mark.parametrize('topic', [name for name in SERIES if name != 'rotor_states'])
+def test_what_is_not_finite_is_read_but_not_flown_with(topic):
+    entry, sent = ALL[topic], value(topic)
+    name = next(field.name for field in fields(sent)
+                if field.name != 'stamp' and field.name not in ('names', 'cells'))
+    part = getattr(sent, name)
+    spoilt = replace(sent, **{name: part * np.nan if isinstance(part, np.ndarray) else np.nan})
+    message = from_bytes(cdr(topic, spoilt), entry.type)
+    assert np.isnan(getattr(entry.read(message), name)).all()
+    with pytest.raises(MessageError, match='not finite'):
+        entry.take(message)
+
+
+def test_names_are_unique_and_any_controller_has_a_topic():
+    assert len(ALL) == len(TABLE)
+    assert topic_of('mine/command').name == 'mine/command'
+    with pytest.raises(KeyError):
+        topic_of('mine/state')
+    for one, other in itertools.combinations(TABLE, 2):
+        assert one.name != other.name
