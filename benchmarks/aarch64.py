@@ -1,0 +1,292 @@
+"""
+The flight path on aarch64, shown on a computer that has none.
+
+    python benchmarks/aarch64.py wheels            # what PyPI holds for aarch64
+    python benchmarks/aarch64.py tests [TEST...]   # the flight path's tests under qemu-user
+    python benchmarks/aarch64.py count             # instructions of one NMPC cycle, one inference
+    python benchmarks/aarch64.py all [--json FILE]
+
+`tests` and `count` need qemu-user 7 or 8 and a cross compiler: `apt-get install qemu-user
+gcc-aarch64-linux-gnu`. They unpack Python and its libraries from Debian's arm64 pool and the
+wheels from PyPI into a folder of the cache (--sysroot), 1 GB, once. Nothing there is installed on
+this computer. The controller is compiled by the cross compiler, which the emulated Python calls.
+"""
+
+from __future__ import annotations
+
+import argparse
+from datetime import date
+import json
+import lzma
+import os
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from beetle_omni_ros.robot.native import cache_folder
+
+ROOT = Path(__file__).resolve().parents[1]
+PYTHONS = ('3.10', '3.11', '3.12', '3.13')      # those of setup.py; Ubuntu 24.04 has 3.12
+# Newest first: the C libraries of Debian 12 and Ubuntu 24.04 read all of them.
+PLATFORMS = ('manylinux_2_34_aarch64', 'manylinux_2_31_aarch64', 'manylinux_2_28_aarch64',
+             'manylinux_2_27_aarch64', 'manylinux_2_26_aarch64', 'manylinux_2_24_aarch64',
+             'manylinux_2_17_aarch64', 'manylinux2014_aarch64')
+DEBIAN = 'http://deb.debian.org/debian'
+RELEASE, PYTHON = 'bookworm', '3.11'            # Debian's release and its Python, for qemu
+DEBS = ('python3.11', 'libpython3.11-stdlib', 'libstdc++6', 'libgomp1', 'libgl1', 'libegl1')
+# onnxruntime 1.32 ends at its import in qemu 7.2, whatever the emulated processor.
+EMULATED = ('onnxruntime<1.24', 'pytest>=8', 'pytest-timeout>=2.2', 'hypothesis>=6.100',
+            'onnx>=1.16')
+# What lies between sensors and actuators, without ROS and without limits in real time.
+TESTS = ('test/estimation/test_noise.py', 'test/estimation/test_odometry.py',
+         'test/estimation/test_propagation.py', 'test/estimation/test_extrinsics.py',
+         'test/control/test_rti.py', 'test/control/test_ocp.py', 'test/control/test_hover.py',
+         'test/control/test_observation.py', 'test/control/test_policy.py',
+         'test/control/test_policy_file.py', 'test/control/test_references.py',
+         'test/safety/test_limits.py', 'test/safety/test_watch.py', 'test/safety/test_ramp.py',
+         'test/drivers/test_mavlink_packets.py', 'test/drivers/test_mavlink_receiver.py',
+         'test/drivers/test_clock_offset.py', 'test/drivers/test_servo_guard.py',
+         'test/drivers/test_servo_turns.py')
+COMPILER = 'aarch64-linux-gnu-gcc'
+PARTS = {2: ('one NMPC cycle', 5.0), 4: ('one step of the policy, with guidance', None),
+         6: ('one inference', 0.3)}             # mark -> what it is, bound of p99 [ms]
+FIRST = 5       # steps that warm up: what they load and allocate no later one does
+CLOCK, CYCLES = 2.2e9, (0.7, 1.0, 1.4)          # [Hz] of a Cortex-A73; instructions a cycle
+
+
+def requirements() -> dict[str, list[str]]:
+    """Extra ('' for none) -> requirements of setup.py that a flight needs."""
+    text = (ROOT / 'setup.py').read_text()
+    found = {}
+    for extra, name in (('', 'REQUIREMENTS'), ('hardware', 'HARDWARE')):
+        block = re.search(rf'^{name} = \[(.*?)^\]', text, re.M | re.S).group(1)
+        found[extra] = re.findall(r"^    '([^']+)',", block, re.M)
+    return found
+
+
+def resolved(python: str, wanted: list[str]) -> tuple[list[dict], str]:
+    """
+    Resolve ``wanted`` for aarch64 with wheels alone.
+
+    Returns:
+        the distributions, each name, version and file; the complaint of pip, or ''.
+
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / 'report.json'
+        done = subprocess.run(
+            [sys.executable, '-m', 'pip', 'install', '--dry-run', '--quiet', '--ignore-installed',
+             '--only-binary', ':all:', '--target', folder, '--report', str(report),
+             '--implementation', 'cp', '--python-version', python,
+             *(part for name in PLATFORMS for part in ('--platform', name)), *wanted],
+            capture_output=True, text=True, timeout=900)
+        if done.returncode:
+            lines = [line for line in done.stderr.splitlines() if line.startswith('ERROR')]
+            return [], lines[-1] if lines else done.stderr.strip()[-200:]
+        return [{'name': one['metadata']['name'], 'version': one['metadata']['version'],
+                 'file': one['download_info']['url'].rpartition('/')[2]}
+                for one in json.loads(report.read_text())['install']], ''
+
+
+def wheels(console: Console) -> dict:
+    """Each distribution of the flight path: does aarch64 have a wheel, for which Python."""
+    wanted = [one for group in requirements().values() for one in group]
+    files: dict[str, dict] = {}
+    complaints = {}
+    for python in PYTHONS:
+        found, complaint = resolved(python, wanted)
+        if complaint:
+            complaints[python] = complaint
+        for one in found:
+            files.setdefault(one['name'].lower().replace('_', '-'), {})[python] = one
+    direct = {re.split(r'[\[<>=;!~ ]', one)[0].lower() for one in wanted}
+    table = Table(title=f'wheels for aarch64 on PyPI, {date.today()}')
+    for column in ('distribution', *PYTHONS, 'kind'):
+        table.add_column(column)
+    rows = []
+    for name in sorted(files, key=lambda name: (name not in direct, name)):
+        versions = files[name]
+        kinds = {'any' if one['file'].endswith('any.whl') else 'aarch64'
+                 for one in versions.values()}
+        rows.append([name if name in direct else f'({name})',
+                     *(versions[p]['version'] if p in versions else '-' for p in PYTHONS),
+                     ', '.join(sorted(kinds))])
+        table.add_row(*rows[-1])
+    console.print(table)
+    for python, complaint in complaints.items():
+        console.print(f'Python {python}: {complaint}', style='red', markup=False)
+    return {'rows': rows, 'complaints': complaints,
+            'missing': sorted(direct - set(files))}
+
+
+# --- the sysroot ----------------------------------------------------------------------------
+
+def packages() -> dict[str, dict]:
+    """Name -> fields of every package of the release for arm64."""
+    url = f'{DEBIAN}/dists/{RELEASE}/main/binary-arm64/Packages.xz'
+    with urllib.request.urlopen(url, timeout=120) as answer:
+        text = lzma.decompress(answer.read()).decode()
+    found = {}
+    for block in text.split('\n\n'):
+        fields = dict(re.findall(r'^([A-Za-z-]+): (.*)$', block, re.M))
+        if 'Package' in fields:
+            found[fields['Package']] = fields
+    return found
+
+
+def closure(known: dict[str, dict], wanted) -> list[str]:
+    """Packages with all that they depend on; of alternatives the first."""
+    done, todo = [], list(wanted)
+    while todo:
+        name = todo.pop()
+        if name in done or name not in known:
+            continue
+        done.append(name)
+        for field in ('Depends', 'Pre-Depends'):
+            for part in known[name].get(field, '').split(','):
+                todo.append(re.split(r'[ (|:]', part.strip())[0])
+    return sorted(done)
+
+
+def make_sysroot(folder: Path, console: Console) -> Path:
+    """Unpack Debian's Python and PyPI's wheels for aarch64 into ``folder``, once."""
+    stamp = folder / '.complete'
+    wanted = [one for group in requirements().values() for one in group]
+    content = json.dumps([RELEASE, DEBS, wanted, EMULATED])
+    if stamp.is_file() and stamp.read_text() == content:
+        return folder
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    known = packages()
+    names = closure(known, DEBS)
+    console.print(f'{len(names)} packages of Debian {RELEASE} arm64')
+    for name in names:
+        deb = folder / 'package.deb'
+        urllib.request.urlretrieve(f"{DEBIAN}/{known[name]['Filename']}", deb)
+        subprocess.run(['dpkg-deb', '-x', str(deb), str(folder)], check=True)
+        deb.unlink()
+    console.print('wheels for aarch64')
+    subprocess.run(
+        [sys.executable, '-m', 'pip', 'install', '--quiet', '--only-binary', ':all:', '--target',
+         str(folder / 'site'), '--implementation', 'cp', '--python-version', PYTHON,
+         *(part for name in PLATFORMS for part in ('--platform', name)), *wanted, *EMULATED],
+        check=True)
+    # A process that starts Python again finds it through qemu.
+    python = folder / 'usr' / 'bin' / f'python{PYTHON}'
+    python.rename(f'{python}.aarch64')
+    python.write_text(f'#!/bin/sh\nexec qemu-aarch64 -L {folder} ${{PLUGIN:+-plugin $PLUGIN}} '
+                      f'-0 "$0" {python}.aarch64 "$@"\n')
+    python.chmod(0o755)
+    stamp.write_text(content)
+    return folder
+
+
+def emulated(sysroot: Path, *arguments: str, plugin: str = '', **options):
+    """Run Python for aarch64; arguments and options as for subprocess.run."""
+    for program in ('qemu-aarch64', COMPILER):
+        if not shutil.which(program):
+            sys.exit(f'aarch64: {program} is missing: apt-get install qemu-user '
+                     'gcc-aarch64-linux-gnu')
+    environment = {key: value for key, value in os.environ.items() if key not in (
+        'LD_LIBRARY_PATH', 'VIRTUAL_ENV', 'PYTHONHOME', '_ROS_WHEELS_BOOTSTRAP_COMPLETE')}
+    environment.update(
+        PYTHONPATH=f"{ROOT}:{sysroot / 'site'}", CC=COMPILER, PYTHONDONTWRITEBYTECODE='1',
+        XDG_CACHE_HOME=str(sysroot / 'cache'), OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1',
+        PLUGIN=plugin)
+    return subprocess.run([str(sysroot / 'usr' / 'bin' / f'python{PYTHON}'), *arguments],
+                          env=environment, cwd=ROOT, text=True, **options)
+
+
+def run_tests(sysroot: Path, tests, console: Console) -> list[dict]:
+    """Run test files one after the other; what each ended with, and how long it took."""
+    table, rows = Table(title=f'tests on aarch64 under qemu-user, {date.today()}'), []
+    for column in ('tests', 'passed', 'failed', 'skipped', 's'):
+        table.add_column(column, justify='left' if column == 'tests' else 'right')
+    for test in tests:
+        begin = time.monotonic()
+        done = emulated(sysroot, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', '--timeout',
+                        '3000', test, capture_output=True)
+        counts = {what: sum(map(int, re.findall(rf'(\d+) {what}', done.stdout[-400:])))
+                  for what in ('passed', 'failed', 'skipped')}
+        if done.returncode and not counts['failed']:
+            counts['failed'] = 1
+        rows.append({'tests': test, **counts, 's': round(time.monotonic() - begin)})
+        table.add_row(*map(str, rows[-1].values()))
+        print(rows[-1], file=sys.stderr, flush=True)
+        if done.returncode:
+            print(done.stdout[-3000:], done.stderr[-1000:], file=sys.stderr)
+    console.print(table)
+    return rows
+
+
+def count(sysroot: Path, console: Console) -> list[dict]:
+    """Instructions of the controllers' steps in a recorded flight, and what they bound."""
+    here = ROOT / 'benchmarks' / 'instructions'
+    with tempfile.TemporaryDirectory() as folder:
+        plugin, inputs = f'{folder}/plugin.so', f'{folder}/inputs'
+        subprocess.run(['gcc', '-O2', '-shared', '-fPIC', str(here / 'plugin.c'), '-o', plugin],
+                       check=True)
+        subprocess.run([sys.executable, str(here / 'replay.py'), 'record', inputs], check=True)
+        # Once without counting, so that what is compiled is there.
+        emulated(sysroot, str(here / 'replay.py'), 'replay', inputs, '--steps', '2', check=True)
+        done = emulated(sysroot, str(here / 'replay.py'), 'replay', inputs, plugin=plugin,
+                        capture_output=True)
+    if done.returncode:
+        sys.exit(f'aarch64: counting failed: {done.stderr[-500:]}')
+    begun, counts = {}, {key: [] for key in PARTS}
+    for number, total in re.findall(r'^mark (\d+) (\d+)$', done.stderr, re.M):
+        number, total = int(number), int(total)
+        if number in PARTS:
+            begun[number] = total
+        else:
+            counts[number - 1].append(total - begun[number - 1])
+    table, rows = Table(title=f'instructions on aarch64, {date.today()}'), []
+    for column in ('', 'steps', 'median [10^6]', 'p99', 'max', *(
+            f'p99 [ms] at {one} a cycle' for one in CYCLES), 'bound [ms]', 'needs a cycle'):
+        table.add_column(column, justify='right')
+    for key, (what, bound) in PARTS.items():
+        values = np.array(counts[key][FIRST:])
+        median, high, most = np.percentile(values, [50, 99, 100])
+        rows.append({'what': what, 'steps': len(values), 'median': median, 'p99': high,
+                     'max': most, 'bound_ms': bound})
+        table.add_row(what, str(len(values)), *(f'{x / 1e6:.2f}' for x in (median, high, most)),
+                      *(f'{1e3 * high / one / CLOCK:.2f}' for one in CYCLES),
+                      f'{bound or ""}', f'{1e3 * high / bound / CLOCK:.2f}' if bound else '')
+    console.print(table)
+    return rows
+
+
+def main():
+    """Run what is asked for; status 1 when a wheel is missing or a test fails."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('what', choices=['wheels', 'tests', 'count', 'all'])
+    parser.add_argument('tests', nargs='*', default=TESTS)
+    parser.add_argument('--sysroot', type=Path, default=cache_folder() / 'aarch64')
+    parser.add_argument('--json', type=Path, help='file for the numbers')
+    given = parser.parse_args()
+    console, found = Console(width=120), {}
+    if given.what in ('wheels', 'all'):
+        found['wheels'] = wheels(console)
+    if given.what != 'wheels':
+        make_sysroot(given.sysroot.absolute(), console)
+    if given.what in ('tests', 'all'):
+        found['tests'] = run_tests(given.sysroot.absolute(), given.tests, console)
+    if given.what in ('count', 'all'):
+        found['count'] = count(given.sysroot.absolute(), console)
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=1))
+    bad = found.get('wheels', {}).get('missing') or found.get('wheels', {}).get('complaints')
+    sys.exit(1 if bad or any(row['failed'] for row in found.get('tests', ())) else 0)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,154 @@
+"""The installer of the onboard computer, the images and the container say what they should."""
+
+import json
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from beetle_omni_ros.nodes import plan
+from beetle_omni_ros.nodes.lifecycle_node import AUTOSTART, INACTIVE
+
+ROOT = Path(__file__).resolve().parents[1]
+DEPLOY = ROOT / 'deploy'
+pytestmark = pytest.mark.skipif(not DEPLOY.is_dir(), reason='no source checkout')
+RULES = 'etc/udev/rules.d/99-beetle-omni.rules'
+LIMITS = 'etc/security/limits.d/99-beetle-omni.conf'
+UNIT = 'etc/systemd/system/beetle-omni-bridges.service'
+
+
+def install(root, *options):
+    """Run the installer into a folder."""
+    return subprocess.run(['sh', str(DEPLOY / 'install.sh'), '--root', str(root), '--user',
+                           'pilot', *options], capture_output=True, text=True, timeout=60)
+
+
+def files(root):
+    """Path -> text of all files below ``root``."""
+    return {str(path.relative_to(root)): path.read_text()
+            for path in root.rglob('*') if path.is_file()}
+
+
+def test_it_writes_three_files_and_the_second_time_nothing(tmp_path):
+    done = install(tmp_path)
+    assert done.returncode == 0, done.stderr
+    written = files(tmp_path)
+    assert set(written) == {RULES, LIMITS, UNIT}
+    times = {path: (tmp_path / path).stat().st_mtime_ns for path in written}
+    again = install(tmp_path)
+    assert again.returncode == 0 and again.stdout.count('unchanged') == 3
+    assert times == {path: (tmp_path / path).stat().st_mtime_ns for path in written}
+    assert 'pilot - rtprio' in written[LIMITS]
+
+
+def test_uninstalling_leaves_nothing_of_it_and_all_else(tmp_path):
+    other = tmp_path / 'etc/udev/rules.d/10-other.rules'
+    other.parent.mkdir(parents=True)
+    other.write_text('# another\n')
+    assert install(tmp_path).returncode == 0
+    for _ in range(2):
+        assert install(tmp_path, '--uninstall').returncode == 0
+        assert files(tmp_path) == {'etc/udev/rules.d/10-other.rules': '# another\n'}
+
+
+def test_the_rules_name_both_ports_and_set_the_latency_timer(tmp_path):
+    assert install(tmp_path, '--servo-serial', 'FT2N08', '--board-serial', '3276').returncode == 0
+    rules = files(tmp_path)[RULES]
+    lines = [line for line in rules.splitlines() if not line.startswith('#')]
+    assert len(lines) == 3
+    servos, timer, board = lines
+    assert 'ATTRS{serial}=="FT2N08"' in servos and 'SYMLINK+="beetle_servos"' in servos
+    assert 'ATTRS{serial}=="3276"' in board and 'SYMLINK+="motor_board"' in board
+    assert 'ATTR{latency_timer}="1"' in timer
+    for line in lines:      # key, operator and quoted value, separated by commas
+        assert re.fullmatch(r'(?:[A-Z_]+(?:\{\w+\})?(?:==|\+=|=)"[^"]*"(?:, |$))+', line), line
+
+
+def test_the_service_opens_the_bridges_and_arms_nothing(tmp_path):
+    robot = tmp_path / 'robot.yaml'
+    robot.touch()
+    done = install(tmp_path, '--workspace', '/home/pilot/ws', '--robot', str(robot))
+    assert done.returncode == 0, done.stderr
+    unit = (tmp_path / UNIT).read_text()
+    start = re.search(r'^ExecStart=(.*)$', unit, re.M)[1]
+    assert AUTOSTART['configure'] == INACTIVE
+    for node in ('joint_bridge_node', 'rotor_bridge_node'):
+        assert node in plan.NODES
+        assert re.findall(rf'-p {node}:autostart:=(\w+)', start) == ['configure']
+        assert f'-p {node}:robot_file:={robot}' in start
+    assert 'activate ' not in start.replace('/bin/activate', '') and 'supervisor' not in start
+    assert {'User=pilot', 'KillSignal=SIGINT'} <= set(unit.splitlines())
+    analyse = shutil.which('systemd-analyze')
+    if analyse:
+        said = subprocess.run([analyse, 'verify', str(tmp_path / UNIT)], capture_output=True,
+                              text=True, timeout=60).stderr
+        assert not re.search(r'Unknown|Invalid|Failed to parse|ignoring', said), said
+
+
+def test_without_service_only_rules_and_limits_are_there(tmp_path):
+    assert install(tmp_path).returncode == 0
+    assert install(tmp_path, '--no-service').returncode == 0
+    assert set(files(tmp_path)) == {RULES, LIMITS}
+
+
+@pytest.mark.parametrize('options', [
+    ['--user', 'a b'], ['--user', 'x;reboot'], ['--servo-serial', '"'], ['--workspace', '$HOME'],
+    ['--board-serial', 'a\nb'], ['--robot', '/does/not/exist'], ['--robot', 'r.yaml'],
+    ['--workspace', 'ws'], ['--servo-serial'], ['--wrong'], ['--root', '/does/not/exist']])
+def test_unusable_options_are_refused_in_one_line_and_write_nothing(tmp_path, options):
+    done = install(tmp_path, *options)
+    assert done.returncode == 2 and done.stderr.startswith('install: error: ')
+    assert not files(tmp_path)
+
+
+def test_help_names_every_option():
+    script = (DEPLOY / 'install.sh').read_text()
+    said = subprocess.run(['sh', str(DEPLOY / 'install.sh'), '--help'], capture_output=True,
+                          text=True, timeout=60).stdout
+    for option in re.findall(r'^ +(--[\w-]+)\)', script, re.M):
+        assert option in said
+
+
+def test_shell_scripts_are_clean():
+    checker = Path(sys.executable).with_name('shellcheck')
+    if not checker.is_file():
+        pytest.skip('no shellcheck here')
+    done = subprocess.run([str(checker), '--exclude=SC1091', str(DEPLOY / 'install.sh'),
+                           str(DEPLOY / 'entrypoint')], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout
+
+
+def commands(dockerfile):
+    """The text of all RUN lines, continued lines joined."""
+    text = dockerfile.read_text().replace('\\\n', ' ')
+    return ' '.join(' '.join(line.split()) for line in text.splitlines()
+                    if line.startswith('RUN '))
+
+
+def test_the_image_with_ros_is_built_by_the_lines_of_the_page():
+    run = commands(DEPLOY / 'Dockerfile').replace(' --no-cache-dir', '')
+    page = (ROOT / 'docs/how-to/install.md').read_text()
+    block = re.search(r'```sh\n(sudo apt install python3-venv.*?)```', page, re.S)[1]
+    for line in block.splitlines():
+        if line.startswith(('sudo', 'mkdir', '. install', 'ros2')):
+            continue
+        for command in line.split(' && '):
+            assert command in run, command
+    wanted = re.search(r'sudo apt install (.*)', block)[1].split()
+    assert set(wanted) <= set(run.split())
+
+
+def test_the_image_without_ros_uses_the_set_up_of_the_makefile():
+    assert '.ci/setup' in commands(DEPLOY / 'Dockerfile.python')
+    assert '.ci/setup' in (ROOT / 'Makefile').read_text()
+
+
+def test_the_container_is_built_from_the_image_with_ros():
+    content = json.loads((ROOT / '.devcontainer/devcontainer.json').read_text())
+    build = content['build']
+    folder = ROOT / '.devcontainer'
+    assert (folder / build['dockerfile']).resolve() == DEPLOY / 'Dockerfile'
+    assert (folder / build['context']).resolve() == ROOT
