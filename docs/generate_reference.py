@@ -49,6 +49,7 @@ FILES = {
     'supervisor.yaml': ('safety.parameters:SupervisorParameters',
                         'Checks of commands, takeoff, landing, detection of faults.'),
     'targets.yaml': ('runs.target_checks:TargetLimits', 'What a target pose must keep to.'),
+    'drive.yaml': ('drive.parameters:DriveParameters', 'Driving by hand.'),
     'servo_bus.yaml': ('drivers.servo_parameters:ServoBusParameters', 'The bus of tilt servos.'),
     'motor_board.yaml': ('drivers.motor_board_parameters:MotorBoardParameters',
                          'The motor board.'),
@@ -64,8 +65,8 @@ FILES = {
 
 # Nodes whose code is not in a file of their own name; '' is no node of its own.
 SHARED = {'controller_node': 'nmpc_node, rl_node', 'health': 'every node', 'operator': '',
-          'listener': '', 'node': '', 'recorder_node': '', 'command_source': '', 'graph': '',
-          'process_faults': '', 'wire': ''}
+          'driver': '', 'listener': '', 'node': '', 'recorder_node': '', 'command_source': '',
+          'graph': '', 'process_faults': '', 'wire': ''}
 
 # Topics that viewers and clocks need, which no other part of the package reads.
 OTHERS = {
@@ -270,15 +271,16 @@ def _options(command) -> list[list[str]]:
                                                                and not (option.metavar or '')
                                                                .rstrip(']').endswith('...')
                                                                else '')
-        elif not option.is_flag:
+        is_flag = getattr(option, 'is_flag', False)     # an argument has none
+        if option.param_type_name != 'argument' and not is_flag:
             names += f' {option.metavar or option.name.upper()}'
         default = option.default
         text = 'required' if option.required else ''
         told = default is not None and str(default) not in ('', 'False', '()')
         if not option.required and told and not callable(default) \
-                and not (option.is_flag and not option.secondary_opts):
+                and not (is_flag and not option.secondary_opts):
             text = (option.opts[0] if default else option.secondary_opts[0]) \
-                if option.is_flag else str(default)
+                if is_flag else str(default)
         rows.append([f'`{names}`', f'`{text}`' if text not in ('', 'required') else text,
                      ' '.join((getattr(option, 'help', '') or '').split())])
     return rows

@@ -16,6 +16,7 @@ from beetle_omni_ros.bringup.limits import CheckLimits
 from beetle_omni_ros.control.hover import HoverParameters
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.control.policy import PolicyParameters
+from beetle_omni_ros.drive.parameters import DriveParameters
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.estimation.parameters import EkfParameters
@@ -42,7 +43,8 @@ DISTRIBUTION = {'yaml': 'pyyaml', 'mcap_ros2': 'mcap-ros2-support', 'serial': 'p
 KEY = {'yaml': 'python3-yaml', 'mcap': 'mcap-ros2-support', 'mcap_ros2': 'mcap-ros2-support',
        'casadi': 'casadi-pip', 'serial': 'python3-serial', 'PIL': 'python3-pil'}
 PARAMETER_CLASSES = {
-    'check.yaml': CheckLimits, 'degraded.yaml': HoldingParameters, 'ekf.yaml': EkfParameters,
+    'check.yaml': CheckLimits, 'degraded.yaml': HoldingParameters,
+    'drive.yaml': DriveParameters, 'ekf.yaml': EkfParameters,
     'emulated_board.yaml': EmulatedBoardParameters, 'faults.yaml': FaultList,
     'gap.yaml': GapParameters,
     'hover.yaml': HoverParameters,

@@ -97,9 +97,14 @@ class Operator:
         self.diagnostics.update((status.name, status) for status in statuses)
 
     @property
+    def answers(self) -> bool:
+        """Whether the supervisor can be called."""
+        return self._clients['arm'].service_is_ready()
+
+    @property
     def ready(self) -> bool:
         """Whether the supervisor can be called and the controller commands."""
-        return self.commands > 0 and self._clients['arm'].service_is_ready()
+        return self.commands > 0 and self.answers
 
     def waits_for(self, bridges: Sequence[str]) -> str:
         """What keeps a bridge of these from flying, in its words; '' when nothing does."""

@@ -1,0 +1,336 @@
+"""`beetle_omni drive`: an operator whose keys, stick or words become targets."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager, ExitStack
+import os
+from pathlib import Path
+import select
+import sys
+import termios
+import tty
+
+import numpy as np
+from rich.console import Console
+from sensor_msgs.msg import Joy
+
+from beetle_omni_ros.control import registry
+from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.drive import keys, words
+from beetle_omni_ros.drive.parameters import DriveParameters, read_named_poses
+from beetle_omni_ros.drive.steering import Steering
+from beetle_omni_ros.drive.words import Go, Order, Shift, WordError
+from beetle_omni_ros.messages.topics import SENSOR
+from beetle_omni_ros.messages.values import Odom
+from beetle_omni_ros.nodes import wire
+from beetle_omni_ros.nodes.discovery import confine
+from beetle_omni_ros.nodes.interrupts import terminable
+from beetle_omni_ros.nodes.operator import Operator
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.runs.target_checks import TargetChecks
+
+OK, FAILED = 0, 1
+PERIOD = 0.05           # s between two targets
+SUPERVISOR_TIMEOUT = 10.0   # s for the supervisor and the estimate to be seen
+SETTLE_TIME = 0.5       # s that `wait` takes at least, so that what was asked has begun
+NEAR, ALIGNED = 0.1, np.radians(10)     # [m], [rad] of the robot from its target: it is there
+SOURCES = ('keyboard', 'joystick', 'terminal')
+RESTING = ('disarmed', 'emergency_stop')
+
+
+class Driver(Operator):
+    """
+    An operator who publishes target_pose while somebody flies.
+
+    Attributes:
+        odom: the newest estimate, or None.
+        steering: of the target; None while nothing flies.
+
+    """
+
+    def __init__(self, domain: int, parameters: DriveParameters, robot: RobotParameters):
+        """Join ``domain``."""
+        super().__init__(domain)
+        self._p, self._checks = parameters, TargetChecks(robot)
+        self.odom: Odom | None = None
+        self.steering: Steering | None = None
+        self.axes, self.buttons, self.joy_at = (), (), -np.inf
+        node = self._node
+        wire.subscribe(node, 'odom', self._on_odom, qos=SENSOR)
+        node.create_subscription(Joy, 'joy', self._on_joy, wire.profile(SENSOR))
+        self._targets = wire.Publisher(node, 'target_pose')
+        self._sent = None
+
+    def _on_odom(self, odom):
+        self.odom = odom
+
+    def _on_joy(self, message):
+        self.axes, self.buttons, self.joy_at = message.axes, message.buttons, self.time()
+
+    @property
+    def flies(self) -> bool:
+        """Whether a controller takes targets."""
+        return self.state.startswith('flying')
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the robot is at its goal, or nothing flies and nothing is on its way up."""
+        if not self.flies:
+            return self.state in RESTING
+        steering = self.steering
+        return steering is not None and steering.arrived and self.odom is not None and bool(
+            np.linalg.norm(self.odom.position - steering.position) < NEAR) and \
+            rotations.geodesic_angle(self.odom.quaternion, steering.quaternion) < ALIGNED
+
+    def follow(self, seconds: float) -> str:
+        """Move the target on by ``seconds`` and publish it where it moved; '' or a refusal."""
+        if not self.flies or self.odom is None:
+            self.steering = self._sent = None
+            return ''
+        if self.steering is None:
+            self.steering = Steering(self._p, self._checks.why_not_pose, self.odom.position,
+                                     self.odom.quaternion)
+        refused = self.steering.update(seconds, self.odom.position)
+        pose = (*self.steering.position, *self.steering.quaternion)
+        if pose != self._sent and not (self._sent is None and self.steering.arrived):
+            self._sent = pose
+            self._targets.publish(PoseTarget(self.steering.position, self.steering.quaternion))
+        return refused
+
+    def obey(self, action: Shift | Go | Order) -> str:
+        """Do what was asked for; what is to be said about it."""
+        if isinstance(action, Order):
+            return self._order(action)
+        if self.steering is None:
+            return f"nothing flies (supervisor in '{self.state or 'unknown'}'); arm first"
+        if isinstance(action, Shift):
+            return self.steering.shift(action.way, action.turn)
+        quaternion = self.steering.goal[1] if action.quaternion is None else action.quaternion
+        return self.steering.go(action.position, quaternion)
+
+    def _order(self, order):
+        if order.name in ('arm', 'land', 'emergency_stop'):
+            accepted, answer = self.call(order.name)
+            return f"{order.name}: {answer or ('done' if accepted else 'refused')}"
+        if order.name == 'controller':
+            name = order.value or self._other()
+            accepted, answer = self.set('supervisor_node', 'controller', name)
+            return f'controller {name}' if accepted else f'controller {name}: {answer}'
+        if order.name == 'where':
+            return self.where()
+        if self.steering is None:
+            return f"nothing flies (supervisor in '{self.state or 'unknown'}'); arm first"
+        if order.name == 'hold':
+            self.steering.hold()
+            return ''
+        yaw = rotations.to_rpy(self.steering.goal[1])[2]        # level
+        return self.steering.go(self.steering.goal[0], rotations.from_rpy(0.0, 0.0, yaw))
+
+    def _other(self):
+        names, now = list(registry.standing_by()), self.state.partition(':')[2]
+        return names[(names.index(now) + 1) % len(names)] if now in names else names[0]
+
+    def where(self) -> str:
+        """State, pose of the robot and of its target in one line."""
+        told = [self.state or 'no supervisor']
+        for name, at in (('at', self.odom), ('target', self.steering)):
+            if at is not None:
+                angles = np.degrees(rotations.to_rpy(at.quaternion))
+                told.append(f"{name} {' '.join(f'{x:.2f}' for x in at.position)} m, "
+                            f"{' '.join(f'{a:.0f}' for a in angles)} deg")
+        return '; '.join(told)
+
+
+def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None = None,
+              robot: Path | None = None, domain_id: int | None = None,
+              discovery: str | None = None, console: Console | None = None) -> int:
+    """
+    Drive until the user quits.
+
+    Args:
+        source: of SOURCES.
+        parameters: file in place of params/drive.yaml.
+        poses: file of more named poses.
+        robot: file of the robot, for the floor under it; default the shipped one.
+        domain_id: ROS domain; default ROS_DOMAIN_ID, or 0.
+        discovery: who can find the nodes, see :mod:`discovery`.
+        console: where to print.
+
+    Returns:
+        Exit status: 0 left by the user, 1 no flight stack there.
+
+    Raises:
+        ParameterError: unusable input.
+
+    """
+    if source not in SOURCES:
+        raise ParameterError(f"source '{source}': expected {' or '.join(SOURCES)}")
+    p = DriveParameters.load(parameters)
+    named = {**p.poses, **(read_named_poses(poses) if poses else {})}
+    believed = RobotParameters.load(robot)
+    if source == 'keyboard' and not sys.stdin.isatty():
+        raise ParameterError('keyboard: standard input is no terminal; expected one, or the '
+                             'source terminal, which reads lines')
+    confine(asked=discovery)
+    console = console or Console()
+    domain = int(os.environ.get('ROS_DOMAIN_ID') or 0) if domain_id is None else domain_id
+    with ExitStack() as stack:
+        stack.enter_context(terminable())
+        driver = Driver(domain, p, believed)
+        stack.callback(driver.close)
+
+        def say(text):
+            if text:
+                console.print(text, markup=False, emoji=False, highlight=False)
+
+        if not driver.wait(lambda: driver.answers and driver.odom is not None,
+                           SUPERVISOR_TIMEOUT):
+            missing = 'odom' if driver.answers else 'supervisor_node'
+            print(f'beetle_omni drive: error: {missing}: not seen in ROS domain {domain}; '
+                  'expected a running graph (bringup.launch.py, or beetle_omni fly)',
+                  file=sys.stderr)
+            return FAILED
+        asks = {'keyboard': _Keyboard, 'joystick': _Joystick, 'terminal': _Terminal}[source](
+            driver, p, named, say)
+        stack.enter_context(asks.open())
+        say(asks.help)
+        say(driver.where())
+        before = driver.time()
+        while not asks.done:
+            driver.spin(PERIOD)
+            now = driver.time()
+            for action in asks.actions(now - before):
+                say(driver.obey(action))
+            say(driver.follow(now - before))
+            before = now
+        say('left; the robot holds its last target')
+    return OK
+
+
+class _Keyboard:
+    """Single keys of a terminal."""
+
+    help = keys.HELP
+
+    def __init__(self, driver, p, poses, say):
+        self._p, self._poses, self.done = p, poses, False
+
+    @contextmanager
+    def open(self):
+        """Take keys as they come, without echo, and give the terminal back as it was."""
+        before = termios.tcgetattr(sys.stdin)
+        try:
+            tty.setcbreak(sys.stdin)
+            yield
+        finally:
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+    def actions(self, seconds):
+        """What the keys since the last call ask for."""
+        found = []
+        while select.select([sys.stdin], [], [], 0)[0]:
+            for key in os.read(sys.stdin.fileno(), 64).decode(errors='replace') or 'q':
+                shift, word = keys.shift_of_key(key, self._p), keys.WORDS.get(key)
+                if word == 'quit':
+                    self.done = True
+                    return found
+                if shift:
+                    found.append(Shift(*shift))
+                elif word in self._poses:
+                    found.append(words.parse(word, self._poses))
+                elif word:
+                    found.append(Order(word))
+        return found
+
+
+class _Joystick:
+    """The topic joy, of the package joy or another driver."""
+
+    help = 'joy: sticks move and turn, buttons arm, land, hold, home; Ctrl-C leaves'
+    done = False
+
+    def __init__(self, driver, p, poses, say):
+        self._driver, self._p, self._poses, self._buttons = driver, p, poses, ()
+
+    @contextmanager
+    def open(self):
+        """Nothing to open."""
+        yield
+
+    def actions(self, seconds):
+        """What sticks and buttons ask for."""
+        driver, p = self._driver, self._p
+        if driver.time() - driver.joy_at > p.joystick_timeout:
+            return []
+        before, self._buttons = self._buttons, tuple(driver.buttons)
+        found = [words.parse(name, self._poses) for name in keys.pressed(before, self._buttons, p)]
+        way, turn = keys.shift_of_sticks(driver.axes, seconds, p)
+        if driver.steering is not None and (way.any() or turn.any()):
+            found.append(Shift(way, turn))
+        return found
+
+
+class _Terminal:
+    """Lines of standard input; at its end the last one is carried out."""
+
+    help = f'{words.HELP}, or the name of a pose'
+
+    def __init__(self, driver, p, poses, say):
+        self._driver, self._poses, self._say = driver, poses, say
+        self._rest, self._ended, self.done = '', False, False
+        self._until = self._begin = None
+
+    @contextmanager
+    def open(self):
+        """Nothing to open."""
+        yield
+
+    def actions(self, seconds):
+        """What the next lines ask for, up to one that waits."""
+        found = []
+        while not self._waits() and not self.done:
+            line = self._line()
+            if line is None:
+                break
+            try:
+                action = words.parse(line, self._poses)
+            except WordError as error:
+                self._say(str(error))
+                continue
+            if isinstance(action, Order) and action.name == 'quit':
+                self.done = True
+            elif isinstance(action, Order) and action.name == 'help':
+                self._say(f"{self.help}: {', '.join(self._poses)}")
+            elif isinstance(action, Order) and action.name == 'wait':
+                self._begin = self._driver.time()
+                self._until = float(action.value) if action.value else None
+            elif action is not None:
+                found.append(action)
+        return found
+
+    def _waits(self):
+        if self._begin is None:
+            return False
+        passed = self._driver.time() - self._begin
+        if self._until is None:
+            over = passed > SETTLE_TIME and self._driver.is_there
+        else:
+            over = passed >= self._until
+        if over:
+            self._begin = None
+        return not over
+
+    def _line(self):
+        """Next whole line, or None; at the end of the input it waits once more and is done."""
+        while '\n' not in self._rest and not self._ended \
+                and select.select([sys.stdin], [], [], 0)[0]:
+            read = os.read(sys.stdin.fileno(), 4096).decode(errors='replace')
+            self._ended = not read
+            self._rest += read or '\nwait\nquit\n'
+        line, newline, rest = self._rest.partition('\n')
+        if not newline:
+            return None
+        self._rest = rest
+        return line

@@ -1,0 +1,104 @@
+"""Keys, sticks and words become shifts, goals and orders; what is none is refused in one line."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.drive import keys
+from beetle_omni_ros.drive.parameters import DriveParameters, read_named_poses
+from beetle_omni_ros.drive.words import Go, Order, parse, Shift, WordError
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.schema import ParameterError
+
+
+@pytest.fixture(scope='module')
+def p():
+    return DriveParameters.load()
+
+
+def test_each_axis_has_two_keys_that_cancel_out(p):
+    total = [np.zeros(3), np.zeros(3)]
+    for key in keys.MOVES:
+        for sum_, part in zip(total, keys.shift_of_key(key, p)):
+            sum_ += part
+    assert not np.any(total) and {axis for axis, _ in keys.MOVES.values()} == set(range(6))
+    assert keys.shift_of_key('w', p)[0] == pytest.approx([p.step, 0, 0])
+    assert keys.shift_of_key('j', p)[1] == pytest.approx([0, 0, p.turn])
+    assert keys.shift_of_key('z', p) is None
+    assert not set(keys.MOVES) & set(keys.WORDS)
+
+
+def test_a_full_stick_is_the_speed_and_the_dead_zone_nothing(p):
+    axes = np.zeros(8)
+    for number, sign in zip(p.axes.astype(int), p.signs):
+        axes[number] = sign
+    way, turn = keys.shift_of_sticks(axes, 0.1, p)
+    assert way == pytest.approx([0.1 * p.speed] * 3) and turn == pytest.approx([0.1 * p.rate] * 3)
+    way, turn = keys.shift_of_sticks(axes * p.dead_zone * 0.99, 0.1, p)
+    assert not way.any() and not turn.any()
+    half = keys.shift_of_sticks(axes * (p.dead_zone + (1 - p.dead_zone) / 2), 0.1, p)[0]
+    assert half == pytest.approx([0.05 * p.speed] * 3)
+
+
+def test_axes_that_are_missing_or_not_finite_count_as_released(p):
+    for axes in ((), [np.nan] * 8, (0.0,)):
+        way, turn = keys.shift_of_sticks(axes, 0.1, p)
+        assert not way.any() and not turn.any()
+    without = replace(p, axes=np.full(6, -1.0))
+    assert not keys.shift_of_sticks([1.0] * 8, 0.1, without)[0].any()
+    way, _ = keys.shift_of_sticks([9.0] * 8, 0.1, p)
+    assert np.abs(way).max() == pytest.approx(0.1 * p.speed)
+
+
+def test_a_button_counts_once_when_it_goes_down(p):
+    down = [0] * 11
+    down[p.buttons['arm']] = 1
+    assert keys.pressed((), down, p) == ['arm'] and keys.pressed(down, down, p) == []
+    assert keys.pressed(down, (), p) == []
+
+
+@pytest.mark.parametrize(('line', 'way', 'turn'), [
+    ('up 0.3', [0, 0, 0.3], [0, 0, 0]), ('  DOWN 1 # slowly', [0, 0, -1], [0, 0, 0]),
+    ('right 0.5', [0, -0.5, 0], [0, 0, 0]), ('roll 180', [0, 0, 0], [np.pi, 0, 0]),
+    ('yaw -90', [0, 0, 0], [0, 0, -np.pi / 2])])
+def test_words_that_shift(p, line, way, turn):
+    shift = parse(line, p.poses)
+    assert isinstance(shift, Shift)
+    assert shift.way == pytest.approx(way) and shift.turn == pytest.approx(turn)
+
+
+def test_words_that_go_and_order(p):
+    over = parse('over', p.poses)
+    assert isinstance(over, Go) and rotations.matrix(over.quaternion)[2, 2] == pytest.approx(-1)
+    goto = parse('goto 1 0 1.5', p.poses)
+    assert goto.position == pytest.approx([1, 0, 1.5]) and goto.quaternion is None
+    turned = parse('goto 1 0 1.5 0 0 90', p.poses)
+    assert turned.quaternion == pytest.approx([0, 0, 0.5 ** 0.5, 0.5 ** 0.5])
+    assert parse('arm', p.poses) == Order('arm')
+    assert parse('controller rl', p.poses) == Order('controller', 'rl')
+    assert parse('wait 2', p.poses) == Order('wait', '2.0')
+    assert parse('', p.poses) is None and parse('# nothing', p.poses) is None
+
+
+@pytest.mark.parametrize(('line', 'said'), [
+    ('up', 'expected up METRES'), ('up high', 'expected up METRES'), ('up nan', 'METRES'),
+    ('up 1 2', 'METRES'), ('roll 200', 'at most 180'), ('goto 1 2', 'X Y Z'), ('goto', 'X Y Z'),
+    ('jump 3', "'jump': expected"), ('jump', 'or a pose of home'), ('home 3', 'nothing behind'),
+    ('controller', 'NAME'), ('wait -1', 'SECONDS'), ('land now', 'nothing behind')])
+def test_what_is_no_word_is_refused_with_what_was_expected(p, line, said):
+    with pytest.raises(WordError) as raised:
+        parse(line, p.poses)
+    assert said in str(raised.value) and 'expected' in str(raised.value)
+    assert '\n' not in str(raised.value)
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    ('shelf: [1, 2, 3]', "'shelf': expected six numbers"), ('a b: [0, 0, 1, 0, 0, 0]', "'a b'"),
+    ('shelf: [0, 0, 1, 0, 0, .nan]', "'shelf'"), ('- 3', 'expected a mapping')])
+def test_a_file_of_poses_names_what_is_wrong(tmp_path, text, said):
+    file = tmp_path / 'poses.yaml'
+    file.write_text(text)
+    with pytest.raises(ParameterError, match='poses.yaml') as raised:
+        read_named_poses(file)
+    assert said in str(raised.value)
