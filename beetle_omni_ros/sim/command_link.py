@@ -31,9 +31,7 @@ class CommandLink:
         self._limit = robot.joints.position_limit
         self._thrust_range = robot.rotors.thrust_min, robot.rotors.thrust_max
         self._timing = timing
-        tilt, thrust = robot.command_delays
-        self._delays = conditions.tilt_command_delay + tilt, \
-            conditions.thrust_command_delay + thrust
+        self._delays = conditions.command_delays(robot)
         self._pending: tuple[deque, deque] = (deque(), deque())
         self._last_stamp = self._last_arrival = -np.inf
         self.tilt = np.zeros(4)

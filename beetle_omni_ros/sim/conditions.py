@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.mass_properties import Variation
 from beetle_omni_ros.sim.parameters import SimulatorParameters
@@ -51,6 +52,11 @@ class Conditions:
     tilt_latency: float
     tilt_command_delay: float
     thrust_command_delay: float
+
+    def command_delays(self, robot: RobotParameters) -> tuple[float, float]:
+        """Of tilts and of thrusts [s], with what the robot file's effects add."""
+        tilt, thrust = robot.command_delays
+        return self.tilt_command_delay + tilt, self.thrust_command_delay + thrust
 
 
 def draw(name: str, parameters: SimulatorParameters,

@@ -44,10 +44,9 @@ class EmulatedActuators:
         """
         self.bus, self.board = bus, board
         self._simulator = simulator
-        delays = simulator.conditions
-        self._tilts = _line(delays.tilt_command_delay, simulator.tick,
-                            lambda: (np.zeros(4), [False] * 4))
-        self._thrusts = _line(delays.thrust_command_delay, simulator.tick, lambda: np.zeros(4))
+        tilt, thrust = simulator.command_delays
+        self._tilts = _line(tilt, simulator.tick, lambda: (np.zeros(4), [False] * 4))
+        self._thrusts = _line(thrust, simulator.tick, lambda: np.zeros(4))
         self._held: dict[int, float] = {}
         self._servo_faults, self._board_faults = ServoFaultSwitches(), BoardFaultSwitches()
         truth = simulator.truth

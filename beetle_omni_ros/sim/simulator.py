@@ -159,6 +159,11 @@ class Simulator:
         return self._link.thrust
 
     @property
+    def command_delays(self) -> tuple[float, float]:
+        """From a command's stamp until tilts and until thrusts act [s], effects included."""
+        return self.conditions.command_delays(self._robot)
+
+    @property
     def broken(self) -> bool:
         """Whether a crash broke the robot."""
         return self._crash.broken

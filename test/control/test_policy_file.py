@@ -111,6 +111,11 @@ def test_what_is_no_robot_parameter_stays_refused_for_another_robot():
         wrong.check(other, allow_other_robot=True)
 
 
+def test_a_sensor_that_the_estimator_corrects_is_no_other_robot():
+    turned = replace(ROBOT, effects={'imu_misalignment': {'rotation': (0.01, 0.0, 0.02)}})
+    assert not PolicyContract.default(ROBOT).check(turned)
+
+
 def test_effects_alone_are_named():
     corrected = replace(ROBOT, effects={'thrust_coefficient': {'scale': 0.93}})
     with pytest.raises(ParameterError, match='robot_hash.*effects thrust_coefficient'):

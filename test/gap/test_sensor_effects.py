@@ -1,9 +1,15 @@
 """Each effect of sensors and timing, put on the readings, is recovered."""
 
-from flights import KEYS, model, Motion, solved, STEP
+from dataclasses import replace
+
+from flights import BODY, KEYS, model, Motion, P, ROBOT, solved, STEP
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
+from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, names_of
+from beetle_omni_ros.identify.gap.residual import FlightModel
+from beetle_omni_ros.robot.effects import CATALOGUE
 
 MOTION = Motion(5)
 NEUTRAL = dict(model(MOTION.flight()).residual({}).items())
@@ -68,3 +74,18 @@ def test_a_lever_arm_is_where_the_imu_sits():
 def test_units_of_all_sensor_keys_are_their_own():
     for name in ('imu_accelerometer_bias.bias[0]', 'mocap_misalignment.rotation[2]'):
         assert KEYS[name].base == 0.0 and not KEYS[name].body
+
+
+@pytest.mark.parametrize('name', [name for name, effect in CATALOGUE.items()
+                                  if any(map(effect.in_readings, effect.parameters))])
+def test_what_the_robot_file_says_of_readings_is_where_a_fit_begins(name):
+    (parameter, spec), = CATALOGUE[name].parameters.items()
+    known = replace(ROBOT, effects={name: {parameter: (np.array(spec.neutral)
+                                                       + spec.typical).tolist()}})
+    keys = {**all_keys(known), **extra_keys()}
+    told = FlightModel(MOTION.flight(), known, BODY, keys, P).residual({})
+    theta = dict.fromkeys(names_of(name, parameter), spec.typical)
+    fitted = FlightModel(MOTION.flight(), ROBOT, BODY, KEYS, P).residual(theta)
+    for group in told:
+        assert told[group] == pytest.approx(fitted[group], abs=1e-9)
+    assert keys[names_of(name, parameter)[0]].value(0.0) == pytest.approx(spec.typical)
