@@ -76,9 +76,12 @@ class Servo:
 
     def friction(self, space: Namespace, rate):
         """Largest friction at a rate of turn [N m]."""
+        return self.coulomb + (self.stiction - self.coulomb) * self.fading(space, rate)
+
+    def fading(self, space: Namespace, rate):
+        """Share of the stiction that a rate of turn leaves."""
         x = rate / self.fading_rate
-        shape = space.exp(-x * x if self.gaussian else -space.maximum(x, -x))
-        return self.coulomb + (self.stiction - self.coulomb) * shape
+        return space.exp(-x * x if self.gaussian else space.minimum(x, -x))
 
     def motor(self, space: Namespace, error, rate):
         """Torque of the motor [N m] at an error of position [rad] and a rate of turn [rad/s]."""
@@ -124,6 +127,11 @@ class Step:
         self._loss = 2 * damping / (1 + damping)    # share of the rate that damping takes
         self._keep, self._stiff = 1 - self._loss, servo.kp * self.gain
         self._per_torque, self._damping = per_torque, damping
+        if servo.effort_limit is not None:
+            self._push = -per_torque * servo.effort_limit, per_torque * servo.effort_limit
+        if servo.coulomb is not None:
+            self._slides = self.gain * servo.coulomb
+            self._sticks = self.gain * (servo.stiction - servo.coulomb)
 
     def kick(self, target, tilt, rate, load=None):
         """
@@ -146,11 +154,13 @@ class Step:
             push = push - self._loss * rate
             if load is not None:
                 push = push - self._damping * self.gain * load
-            after = rate + _within(space, push, self._per_torque * servo.effort_limit)
+            least, most = self._push
+            after = rate + space.minimum(space.maximum(push, least), most)
             if load is not None:
                 after = after + self._per_torque * load
         if servo.coulomb is not None:
-            after = after - _within(space, after, self.gain * servo.friction(space, rate))
+            after = after - _within(
+                space, after, self._slides + self._sticks * servo.fading(space, rate))
         if servo.velocity_limit is not None:
             after = _within(space, after, servo.velocity_limit)
         return after
