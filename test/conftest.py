@@ -56,6 +56,9 @@ def pytest_collection_modifyitems(config, items):
             raise pytest.UsageError(f'{path}: has tests in real time: name the mark in the file')
     for item in real_time:
         item.add_marker(pytest.mark.real_time)
+    if config.getoption('markexpr').startswith('real_time'):
+        # Devices, which wait, with each other; then processes of nodes, which compute.
+        items.sort(key=lambda item: item.path.parent.name == 'nodes')
     # In real time a second chance is worth little beside others; .ci/test gives it alone.
     for item in [*waiting, *(() if WORKER else real_time)]:
         item.add_marker(pytest.mark.flaky(reruns=RERUNS))
