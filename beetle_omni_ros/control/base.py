@@ -171,6 +171,13 @@ class TrajectoryTarget:
 Target = PoseTarget | TrajectoryTarget
 
 
+class Followed(Protocol):
+    """Anything that has a reference at each time, as both targets do."""
+
+    def at(self, time: float) -> Reference:
+        """The reference at ``time`` [s]."""
+
+
 class Controller(Protocol):
     """
     A function of state and target; whatever differs between controllers is inside.
@@ -196,6 +203,19 @@ class Controller(Protocol):
 
     def step(self, state: State, target: Target) -> Command:
         """One command for one state."""
+
+
+class Fallback(Controller, Protocol):
+    """A controller that the supervisor itself flies: takeoff, fallback and landing."""
+
+    def step(self, state: State, target: Followed) -> Command:
+        """One command for one state."""
+
+    def observe(self, state: State, free: bool = True) -> None:
+        """Learn from a state while another one flies; not where ``free`` is False."""
+
+    def set_health(self, health: ActuatorHealth) -> None:
+        """Fly with what is left."""
 
 
 def corrected(state: State, health: ActuatorHealth) -> State:

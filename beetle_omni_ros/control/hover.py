@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Command, State, Target
+from beetle_omni_ros.control.base import Command, Followed, State
 from beetle_omni_ros.robot import rotations, schema
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.degraded_allocation import allocator, DegradedAllocator, LocalWeights
@@ -116,7 +116,7 @@ class HoverController:
         self._errors = (0.0, 0.0)
         self._saturations = 0
 
-    def step(self, state: State, target: Target) -> Command:
+    def step(self, state: State, target: Followed) -> Command:
         """
         One command for one state.
 

@@ -61,7 +61,7 @@ class BackupEstimator:
         """Forget the flight; samples and biases stay."""
         self.running = False
         self._past: deque = deque(maxlen=KEPT_POSES)
-        self.specific_force_up = None
+        self.specific_force_up: float | None = None
 
     @property
     def last_specific_force(self) -> np.ndarray | None:

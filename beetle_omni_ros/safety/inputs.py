@@ -45,7 +45,8 @@ class Inputs:
         self._in_force: Command | None = None
         imu = parameters.detection.imu
         self._spikes = SpikeFilter(imu.force_change, imu.rate_change)
-        self._sample, self._same_samples = None, 0
+        self._sample: tuple[float, ...] | None = None
+        self._same_samples = 0
         self._floor = 0.0       # height of base_link where it stood [m]
         self.events = EventLog(parameters.quiet_time)
         self._now: float | None = None
@@ -169,8 +170,9 @@ class Inputs:
     def _agrees(self, stamp, position, quaternion):
         """Whether a MoCap pose fits what is known of the flight."""
         vehicle = self.vehicle
-        state = vehicle.state if not vehicle.backup.running else vehicle.backup_state(self._now)
-        known = (None,) * 4
+        state = vehicle.backup_state(self._now) \
+            if vehicle.backup.running and self._now is not None else vehicle.state
+        known: tuple[np.ndarray | None, ...] = (None,) * 4
         if state is not None and abs(state.stamp - stamp) < LATEST:
             known = state.quaternion, state.angular_velocity, state.position, state.velocity
         good = self.watch.on_mocap(stamp, position, quaternion, *known)

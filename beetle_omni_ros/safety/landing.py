@@ -7,7 +7,7 @@ from math import inf, isfinite
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Command, Controller, Reference, TrajectoryTarget
+from beetle_omni_ros.control.base import Command, Fallback, Reference, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.allocation import Allocator
@@ -47,7 +47,7 @@ class Landing:
     """
 
     def __init__(self, parameters: SupervisorParameters, robot: RobotParameters,
-                 hover: Controller, allocator: Allocator, gauge: SupportGauge, vehicle: Vehicle,
+                 hover: Fallback, allocator: Allocator, gauge: SupportGauge, vehicle: Vehicle,
                  events: EventLog, floor: float = 0.0):
         self._parameters, self._blind_limit = parameters.landing, parameters.state.blind_limit
         self._allocator, self._floor = allocator, floor
@@ -64,9 +64,10 @@ class Landing:
         ramp = self._ramp
         times = ramp.stamp + np.arange(0.0, ramp.wait + AHEAD, BETWEEN)
         samples = [ramp.at(time) for time in times]
-        return TrajectoryTarget(times, *(np.array([getattr(one, name) for one in samples]) for name
-                                in ('position', 'quaternion', 'velocity', 'angular_velocity')),
-                                ramp.stamp)
+        return TrajectoryTarget(times, np.array([one.position for one in samples]),
+                                np.array([one.quaternion for one in samples]),
+                                np.array([one.velocity for one in samples]),
+                                np.array([one.angular_velocity for one in samples]), ramp.stamp)
 
     def degrade(self, health: ActuatorHealth, now: float, in_force: Command | None) -> None:
         """Go on with the actuators that are left."""
@@ -84,9 +85,9 @@ class Landing:
 
         """
         if distrusted:
-            self._vehicle.backup.start_from_poses(self._vehicle.state)
+            self._vehicle.backup.start_from_poses(self._vehicle.known)
         elif self._vehicle.estimate.silent:
-            self._vehicle.backup.start(self._vehicle.state)
+            self._vehicle.backup.start(self._vehicle.known)
         self._blind = self._without_mocap
         self.set_out(now, in_force)
 
@@ -96,7 +97,7 @@ class Landing:
         if not backup.running and vehicle.estimate.silent:
             self._events.say(now, ERROR, f'ekf_node {vehicle.estimate.text}: descent goes on with '
                                          'raw sensors')
-            backup.start(vehicle.state)
+            backup.start(vehicle.known)
             self.set_out(now, in_force)
         if self._without_mocap and not self._blind:
             self._blind = True      # what is known of the velocity fades: less time in the air
@@ -160,32 +161,32 @@ class Landing:
         self._due = inf     # not before the joint has turned
         return True
 
-    def _turn_over(self, state, command):
+    def _turn_over(self, found: Turnover, state, command) -> Command:
         """The command with the turning joint's own target; goes on once four rotors push again."""
-        found, elapsed = self._turnover, state.stamp - self._ramp.stamp
+        elapsed = state.stamp - self._ramp.stamp
         p = self._parameters.turnover
         since = elapsed - self._ramp.way.duration - p.settling_time
         if since < 0:
             self._full = float(command.thrust[found.joint])
         elif self._arrived is None:
             # The others take over in steps, so that their joints follow.
-            share = self._rest(1 - since / p.fading_time)
+            share = self._rest(found, 1 - since / p.fading_time)
             if share <= 0:
                 command = replace(command, tilt=np.where(
                     np.arange(4) == found.joint, found.tilt, command.tilt))
                 if abs(state.tilt[found.joint] - found.tilt) < p.arrived \
                         or elapsed > self._ramp.wait:
                     self._arrived = state.stamp
-        elif self._rest((state.stamp - self._arrived) / p.fading_time) >= 1:
+        elif self._rest(found, (state.stamp - self._arrived) / p.fading_time) >= 1:
             self.set_out(state.stamp, command)
         return command
 
-    def _rest(self, share):
+    def _rest(self, found: Turnover, share) -> float:
         """Let the rotor give a share of its thrust, in steps; return the step's share."""
         share = float(np.clip(np.round(share * FADING_STEPS) / FADING_STEPS, 0.0, 1.0))
         if share != self._share:
             self._share = share
-            self._hover.set_health(self._turnover.health(share * self._full))
+            self._hover.set_health(found.health(share * self._full))
         return share
 
     def _end_turnover(self):
@@ -234,7 +235,8 @@ class Landing:
         # Rates from MoCap alone are late and noisy: nothing to learn from.
         self._hover.observe(state, free=self._vehicle.backup.imu_alive)
         command = self._hover.step(state, _Now(reference))
-        return command if self._turnover is None else self._turn_over(state, command)
+        return command if self._turnover is None else \
+            self._turn_over(self._turnover, state, command)
 
     def _slow_enough(self, stamp, reference):
         """Whether the fast descent ends: it brakes, down to the speed of the touchdown."""

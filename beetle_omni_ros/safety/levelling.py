@@ -125,7 +125,7 @@ def _corners(start, allocator):
     heading = np.linspace(0, 2 * np.pi, VIA, endpoint=False)
     ring = np.stack([np.cos(heading), np.sin(heading), np.zeros(VIA)], axis=1)
     arms = allocator.axes
-    ways = [] if start[2] < -1 + 1e-9 else [(start, UP)]
+    ways: list[tuple[np.ndarray, ...]] = [] if start[2] < -1 + 1e-9 else [(start, UP)]
     ways += [(start, side, UP) for side in ring if start @ side > -1 + 1e-9]
     ways += [(start, arm, UP) for arm in arms if start @ arm > -1 + 1e-9]
     return ways + [(start, one, other, UP) for one in arms for other in arms

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import Command, Controller, PoseTarget, Target
+from beetle_omni_ros.control.base import Command, Fallback, PoseTarget, Target
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL, NO_ZEROS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
@@ -53,7 +53,7 @@ class Supervisor(Inputs):
     """
 
     def __init__(self, parameters: SupervisorParameters, robot: RobotParameters,
-                 fallback: Controller, controllers: Sequence[str] | None = None,
+                 fallback: Fallback, controllers: Sequence[str] | None = None,
                  pilot: str | None = None):
         controllers = tuple(registry.standing_by() if controllers is None else controllers)
         super().__init__(parameters, robot, controllers)
@@ -62,14 +62,16 @@ class Supervisor(Inputs):
         self._gauge = SupportGauge(self._allocator, robot.gravity, robot.rotors.time_constant)
         self._handover = Handover(parameters.handover)
         self.state, self.source = DISARMED, 'none'
-        self._takeoff: Takeoff | None = None
-        self._landing: Landing | None = None
-        self._target: PoseTarget | None = None
+        # What a state needs, made as it is entered.
+        self._takeoff: Takeoff
+        self._landing: Landing
+        self._target: PoseTarget
         self._stop_left = 0.0
         self._landing_for = self._fallback_for = 0.0
-        self._health, self._landing_way = ALL_WELL, None
+        self._health = ALL_WELL
+        self._landing_way: Target | None = None
         self._resuming = 0.0    # time in which a pause of this process is looked into [s]
-        self._before = None     # time of the update before [s]
+        self._before: float | None = None   # time of the update before [s]
 
     # Requests ---------------------------------------------------------------------------------
 
@@ -83,7 +85,7 @@ class Supervisor(Inputs):
         self._takeoff = Takeoff(self._parameters.takeoff, self._allocator, self._hover,
                                 self.vehicle.seen(None))
         self._in_force = None
-        self._floor = float(self.vehicle.state.position[2])
+        self._floor = float(self.vehicle.known.position[2])
         self.watch.reset()
         self._health = ALL_WELL
         self._hover.set_health(ALL_WELL)
@@ -143,9 +145,9 @@ class Supervisor(Inputs):
 
         """
         dt = self._tick(now)
-        now = self._now
-        if now is None:
+        if self._now is None:
             return None
+        now = self._now
         if self.vehicle.joints.silent:
             self.vehicle.modelled_tilt = self.watch.silent_joints(now)
         self._look_for_faults(now, dt)
@@ -172,9 +174,10 @@ class Supervisor(Inputs):
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """State, sources and refusals, flat, for operators and logs."""
-        told = {'state': self.state, 'controller': self.active, 'source': self.source,
-                'estimator': self.vehicle.status or 'never heard',
-                'on_backup_estimator': int(self.vehicle.backup.running)}
+        told: dict[str, float | int | str] = {
+            'state': self.state, 'controller': self.active, 'source': self.source,
+            'estimator': self.vehicle.status or 'never heard',
+            'on_backup_estimator': int(self.vehicle.backup.running)}
         told.update({f'fault.{name}': at for name, at in self.faults.items()})
         told.update(self.actuators.diagnostics())
         told.update(self._selection.diagnostics())
@@ -383,7 +386,7 @@ class Supervisor(Inputs):
 
     def _fly(self, now, dt):
         stream = self._selection.stream
-        if stream.silence.silent:
+        if stream.silence.silent or stream.accepted is None:
             estimate = self.vehicle.estimate
             cause = f' (ekf_node {estimate.text} too)' if estimate.elapsed > 0.5 * estimate.limit \
                 else ''
@@ -421,7 +424,7 @@ class Supervisor(Inputs):
 
     def _fall_back(self, now, severity, text, position=None):
         """Hover at the present pose, or at ``position``."""
-        state = self.vehicle.state
+        state = self.vehicle.known
         self._target = PoseTarget(state.position if position is None else position,
                                   state.quaternion, now)
         self._enter(FALLBACK, now, severity, text)

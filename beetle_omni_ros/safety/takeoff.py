@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Command, Controller, State
+from beetle_omni_ros.control.base import Command, Fallback, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.safety.levelling import Way
@@ -34,7 +34,7 @@ class Takeoff:
 
     """
 
-    def __init__(self, parameters: TakeoffParameters, allocator: Allocator, hover: Controller,
+    def __init__(self, parameters: TakeoffParameters, allocator: Allocator, hover: Fallback,
                  state: State):
         self._parameters, self._hover = parameters, hover
         self._start = state
@@ -52,7 +52,7 @@ class Takeoff:
         if self._ramp is None:
             return self._align(state, dt)
         self._climbed_for += dt
-        self._judge(state)
+        self._judge(state, self._ramp.duration)
         self._hover.observe(state, free=self.airborne)
         return self._hover.step(state, self._ramp)
 
@@ -85,8 +85,8 @@ class Takeoff:
                            f'{p.align_patience:g} s (joint_bridge_node)'
         return Command(state.stamp, self._tilt, np.zeros(4))
 
-    def _judge(self, state):
-        p, over = self._parameters, self._climbed_for - self._ramp.duration
+    def _judge(self, state, duration: float):
+        p, over = self._parameters, self._climbed_for - duration
         if over < 0:
             return
         near = np.linalg.norm(state.position - self.target) < p.position_tolerance

@@ -54,6 +54,19 @@ class Vehicle:
         self.last_refusal = ''
         self._low, self._empty, self._lost = 0.0, 0.0, 0.0
 
+    @property
+    def known(self) -> State:
+        """
+        The last good estimate, without which nothing takes off.
+
+        Raises:
+            RuntimeError: there was none yet.
+
+        """
+        if self.state is None:
+            raise RuntimeError('no estimate has come yet')
+        return self.state
+
     def tick(self, dt: float) -> None:
         """``dt`` seconds passed."""
         for source in (self.estimate, self.joints, self.imu, self.mocap):
@@ -90,23 +103,23 @@ class Vehicle:
 
         Only a complete one ends the joints' silence.
         """
-        position, velocity = _numbers(position, 4), _numbers(velocity, 4) or [nan] * 4
-        known = [isfinite(angle) for angle in position or ()]
+        angles, rates = _numbers(position, 4) or [], _numbers(velocity, 4) or [nan] * 4
+        known = [isfinite(angle) for angle in angles]
         if not (isfinite(stamp) and stamp > self.tilt_stamp and any(known)
-                and all(abs(angle) < ABSURD for angle in position if isfinite(angle))):
+                and all(abs(angle) < ABSURD for angle in angles if isfinite(angle))):
             return False
         self.tilt = np.array([new if there else old for new, there, old in zip(
-            position, known, self.tilt.tolist())])
+            angles, known, self.tilt.tolist())])
         self.tilt_stamp = float(stamp)
         self.tilt_velocity = np.array([rate if there and isfinite(rate) else 0.0
-                                       for rate, there in zip(velocity, known)])
+                                       for rate, there in zip(rates, known)])
         if all(known):
             self.joints.heard()
         return True
 
     def seen(self, in_force: Command | None, state: State | None = None) -> State:
         """A state for the hover controller; silent joints that may follow are as modelled."""
-        state = self.state if state is None else state
+        state = self.known if state is None else state
         if self.joints.silent and in_force is not None and not self.stuck:
             tilt = in_force.tilt if self.modelled_tilt is None else self.modelled_tilt
             return replace(state, tilt=tilt, tilt_velocity=np.zeros(4), command=in_force)
@@ -120,12 +133,12 @@ class Vehicle:
     def attitude(self, now: float) -> np.ndarray:
         """(4,) best known attitude."""
         return self.backup_state(now).quaternion if self.backup.running \
-            else self.state.quaternion
+            else self.known.quaternion
 
     @property
     def _best(self) -> State:
         """The estimate, or that of last resort where it is in use."""
-        return self.backup.latest(self.state) if self.backup.running else self.state
+        return self.backup.latest(self.known) if self.backup.running else self.known
 
     @property
     def specific_force_up(self) -> float | None:
@@ -204,10 +217,10 @@ class Vehicle:
 
     def _check_state(self, state, status, now):
         limits = self._parameters.state
-        motion = [_numbers(v, 3) for v in (state.position, state.velocity,
-                                           state.angular_velocity)]
+        motion = [_numbers(v, 3) or [nan] for v in (state.position, state.velocity,
+                                                    state.angular_velocity)]
         quaternion = _numbers(state.quaternion, 4)
-        if not (quaternion and all(motion) and isfinite(state.stamp)
+        if not (quaternion and isfinite(state.stamp)
                 and all(map(isfinite, chain(quaternion, *motion)))):
             return 'not finite'
         if max(map(abs, chain(*motion))) > ABSURD:
@@ -225,7 +238,7 @@ class Vehicle:
         return ''
 
 
-def _numbers(value, size):
+def _numbers(value, size) -> list[float] | None:
     """``value`` as so many floats, finite or not; None where it is something else."""
     try:
         array = np.asarray(value, dtype=float)

@@ -200,8 +200,8 @@ class FaultWatch:
             return self._speeds.forget()
         if self._speeds.lost is not None:
             self._lose_rotor(self._speeds.lost, stamp, 'its ESC')
-        for rotor in np.flatnonzero(self._speeds.thrust > RACES * self._thrust_max):
-            self._lose_rotor(int(rotor), stamp, 'the speed at which it races')
+        for racing in np.flatnonzero(self._speeds.thrust > RACES * self._thrust_max):
+            self._lose_rotor(int(racing), stamp, 'the speed at which it races')
         deaf = self._speeds.deaf
         if deaf is not None and self.health.rotors[deaf] \
                 and self._name(f'rotor{deaf + 1}_deaf', stamp, f'rotor {deaf + 1} does not follow '

@@ -34,9 +34,12 @@ class MocapWatch:
 
     def reset(self) -> None:
         """Begin anew."""
-        self._stamp, self._quaternion, self._values = -np.inf, None, None
-        self._position, self._moved, self._far = None, False, 0
-        self._same, self._off = 0, 0
+        self._stamp = -np.inf
+        self._quaternion: np.ndarray | None = None
+        self._position: np.ndarray | None = None
+        self._values: tuple[float, ...] | None = None
+        self._moved = False
+        self._same = self._off = self._far = 0
         self.good, self.jumped, self.contradicts, self.displaced = True, False, False, False
 
     @property
@@ -65,13 +68,14 @@ class MocapWatch:
         self._same = self._same + 1 if values == self._values else 0
         self._values = values
         dt, before = stamp - self._stamp, self._quaternion
-        self._stamp, self._quaternion = stamp, rotations.normalized(quaternion)
+        now = rotations.normalized(quaternion)
+        self._stamp, self._quaternion = stamp, now
         turning = 0.0 if rate is None else float(np.linalg.norm(rate))
         if before is not None and 0 < dt < LONGEST and rotations.geodesic_angle(
-                before, self._quaternion) > self._p.attitude + turning * dt:
+                before, now) > self._p.attitude + turning * dt:
             self.jumped = True
         off = attitude is not None and rotations.geodesic_angle(
-            attitude, self._quaternion) > self._p.attitude + turning * AGE
+            attitude, now) > self._p.attitude + turning * AGE
         far = self._is_far(dt, np.asarray(position, dtype=float), place, velocity)
         self._off = self._off + 1 if off or far else 0
         self._far = self._far + 1 if far and self._moved else 0
@@ -80,13 +84,13 @@ class MocapWatch:
         self.contradicts = self._off >= self._p.lasting and not self._moved
         self.good = not off and not far and not self.frozen
 
-    def _is_far(self, dt, position, place, velocity):
+    def _is_far(self, dt, position, place, velocity) -> bool:
         """Whether the position is not the estimate's, and whether it jumped there."""
         before, self._position = self._position, position
         if before is not None and 0 < dt < LONGEST \
                 and np.linalg.norm(position - before) > self._p.distance + FASTEST * dt:
             self._moved = True
-        far = place is not None and np.linalg.norm(position - place) > \
+        far = place is not None and float(np.linalg.norm(position - place)) > \
             self._p.distance + float(np.linalg.norm(velocity)) * AGE
         self._moved &= far
         return far

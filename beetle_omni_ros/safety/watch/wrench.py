@@ -60,7 +60,7 @@ class WrenchWatch:
     def reset(self) -> None:
         """Begin anew, with rotors that stand still."""
         self._thrust = np.zeros(ROTORS)
-        self._stamp = None
+        self._stamp: float | None = None
         self.supported = np.zeros(ROTORS, dtype=bool)
         self._lost_for, self._slipped_for = np.zeros(ROTORS), np.zeros(ROTORS)
         self._filtered, self._vectors = np.zeros(6), np.zeros((ROTORS, 2))
@@ -214,7 +214,7 @@ class ContactWatch:
         """
         track = self._track
         track.append((stamp, position))
-        if len(track) < track.maxlen or track[-1][0] - track[0][0] > LONGEST_TRACK:
+        if len(track) < 2 * SPAN + 1 or track[-1][0] - track[0][0] > LONGEST_TRACK:
             return
         (t, a), (u, b), (v, c) = track[0], track[SPAN], track[-1]
         change = float(np.linalg.norm((c - b) / (v - u) - (b - a) / (u - t)))
