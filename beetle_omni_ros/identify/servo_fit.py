@@ -205,4 +205,4 @@ def prior_of(centre: np.ndarray, deviations: dict[str, float]) -> Prior:
     spread = np.full(len(NAMES), np.inf)
     for name, deviation in deviations.items():
         spread[INDEX[name]] = deviation / TERMS[name].scale
-    return Prior(spread, centre)
+    return Prior(spread, centre=centre)

@@ -44,7 +44,8 @@ def refuted(monkeypatch, before, after, gain=(0.0, 1.0)):
     a = Analysis(held_out=True, problem=SimpleNamespace(p=P),
                  runs={'before': runs(before), 'after': runs(after, 1)},
                  gaps={HORIZONS[analysis.JUDGED]: {'before': before, 'after': after}})
-    monkeypatch.setattr(analysis, '_gain_held_out', lambda a: gain)
+    held = SimpleNamespace(total=gain[0], error=gain[1])
+    monkeypatch.setattr(analysis, '_gain_held_out', lambda a: held)
     return analysis._refuted(a, np.ones((3, 5)))
 
 

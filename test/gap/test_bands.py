@@ -9,8 +9,8 @@ import pytest
 from scipy.signal import butter, lfilter, sosfilt
 
 from beetle_omni_ros.identify.gap.bands import apart, aside, by_band, in_part_alone
-from beetle_omni_ros.identify.gap.noise import _autoregression
 from beetle_omni_ros.identify.gap.residual import THIN
+from beetle_omni_ros.identify.inference.noise import autoregression
 
 BODY, OTHERS = 6, 10        # channels of the body's equations come first
 PERIOD = THIN * P.grid * P.body_every
@@ -90,7 +90,7 @@ def test_answers_to_gusts_are_told_from_an_inertia(gusts, wanted, true, passes):
     for flight, c in product(range(3), range(3, BODY)):
         rows = (p.flight == flight) & (p.where == c)
         acceleration, rest = flown(10 * flight + c, max(gusts, 1e-6), wanted)
-        taps, sigma = _autoregression([rest], P.body_order)
+        taps, sigma = autoregression([rest], P.body_order)
         x[rows, 0] = lfilter(taps, 1, acceleration) / sigma
         r[rows] = lfilter(taps, 1, rest - true * acceleration) / sigma
     assert apart(p, x, r)[0] > P.least_gain

@@ -1,6 +1,7 @@
 """How much an effect explains is not counted against tolerances that no robot has."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 from flights import KEYS, P, ROBOT
 import numpy as np
@@ -11,13 +12,13 @@ from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.gates import at_bound, cross_validate, holds
 from beetle_omni_ros.identify.gap.keys import (
     all_keys,
-    Belief,
     THRUST_BUS,
     TILT_BUS,
     tolerances,
 )
 from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.gap.trial import Trial
+from beetle_omni_ros.identify.inference.prior import Prior
 
 LAG, OTHER = 'rotor_lag.time_constant', 'inertia.inertia[0]'
 
@@ -127,11 +128,11 @@ def test_a_lag_within_tolerance_is():
 
 @pytest.mark.parametrize('x, expected', [(0.02, 0.02), (0.2, 0.09), (-0.2, -0.09)])
 def test_a_belief_has_an_end(x, expected):
-    assert Belief(0.03).within(x, P.beyond) == pytest.approx(expected)
+    assert Prior(0.03).within(x, P.beyond) == pytest.approx(expected)
 
 
 def test_a_free_range_ends_beyond_itself():
-    belief = Belief(5e-4, 0.010, 0.005, 0.003)
+    belief = Prior(5e-4, 0.010, 0.005, 0.003)
     assert belief.within(0.004, P.beyond) == 0.004
     assert belief.within(0.02, P.beyond) == pytest.approx(0.0065)
     assert belief.within(-0.02, P.beyond) == pytest.approx(-0.0115)
@@ -153,8 +154,8 @@ def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch
                   believed=of_beliefs)
 
     def agreed(self, trial, accepted):
-        trial.cross, trial.positive = (gain, gain / agreement), 1.0
-        trial.without_best = 0.9 * gain
+        trial.held = SimpleNamespace(total=gain, error=gain / agreement, positive=1.0,
+                                     without_best=0.9 * gain)
 
     monkeypatch.setattr(Search, '_cross_validate', agreed)
     monkeypatch.setattr(Search, '_fought', lambda self, trial, accepted: False)
@@ -170,9 +171,8 @@ def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch
     (100.0, 80.0, 0.75, 90.0, False), (100.0, 80.0, 1.0, 10.0, False)])
 def test_what_gains_little_must_gain_it_evenly(gain, error, positive, of_beliefs, held):
     drag = Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag')
-    trial = Trial(drag, gain, {}, cross=(gain, error), positive=positive,
-                  without_best=0.5 * gain, believed=of_beliefs)
-    assert holds(trial, P) == held
+    blocks = SimpleNamespace(total=gain, error=error, positive=positive, without_best=0.5 * gain)
+    assert holds(Trial(drag, gain, {}, held=blocks, believed=of_beliefs), P) == held
 
 
 @pytest.mark.parametrize('name, delay, physical', [
@@ -256,4 +256,4 @@ def test_a_limit_that_one_block_alone_knows_is_without_it_no_limit_at_worst():
                   dict(point.theta))
     cross_validate(problem, trial, point, without, [], frozenset())
     missed = ((without.r**2)[problem.block == 3]).sum()
-    assert missed > 1e4 and trial.cross[0] > -0.01 * missed
+    assert missed > 1e4 and trial.held.total > -0.01 * missed

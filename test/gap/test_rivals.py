@@ -39,8 +39,8 @@ def rivals(monkeypatch, accepted, other, beside, instead):
     monkeypatch.setattr(Search, '_step', lambda *rest: [trial(other, instead)])
 
     def agreed(self, trial, accepted):
-        trial.cross, trial.positive = (trial.gain, 0.1 * trial.gain), 1.0
-        trial.without_best = 0.9 * trial.gain
+        trial.held = SimpleNamespace(total=trial.gain, error=0.1 * trial.gain, positive=1.0,
+                                     without_best=0.9 * trial.gain)
 
     monkeypatch.setattr(Search, '_cross_validate', agreed)
     search._find_rivals(found, state, 1000.0)

@@ -93,12 +93,12 @@ def test_a_prior_weighs_like_data():
         return np.ones((len(points), 1, 4))
 
     fits = minimise(np.zeros((2, 1)), np.full((2, 1), True), np.array([-9.0]), np.array([9.0]),
-                    residual, jacobian, Prior(np.array([0.5]), np.array([1.0])), 30,
+                    residual, jacobian, Prior(np.array([0.5]), centre=np.array([1.0])), 30,
                     Steps(1e-14))
     assert fits.points[:, 0] == pytest.approx((4 * value + 4 * 1.0) / 8, abs=1e-6)
 
 
-@pytest.mark.parametrize('prior', [Prior(0.5), Prior(0.5, 2.0), Prior(0.1, 0.0, 0.3, 0.7, 5.0)])
+@pytest.mark.parametrize('prior', [Prior(0.5), Prior(0.5, centre=2.0), Prior(0.1, 0.3, 0.7, 5.0)])
 def test_the_slope_of_a_prior_is_its_residuals_derivative(prior):
     x = np.linspace(-3.03, 3.02, 80)
     numeric = (prior.residual(x + 1e-6) - prior.residual(x - 1e-6)) / 2e-6

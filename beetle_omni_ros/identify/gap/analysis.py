@@ -36,6 +36,7 @@ from beetle_omni_ros.identify.gap.trial import Found, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
 from beetle_omni_ros.identify.gap.verdict import decide, disagreement, not_met, withdraw
 from beetle_omni_ros.identify.gap.workers import Workers
+from beetle_omni_ros.identify.inference.blocks import HeldOut
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -272,8 +273,8 @@ def _refuted(a, trim):
     fall, scatter = _fall(a.runs['before'], a.runs['after'], trim, p.runs_a_block)
     if after > p.at_floor and fall < -p.clearly_worse * scatter:
         return 'makes the held-out ones worse'
-    gain, error = _gain_held_out(a)
-    if fall <= scatter and gain <= error:
+    gain = _gain_held_out(a)
+    if fall <= scatter and gain.total <= gain.error:
         return 'does not improve the held-out ones by more than their scatter'
     return ''
 
@@ -286,21 +287,17 @@ def _fall(before, after, trim, together):
         each = ((one.error[JUDGED]**2 - other.error[JUDGED]**2) / floor**2).mean(axis=1)
         count = max(1, len(each) // together)
         falls += [part.mean() for part in np.array_split(each, count)]
-    return float(np.mean(falls)), _error(falls)
+    error = np.std(falls, ddof=1) / np.sqrt(len(falls)) if len(falls) > 1 else 0.0
+    return float(np.mean(falls)), float(error)
 
 
 def _gain_held_out(a):
-    """Gain of chi2 on flights that were not fitted, in the noise of the fit, and its error."""
+    """Gain of chi2 on flights that were not fitted, in the noise of the fit."""
     judges = Problem(a.models[1], a.problem.keys, a.problem.beliefs, a.problem.p)
     judges.use(a.problem.noise)
     before, after = (judges.residual(theta)**2 for theta in (a.found.base, a.found.theta))
-    gains = [float((before - after)[judges.block == b].sum()) for b in range(judges.blocks)]
-    return sum(gains), len(gains) * _error(gains)
-
-
-def _error(values):
-    """Standard error of a mean."""
-    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
+    return HeldOut(np.array([(before - after)[judges.block == b].sum()
+                             for b in range(judges.blocks)]))
 
 
 def _measure(a, trim):

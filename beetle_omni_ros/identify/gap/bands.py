@@ -17,6 +17,8 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import CHANNELS, THIN
+from beetle_omni_ros.identify.inference.least_squares import solved
+from beetle_omni_ros.identify.inference.prior import together
 
 
 def by_band(problem: Problem, x: np.ndarray, r: np.ndarray,
@@ -117,12 +119,7 @@ def aside(problem: Problem, state: State, names: list[str], columns: np.ndarray,
 
     """
     s = state.slopes[:, [state.index[name] for name in names]]
-    beliefs = [0.0 if name in free or name not in problem.beliefs
-               else problem.beliefs[name].slope(state.theta.get(name, 0.0))**2 for name in names]
-    h = s.T @ s + np.diag(beliefs)
-    scale = 1 / np.sqrt(np.maximum(np.diag(h), 1e-12))
-    inner = h * scale[:, None] * scale + 1e-9 * np.eye(len(names))
-    projected = np.linalg.solve(inner, scale[:, None] * (s.T @ np.column_stack(
-        [columns, state.r])))
-    left = np.column_stack([columns, state.r]) - s @ (scale[:, None] * projected)
+    slope, _ = together(problem.beliefs, state.theta, names, free)
+    left = np.column_stack([columns, state.r])
+    left -= s @ solved(s.T @ s + np.diag(slope**2), s.T @ left)
     return left[:, :-1], left[:, -1]

@@ -12,6 +12,8 @@ from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import THIN
 from beetle_omni_ros.identify.gap.series import matrices
+from beetle_omni_ros.identify.inference.least_squares import solved
+from beetle_omni_ros.identify.inference.prior import together
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 
@@ -28,13 +30,8 @@ def deviations(problem: Problem, state: State, names: list[str],
     columns, p = [state.index[name] for name in names], problem.p
     s = state.slopes[:, columns]
     data = s.T @ s
-    belief = np.zeros(len(names))
-    for k, name in enumerate(names):
-        if name in problem.beliefs and name not in free:
-            belief[k] = problem.beliefs[name].slope(state.theta.get(name, 0.0))**2
-    scale = 1 / np.sqrt(np.maximum(np.diag(data) + belief, 1e-12))
-    inverse = np.linalg.inv((data + np.diag(belief)) * scale[:, None] * scale
-                            + 1e-10 * np.eye(len(names))) * scale[:, None] * scale
+    prior = together(problem.beliefs, state.theta, names, free)[0]**2
+    inverse = solved(data + np.diag(prior), np.eye(len(names)), 1e-10)
     weights = (s**2).sum(axis=0)
     widths = {}
     blocks = [problem.block == b for b in range(problem.blocks)]
@@ -44,7 +41,7 @@ def deviations(problem: Problem, state: State, names: list[str],
         level = max(p.least_variance,
                     float((s[:, k]**2 * state.r**2).sum() / max(weights[k], 1e-12)))
         a = inverse[k]
-        curvature = level * float(a @ data @ a) + float((a * a * belief).sum())
+        curvature = level * float(a @ data @ a) + float((a * a * prior).sum())
         half = max(1.96 * np.sqrt(curvature), _scattered(scores @ a, len(blocks)))
         shares = np.array([score @ a for score, _ in slow_to_quick])
         expected = level * np.array([a @ information @ a for _, information in slow_to_quick])

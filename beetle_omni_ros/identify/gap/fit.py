@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 
 from beetle_omni_ros.identify.gap.candidates import LIMITS
-from beetle_omni_ros.identify.gap.keys import Belief, Key
+from beetle_omni_ros.identify.gap.keys import Key
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.identify.gap.workers import Workers
+from beetle_omni_ros.identify.inference.least_squares import solved
+from beetle_omni_ros.identify.inference.prior import Prior, together
 
 HALVINGS = 4
-RIDGE = 1e-9
 # Deviations, residual, columns that changed and their slopes: what a state is beside another.
 Difference = tuple[dict[str, float], np.ndarray, np.ndarray, np.ndarray]
 
@@ -82,7 +83,7 @@ class Problem:
     workers: Workers | None = None
 
     def __init__(self, models: list[FlightModel], keys: dict[str, Key],
-                 beliefs: dict[str, Belief], p: GapParameters,
+                 beliefs: dict[str, Prior], p: GapParameters,
                  others: list[FlightModel] | tuple = ()):
         """See the class."""
         self.models, self.keys, self.beliefs, self.p = models, keys, beliefs, p
@@ -209,15 +210,10 @@ class Problem:
 
     def _solve_all(self, state, wide):
         h, g = state.slopes.T @ state.slopes, state.slopes.T @ state.r
-        for k, name in enumerate(state.names):
-            x = state.theta.get(name, 0.0)
-            belief = self.beliefs.get(name)
-            if belief:
-                h[k, k] += belief.slope(x)**2
-                g[k] += belief.slope(x) * belief.residual(x)
-            else:
-                h[k, k] += wide.get(name, 1.0)**-2
-        return -np.linalg.solve(h, g)
+        slope, off = together(self.beliefs, state.theta, state.names)
+        sought = [0.0 if name in self.beliefs else wide.get(name, 1.0)**-2
+                  for name in state.names]
+        return -np.linalg.solve(h + np.diag(slope**2 + sought), g + slope * off)
 
     def prior(self, theta: dict[str, float], free: frozenset[str] = frozenset()) -> float:
         """Cost of straying from what is believed, of keys that are not ``free``."""
@@ -249,16 +245,9 @@ class Problem:
 
     def solve(self, theta, names, free, h, g, chi2):
         """Finish :meth:`linear_step` from the data's normal equations."""
-        h, g = h.copy(), g.copy()
-        for k, name in enumerate(names):
-            belief = self.beliefs.get(name)
-            if belief and name not in free:
-                x = theta.get(name, 0.0)
-                h[k, k] += belief.slope(x)**2
-                g[k] += belief.slope(x) * belief.residual(x)
-        scale = 1 / np.sqrt(np.maximum(np.diag(h), 1e-12))
-        scaled = h * scale[:, None] * scale + RIDGE * np.eye(len(names))
-        step = -scale * np.linalg.solve(scaled, scale * g)
+        slope, off = together(self.beliefs, theta, names, free)
+        h, g = h + np.diag(slope**2), g + slope * off
+        step = -solved(h, g)
         cost = chi2 + self.prior(theta, free) + 2 * g @ step + step @ h @ step
         return step, float(cost), h
 

@@ -10,6 +10,7 @@ from beetle_omni_ros.identify.gap.fit import HALVINGS, Problem, State
 from beetle_omni_ros.identify.gap.keys import delays_of, Key
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.trial import Found, Trial
+from beetle_omni_ros.identify.inference.blocks import HeldOut
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 COMMANDS = delays_of('tilt', 'thrust')
@@ -76,13 +77,14 @@ def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = (),
 
 def holds(trial: Trial, p: GapParameters) -> bool:
     """Whether blocks that were left out agree; see :func:`cross_validate`."""
-    gain, error = trial.cross
-    sure = gain >= p.held_out_errors * error or trial.positive >= p.held_out_nearly_all and (
-        trial.gain >= p.least_uneven or trial.believed >= p.least_believed)
-    return sure and gain >= p.held_out_share * trial.gain \
-        and trial.positive >= p.held_out_blocks \
-        and trial.without_best >= max(p.elsewhere_share * min(gain, trial.gain),
-                                      p.least_elsewhere)
+    held = trial.held
+    sure = held.total >= p.held_out_errors * held.error \
+        or held.positive >= p.held_out_nearly_all and (
+            trial.gain >= p.least_uneven or trial.believed >= p.least_believed)
+    return sure and held.total >= p.held_out_share * trial.gain \
+        and held.positive >= p.held_out_blocks \
+        and held.without_best >= max(p.elsewhere_share * min(held.total, trial.gain),
+                                     p.least_elsewhere)
 
 
 def neither_holds(found: Found, own: str, other: str, least: float) -> bool:
@@ -144,14 +146,10 @@ def cross_validate(problem: Problem, trial: Trial, point: State, without: State,
     """
     c = trial.candidate
     with_it = list(dict.fromkeys([*involved, *c.keys]))
-    held = _left_out(problem, without, [name for name in with_it if name not in c.keys
-                                        or name in problem.beliefs], free) \
-        - _left_out(problem, point, with_it, free | set(c.keys), c.name in LIMITS)
-    several = len(held) > 1
-    trial.cross = (float(held.sum()),
-                   float(held.std(ddof=1) * np.sqrt(len(held))) if several else np.inf)
-    trial.positive = float((held > 0).mean())
-    trial.without_best = float(held.sum() - held.max()) if several else 0.0
+    others = [name for name in with_it if name not in c.keys or name in problem.beliefs]
+    trial.held = HeldOut(
+        _left_out(problem, without, others, free)
+        - _left_out(problem, point, with_it, free | set(c.keys), c.name in LIMITS))
 
 
 def _left_out(problem, at, names, free, bent=False):

@@ -187,7 +187,7 @@ def _evidence(trial: Trial):
     held = trial.held
     return {'delta_bic': trial.gain - trial.numbers * float(np.log(trial.samples)),
             'delta_chi2': trial.gain, 'cv_gain': held.total,
-            'cv_gain_se': held.total / held.error if held.error > 0 else 0.0,
+            'cv_gain_se': held.sigmas,
             'blocks_positive': int((held.gains > 0).sum())}
 
 

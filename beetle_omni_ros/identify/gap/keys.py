@@ -15,6 +15,7 @@ import math
 import numpy as np
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.inference.prior import Prior
 from beetle_omni_ros.robot.effects import CATALOGUE, delaying
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -130,36 +131,8 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
     return keys
 
 
-@dataclass(frozen=True)
-class Belief:
-    """
-    What is believed of a key beside the data: zero, within ``deviation``.
-
-    Within -below to above of zero nothing is said but ``inner``, a very wide deviation.
-    """
-
-    deviation: float
-    below: float = 0.0
-    above: float = 0.0
-    inner: float = math.inf
-
-    def residual(self, x: float) -> float:
-        """How many standard deviations ``x`` lies off, and within the free range little."""
-        out = max(x - self.above, 0.0) + min(x + self.below, 0.0)
-        return out / self.deviation + x / self.inner
-
-    def within(self, x: float, deviations: float) -> float:
-        """``x``, or the nearest value that is no more than so many deviations off."""
-        reach = deviations * self.deviation
-        return min(max(x, -self.below - reach), self.above + reach)
-
-    def slope(self, x: float) -> float:
-        """Derivative of :meth:`residual`."""
-        return (0.0 if -self.below < x < self.above else 1 / self.deviation) + 1 / self.inner
-
-
 def tolerances(p: GapParameters, coarse: bool = False,
-               swing: float = 0.0) -> dict[str, Belief]:
+               swing: float = 0.0) -> dict[str, Prior]:
     """
     Keys that every robot differs by, with the belief that it is by little.
 
@@ -178,19 +151,19 @@ def tolerances(p: GapParameters, coarse: bool = False,
                  f'servo.kd[{k}]': p.tolerance_lag}
     for k in range(12):
         made[f'position.offset[{k}]'] = p.tolerance_position
-    beliefs = {name: Belief(deviation) for name, deviation in made.items()}
-    beliefs['imu_filter_lag.delay'] = Belief(p.tolerance_delay, 0.0, p.imu_averaging, 0.002)
+    beliefs = {name: Prior(deviation) for name, deviation in made.items()}
+    beliefs['imu_filter_lag.delay'] = Prior(p.tolerance_delay, 0.0, p.imu_averaging, 0.002)
     reach, nominal = p.command_delay_range, p.command_delay
     for bus in (TILT_BUS, THRUST_BUS):
-        beliefs[bus] = Belief(5e-4, nominal, reach / 2, p.bus_near[0])
+        beliefs[bus] = Prior(5e-4, nominal, reach / 2, p.bus_near[0])
     near = p.tolerance_swing
-    beliefs['swing.ratio'] = Belief(p.tolerance_lag, near, max(swing, near), swing + near)
+    beliefs['swing.ratio'] = Prior(p.tolerance_lag, near, max(swing, near), swing + near)
     if coarse:
         imu, joint = p.coarse_latency
-        beliefs['imu_filter_lag.delay'] = Belief(p.tolerance_delay, 0.0, imu, imu)
-        beliefs['joint_feedback_delay.delay'] = Belief(p.tolerance_delay, 0.0, joint, joint)
+        beliefs['imu_filter_lag.delay'] = Prior(p.tolerance_delay, 0.0, imu, imu)
+        beliefs['joint_feedback_delay.delay'] = Prior(p.tolerance_delay, 0.0, joint, joint)
         for bus in (TILT_BUS, THRUST_BUS):
-            beliefs[bus] = Belief(5e-4, nominal, reach / 2, p.bus_near[1])
+            beliefs[bus] = Prior(5e-4, nominal, reach / 2, p.bus_near[1])
     return beliefs
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.residual import CHANNELS
+from beetle_omni_ros.identify.inference.noise import autoregression, gain, whitened
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,8 @@ class Noise:
             rows, levels, own = [], [], []
             for k in range(len(channels)):
                 series = [r[group][:, k] for r in residuals]
-                filtered, level = _autoregression(series, order)
-                coloured = level * np.sqrt(_gain(filtered))
+                filtered, level = autoregression(series, order)
+                coloured = level * np.sqrt(gain(filtered))
                 rows.append(filtered)
                 own.append(level)
                 levels.append(level * max(1.0, floors[group][k] / max(coloured, 1e-12)))
@@ -73,19 +72,16 @@ class Noise:
 
     def whiten(self, residual: dict[str, np.ndarray]) -> np.ndarray:
         """(n,) or (n, K) whitened samples of one flight's residual or slopes, groups in a row."""
-        parts = []
+        parts: list[np.ndarray] = []
         for group, taps in self.taps.items():
-            values = residual[group]
-            order = taps.shape[1] - 1
-            for k, tap in enumerate(taps):
-                filtered = lfilter(tap, 1.0, values[:, k], axis=0)[order:]
-                parts.append(filtered / self.sigma[group][k])
+            parts += [whitened(residual[group][:, k], tap, sigma)
+                      for k, (tap, sigma) in enumerate(zip(taps, self.sigma[group], strict=True))]
         return np.concatenate(parts)
 
     @property
     def spread(self) -> dict[str, np.ndarray]:
         """Group -> (channels,) standard deviation of the coloured noise, not whitened."""
-        return {group: self.sigma[group] * np.sqrt([_gain(tap) for tap in taps])
+        return {group: self.sigma[group] * np.sqrt([gain(tap) for tap in taps])
                 for group, taps in self.taps.items()}
 
     def places(self, counts: dict[str, int]) -> list[tuple[str, int, np.ndarray]]:
@@ -101,26 +97,3 @@ def _floors(p):
     force, torque, world, rate, joint = p.floors
     return {'B': np.array([force] * 3 + [torque] * 3), 'A': np.full(3, world),
             'W': np.full(3, rate), 'J': np.full(4, joint)}
-
-
-def _autoregression(series, order):
-    """Prediction-error filter (order + 1,) and its error's standard deviation."""
-    correlation, count = np.zeros(order + 1), 0
-    for x in series:
-        for lag in range(order + 1):
-            correlation[lag] += x[lag:] @ x[:len(x) - lag]
-        count += len(x)
-    correlation /= max(count, 1)
-    if correlation[0] < 1e-20:
-        return np.eye(1, order + 1)[0], 1e-10
-    correlation[0] *= 1.0 + 1e-6
-    a = solve_toeplitz(correlation[:-1], correlation[1:])
-    taps = np.concatenate([[1.0], -a])
-    return taps, float(np.sqrt(max(taps @ correlation, 1e-20)))
-
-
-def _gain(taps):
-    """Variance of the coloured series for unit variance of what drives it."""
-    # Round the whole circle: half of it would count the slowest twice, of which colour is made.
-    response = np.fft.fft(taps, 4096)
-    return float(np.mean(1 / np.maximum(np.abs(response)**2, 1e-9)))

@@ -18,6 +18,8 @@ from scipy.signal import bilinear, lfilter
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
 from beetle_omni_ros.identify.gap.series import matrices
+from beetle_omni_ros.identify.inference.blocks import ridge_held_out
+from beetle_omni_ros.identify.inference.noise import whitened
 
 SWINGING = 'a mass that swings'
 ROTORS = tuple(f'rotor_thrust_coefficient.scale[{k}]' for k in range(4))
@@ -83,12 +85,12 @@ def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:
         x = np.concatenate(white)
         known = np.linalg.lstsq(fitted, x, rcond=None)[0]
         x -= fitted @ known
-        held, weights = _judged(x, r, problem.block[rows], problem.blocks)
+        # Columns are of likely size: their weights are about one.
+        held, weights = ridge_held_out(x, r, problem.block[rows], problem.blocks, 1.0)
         # What a known number takes over, a constant wind or a thrust, is no part of it.
         size = np.sqrt(np.mean([((each @ weights - slopes @ (known @ weights))**2).mean(axis=0)
                                 for each, slopes in zip(plain, raw, strict=True)], axis=0))
-        error = float(held.std(ddof=1) * np.sqrt(len(held))) if len(held) > 1 else np.inf
-        made.append(Pattern(text, float(held.sum()), error, float((held > 0).mean()),
+        made.append(Pattern(text, held.total, held.error, held.positive,
                             (float(np.linalg.norm(size[:3])), float(np.linalg.norm(size[3:])))))
     return sorted(made, key=lambda p: -p.gain)
 
@@ -157,23 +159,9 @@ def _swings(force, period, p):
 def _seen(problem, model, columns):
     """Columns (N, 6, K) as they show in one flight's residual, whitened and not."""
     smooth = model._mask[:, None, None] * model.filters['B'](columns)
-    taps, sigma = problem.noise.taps['B'], problem.noise.sigma['B']
-    white = [lfilter(tap, 1.0, smooth[:, c], axis=0)[len(tap) - 1:] / sigma[c]
-             for c, tap in enumerate(taps)]
+    white = [whitened(smooth[:, c], tap, sigma) for c, (tap, sigma) in enumerate(zip(
+        problem.noise.taps['B'], problem.noise.sigma['B'], strict=True))]
     return np.concatenate(white), smooth
-
-
-def _judged(x, r, block, blocks):
-    """Gain of chi2 on each block left out, of weights that are likely to be about one."""
-    parts = [(x[block == b].T @ x[block == b], x[block == b].T @ r[block == b])
-             for b in range(blocks)]
-    h, g = (sum(part[k] for part in parts) for k in (0, 1))
-    one = np.eye(len(g))
-    held = np.zeros(blocks)
-    for b, (own, score) in enumerate(parts):
-        w = np.linalg.solve(h - own + one, g - score)
-        held[b] = 2 * score @ w - w @ own @ w
-    return held, np.linalg.solve(h + one, g)
 
 
 @dataclass(frozen=True)

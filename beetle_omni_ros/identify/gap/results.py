@@ -130,11 +130,10 @@ def at_least(stiction: dict, coulomb: dict) -> None:
 def evidence(a: Analysis, trial: Trial) -> dict:
     """Numbers behind a decision."""
     count = len(a.problem.time)
-    gain, error = trial.cross
+    held = trial.held
     return {'delta_bic': trial.gain - len(trial.candidate.keys) * math.log(count),
-            'delta_chi2': trial.gain, 'cv_gain': gain,
-            'cv_gain_se': gain / error if error > 0 and math.isfinite(error) else 0.0,
-            'blocks_positive': trial.positive, 'explained_share': trial.share}
+            'delta_chi2': trial.gain, 'cv_gain': held.total, 'cv_gain_se': held.sigmas,
+            'blocks_positive': held.positive, 'explained_share': trial.share}
 
 
 def _candidates(a):

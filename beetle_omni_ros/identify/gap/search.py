@@ -187,7 +187,8 @@ class Search:
             else:
                 self._cross_validate(trial, accepted)
                 much = p.weak_agreement if trial.gain > p.weak_gain * need else p.strong_agreement
-                sure = trial.cross[0] > much * trial.cross[1] and trial.positive >= p.sure_blocks
+                sure = trial.held.total > much * trial.held.error \
+                    and trial.held.positive >= p.sure_blocks
                 if not holds(trial, p):
                     trial.reason = NOT_HELD
                 elif trial.share < p.least_share and not (

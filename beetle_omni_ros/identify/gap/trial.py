@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import State
+from beetle_omni_ros.identify.inference.blocks import HeldOut
 
 TOO_SMALL = 'too small to matter'
 IMPOSSIBLE = 'beyond what is physical'
@@ -24,9 +27,7 @@ class Trial:
         theta: all numbers with it.
         refined: whether fitted, else a straight line's estimate.
         believed: part of the gain that is of beliefs: tolerances which stray less beside it.
-        cross: gain on blocks left out, and its standard error.
-        positive: part of the blocks that gain.
-        without_best: gain on blocks left out but for the best: one event is no effect.
+        held: gains on blocks left out.
         share: of what was left unexplained.
         reason: why not accepted, '' if it was.
 
@@ -37,9 +38,7 @@ class Trial:
     theta: dict[str, float]
     refined: bool = False
     believed: float = 0.0
-    cross: tuple[float, float] = (0.0, 1.0)
-    positive: float = 0.0
-    without_best: float = 0.0
+    held: HeldOut = HeldOut(np.zeros(1))
     share: float = 0.0
     reason: str = ''
 

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import orth
-from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.bands import in_part_alone
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel, THIN
 from beetle_omni_ros.identify.gap.series import matrices
+from beetle_omni_ros.identify.inference.blocks import ridge_held_out
+from beetle_omni_ros.identify.inference.noise import whitened
 
 TERMS_SHOWN = 4
 ALIKE = 1e-6            # singular values of slopes, of the largest, below which they say the same
@@ -149,8 +150,7 @@ def _whitened(problem, model, group, channel, columns):
     if group == 'B':
         smooth = model._mask[:, None] * smooth
     tap = problem.noise.taps[group][channel]
-    white = lfilter(tap, 1.0, smooth, axis=0)[len(tap) - 1:] / problem.noise.sigma[group][channel]
-    return white, smooth[len(tap) - 1:]
+    return whitened(smooth, tap, problem.noise.sigma[group][channel]), smooth[len(tap) - 1:]
 
 
 def _cross(x, fitted, r, block, blocks, ridge):
@@ -171,17 +171,8 @@ def _cross(x, fitted, r, block, blocks, ridge):
     x, r = x - basis @ (basis.T @ x), r - basis @ (basis.T @ r)
     weight = np.sqrt((x**2).mean(axis=0))
     x = x[:, weight > 0.05]
-    h = [x[block == b].T @ x[block == b] for b in range(blocks)]
-    g = [x[block == b].T @ r[block == b] for b in range(blocks)]
-    all_h, all_g = sum(h), sum(g)
-    ridge = ridge * np.trace(all_h) / max(len(all_h), 1) / 100 * np.eye(len(all_h))
-    held = np.zeros(blocks)
-    for b in range(blocks):
-        w = np.linalg.solve(all_h - h[b] + ridge, all_g - g[b])
-        held[b] = 2 * g[b] @ w - w @ h[b] @ w
-    scores = np.zeros(len(weight))
-    scores[weight > 0.05] = all_g**2 / np.maximum(np.diag(all_h), 1e-9)
-    weights = np.zeros(len(weight))
-    own = np.linalg.solve(all_h + ridge, all_g)
-    weights[weight > 0.05] = own
-    return held, scores, weights / scale, x @ own, r
+    size = (x**2).sum(axis=0)
+    held, own = ridge_held_out(x, r, block, blocks, ridge * size.sum() / max(len(size), 1) / 100)
+    scores, weights = np.zeros((2, len(weight)))
+    scores[weight > 0.05], weights[weight > 0.05] = (x.T @ r)**2 / np.maximum(size, 1e-9), own
+    return held.gains, scores, weights / scale, x @ own, r

@@ -18,7 +18,7 @@ def block_masks(weight: np.ndarray, blocks: int) -> np.ndarray:
                      for a, b in zip(edges[:-1], edges[1:], strict=True)], dtype=float)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HeldOut:
     """
     Gains of chi2 on blocks that were left out.
@@ -42,6 +42,11 @@ class HeldOut:
         return float(self.gains.std(ddof=1) * np.sqrt(count)) if count > 1 else np.inf
 
     @property
+    def sigmas(self) -> float:
+        """:attr:`total` in standard errors; 0 where there is no scatter."""
+        return self.total / self.error if self.error > 0 else 0.0
+
+    @property
     def positive(self) -> float:
         """Part of the blocks that gain."""
         return float((self.gains > 0).mean())
@@ -50,6 +55,33 @@ class HeldOut:
     def without_best(self) -> float:
         """Gain without the block that gains most: one event is no effect."""
         return float(self.gains.sum() - self.gains.max()) if len(self.gains) > 1 else 0.0
+
+
+def ridge_held_out(x: np.ndarray, r: np.ndarray, block: np.ndarray, blocks: int,
+                   ridge: float) -> tuple[HeldOut, np.ndarray]:
+    """
+    Ridge regression of r (n,) on x (n, P), judged on each block by a fit to the others.
+
+    Args:
+        x: features.
+        r: whitened residual.
+        block: (n,) number of each sample's block.
+        blocks: how many.
+        ridge: precision of every weight, about 0.
+
+    Returns:
+        gains of chi2, and the weights (P,) of a fit to all blocks.
+
+    """
+    parts = [(x[block == b].T @ x[block == b], x[block == b].T @ r[block == b])
+             for b in range(blocks)]
+    h, g = (sum(part[k] for part in parts) for k in (0, 1))
+    h = h + ridge * np.eye(x.shape[1])
+    held = np.zeros(blocks)
+    for b, (own, score) in enumerate(parts):
+        w = np.linalg.solve(h - own, g - score)
+        held[b] = 2 * score @ w - w @ own @ w
+    return HeldOut(held), np.linalg.solve(h, g)
 
 
 def gradient_scatter(slopes: np.ndarray, residual: np.ndarray, covariance: np.ndarray,

@@ -132,6 +132,21 @@ def _step(points, normal, slope, free, low, high, damping):
     return -np.linalg.solve(matrix, np.where(move, slope, 0.0)[..., None])[..., 0]
 
 
+def solved(h: np.ndarray, right: np.ndarray, ridge: float = 1e-9) -> np.ndarray:
+    """
+    Solution of ``h x = right`` of normal equations whose parameters differ in scale.
+
+    Args:
+        h: (P, P) positive.
+        right: (P,) or (P, K).
+        ridge: added to each diagonal element, relative to it.
+
+    """
+    scale = 1 / np.sqrt(np.maximum(np.diag(h), 1e-12))
+    inner = h * scale[:, None] * scale + ridge * np.eye(len(h))
+    return (scale * np.linalg.solve(inner, (scale * right.T).T).T).T
+
+
 def covariance(information: np.ndarray, free: np.ndarray) -> np.ndarray:
     """
     (P, P) inverse of the information on the free parameters; 0 for the others.

@@ -16,18 +16,18 @@ class Prior:
 
     Attributes:
         deviation: standard deviation; inf: nothing is known.
-        centre: most likely value.
         below: width of the free range on the low side.
         above: on the high side.
         inner: standard deviation within the free range.
+        centre: most likely value.
 
     """
 
     deviation: float | np.ndarray
-    centre: float | np.ndarray = 0.0
     below: float = 0.0
     above: float = 0.0
     inner: float = np.inf
+    centre: float | np.ndarray = 0.0
 
     def residual(self, x):
         """How many standard deviations ``x`` lies off, and within the free range little."""
@@ -49,3 +49,26 @@ class Prior:
         """``x``, or the nearest value that is no more than so many deviations off."""
         reach = deviations * self.deviation
         return np.clip(x, self.centre - self.below - reach, self.centre + self.above + reach)
+
+
+def together(priors: dict[str, Prior], values: dict[str, float], names: list[str],
+             free: frozenset[str] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Slopes and residuals of the priors of several parameters.
+
+    Args:
+        priors: by name.
+        values: by name; 0 where it is missing.
+        names: K of them.
+        free: of which nothing is known.
+
+    Returns:
+        (K,) and (K,); 0 where a parameter is free or has no prior.
+
+    """
+    made = np.zeros((2, len(names)))
+    for k, name in enumerate(names):
+        if name in priors and name not in free:
+            x = values.get(name, 0.0)
+            made[:, k] = priors[name].slope(x), priors[name].residual(x)
+    return made[0], made[1]
