@@ -10,9 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from beetle_omni_ros.identify.csv_table import LogError
+from beetle_omni_ros.identify.inference.least_squares import (
+    differences,
+    minimise,
+    soft_l1,
+    Steps,
+)
+from beetle_omni_ros.identify.inference.prior import UNKNOWN
 from beetle_omni_ros.identify.rotor_log import Plateau, RotorLog
 
 UNIT_THRUST = 10.0      # [N] of g
@@ -103,8 +109,7 @@ def fit_row(name: str, plateau: Plateau) -> MapRow:
     weight = np.ones(len(g))
     for _ in range(3):
         scale = 3 * 1.4826 * np.median(np.abs(_error(coefficients, g, duty, weight)[:len(g)]))
-        coefficients = least_squares(_error, coefficients, loss='soft_l1', x_scale='jac',
-                                     f_scale=scale + 1e-6, args=(g, duty, weight)).x
+        coefficients = _fitted(coefficients, g, duty, weight, scale + 1e-6)
         fitted = inverse(coefficients, duty, UNIT_THRUST * top) / UNIT_THRUST
         weight = _weights(fitted, fitted - g)
     slopes = np.polyval(np.polyder(coefficients[::-1]), np.linspace(0, g.max(), GRID))
@@ -133,6 +138,16 @@ def _start(g, duty):
     if np.polyval(np.polyder(start[::-1]), np.linspace(0, g.max(), 60)).min() < LEAST_SLOPE:
         start = np.array([*np.polyfit(g[run], duty[run], 1)[::-1], 0.0, 0.0])
     return start
+
+
+def _fitted(start, g, duty, weight, scale):
+    """Coefficients whose error is least, in a loss that is linear beyond ``scale``."""
+    def residual(points, _):
+        return np.array([soft_l1(_error(point, g, duty, weight), scale) for point in points])
+
+    end = np.full(len(start), np.inf)
+    return minimise(start[None], np.full((1, len(start)), True), -end, end, residual,
+                    differences(residual, 1e-7), UNKNOWN, 100, Steps(1e-12, np.inf)).points[0]
 
 
 def _error(coefficients, g, duty, weight):

@@ -10,7 +10,6 @@ says which parameter sets a point stands for: those of one joint, or of joints t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from beetle_omni_ros.identify.inference.least_squares import (
     Steps,
 )
 from beetle_omni_ros.identify.inference.noise import Noise
-from beetle_omni_ros.identify.inference.prior import Prior
+from beetle_omni_ros.identify.inference.prior import Prior, UNKNOWN
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
 
@@ -37,12 +36,11 @@ ORDERS = 6, 40          # its range in samples
 DIFFERENCE = 0.05       # of a parameter's scale, for derivatives
 DIFFERENT = 10          # blocks over which the gradient's scatter is taken
 BEYOND = 1.15           # a limit counts only if the command asks for so much more than it
-UNKNOWN = Prior(np.inf)
 
 
-class Layout(Protocol):
+class Apart:
     """
-    What a point of a fit stands for.
+    The layout in which each problem is one joint, and a point its parameter set.
 
     Attributes:
         coordinates: of a point (P,).
@@ -51,23 +49,12 @@ class Layout(Protocol):
 
     """
 
-    coordinates: Coordinates
-    owner: np.ndarray
-    steps: Steps
-
-    def sets(self, points: np.ndarray) -> np.ndarray:
-        """(M, J, len(NAMES)) parameter sets of points (M, P)."""
-
-
-class Apart:
-    """Each problem is one joint, and a point its parameter set."""
-
     coordinates = Coordinates(tuple(TERMS.values()))
     owner = np.full(len(NAMES), -1)
     steps = Steps()
 
     def sets(self, points: np.ndarray) -> np.ndarray:
-        """See :class:`Layout`."""
+        """(M, J, len(NAMES)) parameter sets of points (M, P)."""
         return decode(points)[:, None]
 
 
@@ -133,12 +120,12 @@ class ServoFitter:
     Args:
         log: the measured data.
         noise: how residuals are whitened.
-        layout: of the points.
+        layout: of the points: :class:`Apart`, or joints that share parameters.
         prior: beside the data, of points (P,).
 
     """
 
-    def __init__(self, log: JointLog, noise: Noise, layout: Layout = APART,
+    def __init__(self, log: JointLog, noise: Noise, layout=APART,
                  prior: Prior = UNKNOWN):
         """Keep the four; see the class."""
         self.log, self.noise, self.layout, self.prior = log, noise, layout, prior

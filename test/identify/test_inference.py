@@ -10,25 +10,31 @@ from scipy.signal import lfilter
 from scipy.special import huber as huber_cost
 
 from beetle_omni_ros.identify import inference
-from beetle_omni_ros.identify.inference.blocks import block_masks, gradient_scatter, HeldOut
+from beetle_omni_ros.identify.inference.blocks import (
+    block_masks,
+    gradient_scatter,
+    HeldOut,
+    ridge_held_out,
+)
 from beetle_omni_ros.identify.inference.coordinates import Coordinates
 from beetle_omni_ros.identify.inference.least_squares import (
     covariance,
+    differences,
     HUBER,
     huber,
     minimise,
     soft_l1,
+    solved,
     Steps,
 )
 from beetle_omni_ros.identify.inference.noise import autoregression, gain, Noise, whitened
-from beetle_omni_ros.identify.inference.prior import Prior
+from beetle_omni_ros.identify.inference.prior import Prior, together, UNKNOWN
 from beetle_omni_ros.identify.servo_model import TERMS
 
 FOLDER = Path(inference.__file__).parent
 OWN = 'beetle_omni_ros.identify.inference'
 T = np.linspace(0, 2, 60)
 LOW, HIGH = np.array([-5.0, 0.0]), np.array([5.0, 3.0])
-UNKNOWN = Prior(np.inf)
 
 
 @pytest.mark.parametrize('path', sorted(FOLDER.glob('*.py')), ids=lambda path: path.stem)
@@ -184,3 +190,42 @@ def test_gains_on_blocks_left_out():
     assert held.error == pytest.approx(4 * np.std([4, -1, 2, 3], ddof=1) / 2)
     one = HeldOut(np.array([5.0]))
     assert one.error == np.inf and one.without_best == 0.0
+    assert held.sigmas == pytest.approx(8.0 / held.error) and one.sigmas == 0.0
+
+
+def test_a_regression_is_judged_on_blocks_that_it_was_not_fitted_to():
+    rng = np.random.default_rng(0)
+    x, block = rng.standard_normal((400, 3)), np.arange(400) // 80
+    r = x @ [1.0, -0.5, 0.0] + rng.standard_normal(400)
+    held, weights = ridge_held_out(x, r, block, 5, 2.0)
+    assert weights == pytest.approx(np.linalg.solve(x.T @ x + 2 * np.eye(3), x.T @ r))
+    for b, gain_of_block in enumerate(held.gains):
+        out = block == b
+        w = np.linalg.solve(x[~out].T @ x[~out] + 2 * np.eye(3), x[~out].T @ r[~out])
+        assert gain_of_block == pytest.approx((r[out]**2).sum() - ((r[out] - x[out] @ w)**2).sum())
+    noise, _ = ridge_held_out(x, rng.standard_normal(400), block, 5, 2.0)
+    assert noise.total < 10.0 and held.total > 300.0
+
+
+def test_normal_equations_of_any_scale_are_solved():
+    rng = np.random.default_rng(0)
+    root, scale = rng.standard_normal((4, 9)), np.array([1e-5, 1.0, 1e4, 30.0])
+    h = (scale[:, None] * root) @ (scale[:, None] * root).T
+    truth = rng.standard_normal((4, 2)) / scale[:, None]
+    assert solved(h, h @ truth) * scale[:, None] == pytest.approx(truth * scale[:, None], rel=1e-6)
+    assert solved(h, h @ truth[:, 0]) * scale == pytest.approx(truth[:, 0] * scale, rel=1e-6)
+
+
+def test_differences_are_the_jacobian():
+    _, residual, jacobian = problems(3)
+    points, rows = np.array([[2.0, 1.0], [1.0, 0.4], [2.5, 2.0]]), np.arange(3)
+    base = residual(points, rows)
+    assert differences(residual, 1e-6)(points, rows, base) == pytest.approx(
+        jacobian(points, rows, base), abs=1e-3)
+
+
+def test_priors_by_name_count_where_they_are_known_and_wanted():
+    priors = {'a': Prior(0.5), 'b': Prior(2.0), 'c': Prior(1.0)}
+    slopes, off = together(priors, {'a': 1.0, 'c': 9.0}, ['a', 'b', 'c', 'd'], frozenset('c'))
+    assert slopes == pytest.approx([2.0, 0.5, 0.0, 0.0])
+    assert off == pytest.approx([2.0, 0.0, 0.0, 0.0])

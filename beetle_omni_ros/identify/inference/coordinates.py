@@ -4,27 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any
 
 import numpy as np
-
-
-class Coordinate(Protocol):
-    """
-    One fitted parameter.
-
-    Attributes:
-        low: smallest value of a fit.
-        high: largest.
-        scale: a change that matters; of the logarithm where ``logarithmic``.
-        logarithmic: whether it is fitted as its logarithm.
-
-    """
-
-    low: float
-    high: float
-    scale: float
-    logarithmic: bool
 
 
 @dataclass(frozen=True)
@@ -33,12 +15,13 @@ class Coordinates:
     Points (..., P): values in units of their scales, logarithms where fitted so.
 
     Attributes:
-        each: declarations of the P parameters.
+        each: the P parameters, each with ``low`` and ``high`` (of a fit), ``scale`` (a change that
+            matters; of the logarithm where ``logarithmic``) and ``logarithmic``.
         low, high: (P,) bounds of points.
 
     """
 
-    each: Sequence[Coordinate]
+    each: Sequence[Any]
     scale: np.ndarray = field(init=False)
     low: np.ndarray = field(init=False)
     high: np.ndarray = field(init=False)

@@ -120,6 +120,14 @@ def minimise(points: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.nda
     return Fits(points, chi2)
 
 
+def differences(residual: Callable[[np.ndarray, np.ndarray], np.ndarray], step: float) -> Callable:
+    """Jacobian for :func:`minimise` by one-sided differences of ``step`` in each parameter."""
+    def jacobian(points, rows, base):
+        return np.stack([(residual(points + move, rows) - base) / step
+                         for move in step * np.eye(points.shape[1])], axis=1)
+    return jacobian
+
+
 def _step(points, normal, slope, free, low, high, damping):
     """Damped steps (B, P); parameters at a bound that push outwards stay."""
     stuck = ((points <= low + 1e-9) & (slope > 0)) | ((points >= high - 1e-9) & (slope < 0))

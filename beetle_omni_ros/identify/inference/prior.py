@@ -51,6 +51,9 @@ class Prior:
         return np.clip(x, self.centre - self.below - reach, self.centre + self.above + reach)
 
 
+UNKNOWN = Prior(np.inf)
+
+
 def together(priors: dict[str, Prior], values: dict[str, float], names: list[str],
              free: frozenset[str] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
     """
