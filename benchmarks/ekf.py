@@ -11,7 +11,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test' / 'estimation')]
 
 from ekf_flights import fly, GRAVITY  # noqa: E402
 
-from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, ImuSample  # noqa: E402
+from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, ImuReading  # noqa: E402
 
 FLIGHT = 800.0  # [s] a run of 100 poses
 
@@ -22,7 +22,7 @@ def main(duration=20.0):
     arrivals = list(fly(0, duration).arrivals())
     times = {'imu': [], 'pose with replay': [], 'estimate': []}
     for _, sample in arrivals:
-        is_imu = isinstance(sample, ImuSample)
+        is_imu = isinstance(sample, ImuReading)
         start = process_time_ns()
         (ekf.imu if is_imu else ekf.pose)(sample)
         middle = process_time_ns()
@@ -37,7 +37,7 @@ def main(duration=20.0):
     ekf.reset()
     start = process_time()
     for _, sample in arrivals:
-        (ekf.imu if isinstance(sample, ImuSample) else ekf.pose)(sample)
+        (ekf.imu if isinstance(sample, ImuReading) else ekf.pose)(sample)
     whole = (process_time() - start) * FLIGHT / duration
     print(f'{FLIGHT:.0f} s of flight: {whole:.1f} s CPU')
 

@@ -26,19 +26,12 @@ from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.motor_board_watch import BoardWatch, restarted
 from beetle_omni_ros.drivers.servo_link import ServoLink
 from beetle_omni_ros.drivers.servo_port import ServoPort
-from beetle_omni_ros.estimation.samples import ImuSample
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.topics import ALL
-from beetle_omni_ros.messages.values import (
-    Battery,
-    Joints,
-    MessageError,
-    Odom,
-    RotorSpeeds,
-    Wrench,
-)
+from beetle_omni_ros.messages.values import MessageError, Odom, Wrench
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, RotorReading
 from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.sim.emulated import mavlink
 from beetle_omni_ros.sim.emulated.dynamixel import fast_status, packet, Receiver, status
@@ -159,13 +152,13 @@ class Messages:
         track = wire.message('target_trajectory', TrajectoryTarget(
             np.arange(3.0), np.ones((3, 3)), np.tile(LEVEL, (3, 1)), np.zeros((3, 3)),
             np.zeros((3, 3))))
-        pose, joints = PoseTarget(zero, LEVEL, 1.0), Joints(1.0, np.zeros(4), np.zeros(4))
+        pose, joints = PoseTarget(zero, LEVEL, 1.0), JointReading(1.0, np.zeros(4), np.zeros(4))
         values = {'mocap/pose': pose, 'odom': Odom(1.0, zero, zero, LEVEL, zero),
                   'command': Command(1.0, np.zeros(4), np.ones(4)), 'joint_states': joints,
-                  'rotor_states': RotorSpeeds(1.0, np.ones(4)),
-                  'battery_state': Battery(1.0, 24.0, -9.0, 6),
+                  'rotor_states': RotorReading(1.0, np.ones(4)),
+                  'battery_state': BatteryReading(1.0, 24.0, -9.0, 6),
                   'disturbance': Wrench(1.0, zero, zero),
-                  'imu/data_raw': ImuSample(0.0, zero, zero)}
+                  'imu/data_raw': ImuReading(0.0, zero, zero)}
         self._kinds: list[tuple[Callable, Callable]] = [
             (lambda: wire.message('target_pose', PoseTarget(zero + 1, LEVEL, 1.0)), self._target),
             (lambda: track, self._track),

@@ -9,6 +9,7 @@ import numpy as np
 
 from beetle_omni_ros.drivers.mavlink_dialect import common
 from beetle_omni_ros.drivers.mavlink_receiver import ReceiveCounts
+from beetle_omni_ros.robot.readings import BatteryReading
 
 # docs/reference/firmware.md: the bytes of HEARTBEAT.custom_mode and COMMAND_ACK.result_param2.
 CONTRACT_VERSION = 1
@@ -39,15 +40,6 @@ class BoardStatus:
     def armed(self) -> bool:
         """Whether the rotors may turn."""
         return self.state in ('armed', 'running')
-
-
-@dataclass(frozen=True, slots=True)
-class Battery:
-    """Pack voltage [V] and current [A, negative while discharging; nan unknown], host time [s]."""
-
-    stamp: float
-    voltage: float
-    current: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +123,7 @@ class BoardUpdate:
 
     """
 
-    battery: Battery | None
+    battery: BatteryReading | None
     rotors: RotorStates | None
     status: BoardStatus | None
     events: tuple[tuple[str, str], ...] = field(repr=False)
@@ -154,13 +146,13 @@ def conditions_of(bits: int) -> tuple[str, ...]:
     return tuple(text for bit, text in CONDITIONS.items() if bits & bit)
 
 
-def battery_of(message, stamp: float) -> Battery | None:
-    """BATTERY_STATUS to :class:`Battery`; None if it holds no voltage."""
+def battery_of(message, stamp: float) -> BatteryReading | None:
+    """BATTERY_STATUS to :class:`BatteryReading`; None if it holds no voltage."""
     cells = [cell for cell in message.voltages if cell != UNKNOWN_CELL]
     if not cells:
         return None
     current = message.current_battery
-    return Battery(stamp, sum(cells) / 1000,
+    return BatteryReading(stamp, sum(cells) / 1000,
                    math.nan if current == UNKNOWN_CURRENT else -current / 100)
 
 

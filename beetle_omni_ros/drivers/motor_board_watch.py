@@ -11,7 +11,6 @@ import time
 from beetle_omni_ros.drivers.clock_offset import ClockOffset
 from beetle_omni_ros.drivers.mavlink_dialect import common, EscInfo, EscStatus
 from beetle_omni_ros.drivers.motor_board_messages import (
-    Battery,
     battery_of,
     BoardReception,
     BoardStatus,
@@ -22,6 +21,7 @@ from beetle_omni_ros.drivers.motor_board_messages import (
 )
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.readings import BatteryReading
 
 EVENTS_KEPT = 200
 QUESTIONS_KEPT = 50     # of TIMESYNC; an answer later than these is of no use
@@ -49,7 +49,7 @@ class BoardWatch:
         self.voltage: float | None = None
         self.reception: BoardReception | None = None
         self._info = None
-        self._battery: Battery | None = None
+        self._battery: BatteryReading | None = None
         self._rotors: RotorStates | None = None
         self._events: deque = deque(maxlen=EVENTS_KEPT)
         self._asked: deque = deque(maxlen=QUESTIONS_KEPT)

@@ -19,12 +19,13 @@ from beetle_omni_ros.estimation.mounting import Mounting
 from beetle_omni_ros.estimation.noise import NoiseMonitor
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.propagation import TIME_OFFSET
-from beetle_omni_ros.estimation.samples import ATTITUDE, Estimate, ImuSample, PoseSample
+from beetle_omni_ros.estimation.samples import ATTITUDE, Estimate
 from beetle_omni_ros.estimation.track import interpolate, SAME_INSTANT, Track
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.readings import ImuReading, PoseReading
 from beetle_omni_ros.robot.rotations import geodesic_angle
 
-__all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuSample', 'PoseSample']
+__all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuReading', 'PoseReading']
 
 ALIGNED = 0.8   # cosine between residuals of one cause; of noise in six dimensions 3 % reach it
 SURE = 5.0      # standard deviations of the attitude
@@ -89,7 +90,7 @@ class ErrorStateEkf:
             self._estimate = self._mounting.estimate(self._track.newest, self._readings)
         return self._estimate
 
-    def imu(self, sample: ImuSample) -> bool:
+    def imu(self, sample: ImuReading) -> bool:
         """
         Predict to the sample's stamp.
 
@@ -117,7 +118,7 @@ class ErrorStateEkf:
             self._apply(*self._early.popleft())
         return True
 
-    def pose(self, sample: PoseSample) -> bool:
+    def pose(self, sample: PoseReading) -> bool:
         """
         Correct the state at the capture time of a MoCap pose.
 

@@ -1,4 +1,4 @@
-"""What goes into the estimator and what comes out."""
+"""What comes out of the estimator, and the order of its error states."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,40 +14,6 @@ ATTITUDE = slice(6, 9)
 ACCELEROMETER_BIAS = slice(9, 12)
 GYROSCOPE_BIAS = slice(12, 15)
 ERROR_STATES = 15
-
-
-@dataclass(frozen=True)
-class ImuSample:
-    """
-    One IMU reading (REP-145), in the IMU's own axes.
-
-    Attributes:
-        stamp: when it was measured [s].
-        specific_force: (3,) acceleration minus gravity [m/s^2]; +g along up at rest.
-        angular_velocity: (3,) [rad/s].
-
-    """
-
-    stamp: float
-    specific_force: np.ndarray
-    angular_velocity: np.ndarray
-
-
-@dataclass(frozen=True)
-class PoseSample:
-    """
-    One MoCap pose of the tracked body in world.
-
-    Attributes:
-        stamp: when it was captured [s], not when it arrived.
-        position: (3,) [m].
-        quaternion: (4,) body to world (x, y, z, w); its sign is free.
-
-    """
-
-    stamp: float
-    position: np.ndarray
-    quaternion: np.ndarray
 
 
 @dataclass(frozen=True)

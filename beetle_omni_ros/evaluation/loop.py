@@ -27,7 +27,7 @@ from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
 from beetle_omni_ros.evaluation.processes import Processes
-from beetle_omni_ros.messages.values import Battery, Joints, Odom, Wrench
+from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot.actuator_health import ALL_WELL
 from beetle_omni_ros.runs.target_checks import out_of_reach
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
@@ -234,12 +234,10 @@ class FlightLoop:
         if frame.joints is not None:
             self._joints = joints = frame.joints
             tell('on_joints', joints.stamp, joints.position, joints.velocity)
-            recorder.write('joint_states', Joints(joints.stamp, joints.position, joints.velocity,
-                                                  joints.effort), now)
+            recorder.write('joint_states', joints, now)
         if frame.battery is not None:
             tell('on_battery', frame.battery.voltage)
-            recorder.write('battery_state', Battery(
-                frame.battery.stamp, frame.battery.voltage, frame.battery.current))
+            recorder.write('battery_state', frame.battery)
         if frame.imu is not None:
             imu = frame.imu
             self._estimator.imu(imu)

@@ -17,14 +17,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
-from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
 from beetle_omni_ros.messages.values import (
-    Battery,
     Diagnostic,
-    Joints,
     MessageError,
     Odom,
-    RotorSpeeds,
     ToldHealth,
     Wish,
     Wrench,
@@ -32,6 +28,13 @@ from beetle_omni_ros.messages.values import (
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
+from beetle_omni_ros.robot.readings import (
+    BatteryReading,
+    ImuReading,
+    JointReading,
+    PoseReading,
+    RotorReading,
+)
 
 WORLD, BODY = 'world', 'base_link'
 JOINTS, ROTORS = list(JOINT_NAMES), list(ROTOR_NAMES)
@@ -153,13 +156,13 @@ def _floats(values):
 
 # --- sensors ------------------------------------------------------------------------------------
 
-def read_imu(message: Any) -> ImuSample:
+def read_imu(message: Any) -> ImuReading:
     """Specific force and rates."""
-    return ImuSample(seconds(message.header.stamp), xyz(message.linear_acceleration),
+    return ImuReading(seconds(message.header.stamp), xyz(message.linear_acceleration),
                      xyz(message.angular_velocity))
 
 
-def take_imu(message: Any) -> ImuSample:
+def take_imu(message: Any) -> ImuReading:
     """Refuse what is not finite."""
     sample = read_imu(message)
     finite(sample.specific_force, 'linear_acceleration')
@@ -167,7 +170,7 @@ def take_imu(message: Any) -> ImuSample:
     return sample
 
 
-def write_imu(kind: Kind, value: ImuSample) -> Any:
+def write_imu(kind: Kind, value: ImuReading) -> Any:
     """Without orientation, as REP-145 has it."""
     message = _begin(kind, 'sensor_msgs/msg/Imu', value.stamp, BODY)
     message.orientation.w = 1.0
@@ -177,13 +180,13 @@ def write_imu(kind: Kind, value: ImuSample) -> Any:
     return message
 
 
-def read_pose(message: Any) -> PoseSample:
+def read_pose(message: Any) -> PoseReading:
     """Pose of base_link in world."""
-    return PoseSample(seconds(message.header.stamp), xyz(message.pose.position),
+    return PoseReading(seconds(message.header.stamp), xyz(message.pose.position),
                       xyzw(message.pose.orientation))
 
 
-def take_pose(message: Any) -> PoseSample:
+def take_pose(message: Any) -> PoseReading:
     """Refuse what is not finite; the estimator judges the quaternion by its own tolerance."""
     sample = read_pose(message)
     finite(sample.position, 'position')
@@ -191,32 +194,33 @@ def take_pose(message: Any) -> PoseSample:
     return sample
 
 
-def write_pose(kind: Kind, value: PoseSample | PoseTarget) -> Any:
+def write_pose(kind: Kind, value: PoseReading | PoseTarget) -> Any:
     """Pose in world, measured or wanted."""
     message = _begin(kind, 'geometry_msgs/msg/PoseStamped', value.stamp, WORLD)
     _set_pose(message.pose, value.position, value.quaternion)
     return message
 
 
-def read_joints(message: Any) -> Joints:
+def read_joints(message: Any) -> JointReading:
     """Read the four tilt joints, in whatever order the message names them."""
     order = _order(message.name, JOINTS)
-    return Joints(seconds(message.header.stamp), _values(message.position, order, 'position'),
-                  _values(message.velocity, order, 'velocity') if len(message.velocity) else None,
-                  _values(message.effort, order, 'effort') if len(message.effort) else None)
+    return JointReading(
+        seconds(message.header.stamp), _values(message.position, order, 'position'),
+        _values(message.velocity, order, 'velocity') if len(message.velocity) else None,
+        _values(message.effort, order, 'effort') if len(message.effort) else None)
 
 
-def take_joints(message: Any) -> Joints:
+def take_joints(message: Any) -> JointReading:
     """Refuse what is not finite; joints whose rates are not told stand still."""
     order = _order(message.name, JOINTS)
     position = _values(message.position, order, 'position')
     velocity = _values(message.velocity, order, 'velocity') if len(message.velocity) \
         else np.zeros(4)
-    return Joints(seconds(message.header.stamp), finite(position, 'position'),
+    return JointReading(seconds(message.header.stamp), finite(position, 'position'),
                   finite(velocity, 'velocity'))
 
 
-def take_known_joints(message: Any) -> Joints:
+def take_known_joints(message: Any) -> JointReading:
     """Read those tilt joints that the message names; angle and rate of the others are nan."""
     places = [k for k, name in enumerate(JOINTS) if name in message.name]
     order = _order(message.name, [JOINTS[k] for k in places])
@@ -224,10 +228,10 @@ def take_known_joints(message: Any) -> Joints:
     position[places] = finite(_values(message.position, order, 'position'), 'position')
     velocity[places] = finite(_values(message.velocity, order, 'velocity'), 'velocity') \
         if len(message.velocity) else 0.0
-    return Joints(seconds(message.header.stamp), position, velocity)
+    return JointReading(seconds(message.header.stamp), position, velocity)
 
 
-def write_joints(kind: Kind, value: Joints) -> Any:
+def write_joints(kind: Kind, value: JointReading) -> Any:
     """All four, or those that the value names."""
     message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
     message.name = list(value.names)
@@ -239,14 +243,14 @@ def write_joints(kind: Kind, value: Joints) -> Any:
     return message
 
 
-def read_rotors(message: Any) -> RotorSpeeds:
+def read_rotors(message: Any) -> RotorReading:
     """Read the speeds by the ESCs."""
     if list(message.name) != ROTORS or len(message.velocity) != len(ROTORS):
         raise MessageError(f'expected velocities of {ROTORS}')
-    return RotorSpeeds(seconds(message.header.stamp), np.array(message.velocity, dtype=float).T)
+    return RotorReading(seconds(message.header.stamp), np.array(message.velocity, dtype=float).T)
 
 
-def write_rotors(kind: Kind, value: RotorSpeeds) -> Any:
+def write_rotors(kind: Kind, value: RotorReading) -> Any:
     """Speeds as velocities of the rotors."""
     message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
     message.name = ROTORS
@@ -254,19 +258,19 @@ def write_rotors(kind: Kind, value: RotorSpeeds) -> Any:
     return message
 
 
-def read_battery(message: Any) -> Battery:
+def read_battery(message: Any) -> BatteryReading:
     """Voltage and current."""
-    return Battery(seconds(message.header.stamp), message.voltage, message.current)
+    return BatteryReading(seconds(message.header.stamp), message.voltage, message.current)
 
 
-def take_battery(message: Any) -> Battery:
+def take_battery(message: Any) -> BatteryReading:
     """Refuse a voltage that is not finite."""
     if not isfinite(message.voltage):
         raise MessageError('voltage is not finite')
     return read_battery(message)
 
 
-def write_battery(kind: Kind, value: Battery) -> Any:
+def write_battery(kind: Kind, value: BatteryReading) -> Any:
     """Voltage and current; what nobody measures is NaN."""
     message = _begin(kind, 'sensor_msgs/msg/BatteryState', value.stamp)
     message.voltage, message.current = float(value.voltage), float(value.current)

@@ -12,17 +12,14 @@ from typing import Any, NamedTuple
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
-from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
 from beetle_omni_ros.messages import conversions as c
-from beetle_omni_ros.messages.values import (
-    Battery,
-    Diagnostic,
-    Joints,
-    Odom,
-    RotorSpeeds,
-    ToldHealth,
-    Wish,
-    Wrench,
+from beetle_omni_ros.messages.values import Diagnostic, Odom, ToldHealth, Wish, Wrench
+from beetle_omni_ros.robot.readings import (
+    BatteryReading,
+    ImuReading,
+    JointReading,
+    PoseReading,
+    RotorReading,
 )
 
 
@@ -99,16 +96,16 @@ def request(controller: str) -> Topic:
 
 
 TABLE = (
-    Topic('mocap/pose', POSE, SENSOR, PoseSample, c.read_pose, c.write_pose,
+    Topic('mocap/pose', POSE, SENSOR, PoseReading, c.read_pose, c.write_pose,
           'pose of base_link in world, stamped at capture, 100 Hz', c.take_pose, required=True),
-    Topic('imu/data_raw', 'sensor_msgs/msg/Imu', SENSOR, ImuSample, c.read_imu, c.write_imu,
+    Topic('imu/data_raw', 'sensor_msgs/msg/Imu', SENSOR, ImuReading, c.read_imu, c.write_imu,
           'specific force and angular rate in base_link, without orientation (REP-145), 200 Hz',
           c.take_imu, required=True),
-    Topic('joint_states', JOINT_STATE, SENSOR, Joints, c.read_joints, c.write_joints,
+    Topic('joint_states', JOINT_STATE, SENSOR, JointReading, c.read_joints, c.write_joints,
           'position, velocity and effort of `gimbal1..4`', c.take_joints, required=True),
-    Topic('battery_state', 'sensor_msgs/msg/BatteryState', SENSOR, Battery, c.read_battery,
+    Topic('battery_state', 'sensor_msgs/msg/BatteryState', SENSOR, BatteryReading, c.read_battery,
           c.write_battery, 'pack voltage and current, negative when discharging', c.take_battery),
-    Topic('rotor_states', JOINT_STATE, SENSOR, RotorSpeeds, c.read_rotors, c.write_rotors,
+    Topic('rotor_states', JOINT_STATE, SENSOR, RotorReading, c.read_rotors, c.write_rotors,
           '`velocity` of `rotor1..4` [rad/s], positive for both spins, NaN where unknown',
           in_flight=False),
     Topic('odom', 'nav_msgs/msg/Odometry', ESTIMATE, Odom, c.read_odom, c.write_odom,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
-from beetle_omni_ros.robot.parameters import JOINT_NAMES
 
 
 class MessageError(ValueError):
@@ -57,45 +55,6 @@ class Odom:
         """Take over the five of an estimate, a state or the truth, at another stamp if given."""
         return cls(state.stamp if stamp is None else stamp, state.position, state.velocity,
                    state.quaternion, state.angular_velocity, *covariances)
-
-
-@dataclass(frozen=True)
-class Joints:
-    """
-    Measured tilt joints.
-
-    Attributes:
-        stamp: of capture [s].
-        position: (4,) [rad].
-        velocity: (4,) [rad/s], or None where none were measured.
-        effort: (4,) [N m], or None where none were measured.
-        names: of the joints, where a message is written for fewer than four.
-
-    """
-
-    stamp: float
-    position: np.ndarray
-    velocity: np.ndarray | None
-    effort: np.ndarray | None = None
-    names: Sequence[str] = JOINT_NAMES
-
-
-@dataclass(frozen=True)
-class Battery:
-    """Pack voltage under load [V] and current [A, negative when discharging]; its cells."""
-
-    stamp: float
-    voltage: float
-    current: float
-    cells: int = 0
-
-
-@dataclass(frozen=True)
-class RotorSpeeds:
-    """Speeds of the rotors by their ESCs (4,) [rad/s], positive for both spins; NaN unknown."""
-
-    stamp: float
-    speed: np.ndarray
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import Goal, ServoLoop
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
-from beetle_omni_ros.messages.values import Joints
 from beetle_omni_ros.nodes import health, runner
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.joint_bridge_status import bus_status, servo_status
@@ -23,6 +22,7 @@ from beetle_omni_ros.nodes.lifecycle_node import (
     LifecycleFlightNode,
 )
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
+from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import parameter
 
 COMMAND_AGE = 0.1   # [s] older commands are not written
@@ -164,10 +164,10 @@ class JointBridgeNode(LifecycleFlightNode):
 
     def _publish(self, readings, good):
         if good.all():
-            self._joints.publish(Joints(
+            self._joints.publish(JointReading(
                 readings.stamp, readings.position, readings.velocity, readings.effort))
         elif good.any():
-            self._joints.publish(Joints(
+            self._joints.publish(JointReading(
                 readings.stamp, readings.position[good], readings.velocity[good],
                 readings.effort[good], [n for n, is_good in zip(JOINT_NAMES, good) if is_good]))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 import time
 
@@ -10,13 +10,13 @@ from beetle_omni_ros.drivers.motor_board import MotorBoard
 from beetle_omni_ros.drivers.motor_board_arming import Arming, FLIES
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.serial_port import SerialPortError
-from beetle_omni_ros.messages.values import Battery, RotorSpeeds
 from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.lifecycle_node import AUTOSTART, LifecycleFlightNode
 from beetle_omni_ros.nodes.rotor_bridge_report import RotorBridgeReport
 from beetle_omni_ros.nodes.target_stream import TargetStream
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.readings import RotorReading
 from beetle_omni_ros.robot.schema import parameter
 
 RPM = math.pi / 30      # [rad/s]
@@ -169,11 +169,9 @@ class RotorBridgeNode(LifecycleFlightNode):
         update = self._board.poll()
         self._report.update(update)
         if update.battery is not None:
-            battery = update.battery
-            self._batteries.publish(Battery(
-                battery.stamp, battery.voltage, battery.current, self._cells))
+            self._batteries.publish(replace(update.battery, cells=self._cells))
         if update.rotors is not None:
-            self._rotors.publish(RotorSpeeds(
+            self._rotors.publish(RotorReading(
                 update.rotors.stamp, RPM * update.rotors.rpm))
         for event in update.events:
             self._log(*event)

@@ -12,7 +12,7 @@ from rosgraph_msgs.msg import Clock
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.messages.conversions import set_time
 from beetle_omni_ros.messages.topics import SENSOR
-from beetle_omni_ros.messages.values import Battery, Joints, Odom, RotorSpeeds
+from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import health, runner, wire
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
@@ -226,19 +226,16 @@ class SimNode(FlightNode):
         if frame.mocap is not None:
             publish_to['mocap'].publish(replace(frame.mocap, stamp=epoch + frame.mocap.stamp))
         if self._devices is None and frame.joints is not None:
-            publish_to['joints'].publish(Joints(
-                epoch + frame.joints.stamp, frame.joints.position, frame.joints.velocity,
-                frame.joints.effort))
+            publish_to['joints'].publish(replace(frame.joints, stamp=epoch + frame.joints.stamp))
         if frame.imu is not None:
             publish_to['imu'].publish(replace(frame.imu, stamp=epoch + frame.imu.stamp))
         publish_to['truth'].publish(Odom.of(frame.truth, stamp=epoch + frame.truth.stamp))
         if self._devices is None and frame.rotors is not None:
-            publish_to['rotors'].publish(RotorSpeeds(
-                epoch + frame.rotors.stamp, frame.rotors.speed))
+            publish_to['rotors'].publish(replace(frame.rotors, stamp=epoch + frame.rotors.stamp))
         if self._devices is None and frame.battery is not None:
-            publish_to['battery'].publish(Battery(
-                epoch + frame.battery.stamp, frame.battery.voltage, frame.battery.current,
-                self._robot.battery.cells))
+            publish_to['battery'].publish(replace(
+                frame.battery, stamp=epoch + frame.battery.stamp,
+                cells=self._robot.battery.cells))
 
     def _on_command(self, command):
         self._latency.add(self.now() - command.stamp)

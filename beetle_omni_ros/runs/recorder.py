@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, Target
-from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
 from beetle_omni_ros.messages.topics import requester
-from beetle_omni_ros.messages.values import Battery, Diagnostic, Joints, Odom, Wrench
+from beetle_omni_ros.messages.values import Diagnostic, Odom, Wrench
+from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
 from beetle_omni_ros.runs.log import (
     Commands,
     COMPUTE_KEYS,
@@ -67,19 +67,19 @@ class Recorder:
 
     def write_imu(self, t, specific_force, angular_velocity) -> None:
         """One IMU sample in base_link."""
-        self.write('imu/data_raw', ImuSample(t, specific_force, angular_velocity))
+        self.write('imu/data_raw', ImuReading(t, specific_force, angular_velocity))
 
     def write_mocap(self, t, position, quaternion, received=None) -> None:
         """One MoCap pose, captured at ``t``, available at ``received``."""
-        self.write('mocap/pose', PoseSample(t, position, quaternion), received)
+        self.write('mocap/pose', PoseReading(t, position, quaternion), received)
 
     def write_joints(self, t, position, velocity, effort=None, received=None) -> None:
         """One joint feedback, captured at ``t``, available at ``received``."""
-        self.write('joint_states', Joints(t, position, velocity, effort), received)
+        self.write('joint_states', JointReading(t, position, velocity, effort), received)
 
     def write_battery(self, t, voltage, current) -> None:
         """Pack voltage [V] and current [A, negative when discharging]."""
-        self.write('battery_state', Battery(t, voltage, current))
+        self.write('battery_state', BatteryReading(t, voltage, current))
 
     def write_command(self, t, tilt, thrust, received=None) -> None:
         """Record the selected command; ``t`` is the stamp of the estimate that it answers."""

@@ -1,4 +1,4 @@
-"""What the simulator hands out: sensor readings and the truth. Seconds since reset, SI units."""
+"""What the simulator hands out in a tick: readings and the truth. Seconds since reset."""
 
 from __future__ import annotations
 
@@ -7,58 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-
-@dataclass(frozen=True, slots=True)
-class ImuReading:
-    """
-    One IMU reading.
-
-    Attributes:
-        stamp: [s].
-        specific_force: (3,) in base_link [m/s^2]; +gravity along z when level at rest.
-        angular_velocity: (3,) in base_link [rad/s].
-
-    """
-
-    stamp: float
-    specific_force: np.ndarray
-    angular_velocity: np.ndarray
-
-
-@dataclass(frozen=True, slots=True)
-class PoseReading:
-    """One motion capture frame: capture time [s], (3,) [m] in world, (4,) quaternion xyzw."""
-
-    stamp: float
-    position: np.ndarray
-    quaternion: np.ndarray
-
-
-@dataclass(frozen=True, slots=True)
-class JointReading:
-    """Servo feedback: capture time [s], tilts [rad], rates [rad/s], torques [N m], each (4,)."""
-
-    stamp: float
-    position: np.ndarray
-    velocity: np.ndarray
-    effort: np.ndarray
-
-
-@dataclass(frozen=True, slots=True)
-class BatteryReading:
-    """Pack voltage under load [V] and current [A], negative while discharging (REP convention)."""
-
-    stamp: float
-    voltage: float
-    current: float
-
-
-@dataclass(frozen=True, slots=True)
-class RotorReading:
-    """Speed controllers' telemetry: capture time [s], rotor speeds (4,) [rad/s]."""
-
-    stamp: float
-    speed: np.ndarray
+from beetle_omni_ros.robot.readings import (
+    BatteryReading,
+    ImuReading,
+    JointReading,
+    PoseReading,
+    RotorReading,
+)
 
 
 @dataclass(frozen=True, slots=True)

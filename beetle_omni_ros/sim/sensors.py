@@ -8,19 +8,19 @@ import numpy as np
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.effects import SensorErrors
-from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.sim.battery import Battery
-from beetle_omni_ros.sim.conditions import Conditions
-from beetle_omni_ros.sim.parameters import SimulatorParameters
-from beetle_omni_ros.sim.plant import Plant
-from beetle_omni_ros.sim.readings import (
+from beetle_omni_ros.robot.readings import (
     BatteryReading,
     ImuReading,
     JointReading,
     PoseReading,
     RotorReading,
-    Truth,
 )
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.sim.battery import Battery
+from beetle_omni_ros.sim.conditions import Conditions
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+from beetle_omni_ros.sim.plant import Plant
+from beetle_omni_ros.sim.readings import Truth
 
 BLOCK = 1024            # noise is drawn this many readings at a time, because one by one is slow
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from beetle_omni_ros.estimation.ekf import ImuSample, PoseSample
+from beetle_omni_ros.estimation.ekf import ImuReading, PoseReading
 
 GRAVITY = 9.80665
 IMU_PERIOD, MOCAP_PERIOD, MOCAP_DELAY = 0.005, 0.01, 0.01
@@ -111,7 +111,7 @@ class Sensors:
         rate = axes.inv().apply(rate + biases[:, 3:])
         force = force + self.accelerometer_noise * rng.standard_normal(force.shape)
         rate = rate + self.gyroscope_noise * rng.standard_normal(rate.shape)
-        return [ImuSample(*row) for row in zip(times.tolist(), force, rate)]
+        return [ImuReading(*row) for row in zip(times.tolist(), force, rate)]
 
     def mocap(self, trajectory, times, rng):
         """Poses of the marker body at ``times``."""
@@ -122,7 +122,7 @@ class Sensors:
                                      * rng.standard_normal(position.shape))
         quaternion = (truth['rotation'] * Rotation.from_rotvec(self.mocap_rotation)
                       * noise).as_quat()
-        return [PoseSample(*row) for row in zip(times.tolist(), position, quaternion)]
+        return [PoseReading(*row) for row in zip(times.tolist(), position, quaternion)]
 
 
 @dataclass
@@ -158,7 +158,7 @@ def fly(seed, duration, sensors=None, agility=1.0, start=0.0, delay=MOCAP_DELAY,
 
 def feed(ekf, sample):
     """Give one sample to its entrance."""
-    return ekf.imu(sample) if isinstance(sample, ImuSample) else ekf.pose(sample)
+    return ekf.imu(sample) if isinstance(sample, ImuReading) else ekf.pose(sample)
 
 
 def run(ekf, flight, drop=lambda time: False, until=np.inf):
@@ -166,7 +166,7 @@ def run(ekf, flight, drop=lambda time: False, until=np.inf):
     for time, sample in flight.arrivals():
         if time > until:
             break
-        if isinstance(sample, PoseSample) and drop(sample.stamp):
+        if isinstance(sample, PoseReading) and drop(sample.stamp):
             continue
         feed(ekf, sample)
     return ekf

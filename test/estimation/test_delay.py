@@ -6,7 +6,7 @@ from ekf_flights import error_state, feed, fly, GRAVITY, run, Sensors
 import numpy as np
 import pytest
 
-from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, PoseSample
+from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, PoseReading
 from beetle_omni_ros.estimation.mounting import Mounting
 
 
@@ -21,7 +21,7 @@ def test_replay_equals_processing_in_order(delay, capture):
     """However late poses come and wherever they fall between IMU samples."""
     flight = fly(1, 1.5)
     poses = flight.trajectory(np.array([s.stamp + capture for s in flight.poses]))
-    flight.poses = [PoseSample(s.stamp + capture, p, q) for s, p, q in
+    flight.poses = [PoseReading(s.stamp + capture, p, q) for s, p, q in
                     zip(flight.poses, poses['position'], poses['rotation'].as_quat())
                     if s.stamp + capture + delay < 1.49]
     flight.delay = delay

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from ekf_flights import error_state, feed, fly, GRAVITY, ImuSample, run, Sensors
+from ekf_flights import error_state, feed, fly, GRAVITY, ImuReading, run, Sensors
 import numpy as np
 import pytest
 
@@ -20,7 +20,7 @@ def history(ekf, flight, drop=lambda time: False):
     """Feed a flight; list (time, status, position variance) after each IMU sample."""
     rows = []
     for time, sample in flight.arrivals():
-        if isinstance(sample, ImuSample):
+        if isinstance(sample, ImuReading):
             feed(ekf, sample)
             variance = ekf.estimate.covariance[0, 0] if ekf.estimate else np.inf
             rows.append((time, ekf.status, variance))
@@ -183,7 +183,7 @@ def test_a_blow_that_the_imu_measures_badly_does_not_lose_the_track(seen):
 def test_a_frozen_pose_is_refused_and_the_filter_dead_reckons():
     ekf, flight, kept = new_ekf(), fly(3, 6.0), {}
     for time, sample in flight.arrivals():
-        if 4.0 < time and not isinstance(sample, ImuSample):
+        if 4.0 < time and not isinstance(sample, ImuReading):
             kept.setdefault('position', sample.position)
             kept.setdefault('quaternion', sample.quaternion)
             sample = replace(sample, **kept)
@@ -198,7 +198,7 @@ def test_an_attitude_that_the_gyroscope_rules_out_is_never_believed():
     ekf, flight = new_ekf(), fly(3, 9.0)
     turn = rotations.exp(np.array([0.0, 0.0, np.pi / 2]))
     for time, sample in flight.arrivals():
-        if 4.0 < time and not isinstance(sample, ImuSample):
+        if 4.0 < time and not isinstance(sample, ImuReading):
             sample = replace(sample, quaternion=rotations.multiply(sample.quaternion, turn))
         feed(ekf, sample)
     assert ekf.status == 'dead_reckoning'

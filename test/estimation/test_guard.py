@@ -3,7 +3,7 @@
 from dataclasses import replace
 import warnings
 
-from ekf_flights import feed, fly, GRAVITY, ImuSample, PoseSample, run
+from ekf_flights import feed, fly, GRAVITY, ImuReading, PoseReading, run
 import numpy as np
 import pytest
 
@@ -82,7 +82,7 @@ def test_bad_imu_sample_is_refused_and_forgotten(flying, reason, change):
     change = dict(change)
     last = max(s.stamp for s in flight.imu if s.stamp <= 1.5)
     stamp = last + change.pop('ahead', 0.005)
-    good = ImuSample(stamp, np.array([0.0, 0.0, GRAVITY]), np.zeros(3))
+    good = ImuReading(stamp, np.array([0.0, 0.0, GRAVITY]), np.zeros(3))
     refused(ekf, replace(good, **change), reason)
     continued(ekf, flight, 1.5)
 
@@ -108,7 +108,7 @@ def test_a_pose_older_than_the_history_is_refused():
 
 def test_a_pose_without_any_imu_is_refused():
     ekf = ErrorStateEkf(EkfParameters.load(), GRAVITY)
-    assert ekf.pose(PoseSample(0.0, np.zeros(3), np.array([0, 0, 0, 1.0]))) is False
+    assert ekf.pose(PoseReading(0.0, np.zeros(3), np.array([0, 0, 0, 1.0]))) is False
     assert ekf.rejected == {'no_imu': 1}
 
 
@@ -134,12 +134,12 @@ def test_the_caller_may_reuse_its_buffers():
     reference = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight).estimate
     buffers = [np.zeros(3), np.zeros(3), np.zeros(4)]
     for _, sample in flight.arrivals():
-        if isinstance(sample, ImuSample):
+        if isinstance(sample, ImuReading):
             buffers[0][:], buffers[1][:] = sample.specific_force, sample.angular_velocity
-            ekf.imu(ImuSample(sample.stamp, buffers[0], buffers[1]))
+            ekf.imu(ImuReading(sample.stamp, buffers[0], buffers[1]))
         else:
             buffers[1][:], buffers[2][:] = sample.position, sample.quaternion
-            ekf.pose(PoseSample(sample.stamp, buffers[1], buffers[2]))
+            ekf.pose(PoseReading(sample.stamp, buffers[1], buffers[2]))
     assert np.array_equal(ekf.estimate.covariance, reference.covariance)
     assert np.array_equal(ekf.estimate.position, reference.position)
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.hover import HoverController, HoverParameters
-from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf, ImuSample, PoseSample
+from beetle_omni_ros.estimation.ekf import EkfParameters, ErrorStateEkf
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.simulator import Simulator
@@ -34,8 +34,8 @@ def fly(conditions, seed, drop=lambda time: False, true=None, believed=None):
             quaternion = Rotation.random(random_state=int(rng.integers(2 ** 31))).as_quat()
             target = PoseTarget(np.append(rng.uniform(-1, 1, 2), HEIGHT), quaternion)
         if frame.mocap is not None and not drop(frame.mocap.stamp):
-            feed(ekf, PoseSample(frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion))
-        feed(ekf, ImuSample(frame.imu.stamp, frame.imu.specific_force, frame.imu.angular_velocity))
+            feed(ekf, frame.mocap)
+        feed(ekf, frame.imu)
         if k % 2 == 0:
             command = hover.step(
                 State(truth.stamp, truth.position, truth.velocity, truth.quaternion,

@@ -10,7 +10,7 @@ import pytest
 from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.control.nmpc import redated, with_delays
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
-from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuSample, PoseSample
+from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.robot import consumers, dynamics
 from beetle_omni_ros.robot.allocation import Allocator
@@ -120,9 +120,9 @@ def estimator(robot):
     """The estimate after those samples."""
     ekf = ErrorStateEkf(EkfParameters.load().of_robot(robot), robot.gravity)
     for k, (t, force, rate, pose) in enumerate(zip(*samples(), strict=True)):
-        ekf.imu(ImuSample(t, force, rate))
+        ekf.imu(ImuReading(t, force, rate))
         if k % 2:
-            ekf.pose(PoseSample(t, np.zeros(3), pose))
+            ekf.pose(PoseReading(t, np.zeros(3), pose))
     found = ekf.estimate
     return [found.position, found.velocity, found.quaternion, found.angular_velocity]
 

@@ -7,24 +7,27 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
-from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
 from beetle_omni_ros.messages import columns
 from beetle_omni_ros.messages.bag_types import BAG, from_bytes, to_bytes
 from beetle_omni_ros.messages.columns import read_all
 from beetle_omni_ros.messages.topics import ALL, TABLE, topic_of
 from beetle_omni_ros.messages.values import (
-    Battery,
     Diagnostic,
-    Joints,
     MessageError,
     Odom,
-    RotorSpeeds,
     ToldHealth,
     Wish,
     Wrench,
 )
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.readings import (
+    BatteryReading,
+    ImuReading,
+    JointReading,
+    PoseReading,
+    RotorReading,
+)
 
 STAMP = 1_790_000_000.25
 SERIES = ('mocap/pose', 'imu/data_raw', 'joint_states', 'battery_state', 'rotor_states', 'odom',
@@ -38,11 +41,11 @@ def value(topic, seed=0, stamp=STAMP):
     path = TrajectoryTarget(stamp + np.arange(3.0), draw(size=(3, 3)), np.tile(turn, (3, 1)),
                             draw(size=(3, 3)), draw(size=(3, 3)), stamp)
     made = {
-        PoseSample: lambda: PoseSample(stamp, draw(size=3), turn),
-        ImuSample: lambda: ImuSample(stamp, draw(size=3), draw(size=3)),
-        Joints: lambda: Joints(stamp, draw(size=4), draw(size=4), draw(size=4)),
-        Battery: lambda: Battery(stamp, 24.5, -20.25, 6),
-        RotorSpeeds: lambda: RotorSpeeds(stamp, draw(size=4)),
+        PoseReading: lambda: PoseReading(stamp, draw(size=3), turn),
+        ImuReading: lambda: ImuReading(stamp, draw(size=3), draw(size=3)),
+        JointReading: lambda: JointReading(stamp, draw(size=4), draw(size=4), draw(size=4)),
+        BatteryReading: lambda: BatteryReading(stamp, 24.5, -20.25, 6),
+        RotorReading: lambda: RotorReading(stamp, draw(size=4)),
         Odom: lambda: Odom(stamp, draw(size=3), draw(size=3), turn, draw(size=3),
                            draw(size=(6, 6)), draw(size=(6, 6))),
         PoseTarget: lambda: PoseTarget(draw(size=3), turn, stamp),
@@ -114,7 +117,7 @@ def test_messages_of_several_layouts_keep_their_order():
     data = [cdr('joint_states', one) for one in sent]
     data.insert(5, data[0][:40])                # cut off
     data.insert(9, b'\0\1')                     # nothing
-    data.insert(2, cdr('joint_states', Joints(STAMP, np.ones(1), np.ones(1), None, ['wheel'])))
+    data.insert(2, cdr('joint_states', JointReading(STAMP, np.ones(1), None, None, ['wheel'])))
     rows, at_once, refused = read_all(entry, data)
     assert refused.total() == 3 and len(rows) == 12
     assert at_once.stamp.tolist() == [STAMP + k for k in range(12)]

@@ -9,15 +9,15 @@ from rclpy.parameter import Parameter
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.control.registry import ControllerEntry
-from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.values import Joints, Odom
+from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.ekf_node import EkfNode
 from beetle_omni_ros.nodes.reference_node import ReferenceNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
+from beetle_omni_ros.robot.readings import ImuReading, JointReading, PoseReading
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -92,7 +92,7 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(make):
     node = make(FollowerNode)
     fly(node, 100 + 0.005 * np.arange(20))
     assert not node._publisher          # no joint angles yet
-    node._on_joints(Joints(100.0, np.zeros(4), np.zeros(4)))
+    node._on_joints(JointReading(100.0, np.zeros(4), np.zeros(4)))
     stamps = 101 + 0.005 * np.arange(200)
     fly(node, stamps)
     sent = [conversions.seconds(m.header.stamp) for m in node._publisher]
@@ -105,7 +105,7 @@ def test_the_controller_steps_once_a_period_and_stamps_with_the_state(make):
 @pytest.mark.parametrize('rate', [100, 200])
 def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(make, rate):
     node = make(FollowerNode)
-    node._on_joints(Joints(100.0, np.zeros(4), np.zeros(4)))
+    node._on_joints(JointReading(100.0, np.zeros(4), np.zeros(4)))
 
     def steps_from(begin):
         before = len(node._publisher)
@@ -130,7 +130,7 @@ def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(m
 
 def test_without_a_target_it_holds_the_pose_of_the_hand_over(make):
     node = make(FollowerNode)
-    node._on_joints(Joints(100.0, np.zeros(4), np.zeros(4)))
+    node._on_joints(JointReading(100.0, np.zeros(4), np.zeros(4)))
     node._on_mode('takeoff')
     fly(node, [100.0], height=0.2)
     node._on_mode('flying:nmpc')
@@ -145,7 +145,7 @@ def test_without_a_target_it_holds_the_pose_of_the_hand_over(make):
 
 def test_the_newest_target_counts_and_an_unset_stamp_means_now(make):
     node = make(FollowerNode)
-    node._on_joints(Joints(100.0, np.zeros(4), np.zeros(4)))
+    node._on_joints(JointReading(100.0, np.zeros(4), np.zeros(4)))
     for stamp, x in ((50.0, 1.0), (60.0, 2.0), (50.0, 3.0)):
         node._on_target(PoseTarget(np.array([x, 0, 0]), LEVEL, stamp))
     fly(node, [100.0])
@@ -234,8 +234,8 @@ def test_the_estimator_publishes_only_what_it_believes(make):
     for k in range(400):
         stamp = 100 + 0.005 * k
         if k % 2:
-            node._on_pose(PoseSample(stamp - 0.01, np.array([0, 0, 0.3]), LEVEL))
-        node._on_imu(ImuSample(stamp, at_rest, np.zeros(3)))
+            node._on_pose(PoseReading(stamp - 0.01, np.array([0, 0, 0.3]), LEVEL))
+        node._on_imu(ImuReading(stamp, at_rest, np.zeros(3)))
         if k == 3:
             assert not node._publisher      # too few poses to believe
     message = node._publisher[-1]

@@ -16,11 +16,12 @@ from witness import HEADER, READY
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.messages.topics import split_topic, topic_of, topics_with
-from beetle_omni_ros.messages.values import Joints, MessageError, Odom
+from beetle_omni_ros.messages.values import MessageError, Odom
 from beetle_omni_ros.nodes import plan
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import read_bag
 
@@ -74,7 +75,7 @@ def test_any_controller_sees_true_tilts_and_no_target_beyond_its_reach(make, mon
         state, target))
     health = ActuatorHealth(zeros=(0.1, 0.0, 0.0, -0.2))
     node._on_actuators(SimpleNamespace(health=health))
-    node._on_joints(Joints(1.0, np.zeros(4), np.zeros(4)))
+    node._on_joints(JointReading(1.0, np.zeros(4), np.zeros(4)))
     node._on_odom(Odom(1.0, np.array([0.0, 0.0, 1.0]), np.zeros(3), LEVEL,
                                np.zeros(3)))
     assert seen[0].tilt == pytest.approx(health.true(np.zeros(4))) and seen[0].tilt.any()

@@ -14,11 +14,11 @@ from std_msgs.msg import String
 
 from beetle_omni_ros.bringup.limits import CheckLimits
 from beetle_omni_ros.bringup.topics import check_topics
-from beetle_omni_ros.estimation.samples import PoseSample
 from beetle_omni_ros.messages.topics import EVENT, LATCHED, SENSOR
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.listener import listen
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.readings import PoseReading
 from beetle_omni_ros.robot.schema import ParameterError
 
 UPRIGHT = np.array([0, 0, 0, 1.0])
@@ -62,7 +62,7 @@ class Drivers:
             now = time.time()
             self.imu.publish(wire.message('imu/data_raw', Reading(now + 0.05, rng)))
             if k % 2 == 0:
-                self.mocap.publish(wire.message('mocap/pose', PoseSample(
+                self.mocap.publish(wire.message('mocap/pose', PoseReading(
                     now - 0.008, rng.normal(size=3), UPRIGHT)))
                 self.joints.publish(JointState(name=['gimbal1'], position=[0.0]))
             if k % 100 == 0:

@@ -20,11 +20,12 @@ from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.control.policy import DEFAULT, PolicyController, PolicyParameters
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.topics import COMMAND, ESTIMATE, LATCHED, SENSOR
-from beetle_omni_ros.messages.values import Joints, Odom
+from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.plan import controller_nodes, unfit
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import read_bag
@@ -77,12 +78,12 @@ def test_the_node_answers_as_the_controller_does(process):
         now = time.time()
         state = Odom(now, np.array([0.0, 0.1 * k, 1.0]), np.array([0.1, 0.2, -0.3]),
                      np.array([0.5, 0.5, 0.5, 0.5]), np.array([0.3, 0.0, -0.1]))
-        joints.publish(wire.message('joint_states', Joints(now - 0.01, tilt, np.zeros(4))))
+        joints.publish(wire.message('joint_states', JointReading(now - 0.01, tilt, np.zeros(4))))
         witness.spin(0.01)
         odom.publish(wire.message('odom', state))
         witness.spin(0.02)
         expected = controller.step(
-            State.join(state, Joints(now, tilt, np.zeros(4)), None), target)
+            State.join(state, JointReading(now, tilt, np.zeros(4)), None), target)
         return round(now, 4), np.concatenate((expected.tilt, expected.thrust))
 
     def answered(asked):

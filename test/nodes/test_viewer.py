@@ -12,11 +12,12 @@ from std_msgs.msg import String
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.topics import EVENT, LATCHED
-from beetle_omni_ros.messages.values import Joints, Odom
+from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.transform_message import transform_message
 from beetle_omni_ros.nodes.viewer_node import ViewerNode
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.readings import JointReading
 
 
 class Sent(list):
@@ -44,7 +45,7 @@ def test_thrust_arrows_point_along_the_tilted_rotors(viewer):
     viewer._draw()
     assert not viewer._markers              # nothing known yet
     viewer._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
-    viewer._joints = Joints(5.0, tilt, np.zeros(4))
+    viewer._joints = JointReading(5.0, tilt, np.zeros(4))
     viewer._command = Command(5.0, tilt, np.array([8.0, 4.0, 0.0, 20.0]))
     viewer._target = PoseTarget(position, rotation)
     viewer._draw()
@@ -80,7 +81,7 @@ def test_the_frames_of_all_links_form_one_tree_and_stand_where_the_rotors_are(ro
         rotation = rotations.from_rpy(0.4, -0.2, 1.0)
         position, tilt = np.array([1.0, 2.0, 3.0]), np.array([0.0, np.pi / 2, 0.0, -0.3])
         node._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
-        node._joints = Joints(4.9, tilt, np.zeros(4))
+        node._joints = JointReading(4.9, tilt, np.zeros(4))
         end = time.monotonic() + 20
         while not all(heard.values()) and time.monotonic() < end:
             node._moved = None

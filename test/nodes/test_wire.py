@@ -7,19 +7,12 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
-from beetle_omni_ros.estimation.samples import ImuSample, PoseSample
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.values import (
-    Joints,
-    MessageError,
-    Odom,
-    RotorSpeeds,
-    ToldHealth,
-    Wish,
-)
+from beetle_omni_ros.messages.values import MessageError, Odom, ToldHealth, Wish
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
+from beetle_omni_ros.robot.readings import ImuReading, JointReading, PoseReading, RotorReading
 
 
 @pytest.fixture
@@ -50,7 +43,7 @@ def test_stamps_survive_to_the_nanosecond():
 @pytest.mark.parametrize('kind', [float, np.float32, int])
 def test_scalars_of_any_number_type_arrive_as_sent(kind):
     values = [kind(1), kind(2), kind(3)]
-    message = over_the_wire(wire.message('imu/data_raw', ImuSample(4.0, values, values)))
+    message = over_the_wire(wire.message('imu/data_raw', ImuReading(4.0, values, values)))
     sample = conversions.take_imu(message)
     assert sample.specific_force.tolist() == [1, 2, 3]
     assert sample.angular_velocity.tolist() == [1, 2, 3]
@@ -71,7 +64,7 @@ def test_command_round_trip_and_layout(rng):
 
 def test_joints_are_found_by_name_not_by_place(rng):
     position = rng.normal(size=4)
-    message = wire.message('joint_states', Joints(1.0, position, -position))
+    message = wire.message('joint_states', JointReading(1.0, position, -position))
     shuffled = JointState(name=[message.name[k] for k in (2, 0, 3, 1)],
                           position=[message.position[k] for k in (2, 0, 3, 1)],
                           velocity=[message.velocity[k] for k in (2, 0, 3, 1)])
@@ -81,7 +74,7 @@ def test_joints_are_found_by_name_not_by_place(rng):
 
 def test_rotor_speeds_stand_under_the_rotors_names():
     message = over_the_wire(wire.message(
-        'rotor_states', RotorSpeeds(2.5, np.array([1.0, np.nan, 3, 400]))))
+        'rotor_states', RotorReading(2.5, np.array([1.0, np.nan, 3, 400]))))
     assert list(message.name) == ['rotor1', 'rotor2', 'rotor3', 'rotor4']
     np.testing.assert_array_equal(message.velocity, [1, np.nan, 3, 400])
     assert not len(message.position) and not len(message.effort)
@@ -129,7 +122,7 @@ def test_bad_messages_are_refused_with_a_reason(rng):
             'target_pose', PoseTarget(np.zeros(3), [0, 0, 0, 0.9], 0.0)))
     with pytest.raises(MessageError, match='position is not finite'):
         conversions.take_pose(wire.message(
-            'mocap/pose', PoseSample(0.0, [0, float('inf'), 0], [0, 0, 0, 1])))
+            'mocap/pose', PoseReading(0.0, [0, float('inf'), 0], [0, 0, 0, 1])))
 
 
 def test_what_the_supervisor_tells_survives_the_way_through_messages():

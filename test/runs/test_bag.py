@@ -17,11 +17,11 @@ from synthetic_flights import fly
 import yaml
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
-from beetle_omni_ros.estimation.samples import ImuSample
 from beetle_omni_ros.messages import conversions
 from beetle_omni_ros.messages.bag_types import BAG, to_bytes, TYPESTORE
 from beetle_omni_ros.messages.topics import TOPICS
 from beetle_omni_ros.messages.values import Odom
+from beetle_omni_ros.robot.readings import ImuReading
 from beetle_omni_ros.runs.bag import (
     add_meta,
     BagError,
@@ -301,7 +301,7 @@ def test_namespaces_are_taken_off_and_several_robots_need_a_choice(tmp_path):
     with BagWriter(tmp_path / 'one', namespace='robot1') as writer:
         writer.write_command(1.0, np.ones(4), np.ones(4))
         writer.write_request('nmpc', 1.0, np.zeros(4), np.ones(4))
-        imu = to_bytes(conversions.write_imu(BAG, ImuSample(2.0, (0, 0, 1), (0, 0, 0))),
+        imu = to_bytes(conversions.write_imu(BAG, ImuReading(2.0, (0, 0, 1), (0, 0, 0))),
                        'sensor_msgs/msg/Imu')
         writer.write_raw('/robot2/imu/data_raw', 'sensor_msgs/msg/Imu', imu, 2.0)
     with pytest.raises(BagError, match='several robots'):
