@@ -89,7 +89,8 @@ def minimise(points: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.nda
     points = np.where(free, np.clip(points, low, high), points)
     base = residual(points, np.arange(len(points)))
     chi2 = (base**2).sum(axis=1) + prior.cost(points)
-    damping, busy = np.full(len(chi2), 0.01), free.any(axis=1)
+    damping = np.full(len(chi2), 0.01)
+    busy = np.asarray(free.any(axis=1))
     for _ in range(iterations):
         rows = np.flatnonzero(busy)
         if not rows.size:

@@ -32,7 +32,7 @@ def autoregression(series: list[np.ndarray], order: int,
     if correlation[0] < 1e-20:
         return np.eye(1, order + 1)[0], 1e-10
     taps = np.concatenate([[1.0], -solve_toeplitz(correlation[:-1], correlation[1:])])
-    return taps, float(np.sqrt(max(taps @ correlation, 1e-20)))
+    return taps, float(np.sqrt(max(float(taps @ correlation), 1e-20)))
 
 
 def whitened(series: np.ndarray, taps: np.ndarray, sigma: float) -> np.ndarray:
