@@ -193,8 +193,9 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
            only: Annotated[Optional[str], typer.Option(
                '--only', metavar='NAME,...', help='Of the list. Default: all.')] = None,
            starts: Annotated[Optional[str], typer.Option(
-               '--from', metavar='NAME,...', help='hover, moving, upside_down. '
-                                                  'Default: all.')] = None,
+               '--from', metavar='NAME,...', help='hover, moving, upside_down, or random: a '
+                                                  'random moment of random100. Default: the first '
+                                                  'three.')] = None,
            seeds: Annotated[int, typer.Option(
                '--seeds', metavar='N', min=1, help='Flights of each fault from each start.')] = 1,
            conditions: ConditionsOption = 'nominal',

@@ -17,7 +17,7 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.faults import campaign, page
-from beetle_omni_ros.faults.flight import STARTS
+from beetle_omni_ros.faults.flight import ALL_STARTS, STARTS
 from beetle_omni_ros.faults.healthy import CONDITIONS, fly_healthy, HealthyTrial
 from beetle_omni_ros.faults.landings import fly_landing, LandingTrial
 from beetle_omni_ros.faults.trial import fly_trial, Trial
@@ -42,7 +42,7 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     Args:
         faults: file of the list; by default params/faults.yaml.
         only: names of the list to fly; by default all.
-        starts: of STARTS; by default all.
+        starts: of ALL_STARTS; by default STARTS.
         seeds: flights of each fault from each start.
         conditions: 'nominal' or 'published'; healthy flights are flown in all.
         controller: the active one.
@@ -110,8 +110,8 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
 
 def _check(starts, output, json_path, docs, bags):
     for start in starts or ():
-        if start not in STARTS:
-            raise ParameterError(f"--from '{start}': expected {', '.join(STARTS)}")
+        if start not in ALL_STARTS:
+            raise ParameterError(f"--from '{start}': expected {', '.join(ALL_STARTS)}")
     if bags and output is None:
         raise ParameterError('--bags: expected --output DIR to record to')
     if json_path:

@@ -25,7 +25,8 @@ from beetle_omni_ros.sim.faults.listed import FaultList, FlightPlan
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
-STARTS = ('hover', 'moving', 'upside_down')
+STARTS = ('hover', 'moving', 'upside_down')      # of the list
+ALL_STARTS = (*STARTS, 'random')
 OFF = ('disarmed', 'emergency_stop')
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.evaluation.compute import collector_off
-from beetle_omni_ros.faults.flight import Flight, OFF, STARTS, Watcher
+from beetle_omni_ros.faults.flight import ALL_STARTS, Flight, OFF, Watcher
 from beetle_omni_ros.faults.watch import as_expected
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs.bag import BagWriter
@@ -28,7 +28,7 @@ class Trial:
 
     Attributes:
         case: name of what strikes.
-        start: one of STARTS.
+        start: one of ALL_STARTS.
         seed: of poses, moment and everything random in the simulation.
         conditions: 'nominal' or 'published'.
         controller: the active one.
@@ -87,7 +87,7 @@ def _fly(trial, listed, recorder):
                     strike=listed.cases[trial.case].strike, recorder=recorder)
     loop, supervisor = flight.loop, flight.supervisor
     loop.take_off()
-    _go(flight, trial.start, plan)
+    go_to_the_fault(flight, trial.start, plan)
     watcher = flight.watch(listed)
     start = flight.simulator.time
     loop.start_faults()
@@ -99,14 +99,16 @@ def _fly(trial, listed, recorder):
     return {**told(flight, watcher, asked=asked), 'flown_s': flight.simulator.time - start}
 
 
-def _go(flight: Flight, start: str, plan: FlightPlan):
+def go_to_the_fault(flight: Flight, start: str, plan: FlightPlan):
     """Fly to where the fault strikes."""
-    later = plan.jitter * flight.random.uniform()
-    if start == 'moving':
+    part = flight.random.uniform()
+    later = plan.jitter * part
+    if start in ('moving', 'random'):
+        random = start == 'random'
         flight.aim_anywhere(plan)
-        flight.fly(plan.move_time)
+        flight.fly(plan.pose_time if random else plan.move_time)
         flight.aim_anywhere(plan)
-        flight.fly(later)
+        flight.fly(part * plan.pose_time if random else later)
         return
     upside_down = start == 'upside_down'
     flight.aim((0.0, 0.0, plan.height), rotations.from_rpy(np.pi if upside_down else 0.0, 0, 0))
@@ -117,7 +119,7 @@ def _fly_on(flight: Flight, start: str, plan: FlightPlan, watcher: Watcher) -> b
     """Fly on with the fault; return whether the flight ended in it."""
     left = plan.watch_time
     while left > 0:
-        time = min(left, plan.move_time) if start == 'moving' else left
+        time = min(left, plan.move_time) if start in ('moving', 'random') else left
         if flight.fly(time, watcher):
             return True
         left -= time
@@ -150,4 +152,4 @@ def _is_lost(folder):
         return True
 
 
-__all__ = ['fly_trial', 'STARTS', 'told', 'Trial']
+__all__ = ['ALL_STARTS', 'fly_trial', 'told', 'Trial']

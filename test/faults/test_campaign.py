@@ -15,7 +15,7 @@ from beetle_omni_ros.faults.campaign import healthy_summary, landing_summary, su
 from beetle_omni_ros.faults.command import run_faults
 from beetle_omni_ros.faults.healthy import fly_healthy, HealthyTrial
 from beetle_omni_ros.faults.landings import attitude, fly_landing, LandingTrial
-from beetle_omni_ros.faults.trial import fly_trial, Trial
+from beetle_omni_ros.faults.trial import fly_trial, go_to_the_fault, Trial
 
 ROOT = Path(__file__).parents[2]
 
@@ -138,3 +138,25 @@ def test_unusable_input_is_refused_in_one_line(capsys, arguments, named):
     assert cli.main(['faults', *arguments]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and named in lines[0]
+
+
+def test_at_a_random_moment_faults_strike_all_over_the_time_of_a_pose(listed):
+    class Recorded:
+        """Notes what it is asked for."""
+
+        def __init__(self, seed):
+            self.random, self.asked = np.random.default_rng(seed), []
+
+        def aim_anywhere(self, plan):
+            self.asked.append('pose')
+
+        def fly(self, duration):
+            self.asked.append(duration)
+
+    flights = [Recorded(seed) for seed in range(40)]
+    for flight in flights:
+        go_to_the_fault(flight, 'random', listed.flight)
+    whole = listed.flight.pose_time
+    assert all(flight.asked[:3] == ['pose', whole, 'pose'] for flight in flights)
+    moments = np.array([flight.asked[3] for flight in flights]) / whole
+    assert 0 <= moments.min() < 0.2 and 0.8 < moments.max() <= 1

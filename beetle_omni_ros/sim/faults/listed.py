@@ -54,6 +54,8 @@ class FlightPlan:
     hover_time: float = parameter(doc='until the fault, in hover', unit='s', low=0, high=100)
     turn_time: float = parameter(doc='likewise upside down', unit='s', low=0, high=100)
     move_time: float = parameter(doc='of each pose on the move', unit='s', low=0.5, high=100)
+    pose_time: float = parameter(doc='of each pose, where it strikes at a random moment',
+                               unit='s', low=0.5, high=100)
     jitter: float = parameter(doc='of the time of the fault', unit='s', low=0, high=100)
     watch_time: float = parameter(doc='from the fault to the landing request', unit='s', low=0,
                                   high=1000)
