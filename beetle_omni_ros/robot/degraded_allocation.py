@@ -199,18 +199,18 @@ class DegradedAllocator(Allocator):
         return matrix[:, 0::2] @ (z[ROTORS:] * np.cos(z[:ROTORS])) \
             + matrix[:, 1::2] @ (z[ROTORS:] * np.sin(z[:ROTORS]))
 
-    def _solved(self, wrench):
+    def _solved(self, wrench) -> tuple[np.ndarray, np.ndarray]:
         """Best choice of stuck rotors: its columns and the (8,) components."""
-        best = None
+        found = []      # one choice leaves all stuck rotors out, and is never refused
         for columns, inverse, others in self.choices:
             components = self.components(columns, inverse, others, wrench)
             if any(components[2 * i] < -self._negligible for i in self.stuck):
                 continue
             rest = self._rest(columns, components, wrench)
             cost = (rest if rest > RESIDUAL else 0.0, float(components @ components))
-            if best is None or cost < best[0]:
-                best = cost, columns, components
-        return best[1:]
+            found.append((cost, columns, components))
+        _, columns, components = min(found, key=lambda one: one[0])
+        return columns, components
 
     def _rest(self, columns, components, wrench):
         return float(np.linalg.norm(self._scale * (columns @ components - wrench)))

@@ -194,8 +194,9 @@ def tilt_servo(robot: RobotParameters, joint: int, target, thrust=0.0,
     """
     terms = ServoTerms(target, thrust, gyroscopic)
     for name, values in robot.effects.items():
-        if CATALOGUE[name].servo is not None:
-            CATALOGUE[name].servo(terms, joint, **values)
+        act = CATALOGUE[name].servo
+        if act is not None:
+            act(terms, joint, **values)
     stiction = None if terms.coulomb is None else max(terms.coulomb, terms.stiction)
     return Servo.of(robot.joints, coulomb=terms.coulomb, stiction=stiction), terms
 

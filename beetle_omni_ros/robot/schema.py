@@ -16,7 +16,8 @@ import numpy as np
 from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, shortened, YamlError
 
 # Parameters that hold more than numbers, from lists and mappings of a file.
-STRUCTURED = {tuple: ((list, tuple), 'a list'), dict: ((dict, type(None)), 'a mapping')}
+STRUCTURED: dict[Any, tuple[tuple[type, ...], str]] = {
+    tuple: ((list, tuple), 'a list'), dict: ((dict, type(None)), 'a mapping')}
 NAMES = tuple[str, ...]     # type of a parameter that is a list of names
 FILE_NAME, KEY, WHOLE = 500, 80, 1000    # characters of them in a message
 

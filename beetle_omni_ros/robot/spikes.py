@@ -26,8 +26,8 @@ class SpikeFilter:
 
     def reset(self) -> None:
         """Begin anew at the next reading."""
-        self._last, self._held = None, False
-        self.lasted = False
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._held = self.lasted = False
 
     def passes(self, force: np.ndarray, rate: np.ndarray) -> bool:
         """Whether a reading (3,) [m/s^2], (3,) [rad/s] may be used now."""

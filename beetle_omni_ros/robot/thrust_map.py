@@ -61,7 +61,7 @@ class ThrustMap:
                 repaired.append(row.voltage)
                 duty[:] = _rising(duty)
         self.repaired = tuple(repaired)
-        self._blend_voltage, self._blend = None, None
+        self._blend_voltage, self._blend = np.nan, np.zeros(0)      # of the last voltage asked
 
     def thrust_limit(self, voltage):
         """Largest thrust [N] at ``voltage`` [V], of its shape; as at the ends beyond the rows."""

@@ -37,6 +37,8 @@ class Joint:
 
     def turned(self, angle: float) -> np.ndarray:
         """Quaternion (4,) of the child in the parent's frame at ``angle`` [rad]."""
+        if self.axis is None:
+            return self.quaternion
         return rotations.multiply(self.quaternion, rotations.exp(angle * self.axis))
 
 
