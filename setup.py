@@ -59,7 +59,9 @@ REQUIREMENTS = [
     'rosbags>=0.11,<0.12',
     'scipy>=1.11,<2',
     'threadpoolctl>=3.1',
+    'trimesh>=4,<6',
     'typer>=0.12',
+    'viser>=1.1,<2',
     # Comes with mujoco 3. From 1.14 on it needs Python 3.11; where an index does not say so,
     # the pip 23.0 of Python 3.10 searches without end.
     'etils<1.14; python_version < "3.11"',
@@ -118,6 +120,7 @@ DOCS = [
 DEVELOPMENT = [
     *TEST,
     'colcon-common-extensions>=0.3',
+    'playwright>=1.45',     # drives a browser that is there already; its own is not needed
     'mypy>=1.15,<3',
     'playwright>=1.49',
     'ruff>=0.9',

@@ -48,6 +48,10 @@ ARGUMENTS = {
                   'who can find the nodes; empty: programs of this computer alone'),
     'composed': ('true', ['true', 'false'], 'all nodes in one process'),
     'viewer': ('false', ['true', 'false'], 'description, tf and markers for RViz and Foxglove'),
+    'view': ('false', ['true', 'false'], 'the flight in 3D in the browser; prints the address'),
+    'allow_targets': ('false', ['true', 'false'],
+                      'with view: poses dragged there become targets, and controllers can be '
+                      'selected there'),
     'robot_file': ('', None, 'robot file that estimator and controller believe'),
     'plant_file': ('', None, 'robot file that is true in the simulation'),
     'conditions': ('nominal', ['nominal', 'published'], 'of the simulation'),
@@ -120,6 +124,16 @@ def composed(arguments, nodes, namespace):
                                '--ros-args', *overrides], output='screen')
 
 
+def viewing(given):
+    """Viewer in a process of its own."""
+    return ExecuteProcess(
+        cmd=[sys.executable, '-m', f'{PACKAGE}.start', 'beetle_omni', 'view',
+             *(['--namespace', given['namespace']] if given['namespace'] else []),
+             *(['--robot', given['robot_file']] if given['robot_file'] else []),
+             *(['--allow-targets'] if given['allow_targets'] == 'true' else [])],
+        output='screen')
+
+
 def actions(context):
     """Turn the arguments into processes."""
     from beetle_omni_ros.nodes import plan
@@ -141,6 +155,8 @@ def actions(context):
                      ['--storage-preset-profile', 'zstd_fast']
                      if given['compression'] == 'zstd' else []),
                  *recorded_topics(given['namespace'], controllers)], output='screen'))
+    if given['view'] == 'true':
+        processes.append(viewing(given))
     if given['composed'] == 'true':
         processes += [composed(plan.arguments(nodes, names), {name: nodes[name] for name in names},
                                given['namespace'].strip('/'))

@@ -36,7 +36,7 @@ def refused(capsys, *arguments):
 
 @pytest.mark.parametrize('command', [
     [], ['fly'], ['evaluate'], ['compare'], ['faults'], ['report'], ['film'], ['train'],
-    ['identify'], ['check'], ['controllers'], ['drive']])
+    ['identify'], ['check'], ['controllers'], ['drive'], ['view']])
 def test_every_command_has_help(capsys, command):
     assert cli.main([*command, '--help']) == 0
     assert 'Usage' in capsys.readouterr().out

@@ -29,18 +29,19 @@ ALLOWED = {
     'identify': ('robot', 'pages', 'runs', 'messages'),
     'bringup': ('robot', 'drivers', 'runs.json_file'),
     'drive': ('robot',),
+    'view': ('robot', 'control.base', 'runs', 'messages'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers', 'drive',
-              'messages', 'bringup.heard'),
+              'messages', 'view', 'bringup.heard'),
     'train': ('robot', 'control.observation', 'control.onnx_runtime', 'control.policy_file',
               'control.policy_checksum', 'runs.json_file'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',
-            'faults', 'film', 'nodes', 'train', 'identify', 'bringup'),
+            'faults', 'film', 'nodes', 'train', 'identify', 'bringup', 'view'),
 }
 
 # Library -> the only room that imports it.
 KEPT_IN = {'mujoco': 'sim', 'rclpy': 'nodes', 'launch': 'nodes', 'torch': 'train',
            'rsl_rl': 'train', 'tensordict': 'train', 'dynamixel_sdk': 'drivers',
-           'pymavlink': 'drivers', 'serial': 'drivers'}
+           'pymavlink': 'drivers', 'serial': 'drivers', 'viser': 'view', 'trimesh': 'view'}
 
 
 def imports(path):

@@ -14,7 +14,7 @@ import typer
 from typer.main import get_command
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.cli import driving, flights, gaps, hardware, listing, training
+from beetle_omni_ros.cli import driving, flights, gaps, hardware, listing, training, viewing
 from beetle_omni_ros.cli.options import fail, INTERRUPTED, refuse_empty, UNUSABLE, usage_text
 from beetle_omni_ros.robot.resources import PACKAGE
 from beetle_omni_ros.robot.schema import ParameterError
@@ -28,8 +28,8 @@ HELP = {'help_option_names': ['-h', '--help']}
 app = typer.Typer(no_args_is_help=True, context_settings=HELP,
                   help='Fly, evaluate and report on the tiltable quadrotor.')
 for command in (flights.fly, flights.evaluate, flights.compare, flights.faults, flights.report,
-                flights.film, gaps.gap, training.train, hardware.check, driving.drive,
-                listing.controllers):
+                flights.film, viewing.view, gaps.gap, training.train, hardware.check,
+                driving.drive, listing.controllers):
     app.command()(command)
 identify = typer.Typer(no_args_is_help=True, context_settings=HELP,
                        help='Fit the actuator models from measured data.')

@@ -61,6 +61,11 @@ def fly(bag: Annotated[Path, typer.Option(
         domain_id: Annotated[Optional[int], typer.Option(
             '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
         discovery: DiscoveryOption = None,
+        view: Annotated[bool, typer.Option(
+            '--view', help='Show the flight in the browser, as beetle_omni view does.')] = False,
+        allow_targets: Annotated[bool, typer.Option(
+            '--allow-targets', help='With --view: poses dragged in the page become targets, and '
+                                    'controllers can be selected there.')] = False,
         json_path: JsonOption = None):
     """
     Fly the whole ROS graph in real time against the simulated robot.
@@ -70,6 +75,8 @@ def fly(bag: Annotated[Path, typer.Option(
     """
     check_flight(task=task, seed=seed, conditions=conditions, bag=bag, compression=compression,
                  json_path=json_path, files=(robot, plant, policy, faults))
+    if allow_targets and not view:
+        raise ParameterError('--allow-targets: expected --view with it')
     from beetle_omni_ros.nodes.fly import FlightError, run_fly
     try:
         code = run_fly(controller=controller, task=task, bag=bag, compression=compression,

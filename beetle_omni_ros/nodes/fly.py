@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import contextmanager, ExitStack
 from dataclasses import replace
 from pathlib import Path
 import shutil
+import signal
+import subprocess
 import sys
 import tempfile
+import threading
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -18,7 +22,7 @@ from beetle_omni_ros.nodes import domain, runner
 from beetle_omni_ros.nodes.actuators import ACTUATORS
 from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.flight import Flight, FlightError, TooSlowError
-from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes.graph import child_environment, Graph
 from beetle_omni_ros.nodes.interrupts import terminable, undisturbed
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.nodes.plan import plan, Wanted
@@ -32,6 +36,7 @@ from beetle_omni_ros.runs.tasks import make_task, Task
 from beetle_omni_ros.sim.faults import listed
 
 INTERRUPTED = 130
+VIEWER_STOP_TIMEOUT = 3.0       # s
 CLOCKS = {'auto': ('system', 'simulated'), 'system': ('system',), 'simulated': ('simulated',)}
 
 
@@ -43,6 +48,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             policy: Path | None = None, allow_other_robot: bool = False, standby: bool = True,
             composed: bool = True, faults: Path | None = None, json_path: Path | None = None,
             domain_id: int | None = None, discovery: str | None = None,
+            view: bool = False, allow_targets: bool = False,
             console: Console | None = None) -> int:
     """
     Fly a task through the ROS graph and print what the bag says.
@@ -69,6 +75,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         json_path: file for the results.
         domain_id: ROS domain; default a free one.
         discovery: who can find the nodes, see :mod:`discovery`; default this computer alone.
+        view: show the flight in the browser, from a process of its own.
+        allow_targets: poses dragged there become targets.
         console: where to print.
 
     Returns:
@@ -104,6 +112,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                 _tell(console, f'{name} does not stand by: {reason}')
             controller = registry.find(controller).name
             number = stack.enter_context(domain.reserved()) if domain_id is None else domain_id
+            if view:
+                stack.enter_context(viewed(number, robot, allow_targets, console))
             meta = {'task': task, 'conditions': conditions, 'seed': seed,
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
@@ -153,6 +163,30 @@ def _actuators_for(faults, actuators):
                                      '--actuators direct')
             actuators = 'direct'
     return actuators
+
+
+@contextmanager
+def viewed(domain_id: int, robot: Path | None, allow_targets: bool, console: Console
+           ) -> Iterator[subprocess.Popen]:
+    """Run `beetle_omni view` beside a flight; its lines appear on the console."""
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view',
+         '--domain-id', str(domain_id),
+         *(['--robot', str(robot)] if robot else []),
+         *(['--allow-targets'] if allow_targets else [])],
+        env=child_environment(domain_id), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+        text=True, start_new_session=True)
+    threading.Thread(target=lambda: [_tell(console, line.rstrip()) for line in process.stdout],
+                     daemon=True).start()
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(VIEWER_STOP_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
 
 def _clocks(clock, actuators):

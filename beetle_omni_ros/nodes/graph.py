@@ -78,18 +78,13 @@ class Graph:
 
     def start_process(self, name: str) -> subprocess.Popen:
         """Start one process, also again after it died."""
-        root = str(Path(beetle_omni_ros.__file__).resolve().parents[1])
-        environment = dict(
-            os.environ, ROS_DOMAIN_ID=str(self.domain), BEETLE_OMNI_PARENT=str(os.getpid()),
-            PYTHONPATH=os.pathsep.join(filter(None, [root, os.environ.get('PYTHONPATH')])))
-        confine(environment)
         module, *arguments = self._commands[name]
         with open(self.log(name), 'a') as log:
             self.processes[name] = subprocess.Popen(
                 [sys.executable, '-m', f'{__package__}.{module}', *arguments,
                  '--params-file', str(self._file)],
-                env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                start_new_session=True)     # Ctrl-C is for the one that stops all in order
+                env=child_environment(self.domain), stdin=subprocess.DEVNULL, stdout=log,
+                stderr=log, start_new_session=True)     # Ctrl-C: for the one that stops all
         return self.processes[name]
 
     def log(self, name: str) -> Path:
@@ -150,6 +145,16 @@ class Graph:
                 if '[WARN]' in line or '[ERROR]' in line or ': error: ' in line:
                     lines[line.split(']: ', 1)[-1]] = line
         return list(lines.values())
+
+
+def child_environment(domain: int) -> dict[str, str]:
+    """Variables of a process in ROS domain ``domain`` that ends with this one."""
+    root = str(Path(beetle_omni_ros.__file__).resolve().parents[1])
+    environment = dict(
+        os.environ, ROS_DOMAIN_ID=str(domain), BEETLE_OMNI_PARENT=str(os.getpid()),
+        PYTHONPATH=os.pathsep.join(filter(None, [root, os.environ.get('PYTHONPATH')])))
+    confine(environment)
+    return environment
 
 
 def _ending(code: int, log: Path) -> str:

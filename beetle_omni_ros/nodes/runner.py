@@ -63,7 +63,7 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
     """
     nodes, status = [], OK
     signal.signal(signal.SIGTERM, signal.default_int_handler)   # while starting, as Ctrl-C
-    _end_with_parent()
+    end_with_parent()
     try:
         discovery.confine()
         # Not rclpy's handlers: they end the context under a callback that still publishes.
@@ -170,7 +170,7 @@ def run_before_others():
         pass        # not permitted, or not Linux: as any other process
 
 
-def _end_with_parent():
+def end_with_parent():
     """Let Linux stop this process when the one that started the graph dies, even by SIGKILL."""
     parent = os.environ.get('BEETLE_OMNI_PARENT')
     if parent and sys.platform == 'linux':

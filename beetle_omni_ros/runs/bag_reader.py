@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 import json
+from math import inf
 from pathlib import Path
 from typing import NamedTuple
 
@@ -135,23 +136,50 @@ def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
         BagError: no such bag, unreadable, not MCAP, or several robots in it.
 
     """
-    reading = _Reading(str(path), namespace)
-    for message in read_messages(path, reading.warnings):
-        reading.take(message)
-    recorder = reading.recorder
-    recorder.write_meta(_metadata(path, reading.warnings))
+    recorder, warnings = LogRecorder(), []
+    for _ in replay(path, recorder, warnings, namespace=namespace):
+        pass
     log = recorder.log()
-    log.warnings = reading.finish()
+    log.warnings = warnings
     log.source = str(path)
     return log
+
+
+def replay(path: str | Path, recorder, warnings: list[str], *, namespace: str | None = None,
+           spacing: Callable[[str], float] = lambda _: 0.0) -> Iterator[float]:
+    """
+    Pass the messages of a bag on to a recorder, in the order in which they were recorded.
+
+    Args:
+        path: rosbag2 folder, or one of its files.
+        recorder: takes ``write_*`` calls, see :class:`~beetle_omni_ros.runs.recorder.LogRecorder`.
+        warnings: takes what was missing or wrong, at the end.
+        namespace: of the robot, where the bag holds several.
+        spacing: topic without namespace -> least time between two of its messages [s]; those
+            between, and all after an infinite one, are left out. For readers in a hurry.
+
+    Yields:
+        The time of recording of each message, once the recorder has it [s].
+
+    Raises:
+        BagError: no such bag, unreadable, not MCAP, or several robots in it.
+
+    """
+    reading = _Reading(str(path), namespace, recorder, spacing)
+    for message in read_messages(path, reading.warnings):
+        if reading.take(message):
+            yield message.received
+    recorder.write_meta(_metadata(path, reading.warnings))
+    warnings += reading.finish()
 
 
 class _Reading:
     """Sorts messages by topic and namespace, and counts what cannot be used."""
 
-    def __init__(self, path, namespace):
-        self.recorder = LogRecorder()
+    def __init__(self, path, namespace, recorder, spacing):
         self.warnings: list[str] = []
+        self._recorder, self._spacing = recorder, spacing
+        self._taken: dict[str, float] = {}  # full topic -> time of the newest message taken
         self._path = path
         self._namespace = None if namespace is None else _rooted(namespace)
         self._chosen = namespace is not None
@@ -161,23 +189,31 @@ class _Reading:
         self._reason: dict[str, str] = {}
 
     def take(self, message):
+        """Whether the recorder was given the message."""
         if message.topic not in self._split:
             if self._namespace is None and is_ambiguous(message.topic):
-                return      # until another topic shows in which namespace the robot is
+                return False    # until another topic shows in which namespace the robot is
             self._split[message.topic] = self._recognise(message.topic)
         name = self._split[message.topic]
-        if name is None:
-            return
+        if name is None or self._follows_closely(message, self._spacing(name)):
+            return False
         try:
             topic = topic_of(name)
             if message.type != topic.type:
                 raise MessageError(f'type is {message.type}, not {topic.type}')
             value = topic.read(from_bytes(message.data, message.type))
-            self.recorder.write(name, _stamped(value, message.received), message.received)
+            self._recorder.write(name, _stamped(value, message.received), message.received)
             self._counts[name] += 1
         except Exception as error:  # one message that cannot be used must not lose the others
             self._bad[name] += 1
             self._reason.setdefault(name, str(error) or type(error).__name__)
+            return False
+        self._taken[message.topic] = message.received
+        return True
+
+    def _follows_closely(self, message, spacing):
+        before = self._taken.get(message.topic, inf)    # a clock that was set back starts anew
+        return before <= message.received < before + spacing
 
     def _recognise(self, topic):
         split = split_topic(topic, () if self._namespace is None else (self._namespace,))

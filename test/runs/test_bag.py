@@ -30,6 +30,7 @@ from beetle_omni_ros.runs.bag import (
     read_bag,
     read_messages,
 )
+from beetle_omni_ros.runs.bag_reader import replay
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.recorder import LogRecorder, Tee
 from beetle_omni_ros.runs.tasks import make_task
@@ -74,6 +75,18 @@ def test_a_flight_comes_back_from_its_bag_as_it_was_recorded(recorded):
     log = read_bag(folder)
     assert_equal_logs(memory, log)
     assert log.warnings == []
+
+
+def test_a_replay_leaves_out_what_follows_closely(recorded):
+    folder, memory, _ = recorded
+    recorder, warnings = LogRecorder(), []
+    spacing = {'odom': 0.1, 'imu/data_raw': np.inf}
+    times = list(replay(folder, recorder, warnings, spacing=lambda name: spacing.get(name, 0.0)))
+    log = recorder.log()
+    assert len(log.imu_t) == 1 and np.diff(log.odom_t).min() > 0.095
+    assert len(log.odom_t) == pytest.approx(10 * (memory.odom_t[-1] - memory.odom_t[0]), abs=3)
+    np.testing.assert_array_equal(log.joint_t, memory.joint_t)
+    assert log.meta == memory.meta and not warnings and times == sorted(times)
 
 
 def test_a_trajectory_comes_back_from_its_bag(tmp_path):

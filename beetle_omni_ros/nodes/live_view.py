@@ -1,0 +1,194 @@
+"""`beetle_omni view` without RUN: listens to a graph, and carries the operator's wishes there."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from contextlib import ExitStack, suppress
+from functools import partial
+import os
+from pathlib import Path
+import threading
+
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import NameValidationException
+from rclpy.signals import SignalHandlerOptions
+from rich.console import Console
+
+from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.messages.bag_types import from_bytes
+from beetle_omni_ros.messages.topics import requester, SENSOR, topic_of
+from beetle_omni_ros.nodes import runner, wire
+from beetle_omni_ros.nodes.discovery import confine
+from beetle_omni_ros.nodes.every_offer import EveryOffer
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.view.command import announce
+from beetle_omni_ros.view.frames import Sampler
+from beetle_omni_ros.view.live import Live
+from beetle_omni_ros.view.model import Model
+
+# Of these the newest message counts, and no more than one is read for each picture; of the others
+# every message counts.
+STREAMS = ('odom', 'ground_truth/odom', 'joint_states', 'command', 'battery_state')
+EVENTS = ('supervisor/state', 'disturbance', 'diagnostics')
+TARGETS = ('target_pose', 'target_trajectory')      # of anybody, however they are published
+MOST_EVENTS = 200       # that wait to be read
+NICENESS = 10           # the flight comes first
+SUPERVISOR = 'supervisor_node'
+
+
+class Listener:
+    """
+    The page's ear and voice in a graph; see :class:`~beetle_omni_ros.view.live.Graph`.
+
+    Args:
+        namespace: of the robot's topics.
+        domain: ROS domain; None: as the environment says.
+        discovery: who is looked for, see :mod:`discovery`.
+        speaks: whether targets and the choice of a controller are passed on.
+
+    Raises:
+        ParameterError: no such namespace or range of discovery is possible.
+
+    """
+
+    def __init__(self, namespace: str = '', domain: int | None = None,
+                 discovery: str | None = None, speaks: bool = False):
+        """Join the graph."""
+        confine(asked=discovery)
+        self._context = rclpy.Context()
+        rclpy.init(args=[], context=self._context, domain_id=domain,
+                   signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            self._node = node = rclpy.create_node('view', context=self._context,
+                                                  namespace=namespace)
+        except NameValidationException as error:
+            self._context.try_shutdown()
+            raise ParameterError(f"--namespace '{namespace}': "
+                                 f'{str(error).splitlines()[0]}') from None
+        self._lock = threading.Lock()
+        self._newest: dict[str, bytes] = {}
+        self._waiting: dict[str, list[bytes]] = defaultdict(list)
+        node.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        for topic in STREAMS:
+            self._subscribe(topic, partial(self._keep, topic), SENSOR)
+        for topic in EVENTS:
+            self._subscribe(topic, partial(self._queue, topic))
+        for topic in TARGETS:
+            EveryOffer(node, wire.message_class(topic_of(topic).type), topic,
+                       partial(self._queue, topic), raw=True)
+        self._targets = wire.Publisher(node, 'target_pose') if speaks else None
+        self._setting = node.create_client(SetParameters, f'{SUPERVISOR}/set_parameters') \
+            if speaks else None
+        self._executor = runner.make_executor(self._context)
+        self._executor.add_node(node)
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self):
+        while not self._stopped.is_set():
+            self._executor.spin_once(timeout_sec=0.2)
+
+    def _keep(self, topic, data):
+        with self._lock:
+            self._newest[topic] = data
+
+    def _subscribe(self, topic, callback, qos=None):
+        entry = topic_of(topic)
+        self._node.create_subscription(wire.message_class(entry.type), topic, callback,
+                                       wire.profile(qos or entry.qos), raw=True)
+
+    def _queue(self, topic, data, _=None):
+        with self._lock:
+            if len(self._waiting[topic]) < MOST_EVENTS:
+                self._waiting[topic].append(data)
+
+    def take(self, sampler: Sampler) -> None:
+        """Pass on what came since the last call; what cannot be read is left out."""
+        now = self._node.get_clock().now().nanoseconds * 1e-9
+        with self._lock:
+            newest, self._newest = self._newest, {}
+            waiting, self._waiting = self._waiting, defaultdict(list)
+        for topic, data in (*newest.items(), *((topic, data) for topic, queue in waiting.items()
+                                               for data in queue)):
+            try:
+                known = topic_of(topic)
+                sampler.write(topic, known.take(from_bytes(data, known.type)), now)
+            except Exception:   # whatever broken bytes provoke: the nodes tell what they refuse
+                continue
+
+    def controllers(self) -> list[str]:
+        """Names under which somebody publishes a command."""
+        prefix = self._node.get_namespace().rstrip('/') + '/'
+        names = (requester(name.removeprefix(prefix))
+                 for name, _ in self._node.get_topic_names_and_types() if name.startswith(prefix))
+        return sorted(filter(None, names))
+
+    def publish_target(self, target: PoseTarget) -> None:
+        """Publish it, latched, on target_pose."""
+        if self._targets is not None:
+            self._targets.publish(target)
+
+    def select(self, controller: str, answer) -> None:
+        """Set the supervisor's parameter ``controller``."""
+        if self._setting is None or not self._setting.service_is_ready():
+            answer(f'{SUPERVISOR} is not there')
+            return
+        request = SetParameters.Request(parameters=[Parameter(
+            name='controller', value=ParameterValue(
+                type=ParameterType.PARAMETER_STRING, string_value=controller))])
+
+        def done(future):
+            result = future.result().results[0]
+            answer('' if result.successful else result.reason or 'no reason given')
+        self._setting.call_async(request).add_done_callback(done)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._stopped.set()
+        self._thread.join(2.0)
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+
+def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: str | None = None,
+             robot: Path | None = None, urdf: Path | None = None, host: str, port: int,
+             dark: bool = False, allow_targets: bool = False,
+             console: Console | None = None) -> None:
+    """
+    Show a running graph until Ctrl-C.
+
+    Args:
+        namespace: of the robot's topics.
+        domain_id: ROS domain; None: as the environment says.
+        discovery: who is looked for; None: this computer alone.
+        robot: robot file; None: the shipped one.
+        urdf: description; None: the shipped one.
+        host: address at which the page is served.
+        port: of it; the next free one is taken.
+        dark: colours to begin with.
+        allow_targets: whether the page may publish targets and select controllers.
+        console: where to print.
+
+    Raises:
+        ParameterError: in one line.
+
+    """
+    runner.end_with_parent()
+    model, parameters = Model.load(urdf), RobotParameters.load(robot)
+    from beetle_omni_ros.view.page import Page
+    with ExitStack() as stack:
+        listener = Listener(namespace, domain_id, discovery, allow_targets)
+        stack.callback(listener.close)
+        os.nice(NICENESS)
+        page = Page(['live'], model, parameters, title='Flight', host=host, port=port, dark=dark)
+        stack.callback(page.close)
+        page.look_at_room()
+        live = Live(page, listener, parameters, allow_targets)
+        announce(page.url, console or Console())
+        with suppress(KeyboardInterrupt):       # how a viewer is ended
+            live.run()

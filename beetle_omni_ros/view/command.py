@@ -1,0 +1,72 @@
+"""`beetle_omni view RUN...`: play recorded runs in the browser."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+from rich.console import Console
+
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.view.model import Model
+from beetle_omni_ros.view.recording import Recording
+
+FIRST_ROWS = 60.0       # [s] at most until the first of a run is read
+
+
+def names(paths: list[Path]) -> list[str]:
+    """Name runs by their folders, and where these are alike by the folders above too."""
+    parts = [path.absolute().parts for path in paths]
+    for depth in range(1, max(map(len, parts)) + 1):
+        found = ['/'.join(part[-depth:]) for part in parts]
+        if len(set(found)) == len(found):
+            return found
+    return [f'{found[k]} ({k + 1})' for k in range(len(found))]
+
+
+def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None = None,
+             host: str, port: int, dark: bool = False, start: float = 0.0,
+             play: bool = True, console: Console | None = None) -> None:
+    """
+    Play recorded runs until Ctrl-C.
+
+    Args:
+        runs: rosbag2 folders or their files; the first is drawn solid, the others as ghosts.
+        robot: robot file, for where forces act; None: the shipped one.
+        urdf: description; None: the shipped one.
+        host: address at which the page is served.
+        port: of it; the next free one is taken.
+        dark: colours to begin with.
+        start: where to begin [s].
+        play: whether it runs at once.
+        console: where to print.
+
+    Raises:
+        BagError, ParameterError: in one line.
+
+    """
+    console = console or Console()
+    model, parameters = Model.load(urdf), RobotParameters.load(robot)
+    with ExitStack() as stack:
+        recordings = []
+        for path, name in zip(runs, names(runs), strict=True):
+            recordings.append(Recording(path, name))
+            stack.callback(recordings[-1].close)
+        from beetle_omni_ros.view.page import Page  # while the first seconds are read
+        from beetle_omni_ros.view.playback import Player
+        for recording in recordings:
+            recording.wait(FIRST_ROWS)
+        page = Page([recording.name for recording in recordings], model, parameters, host=host,
+                    port=port, dark=dark)
+        stack.callback(page.close)
+        player = Player(page, recordings, start, play)
+        player.look()
+        player.draw()
+        announce(page.url, console)
+        with suppress(KeyboardInterrupt):       # how a viewer is ended
+            player.run()
+
+
+def announce(url: str, console: Console) -> None:
+    """Print where the page is."""
+    console.print(f'{url}  (Ctrl-C ends it)', markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,160 @@
+"""One robot in the scene: its links, and what moves them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.view import arrows
+from beetle_omni_ros.view.frames import COLUMNS, known, pose
+from beetle_omni_ros.view.model import Model, Visual
+
+Colour = tuple[int, int, int]
+THRUST, TORQUE, FORCE = (240, 140, 30), (120, 90, 220), (210, 40, 60)
+BLADE = (40, 40, 46)
+BLADE_WIDTH, BLADE_HEIGHT = 0.14, 1.3   # of a disc's radius and height
+SEGMENTS = 24                           # of a cylinder
+EYE_RATE = 9.0      # [rad/s] that a rotor turns at most for the eye: real ones would flicker
+
+
+def wxyz(quaternion: np.ndarray) -> np.ndarray:
+    """Quaternion in the order of the viewer."""
+    return np.roll(quaternion, 1)
+
+
+class RobotDrawing:
+    """
+    A robot that can be placed.
+
+    Args:
+        scene: of the viser server.
+        name: of its node.
+        model: what it looks like.
+        robot: where forces act.
+        tint: colour and opacity of a ghost; None: as the description says, with arrows.
+
+    """
+
+    def __init__(self, scene, name: str, model: Model, robot: RobotParameters,
+                 tint: tuple[Colour, float] | None = None):
+        """Add the nodes; nothing is seen before :meth:`show`."""
+        self._robot, self._model = robot, model
+        self._root = scene.add_frame(name, show_axes=False, visible=False)
+        self._joints, self._rotors, paths = [], {}, {}
+        for link in model.links.values():
+            above, position = (name, np.zeros(3)) if link.joint is None else (
+                paths[link.joint.parent], link.joint.position)
+            path = paths[link.name] = f'{above}/{link.name}'
+            node = scene.add_frame(path, show_axes=False, wxyz=wxyz(link.turned()),
+                                   position=position)
+            if link.moves:
+                self._joints.append((link, node))
+            if link.name in ROTOR_NAMES:
+                self._rotors[ROTOR_NAMES.index(link.name)] = (link, node)
+            for k, visual in enumerate(link.visuals):
+                _add(scene, f'{path}/visual{k}', visual, tint)
+                if link.name in ROTOR_NAMES and visual.shape == 'cylinder':
+                    _add_blades(scene, f'{path}/blades{k}', visual, tint)
+        self._turned = np.zeros(len(ROTOR_NAMES))
+        self._arrows = self._arcs = None
+        if tint is None:
+            self._arrows = scene.add_arrows(
+                f'{name}/thrust', np.zeros((4, 2, 3)), THRUST, shaft_radius=0.008,
+                head_radius=0.02, head_length=0.04)
+            self._arcs = scene.add_line_segments(
+                f'{name}/torque', arrows.torque_arcs(robot, np.zeros(4), np.zeros(4)), TORQUE,
+                thickness=0.007)
+        self._forces = True
+
+    def show_forces(self, wanted: bool) -> None:
+        """Show or hide its arrows."""
+        self._forces = wanted
+        for drawn in (self._arrows, self._arcs):
+            if drawn is not None:
+                drawn.visible = wanted
+
+    def hide(self) -> None:
+        """Take it out of sight."""
+        self._root.visible = False
+
+    def show(self, row: np.ndarray, prefix: str = '', passed: float = 0.0) -> None:
+        """
+        Place it.
+
+        Args:
+            row: see :mod:`~beetle_omni_ros.view.frames`.
+            prefix: which pose of the row, see :func:`~beetle_omni_ros.view.frames.pose`.
+            passed: time since the row before, in which the rotors turn [s].
+
+        """
+        placed = pose(row, prefix)
+        self._root.visible = placed is not None
+        if placed is None:
+            return
+        self._root.position, self._root.wxyz = placed[0], wxyz(placed[1])
+        tilt = np.nan_to_num(row[COLUMNS['tilt']])
+        angles = dict(zip(JOINT_NAMES, tilt, strict=True))
+        for link, node in self._joints:
+            node.wxyz = wxyz(link.turned(angles.get(link.moves, 0.0)))
+        thrust = known(row, 'thrust')
+        if thrust is None:
+            thrust = np.zeros(len(ROTOR_NAMES))
+        if passed:
+            self._spin(thrust, passed)
+        if self._arrows is not None and self._forces:
+            self._arrows.points = arrows.thrust_arrows(self._robot, tilt, thrust)
+            self._arcs.points = arrows.torque_arcs(self._robot, tilt, thrust)
+
+    def _spin(self, thrust, passed):
+        """Turn the rotors by the square root of their thrust, as real ones, but slower."""
+        rotors = self._robot.rotors
+        self._turned += rotors.spin * EYE_RATE * passed * np.sqrt(
+            np.clip(thrust / rotors.thrust_max, 0, 1))
+        for k, (link, node) in self._rotors.items():
+            half = self._turned[k] / 2
+            turn = np.array([0, 0, np.sin(half), np.cos(half)])
+            node.wxyz = wxyz(rotations.multiply(link.turned(), turn))
+
+
+def _add(scene, name, visual, tint):
+    place = {'position': visual.position, 'wxyz': wxyz(visual.quaternion)}
+    *colour, opacity = visual.colour
+    look = {'color': tuple(round(255 * part) for part in colour),
+            'opacity': opacity if opacity < 1 else None}
+    if tint is not None:
+        look = {'color': tint[0], 'opacity': tint[1] * opacity}
+    # What is transparent throws no shadow, and is seen through from both sides.
+    look['cast_shadow'] = look['opacity'] is None
+    if visual.shape == 'box':
+        scene.add_box(name, dimensions=visual.size, **look, **place)
+    elif visual.shape == 'cylinder':
+        radius, height = visual.size
+        scene.add_cylinder(name, radius, height, radial_segments=SEGMENTS, **look, **place)
+    elif visual.shape == 'sphere':
+        scene.add_icosphere(name, visual.size[0], subdivisions=2, **look, **place)
+    else:
+        mesh = _mesh(visual.file)
+        scene.add_mesh_simple(name, mesh.vertices, mesh.faces, scale=visual.size,
+                              flat_shading=True, **look, **place)
+
+
+def _add_blades(scene, name, disc: Visual, tint):
+    """A propeller in a plain disc, so that it is seen to turn."""
+    radius, height = disc.size
+    colour, opacity = tint or (BLADE, None)
+    scene.add_box(name, dimensions=(1.96 * radius, BLADE_WIDTH * radius, BLADE_HEIGHT * height),
+                  color=colour, opacity=opacity, position=disc.position,
+                  wxyz=wxyz(disc.quaternion), cast_shadow=tint is None)
+
+
+@lru_cache
+def _mesh(file):
+    import trimesh
+    try:
+        return trimesh.load_mesh(file)
+    except Exception as error:      # whatever a missing or broken file provokes in the library
+        raise ParameterError(f'{file}: not a usable mesh: {error}') from None

@@ -1,0 +1,190 @@
+"""A running graph on the page: what is heard of it, and what the operator asks of it there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import threading
+import time
+from typing import Protocol
+
+import numpy as np
+
+from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.target_checks import TargetChecks
+from beetle_omni_ros.view import plots
+from beetle_omni_ros.view.drawing import wxyz
+from beetle_omni_ros.view.frames import pose, Rows, Sampler, T
+from beetle_omni_ros.view.page import Page, RATE, Shown
+
+KEPT = 60.0             # [s] of rows
+ANSWER_TIME = 3.0       # [s] in which nodes tell that they refused a target: a diagnostic is 1 s
+JUMP = 1.0              # [s] back in the clock by which a new flight shows
+WAITING = 'waiting for odom or ground_truth/odom'
+
+
+class Graph(Protocol):
+    """What the page needs of a running graph."""
+
+    def take(self, sampler: Sampler) -> None:
+        """Pass on what came since the last call."""
+
+    def controllers(self) -> list[str]:
+        """Names of the controllers that command, or could."""
+
+    def publish_target(self, target: PoseTarget) -> None:
+        """Ask for a pose."""
+
+    def select(self, controller: str, answer: Callable[[str], None]) -> None:
+        """Ask the supervisor for a controller; ``answer`` takes why not, '' for yes."""
+
+
+class Live:
+    """
+    Draws a graph as it runs.
+
+    Args:
+        page: with one name.
+        graph: what to listen to.
+        robot: for the checks of targets.
+        allow_targets: whether poses dragged on the page become targets, and controllers can be
+            selected there.
+
+    """
+
+    def __init__(self, page: Page, graph: Graph, robot: RobotParameters, allow_targets: bool):
+        """Add the controls."""
+        self._page, self._graph = page, graph
+        self._checks = TargetChecks(robot)
+        self._sampler, self._rows = Sampler(), Rows(KEPT)
+        self._begin: float | None = None
+        self._stop = threading.Event()
+        self._asked: tuple[float, PoseTarget | None] | None = None
+        self._wanted: PoseTarget | None = None      # by the page, until the next step takes it
+        self._dragging = False
+        self._gizmo = None
+        gui = page.server.gui
+        with page.controls:
+            self._told = gui.add_markdown(WAITING)
+            if allow_targets:
+                self._controller = gui.add_dropdown('controller', ('-',), initial_value='-')
+                self._controller.on_update(self._on_controller)
+                self._position = gui.add_vector3('target [m]', (0.0, 0.0, 1.0), step=0.05)
+                self._angles = gui.add_vector3('roll pitch yaw [deg]', (0.0, 0.0, 0.0), step=5.0)
+                gui.add_button('fly there').on_click(lambda _: self._send(
+                    np.array(self._position.value), rotations.from_rpy(
+                        *np.radians(self._angles.value))))
+        if allow_targets:
+            self._gizmo = page.server.scene.add_transform_controls(
+                '/wanted', scale=0.55, line_width=3.0, depth_test=False, visible=False)
+            self._gizmo.on_update(self._on_gizmo)
+
+    def run(self) -> None:
+        """Draw until :meth:`stop`."""
+        last = time.monotonic()
+        while not self._stop.wait(max(0.0, last + 1 / RATE - time.monotonic())):
+            now = time.monotonic()
+            self.step(now - last)
+            last = now
+
+    def stop(self) -> None:
+        """End :meth:`run`."""
+        self._stop.set()
+
+    def step(self, passed: float) -> None:
+        """Take in what came, and draw it; ``passed`` [s] since the step before."""
+        sampler = self._sampler
+        self._publish()
+        self._graph.take(sampler)
+        self._look_for_refusal()
+        if not sampler.placed:
+            return
+        if len(self._rows) and sampler.clock < self._rows.times[-1] - JUMP:
+            self._rows, self._begin = Rows(KEPT), None
+        row = sampler.row(sampler.clock)
+        self._rows.append(row[None])
+        if self._begin is None:
+            self._begin = sampler.clock
+        now = sampler.clock - self._begin
+        window = self._rows.window(sampler.clock - 2 * plots.BEHIND, np.inf).copy()
+        window[:, T] -= self._begin
+        state = sampler.states[-1][1] if sampler.states else ''
+        self._page.show([Shown(row, window, state, sampler.faults)], now, passed,
+                        f'live: {now:.1f} s')
+        self._tell(state, row)
+
+    def _tell(self, state, row):
+        text = 'live'
+        if self._gizmo is not None:
+            text = 'drag the target, or give numbers'
+            names = ('-', *self._graph.controllers())
+            flying = state.partition(':')[2] if state.startswith('flying:') else ''
+            if names != tuple(self._controller.options):
+                self._controller.options = names
+            if flying in names and self._controller.value != flying:
+                self._controller.value = flying
+            self._place_gizmo(pose(row, 'target_') or pose(row))
+        if self._told.content != text:
+            self._told.content = text
+
+    # -- what the operator asks ------------------------------------------------------------
+
+    def _place_gizmo(self, placed):
+        self._gizmo.visible = True
+        if not self._dragging and self._asked is None:
+            self._gizmo.position, self._gizmo.wxyz = placed[0], wxyz(placed[1])
+
+    async def _on_gizmo(self, event):   # in the loop, which keeps the order of events
+        self._dragging = event.phase != 'end'
+        position = np.array(event.target.position)
+        quaternion = np.roll(np.array(event.target.wxyz), -1)
+        self._position.value = tuple(round(float(x), 3) for x in position)
+        self._angles.value = tuple(round(float(x), 1)
+                                   for x in np.degrees(rotations.to_rpy(quaternion)))
+        if event.phase == 'end':
+            self._send(position, quaternion)
+
+    def _send(self, position, quaternion):
+        """Ask for a pose, if it can be flown at all; the nodes decide whether it is."""
+        # Stamped by the flight's own clock, so that it is newer than the targets before.
+        target = PoseTarget(position, rotations.normalized(quaternion),
+                            float(np.nan_to_num(self._sampler.clock)))
+        if reason := self._checks.why_not(target, None):
+            self._page.notify('target not sent', reason)
+            return
+        self._wanted = target
+
+    def _publish(self):
+        """In the thread that draws, which alone touches the sampler."""
+        target, self._wanted = self._wanted, None
+        if target is not None:
+            self._asked = (time.monotonic(), self._sampler.target)
+            self._sampler.remarks.clear()
+            self._sampler.target = target
+            self._graph.publish_target(target)
+
+    def _look_for_refusal(self):
+        if self._asked is None:
+            self._sampler.remarks.clear()
+            return
+        at, before = self._asked
+        for status, text in self._sampler.remarks:
+            if 'target_pose' in text and 'rejected' in text:
+                self._page.notify('target refused', f'{status}: {text}')
+                self._sampler.target, self._asked = before, None
+                return
+        if time.monotonic() - at > ANSWER_TIME:
+            self._asked = None
+
+    def _on_controller(self, event):
+        name = self._controller.value
+        if event.client is None or name == '-':     # set by this page itself
+            return
+
+        def answer(reason):
+            if reason:
+                self._page.notify(f'{name} refused', reason)
+            else:
+                self._page.notify(f'{name} selected', 'the supervisor agrees', 'green')
+        self._graph.select(name, answer)

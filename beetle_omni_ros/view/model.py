@@ -1,0 +1,190 @@
+"""The robot as its URDF describes it: links, what is seen of them, and how joints move them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.resources import PACKAGE, share_path
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.urdf import description, Joint, joints, SHIPPED
+
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+GREY = (0.5, 0.5, 0.5, 1.0)
+SHAPES = {'box': 'size', 'cylinder': 'radius length', 'sphere': 'radius'}
+
+
+@dataclass(frozen=True)
+class Visual:
+    """
+    One visible shape of a link.
+
+    Attributes:
+        shape: 'box', 'cylinder', 'sphere' or 'mesh'.
+        size: edges; radius and length; radius; scale along each axis [m, mesh: 1].
+        position, quaternion: (3,) [m], (4,) in the link's frame.
+        colour: red, green, blue, opacity, each 0 to 1.
+        file: of a mesh.
+
+    """
+
+    shape: str
+    size: tuple[float, ...]
+    position: np.ndarray
+    quaternion: np.ndarray
+    colour: tuple[float, ...] = GREY
+    file: Path | None = None
+
+
+@dataclass(frozen=True)
+class Link:
+    """
+    A link, the joint that holds it (None: the root), and what is seen of it.
+
+    Attributes:
+        name: of the link.
+        joint: that holds it.
+        visuals: its shapes.
+
+    """
+
+    name: str
+    joint: Joint | None
+    visuals: tuple[Visual, ...] = ()
+
+    @property
+    def moves(self) -> str:
+        """Name of the joint by which it moves; '' where it is fixed."""
+        return self.joint.name if self.joint is not None and self.joint.axis is not None else ''
+
+    def turned(self, angle: float = 0.0) -> np.ndarray:
+        """Quaternion of the link in its parent with the joint at ``angle`` [rad]."""
+        if self.joint is None:
+            return IDENTITY
+        return self.joint.turned(angle) if self.moves else self.joint.quaternion
+
+
+class Model:
+    """
+    Links of a robot, parents before children.
+
+    Attributes:
+        links: name -> link.
+        limits: joint -> lower and upper limit [rad].
+
+    """
+
+    def __init__(self, links: dict[str, Link], limits: dict[str, tuple[float, float]]):
+        """Keep both."""
+        self.links, self.limits = links, limits
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> Model:
+        """
+        Read a URDF file; None: the shipped one.
+
+        Raises:
+            ParameterError: it cannot be read, or is no URDF; one line.
+
+        """
+        path = Path(path) if path else share_path(SHIPPED)
+        text = description(path)
+        try:
+            root = ElementTree.fromstring(text)
+            if root.tag != 'robot':
+                raise ValueError(f'expected <robot>, found <{root.tag}>')
+            return cls(_links(root, joints(text), path), _limits(root))
+        except (ElementTree.ParseError, AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ParameterError(f'{path}: not a usable URDF: {error}') from None
+
+    def poses(self, angles: dict[str, float]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """
+        Place every link.
+
+        Args:
+            angles: joint -> angle [rad]; 0 where not given.
+
+        Returns:
+            Link -> (3,) position [m] and (4,) quaternion in the root's frame.
+
+        """
+        placed = {}
+        for link in self.links.values():
+            if link.joint is None:
+                placed[link.name] = np.zeros(3), IDENTITY
+                continue
+            position, quaternion = placed[link.joint.parent]
+            placed[link.name] = (
+                position + rotations.matrix(quaternion) @ link.joint.position,
+                rotations.multiply(quaternion, link.turned(angles.get(link.moves, 0.0))))
+        return placed
+
+
+def _links(root, held, path):
+    colours = {entry.get('name'): _colour(entry, {}) for entry in root.findall('material')}
+    visuals = {link.get('name'): tuple(_visual(entry, colours, path)
+                                       for entry in link.findall('visual'))
+               for link in root.findall('link')}
+    by_child = {joint.child: joint for joint in held}
+    links = {name: Link(name, None, seen) for name, seen in visuals.items()
+             if name not in by_child}
+    if len(links) != 1:
+        raise ValueError(f'expected one root link, found {len(links)}')
+    while len(links) < len(visuals):
+        following = {name: Link(name, joint, visuals[name]) for name, joint in by_child.items()
+                     if joint.parent in links and name not in links}
+        if not following:
+            raise ValueError('links that hang on nothing')
+        links.update(following)
+    return links
+
+
+def _limits(root):
+    limits = {joint.get('name'): joint.find('limit') for joint in root.findall('joint')}
+    return {name: (float(limit.get('lower')), float(limit.get('upper')))
+            for name, limit in limits.items() if limit is not None and limit.get('upper')}
+
+
+def _visual(entry, colours, path):
+    position, quaternion = _origin(entry)
+    geometry = entry.find('geometry')[0]
+    material = entry.find('material')
+    colour = GREY if material is None else _colour(material, colours)
+    if geometry.tag == 'mesh':
+        return Visual('mesh', tuple(_numbers(geometry.get('scale', '1 1 1'), 3)), position,
+                      quaternion, colour, _mesh_file(geometry.get('filename'), path))
+    size = ' '.join(geometry.get(key) for key in SHAPES[geometry.tag].split())
+    return Visual(geometry.tag, tuple(map(float, size.split())), position, quaternion, colour)
+
+
+def _mesh_file(name, urdf):
+    place = name.removeprefix('file://')
+    if place.startswith(f'package://{PACKAGE}/'):
+        return share_path(place.removeprefix(f'package://{PACKAGE}/'))
+    return urdf.parent / place
+
+
+def _origin(entry):
+    origin = entry.find('origin')
+    if origin is None:
+        return np.zeros(3), IDENTITY
+    return (_numbers(origin.get('xyz', '0 0 0'), 3),
+            rotations.from_rpy(*_numbers(origin.get('rpy', '0 0 0'), 3)))
+
+
+def _colour(material, known):
+    colour = material.find('color')
+    if colour is None:
+        return known.get(material.get('name'), GREY)
+    return tuple(_numbers(colour.get('rgba'), 4))
+
+
+def _numbers(text, count):
+    numbers = np.array([float(part) for part in text.split()])
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise ValueError(f"expected {count} numbers, found '{text}'")
+    return numbers

@@ -1,0 +1,375 @@
+"""The page: scene, panel and plots in the browser, and what the user does there."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+import html
+import io
+import time
+
+import numpy as np
+import viser
+from viser import uplot
+
+from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.view import plots
+from beetle_omni_ros.view.arrows import WORLD_NEWTON_PER_METRE
+from beetle_omni_ros.view.drawing import FORCE, RobotDrawing, wxyz
+from beetle_omni_ros.view.frames import known, pose
+from beetle_omni_ros.view.model import Model
+
+RATE = 30.0             # [Hz] of the scene
+PANEL_RATE, PLOT_RATE = 4.0, 4.0
+SHOWN_PLOTS = ('position error [m]', 'thrust command [N]')      # to begin with
+ESTIMATE = ((70, 140, 250), 0.35)
+GHOST_OPACITY = 0.35
+TARGET_AXES = 0.28      # [m]
+TRAIL_POINTS = 300
+SHADOW_RADIUS, SHADOW_OPACITY = 0.24, 0.15     # of the spot below the robot [m]
+VIEW_FROM, SMALLEST_VIEW = np.array([-0.5, -0.8, 0.36]), 2.0     # [m]
+NARROW, PHONE_DISTANCE, PANEL_SHARE = 0.8, 1.6, 0.35
+SETTLING = 5.0      # [s] in which the page of a newcomer comes to rest
+NUDGE = 1e-6        # [s]
+ROOM = 3.5          # [m]
+LABEL_HEIGHT, LABEL_STEP = 0.38, 0.1    # [m] above base_link, for each further run
+ESTIMATE_SEEN = 0.01, 1.0   # [m], [deg] by which an estimate is off when it is drawn
+LOCAL = '127.0.0.1'
+
+
+@dataclass(frozen=True)
+class Shown:
+    """
+    What is known of one run at one moment.
+
+    Attributes:
+        row: see :mod:`~beetle_omni_ros.view.frames`.
+        window: rows around it, for the plots, on the time base of the first run.
+        state: of the supervisor.
+        faults: named so far -> since when [s].
+
+    """
+
+    row: np.ndarray
+    window: np.ndarray
+    state: str = ''
+    faults: dict[str, float] | None = None
+
+
+class Page:
+    """
+    A page that a browser opens; it draws what it is given.
+
+    Args:
+        names: of the runs; the first is drawn as it is, the others as ghosts.
+        model: what the robot looks like.
+        robot: where forces act on it.
+        title: of the folder that holds the controls.
+        host, port: where it is served; a port in use passes on to the next.
+        dark: colours to begin with.
+
+    Attributes:
+        url: for the browser.
+        controls: folder for the controls of whoever draws.
+
+    """
+
+    def __init__(self, names: list[str], model: Model, robot: RobotParameters, *,
+                 title: str = 'Playback', host: str = LOCAL, port: int = 8080, dark: bool = False):
+        """Serve it."""
+        self._names, self._robot, self._model, self._title = names, robot, model, title
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):     # it prints its own addresses
+                self.server = viser.ViserServer(host, port, label='beetle_omni', verbose=False)
+        except (OSError, OverflowError, RuntimeError) as error:
+            raise ParameterError(f'--host {host} --port {port}: cannot be served there '
+                                 f'({error})') from None
+        shown = 'localhost' if host in (LOCAL, '0.0.0.0') else host
+        self.url = f'http://{shown}:{self.server.get_port()}'
+        self._last_panel = self._last_plot = -np.inf
+        self._nudge, self._newcomer = 0.0, -np.inf
+        self._followed: np.ndarray | None = None
+        self._add_scene(dark)
+        self._add_panel(dark)
+
+        @self.server.on_client_connect
+        def _(client):
+            self._newcomer = time.monotonic()
+            if client.camera.aspect < NARROW:   # a phone, whose lower half is the panel
+                camera, given = client.camera, self.server.initial_camera
+                away = np.asarray(given.position) - given.look_at
+                centre = given.look_at - [0, 0, PANEL_SHARE * np.linalg.norm(away)]
+                camera.position, camera.look_at = (
+                    centre + away * PHONE_DISTANCE, centre)
+
+    # -- scene -----------------------------------------------------------------------------
+
+    def _add_scene(self, dark):
+        scene = self.server.scene
+        scene.configure_default_lights(cast_shadow=False)    # half the cost of a picture
+        self._grid = None
+        self._set_theme(dark)
+        self._robots = [RobotDrawing(
+            scene, f'/run{k}', self._model, self._robot,
+            None if k == 0 else (plots.RUN_COLOURS[k % 4], GHOST_OPACITY))
+            for k in range(len(self._names))]
+        self._estimate = RobotDrawing(scene, '/estimate', self._model, self._robot, ESTIMATE)
+        self._target = scene.add_frame('/target', axes_length=TARGET_AXES, axes_radius=0.008,
+                                       origin_radius=0.018, visible=False)
+        self._shadow = scene.add_cylinder(
+            '/shadow', SHADOW_RADIUS, 0.002, (0, 0, 0), opacity=SHADOW_OPACITY, visible=False,
+            cast_shadow=False, receive_shadow=False)
+        self._force = scene.add_arrows('/force', np.zeros((1, 2, 3)), FORCE, shaft_radius=0.012,
+                                       head_radius=0.03, head_length=0.06, visible=False)
+        self._labels = [scene.add_label(f'/label{k}', name, visible=False,
+                                        anchor='bottom-center')
+                        for k, name in enumerate(self._names)] if len(self._names) > 1 else []
+        self._trails = {}
+
+    def _set_theme(self, dark):
+        self.server.gui.configure_theme(
+            dark_mode=dark, show_logo=False, show_share_button=False, control_width='medium',
+            brand_color=(228, 87, 46))
+        scene = self.server.scene
+        ground, cell, section = ((32, 35, 41), (52, 56, 64), (84, 90, 102)) if dark else \
+            ((238, 240, 243), (214, 218, 224), (176, 182, 191))
+        self._grid = scene.add_grid(
+            '/floor', infinite_grid=True, cell_size=0.5, section_size=1.0, cell_color=cell,
+            section_color=section, plane_color=ground, plane_opacity=1.0, shadow_opacity=0.0,
+            fade_distance=25.0, position=(0, 0, -0.002))
+
+    def look_at(self, centre: np.ndarray, size: float) -> None:
+        """Set the camera of those who open the page: at a centre, for a size [m]."""
+        camera = self.server.initial_camera
+        camera.look_at = centre
+        camera.position = centre + max(size, SMALLEST_VIEW) * VIEW_FROM
+
+    def look_at_room(self) -> None:
+        """Set it for a flight of which nothing is known yet."""
+        self.look_at(np.array([0.0, 0.0, 1.0]), ROOM)
+
+    def draw_trail(self, k: int, positions: np.ndarray) -> None:
+        """Draw the path of a run: (N, 3) in world [m]."""
+        points = positions[::max(1, len(positions) // TRAIL_POINTS)]
+        if len(points) < 2:
+            return
+        lines = np.stack([points[:-1], points[1:]], axis=1)
+        self._trails[k] = self.server.scene.add_line_segments(
+            f'/trail{k}', lines, plots.RUN_COLOURS[k % 4] if len(self._names) > 1
+            else (150, 158, 170), thickness=0.006, visible=self._show_trail.value)
+
+    # -- panel -----------------------------------------------------------------------------
+
+    def _add_panel(self, dark):
+        gui = self.server.gui
+        self._status = gui.add_html('')
+        self.controls = gui.add_folder(self._title, expand_by_default=True)
+        with gui.add_folder('Show', expand_by_default=False):
+            self._show_estimate = gui.add_checkbox('estimate', True)
+            self._show_forces = gui.add_checkbox('thrust and torque', True)
+            self._show_trail = gui.add_checkbox('path', True)
+            self._follow = gui.add_checkbox('follow the robot', False)
+            self._dark = gui.add_checkbox('dark', dark)
+            self._run_boxes = [gui.add_checkbox(name, True) for name in self._names] \
+                if len(self._names) > 1 else []
+        self._dark.on_update(lambda _: self._set_theme(self._dark.value))
+        self._show_forces.on_update(
+            lambda _: self._robots[0].show_forces(self._show_forces.value))
+
+        @self._show_trail.on_update
+        def _(_):
+            for trail in self._trails.values():
+                trail.visible = self._show_trail.value
+        with gui.add_folder('Plots', expand_by_default=True):
+            self._plots = [(gui.add_checkbox(plot.title, plot.title in SHOWN_PLOTS),
+                            self._add_plot(plot)) for plot in plots.PLOTS]
+
+    def _add_plot(self, plot):
+        if plot.compares:
+            labels = self._names
+            colours = [plots.colour(k) for k in range(len(labels))]
+        else:
+            labels, colours = plot.labels, plots.COLOURS
+        series = [uplot.Series(label='t')]
+        series += [uplot.Series(label=label, stroke=colour, width=2, points={'show': False})
+                   for label, colour in zip(labels, colours)]
+        series += [uplot.Series(label='', stroke=plots.NOW, width=1, scale='now',
+                                points={'show': False})]
+        empty = np.zeros(0)
+        return self.server.gui.add_uplot(
+            (empty,) * len(series), tuple(series), height=plots.HEIGHT,
+            scales={'x': uplot.Scale(time=False, auto=True), 'now': uplot.Scale(range=(0, 1))},
+            visible=False, legend=uplot.Legend(show=False), padding=(4, 8, 0, 0))
+
+    # -- what is drawn ---------------------------------------------------------------------
+
+    def show(self, runs: list[Shown], now: float, passed: float, headline: str) -> None:
+        """
+        Draw one moment.
+
+        Args:
+            runs: one for each name.
+            now: present time on the time base of the first run [s].
+            passed: time since the moment before, in which rotors turn [s].
+            headline: first line of the status.
+
+        """
+        first = runs[0]
+        with self.server.atomic():
+            for k, (robot, run) in enumerate(zip(self._robots, runs, strict=True)):
+                wanted = not self._run_boxes or self._run_boxes[k].value
+                robot.show(run.row, passed=passed) if wanted else robot.hide()
+                if self._labels:
+                    self._place_label(k, pose(run.row) if wanted else None)
+            # Where it coincides with the truth it would only tint the robot.
+            if self._show_estimate.value and _differ(*estimate_error(first.row)):
+                self._estimate.show(first.row, 'estimate_')
+            else:
+                self._estimate.hide()
+            self._show_target(pose(first.row, 'target_'))
+            self._show_shadow(pose(first.row))
+            self._show_force(first.row)
+            self._move_cameras(pose(first.row))
+        if time.monotonic() - self._last_panel > 1 / PANEL_RATE:
+            self._last_panel = time.monotonic()
+            self._status.content = status(first, headline, self._model, self._names)
+        self._draw_plots([run.window for run in runs], now)
+
+    def _draw_plots(self, windows, now):
+        if time.monotonic() - self._last_plot > 1 / PLOT_RATE:
+            self._last_plot = time.monotonic()
+            # A chart that is opened while time stands still draws no time axis until that changes.
+            self._nudge = NUDGE - self._nudge
+            for plot, (wanted, handle) in zip(plots.PLOTS, self._plots, strict=True):
+                data = plots.window(plot, windows, now) if wanted.value else None
+                handle.visible = data is not None
+                if data is not None:
+                    data[0][0] += self._nudge
+                    handle.data = data
+
+    def refresh(self) -> None:
+        """Let the next moment renew panel and plots too."""
+        self._last_panel = self._last_plot = -np.inf
+
+    @property
+    def settling(self) -> bool:
+        """Whether somebody has opened the page just now."""
+        return time.monotonic() < self._newcomer + SETTLING
+
+    def _place_label(self, k, placed):
+        self._labels[k].visible = placed is not None
+        if placed is not None:
+            self._labels[k].position = placed[0] + [0, 0, LABEL_HEIGHT + LABEL_STEP * k]
+
+    def _show_target(self, target):
+        self._target.visible = target is not None
+        if target is not None:
+            self._target.position, self._target.wxyz = target[0], wxyz(target[1])
+
+    def _show_shadow(self, placed):
+        self._shadow.visible = placed is not None
+        if placed is not None:
+            self._shadow.position = (*placed[0][:2], 0.001)
+
+    def _show_force(self, row):
+        force, placed = known(row, 'force'), pose(row)
+        self._force.visible = force is not None and placed is not None
+        if self._force.visible:
+            self._force.points = [[placed[0], placed[0] + force / WORLD_NEWTON_PER_METRE]]
+
+    def _move_cameras(self, placed):
+        if not self._follow.value or placed is None:
+            self._followed = None
+            return
+        if self._followed is not None:
+            moved = placed[0] - self._followed
+            for client in self.server.get_clients().values():
+                with contextlib.suppress(AttributeError, AssertionError):  # just connected
+                    camera = client.camera
+                    camera.position, camera.look_at = (camera.position + moved,
+                                                       camera.look_at + moved)
+        self._followed = placed[0].copy()
+
+    def notify(self, title: str, text: str, colour: str = 'red') -> None:
+        """Show a note to everybody who looks."""
+        for client in self.server.get_clients().values():
+            client.add_notification(title, text, color=colour, auto_close_seconds=8.0)
+
+    def close(self) -> None:
+        """Serve no more."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+
+def estimate_error(row: np.ndarray) -> tuple[float, float]:
+    """How far the estimate is from the truth [m], [deg]; NaN where one is unknown."""
+    true, estimated = pose(row), pose(row, 'estimate_')
+    if true is None or estimated is None:
+        return np.nan, np.nan
+    return (float(np.linalg.norm(true[0] - estimated[0])),
+            float(np.degrees(rotations.geodesic_angle(true[1], estimated[1]))))
+
+
+def _differ(metres, degrees):
+    return metres > ESTIMATE_SEEN[0] or degrees > ESTIMATE_SEEN[1]
+
+
+def status(run: Shown, headline: str, model: Model, names: list[str]) -> str:
+    """HTML of the status: state, errors, faults, battery and the winding of the joints."""
+    lines = [f'<b>{html.escape(headline)}</b>']
+    if len(names) > 1:
+        lines.append('<div style="font-size:.85em">' + ' &nbsp; '.join(
+            f'<span style="color:{plots.colour(k)}">&#9632;</span> {html.escape(name)}'
+            for k, name in enumerate(names)) + '</div>')
+    state = html.escape(run.state or 'unknown')
+    target, placed = pose(run.row, 'target_'), pose(run.row)
+    voltage, current = known(run.row, 'voltage'), known(run.row, 'current')
+    told = [('state', state)]
+    if target is not None and placed is not None:
+        away = float(np.linalg.norm(placed[0] - target[0]))
+        angle = np.degrees(rotations.geodesic_angle(placed[1], target[1]))
+        told.append(('off target', f'{away:.3f} m, {angle:.1f}&deg;'))
+    off = estimate_error(run.row)
+    if np.isfinite(off[0]):
+        told.append(('estimate', f'{off[0]:.3f} m, {off[1]:.1f}&deg; off'))
+    if voltage is not None:
+        text = f'{voltage[0]:.1f} V'
+        if current is not None:
+            text += f', {-current[0]:.0f} A'
+        told.append(('battery', text))
+    faults = run.faults or {}
+    told.append(('faults', '<span style="color:#e03131;font-weight:600">' + html.escape(
+        ', '.join(faults)) + '</span>' if faults else 'none'))
+    rows = ''.join(f'<tr><td style="opacity:.65;padding-right:.8em">{key}</td>'
+                   f'<td>{value}</td></tr>' for key, value in told)
+    lines.append(f'<table style="font-size:.85em;line-height:1.45">{rows}</table>')
+    lines.append(_winding(run.row, model))
+    return f'<div style="padding:.2em .9em .3em">{"".join(lines)}</div>'
+
+
+def _winding(row, model):
+    """A bar for each tilt joint: where it is between its limits; its target as a line."""
+    tilt, told = known(row, 'tilt'), known(row, 'tilt_command')
+    bars = []
+    for k, name in enumerate(JOINT_NAMES):
+        low, high = model.limits.get(name, (-np.pi, np.pi))
+        if tilt is None:
+            continue
+        share = 100 * (np.clip([tilt[k], told[k] if told is not None else tilt[k]], low, high)
+                       - low) / (high - low)
+        left, width = min(share[0], 50.0), abs(share[0] - 50.0)
+        colour = '#e03131' if abs(share[0] - 50) > 42 else plots.COLOURS[k]
+        bars.append(
+            f'<div style="display:flex;align-items:center;gap:.5em;font-size:.8em">'
+            f'<span style="opacity:.65;width:4.4em">{name}</span>'
+            f'<span style="position:relative;flex:1;height:.55em;border-radius:3px;'
+            f'background:rgba(128,128,128,.22)">'
+            f'<span style="position:absolute;left:{left:.1f}%;width:{width:.1f}%;height:100%;'
+            f'background:{colour}"></span>'
+            f'<span style="position:absolute;left:{share[1]:.1f}%;width:2px;top:-2px;'
+            f'bottom:-2px;background:currentColor"></span></span>'
+            f'<span style="width:3.6em;text-align:right">{np.degrees(tilt[k]):.0f}&deg;</span>'
+            f'</div>')
+    return ''.join(bars)

@@ -1,0 +1,174 @@
+"""A recorded run, read by a process of its own while its first seconds are shown already."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+import os
+from pathlib import Path
+import pickle
+import subprocess
+import sys
+import threading
+
+import numpy as np
+
+import beetle_omni_ros
+from beetle_omni_ros.runs.bag_reader import bag_files, BagError, replay
+from beetle_omni_ros.view.frames import Rows, Sampler
+
+STEP = 0.02         # [s] between rows
+GAP = 1.0           # [s] without any message that is not filled with rows
+FIRST, PART = 100, 1000     # rows that are handed on at a time
+SKIPPED = ('imu/data_raw', 'mocap/pose')
+HELD = ('odom', 'ground_truth/odom', 'joint_states', 'command')
+
+
+@dataclass
+class Part:
+    """
+    What is new of a run.
+
+    Attributes:
+        rows: (N, WIDTH), see :mod:`~beetle_omni_ros.view.frames`.
+        states: (t, state) of the supervisor so far.
+        faults: name -> when first told [s].
+        meta: of the run; filled at the end.
+        warnings: what was missing or wrong; filled at the end.
+        error: why it cannot be read, '' otherwise.
+
+    """
+
+    rows: np.ndarray = field(default_factory=lambda: Rows().table)
+    states: list[tuple[float, str]] = field(default_factory=list)
+    faults: dict[str, float] = field(default_factory=dict)
+    meta: dict = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    error: str = ''
+
+
+def parts(path: str | Path) -> Iterator[Part]:
+    """
+    Read a bag in parts, the first one a short one.
+
+    Raises:
+        BagError: it cannot be read, or tells nowhere where the robot is.
+
+    """
+    sampler, rows, warnings, due, size = Sampler(), [], [], None, FIRST
+    for t in replay(path, sampler, warnings, spacing=_spacing):
+        if due is None or not due - GAP < t < due + GAP:
+            due = t
+        while due <= t:
+            if sampler.placed:
+                rows.append(sampler.row(due))
+            due += STEP
+        if len(rows) >= size:
+            yield Part(np.array(rows), list(sampler.states), dict(sampler.faults))
+            rows, size = [], PART
+    if not sampler.placed:
+        raise BagError(f'{path}: holds no pose of the robot (odom or ground_truth/odom)')
+    yield Part(np.array(rows) if rows else Rows().table, list(sampler.states),
+               dict(sampler.faults), dict(sampler.meta), warnings)
+
+
+def _spacing(topic):
+    if topic in SKIPPED or topic.endswith('/command'):
+        return np.inf
+    return 0.9 * STEP if topic in HELD else 0.0
+
+
+class Recording:
+    """
+    A run that is being read.
+
+    Attributes:
+        name: for labels.
+        rows: what is known of it so far.
+        states, faults, meta, warnings: as in :class:`Part`, so far.
+        done: whether all of it is known.
+
+    """
+
+    def __init__(self, path: str | Path, name: str | None = None):
+        """
+        Begin to read.
+
+        Raises:
+            BagError: no such bag.
+
+        """
+        bag_files(path)
+        self.path, self.name = Path(path), name or Path(path).absolute().name
+        self.rows = Rows()
+        self.states: list[tuple[float, str]] = []
+        self.faults: dict[str, float] = {}
+        self.meta: dict = {}
+        self.warnings: list[str] = []
+        self.done, self._error = False, ''
+        self._changed = threading.Condition()
+        root = str(Path(beetle_omni_ros.__file__).resolve().parents[1])
+        self._process = subprocess.Popen(
+            [sys.executable, '-m', __name__, str(path)], stdout=subprocess.PIPE,
+            stdin=subprocess.DEVNULL, env=dict(os.environ, PYTHONPATH=os.pathsep.join(
+                filter(None, [root, os.environ.get('PYTHONPATH')]))))
+        threading.Thread(target=self._take_in, daemon=True).start()
+
+    def wait(self, timeout: float | None = None, whole: bool = False) -> None:
+        """
+        Wait for the first seconds, or for the whole.
+
+        Raises:
+            BagError: it cannot be read.
+
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self.done or (len(self.rows) and not whole), timeout)
+        if self._error:
+            raise BagError(self._error)
+
+    def origin(self) -> float:
+        """When its task began, as far as is known, else when it began itself [s]."""
+        flying = (t for t, state in self.states if state.startswith('flying'))
+        return next(flying, float(self.rows.times[0]))
+
+    def close(self) -> None:
+        """Read no further."""
+        self._process.kill()
+        self._process.wait()
+
+    def _take_in(self):
+        try:
+            while True:
+                part = pickle.load(self._process.stdout)
+                with self._changed:
+                    self._error = part.error
+                    self.rows.append(part.rows)
+                    self.states, self.faults = part.states, part.faults
+                    self.meta, self.warnings = part.meta, part.warnings
+                    self._changed.notify_all()
+        except (EOFError, pickle.UnpicklingError, OSError):
+            if not len(self.rows) and not self._error:
+                self._error = f'{self.path}: the process that reads it ended'
+        with self._changed:
+            self.done = True
+            self._changed.notify_all()
+
+
+def main(path: str) -> None:
+    """Read a bag and write its parts to standard output."""
+    output = sys.stdout.buffer
+    try:
+        for part in parts(path):
+            pickle.dump(part, output)
+            output.flush()
+    except BagError as error:
+        pickle.dump(Part(error=str(error)), output)
+    except (BrokenPipeError, KeyboardInterrupt):
+        os._exit(1)     # nobody listens; the interpreter would complain about its output
+
+
+if __name__ == '__main__':
+    # As an import sees it: what is pickled is of this module, not of __main__.
+    from beetle_omni_ros.view import recording
+    recording.main(sys.argv[1])

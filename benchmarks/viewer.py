@@ -1,0 +1,171 @@
+"""
+What the viewer costs: ``python benchmarks/viewer.py [RUN] [--seconds 24] [--pairs 2]``.
+
+Two parts, each on this computer with nothing else:
+
+- Flights of the same poses without viewer, with it, and with a browser that looks on, one after
+  the other, in pairs: latency from the stamp of an IMU sample to its command at the actuators,
+  and CPU of all nodes.
+- Playback of RUN, a long bag: time from the command to the first picture in a headless browser,
+  pictures a second after that, and CPU of reader, server and browser. The browser draws with the
+  processor.
+
+Without RUN, the second part is left out. `beetle_omni evaluate --controllers rl --task random100
+--bag long` makes a bag of 13 minutes.
+"""
+
+import argparse
+from contextlib import contextmanager, nullcontext
+import io
+import json
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+
+from graph import POSE_SECONDS, POSES
+from rich.console import Console
+from rich.table import Table
+
+from beetle_omni_ros.nodes.fly import run_fly
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / 'test' / 'view'))
+from browser import opened, until  # noqa: E402
+
+KINDS = ('without viewer', 'viewer', 'viewer and browser')
+ROWS = {'latency_median_ms': 'latency, median [ms]', 'latency_p99_ms': '99 %',
+        'latency_max_ms': 'max', 'cpu_percent': 'CPU of all nodes [%]'}
+SETTLE, WATCH = 4.0, 15.0       # [s] of playback before and while pictures are counted
+ADDRESS = re.compile(r'http://localhost:\d+')
+PICTURES = '() => window.__viserTestpoints?.rendererInfo?.render?.frame ?? 0'
+
+
+def fly(folder: Path, kind: str, seconds: float) -> dict:
+    """Fly once; return what was measured."""
+    task, result = folder / 'poses.csv', folder / 'result.json'
+    rows = [POSES[k % len(POSES)] for k in range(max(1, round(seconds / POSE_SECONDS)))]
+    task.write_text('\n'.join(['x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg', *rows]) + '\n')
+    result.unlink(missing_ok=True)
+    told = io.StringIO()
+    with looking_on(told) if kind == KINDS[2] else nullcontext():
+        status = run_fly(task=str(task), actuators='direct', clock='system', json_path=result,
+                         view=kind != KINDS[0], console=Console(file=told, width=200))
+    if status or not result.exists():
+        sys.exit(f'flight {kind} failed (status {status})')
+    return json.loads(result.read_text())['meta']['graph']
+
+
+@contextmanager
+def looking_on(told):
+    """Open the page of a flight as soon as its address is told."""
+    over = threading.Event()
+
+    def look():
+        url = until(lambda: over.is_set() or ADDRESS.search(told.getvalue()), 'an address')
+        if url is not True:
+            with opened(url.group()):
+                over.wait()
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def play(run: Path) -> dict:
+    """Play a bag in a headless browser; return what was measured."""
+    begin = time.monotonic()
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view', str(run)],
+        stdout=subprocess.PIPE, text=True,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    try:
+        url = ADDRESS.match(process.stdout.readline())
+        if url is None:
+            sys.exit(f'{run}: not shown')
+        served = time.monotonic() - begin
+        with opened(url.group(), 1280, 720) as (browser, _):
+            until(lambda: browser.evaluate(PICTURES) > 1, 'a picture')
+            first = time.monotonic() - begin
+            browser.wait_for_timeout(1e3 * SETTLE)
+            reading = bool(browser.get_by_text('reading').count())
+            mine, start = tree(os.getpid()), time.monotonic()
+            pictures = browser.evaluate(PICTURES)
+            cpu = {pid: cpu_seconds(pid) for pid in mine}
+            browser.wait_for_timeout(1e3 * WATCH)
+            pictures = browser.evaluate(PICTURES) - pictures
+            passed = time.monotonic() - start
+            spent = {pid: cpu_seconds(pid) - cpu[pid] for pid in mine if pid != os.getpid()}
+        viewer = set(tree(process.pid))
+        return {'served_s': served, 'first_picture_s': first, 'still_reading': reading,
+                'pictures_per_s': pictures / passed,
+                'viewer_cpu_percent': 100 * sum(v for k, v in spent.items() if k in viewer)
+                / passed,
+                'browser_cpu_ms_per_picture': 1e3 * sum(
+                    v for k, v in spent.items() if k not in viewer) / max(1, pictures),
+                'load': os.getloadavg()[0]}
+    finally:
+        process.kill()
+        process.wait()
+
+
+def tree(pid: int) -> list[int]:
+    """Process and those that it has started."""
+    found = [pid]
+    for entry in Path('/proc').glob('[0-9]*'):
+        try:
+            parent = int((entry / 'stat').read_text().rsplit(')', 1)[1].split()[1])
+        except OSError:
+            continue
+        if parent == pid:
+            found += tree(int(entry.name))
+    return found
+
+
+def cpu_seconds(pid: int) -> float:
+    """User and system time of a process [s]; 0 of one that has ended."""
+    try:
+        fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def main():
+    """Measure and print."""
+    arguments = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    arguments.add_argument('run', type=Path, nargs='?', help='long bag to play')
+    arguments.add_argument('--seconds', type=float, default=24, help='flight time of each')
+    arguments.add_argument('--pairs', type=int, default=2, help='flights of each kind; 0: none')
+    arguments.add_argument('--json', type=Path, help='file for the numbers')
+    given = arguments.parse_args()
+    console, measured = Console(), {}
+    if given.pairs:
+        flights = {kind: [] for kind in KINDS}
+        with tempfile.TemporaryDirectory() as folder:
+            for _ in range(given.pairs):
+                for kind in KINDS:
+                    flights[kind].append(fly(Path(folder), kind, given.seconds))
+        table = Table('', *KINDS)
+        for key, text in ROWS.items():
+            table.add_row(text, *(', '.join(f'{flight[key]:.2f}' for flight in flights[kind])
+                                  for kind in KINDS))
+        console.print(table)
+        measured['flights'] = flights
+    if given.run:
+        measured['playback'] = play(given.run)
+        console.print(*(f'{key}: {value:.3g}' for key, value in measured['playback'].items()),
+                      sep='\n')
+    if given.json:
+        given.json.write_text(json.dumps(measured, indent=1) + '\n')
+
+
+if __name__ == '__main__':
+    main()

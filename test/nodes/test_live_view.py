@@ -1,0 +1,126 @@
+"""What the viewer hears of a graph, and what of its wishes arrives there."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from rcl_interfaces.msg import SetParametersResult
+import rclpy
+
+from beetle_omni_ros.control.base import Command, PoseTarget
+from beetle_omni_ros.messages.values import Odom
+from beetle_omni_ros.nodes import runner, wire
+from beetle_omni_ros.nodes.live_view import Listener
+from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.view.frames import COLUMNS, pose, Sampler
+
+TIMEOUT = 20.0      # [s]
+TURNED = np.array([0.0, 0.0, np.sin(0.3), np.cos(0.3)])
+
+
+@pytest.fixture
+def graph(ros_domain):
+    """A node that stands for a graph, spun in a thread."""
+    rclpy.init(domain_id=ros_domain)
+    node = rclpy.create_node('supervisor_node')
+    executor = runner.make_executor()
+    executor.add_node(node)
+    stop = threading.Event()
+
+    def spin():
+        while not stop.is_set():
+            executor.spin_once(timeout_sec=0.05)
+    thread = threading.Thread(target=spin)
+    thread.start()
+    yield node
+    stop.set()
+    thread.join()
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def listener(graph, ros_domain):
+    made = Listener(domain=ros_domain, speaks=True)
+    yield made
+    made.close()
+
+
+def wait(condition):
+    deadline = time.monotonic() + TIMEOUT
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def test_what_the_topics_say_becomes_a_row(graph, listener):
+    odom, truth, command, target = (wire.Publisher(graph, topic) for topic in (
+        'odom', 'ground_truth/odom', 'command', 'target_pose'))
+    target.publish(PoseTarget(np.array([0, 0, 2.0]), TURNED, 6.0))
+    sampler = Sampler()
+
+    def told():
+        for publisher, height in ((odom, 1.01), (truth, 1.0)):
+            publisher.publish(Odom(7.0, np.array([0.5, 0, height]), np.zeros(3), TURNED,
+                                   np.zeros(3), np.zeros((6, 6)), np.zeros((6, 6))))
+        command.publish(Command(7.0, np.full(4, 0.2), np.array([1.0, 2, 3, 4])))
+        listener.take(sampler)
+        row = sampler.row(8.0)
+        return not np.isnan(row[COLUMNS['thrust']]).any() and \
+            pose(row, 'estimate_') and pose(row, 'target_')
+    assert wait(told)
+    row = sampler.row(8.0)
+    np.testing.assert_allclose(row[COLUMNS['position']], [0.5, 0, 1.0])
+    np.testing.assert_allclose(row[COLUMNS['estimate_position']], [0.5, 0, 1.01])
+    np.testing.assert_allclose(row[COLUMNS['target_position']], [0, 0, 2])
+    np.testing.assert_allclose(row[COLUMNS['thrust']], [1, 2, 3, 4])
+    assert sampler.clock == pytest.approx(7.0)
+
+
+def test_a_target_arrives_latched_and_as_it_was_asked(graph, listener):
+    wished = PoseTarget(np.array([0.4, -0.2, 1.5]), TURNED, 12.25)
+    listener.publish_target(wished)
+    heard = []      # of a subscriber that comes later
+    wire.subscribe(graph, 'target_pose', heard.append)
+    assert wait(lambda: heard)
+    found = heard[0]
+    np.testing.assert_allclose(found.position, wished.position)
+    np.testing.assert_allclose(found.quaternion, wished.quaternion)
+    assert found.stamp == wished.stamp
+
+
+def test_the_supervisor_decides_who_flies(graph, listener):
+    answers = []
+    graph.declare_parameter('controller', 'nmpc')
+    graph.add_on_set_parameters_callback(lambda given: SetParametersResult(
+        successful=given[0].value == 'rl', reason='rl alone'))
+    wire.Publisher(graph, 'rl/command')
+    assert wait(lambda: listener.controllers() == ['rl'])
+    assert wait(lambda: listener._setting.service_is_ready())
+    listener.select('rl', answers.append)
+    assert wait(lambda: answers == [''])
+    assert graph.get_parameter('controller').value == 'rl'
+    listener.select('hover', answers.append)
+    assert wait(lambda: answers == ['', 'rl alone'])
+    assert graph.get_parameter('controller').value == 'rl'
+
+
+def test_who_may_not_speak_offers_no_target(graph, ros_domain):
+    silent = Listener(domain=ros_domain)
+    try:
+        silent.publish_target(PoseTarget(np.zeros(3), TURNED, 1.0))
+        answers = []
+        silent.select('rl', answers.append)
+        assert answers == ['supervisor_node is not there']
+        assert wait(lambda: graph.count_subscribers('odom'))    # it is in the graph
+        assert not graph.count_publishers('target_pose')
+    finally:
+        silent.close()
+
+
+def test_an_impossible_namespace_is_refused():
+    with pytest.raises(ParameterError, match="--namespace '7 up'"):
+        Listener('7 up')

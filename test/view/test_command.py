@@ -1,0 +1,74 @@
+"""`beetle_omni view`: what it refuses, in one line, and how it runs as a program."""
+
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+
+import pytest
+from synthetic_flights import fly
+
+from beetle_omni_ros import cli
+from beetle_omni_ros.runs.bag import BagWriter
+from beetle_omni_ros.runs.tasks import make_task
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('view') / 'flight'
+    with BagWriter(folder) as writer:
+        fly(writer, make_task('hover'), duration=4.0, start=50.0)
+    return folder
+
+
+@pytest.mark.parametrize('arguments, told', [
+    (['none'], 'none: no such bag'), (['BAG', 'none'], 'none: no such bag'),
+    (['text.mcap'], 'not an MCAP file'), (['BAG', '--allow-targets'], '--allow-targets'),
+    (['BAG', '--namespace', 'a'], '--namespace'), (['BAG', '--domain-id', '3'], '--domain-id'),
+    (['BAG', '--urdf', 'text.mcap'], 'not a usable URDF'), (['BAG', '--robot', 'none'], 'none'),
+    (['--at', '3'], '--at'), (['--paused'], '--paused'), (['--port', '0'], '--port'),
+    (['BAG', '--host', '300.1.1.1'], '--host 300.1.1.1')])
+def test_unusable_input_is_one_line_and_status_2(bag, tmp_path, monkeypatch, capfd, arguments,
+                                                 told):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'text.mcap').write_text('no bag at all')
+    given = [str(bag) if argument == 'BAG' else argument for argument in arguments]
+    assert cli.main(['view', *given]) == 2
+    captured = capfd.readouterr()
+    lines = captured.err.splitlines()
+    assert len(lines) == 1 and told in lines[0], captured
+    assert not captured.out
+
+
+def test_it_prints_its_address_serves_there_and_ends_with_ctrl_c(bag):
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view', str(bag),
+         '--port', '8420', '--paused'], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)})
+    try:
+        line = process.stdout.readline()
+        url = re.match(r'http://localhost:\d+', line)
+        assert url, line
+        with urllib.request.urlopen(url.group().replace('localhost', '127.0.0.1')) as answer:
+            assert b'<html' in answer.read(500).lower()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 0
+        assert process.stdout.read() == process.stderr.read() == ''
+    finally:
+        process.kill()
+
+
+def test_help_and_flights_without_it_load_no_viewer():
+    program = ('import sys\nfrom beetle_omni_ros import cli\ncli.main(["view", "--help"])\n'
+               'import beetle_omni_ros.nodes.fly\n'
+               'sys.exit(str({"viser", "trimesh"} & set(sys.modules)) '
+               'if {"viser", "trimesh"} & set(sys.modules) else 0)')
+    pytest.importorskip('rclpy')
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
+                          env={**os.environ, 'PYTHONPATH': str(ROOT)}, check=False)
+    assert done.returncode == 0, done.stderr
