@@ -86,7 +86,7 @@ def test_a_replay_leaves_out_what_follows_closely(recorded):
     assert len(log.imu_t) == 1 and np.diff(log.odom_t).min() > 0.095
     assert len(log.odom_t) == pytest.approx(10 * (memory.odom_t[-1] - memory.odom_t[0]), abs=3)
     np.testing.assert_allclose(log.joint_t, memory.joint_t, rtol=0, atol=1e-9)
-    assert log.meta == memory.meta and not warnings and times == sorted(times)
+    assert log.meta == memory.meta and not warnings and max(times) >= memory.end
 
 
 def test_a_trajectory_comes_back_from_its_bag(tmp_path):
