@@ -20,6 +20,8 @@ from beetle_omni_ros.cli.options import (
     FaultsOption,
     JsonOption,
     KNOWN,
+    names,
+    numbers,
     OtherRobotOption,
     PlantOption,
     PolicyOption,
@@ -175,7 +177,6 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
     An interrupted or repeated comparison flies only what is missing.
     Example: beetle_omni compare --controllers rl,nmpc --tasks waypoints --seeds 0,1,2
     """
-    from beetle_omni_ros.comparison.arguments import names, numbers
     from beetle_omni_ros.runs.json_file import check_writable
     arguments = {'controllers': names('--controllers', controllers),
                  'tasks': names('--tasks', tasks),
@@ -236,7 +237,6 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
     Each fault strikes in hover, on the move and upside down; each flight ends with a landing.
     Example: beetle_omni faults --only rotor_1_stops,mocap_lost --seeds 3 --output runs_out/faults
     """
-    from beetle_omni_ros.comparison.arguments import names
     if conditions not in CONDITIONS:
         raise ParameterError(f"--conditions '{conditions}': expected {' or '.join(CONDITIONS)}")
     if faults and not faults.is_file():

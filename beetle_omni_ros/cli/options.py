@@ -110,3 +110,26 @@ def check_flight(*, task, seed, conditions, bag, compression, json_path, files):
     if bag:
         from beetle_omni_ros.runs.bag import check_new
         check_new(bag, compression)
+
+
+def names(option: str, text: str | None) -> list[str] | None:
+    """Split a list of names; None stays None; an entry twice or none is a ParameterError."""
+    if text is None:
+        return None
+    found = [part.strip() for part in text.split(',') if part.strip()]
+    if not found or len(set(found)) != len(found):
+        raise ParameterError(f"{option} '{text}': expected different entries, separated by "
+                             'commas')
+    return found
+
+
+def numbers(option: str, text: str | None) -> list[int] | None:
+    """Split a list of whole numbers from 0; None stays None; others are a ParameterError."""
+    found = names(option, text)
+    if found is None:
+        return None
+    for part in found:
+        if not part.isdecimal() or int(part) >= 2**31:
+            raise ParameterError(f"{option} '{text}': expected whole numbers from 0, separated "
+                                 f"by commas, found '{part}'")
+    return [int(part) for part in found]

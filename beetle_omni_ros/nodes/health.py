@@ -42,6 +42,11 @@ class Distribution:
         k = int(np.searchsorted(np.cumsum(self.counts), fraction * self.count))
         return min(self.LOW * self.RATIO ** (k + 0.5), self.max)
 
+    def milliseconds(self, prefix: str = '') -> dict[str, float]:
+        """Median, 99 % and maximum [ms] under their keys in diagnostics."""
+        return {f'{prefix}median_ms': 1e3 * self.quantile(0.5),
+                f'{prefix}p99_ms': 1e3 * self.quantile(0.99), f'{prefix}max_ms': 1e3 * self.max}
+
 
 @dataclass
 class Input:
@@ -175,8 +180,7 @@ class Health:
 
     def _compute_status(self):
         times = self._compute
-        values = {'median_ms': 1e3 * times.quantile(0.5), 'p99_ms': 1e3 * times.quantile(0.99),
-                  'max_ms': 1e3 * times.max, 'deadline_misses': self._misses,
+        values = {**times.milliseconds(), 'deadline_misses': self._misses,
                   'count': times.count, 'wall_max_ms': 1e3 * self._wall_max}
         level = WARN if self._misses else OK
         return self._status('compute', level, f'{self._misses} deadline misses', values)

@@ -10,8 +10,7 @@ from rclpy.node import Node
 
 from beetle_omni_ros.messages.topics import Qos, topic_of
 from beetle_omni_ros.messages.values import MessageError
-from beetle_omni_ros.nodes import arrival, instance, parameters, wire
-from beetle_omni_ros.nodes.every_offer import EveryOffer
+from beetle_omni_ros.nodes import instance, parameters, wire
 from beetle_omni_ros.nodes.health import Health
 
 # A stamp this far ahead of the clock comes from another clock.
@@ -96,7 +95,7 @@ class FlightNode(Node):
                 MessageError.
             qos: other than what the topic's publisher offers.
             every_offer: hear publishers of any quality of service, see
-                :class:`~beetle_omni_ros.nodes.every_offer.EveryOffer`.
+                :class:`~beetle_omni_ros.nodes.wire.EveryOffer`.
             max_age: refuse stamps older than this, or ahead of the clock [s]; None: any.
             stale_after: silence that is an error, once the topic came [s]; None: none.
             published: pass the time of publication [s, system time, or nan] to ``check`` and
@@ -123,10 +122,10 @@ class FlightNode(Node):
 
         kind = wire.message_class(entry.type)
         if every_offer:
-            EveryOffer(self, kind, topic, callback if published else
+            wire.EveryOffer(self, kind, topic, callback if published else
                        lambda message, _: callback(message))
             return
-        taken = arrival.with_publication(callback) if published else callback
+        taken = wire.with_publication(callback) if published else callback
         self.create_subscription(kind, topic, taken, wire.profile(qos or entry.qos))
 
     def timed(self, function: Callable, *args):

@@ -10,7 +10,6 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.messages.topics import ALL, LATCHED_LOG, LOG, topics_with
 from beetle_omni_ros.nodes import health, runner, wire
-from beetle_omni_ros.nodes.every_offer import EveryOffer
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.robot.urdf import description
@@ -57,7 +56,7 @@ class RecorderNode(FlightNode):
         for name, topic in {**ALL, **topics}.items():
             kind, write = wire.message_class(topic.type), self._writer(prefix + name, topic.type)
             if name in TARGETS:
-                EveryOffer(self, kind, name, write, depth=50, raw=True, on_lost=self._on_lost)
+                wire.EveryOffer(self, kind, name, write, depth=50, raw=True, on_lost=self._on_lost)
                 continue
             profile = wire.profile(LATCHED_LOG if topic.qos.latched else LOG)
             self.create_subscription(

@@ -13,8 +13,7 @@ from beetle_omni_ros.drivers.serial_port import SerialPortError
 from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.lifecycle_node import AUTOSTART, LifecycleFlightNode
-from beetle_omni_ros.nodes.rotor_bridge_report import RotorBridgeReport
-from beetle_omni_ros.nodes.target_stream import TargetStream
+from beetle_omni_ros.nodes.rotor_bridge_report import RotorBridgeReport, TargetStream
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import RotorReading
 from beetle_omni_ros.robot.schema import parameter

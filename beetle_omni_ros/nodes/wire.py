@@ -1,17 +1,26 @@
-"""The table of topics in the terms of rclpy: message classes, quality of service, publishers."""
+"""The table of topics in the terms of rclpy: messages, quality of service, both ends."""
 
 from __future__ import annotations
 
 from array import array
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
+from inspect import Parameter, Signature
+import math
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from beetle_omni_ros.messages.topics import Qos, topic_of
+
+LOOK_PERIOD = 0.5       # s between looks at what publishers offer
+COPIES = 64             # newest messages among which a copy is looked for
+TWO_ARGUMENTS = Signature([Parameter(name, Parameter.POSITIONAL_ONLY)
+                           for name in ('message', 'info')])
 
 
 @cache
@@ -111,3 +120,83 @@ def subscribe(node: Node, topic: str, handle: Callable[[Any], None], *, qos: Qos
     take = read or entry.take
     node.create_subscription(message_class(entry.type), topic,
                              lambda received: handle(take(received)), profile(qos or entry.qos))
+
+
+def with_publication(callback: Callable) -> Callable:
+    """
+    Make a subscription's callback of one that also takes the time of publication.
+
+    rclpy looks at a callback's signature to see whether it wants the message's info. The plain
+    executor then gives two arguments, the events executor of Jazzy one tuple of both.
+
+    Args:
+        callback: called with (message, publication [s, system time, set by the middleware of the
+            publisher]; nan where the middleware tells none).
+
+    """
+    def take(*given):
+        message, info = given if len(given) == 2 else given[0]
+        stamp = info.get('source_timestamp')
+        callback(message, stamp * 1e-9 if stamp and stamp > 0 else math.nan)
+
+    take.__signature__ = TWO_ARGUMENTS
+    return take
+
+
+class EveryOffer:
+    """
+    Hears every publisher of one topic once, and none of them warns.
+
+    A subscription that asks for latched messages is incompatible with a volatile publisher, and
+    one that does not misses what was latched before it came. So there is a volatile one at first,
+    and others follow as soon as a publisher offers what needs them. Both ends are then silent
+    about volatile publishers, which is what `ros2 topic pub` makes.
+
+    A message that two of them hear is passed on once, by its time of publication.
+
+    Args:
+        node: that subscribes, a FlightNode.
+        message_type: ROS message class.
+        topic: name.
+        callback: called with (message, publication [s, system time, or nan]).
+        depth: of the queues.
+        raw: give the callback bytes.
+        on_lost: called with the event of messages that were lost on the way.
+
+    """
+
+    def __init__(self, node: Node, message_type: type, topic: str, callback: Callable, *,
+                 depth: int = 10, raw: bool = False, on_lost: Callable | None = None):
+        """Subscribe, and look for offers from now on."""
+        self._node, self._type, self._topic = node, message_type, topic
+        self._depth, self._raw, self._on_lost = depth, raw, on_lost
+        self._callback = callback
+        self._seen: deque[float] = deque(maxlen=COPIES)     # times of publication
+        self._heard: set[tuple[ReliabilityPolicy, DurabilityPolicy]] = set()
+        self._subscribe(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)
+        node.create_timer(LOOK_PERIOD, self._look, clock=node.steady_clock)
+
+    def _subscribe(self, reliability, durability):
+        if (reliability, durability) in self._heard:
+            return
+        self._heard.add((reliability, durability))
+        self._node.create_subscription(
+            self._type, self._topic, with_publication(self._take),
+            QoSProfile(depth=self._depth, reliability=reliability, durability=durability),
+            raw=self._raw, event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=lambda event: None, message_lost=self._on_lost))
+
+    def _take(self, message, publication):
+        if publication in self._seen:       # nan never is
+            return
+        self._seen.append(publication)
+        self._callback(message, publication)
+
+    def _look(self):
+        """Add what publishers need."""
+        for publisher in self._node.get_publishers_info_by_topic(self._topic):
+            offer = publisher.qos_profile
+            if offer.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+                self._subscribe(ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
+            if offer.reliability == ReliabilityPolicy.BEST_EFFORT:
+                self._subscribe(ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)

@@ -11,7 +11,6 @@ from std_msgs.msg import String
 
 from beetle_omni_ros.messages.topics import COMMAND
 from beetle_omni_ros.nodes import runner, wire
-from beetle_omni_ros.nodes.arrival import with_publication
 
 PATIENCE = 20           # s
 
@@ -25,7 +24,7 @@ def test_a_callback_gets_the_time_at_which_its_message_was_published(make, ros_d
     executor = make(context=context)
     executor.add_node(node)
     heard = []
-    node.create_subscription(String, 'word', with_publication(
+    node.create_subscription(String, 'word', wire.with_publication(
         lambda message, published: heard.append((message.data, published))), wire.profile(COMMAND))
     publisher = node.create_publisher(String, 'word', wire.profile(COMMAND))
     try:
@@ -44,7 +43,7 @@ def test_a_callback_gets_the_time_at_which_its_message_was_published(make, ros_d
 
 def test_a_middleware_that_tells_no_time_gives_nan():
     heard = []
-    take = with_publication(lambda message, published: heard.append(published))
+    take = wire.with_publication(lambda message, published: heard.append(published))
     take('message', {'source_timestamp': 0})
     take(('message', {}))
     take('message', {'source_timestamp': 2_500_000_000})

@@ -7,7 +7,7 @@ pytest.importorskip('pymavlink')
 pytest.importorskip('serial')
 
 from beetle_omni_ros.drivers.motor_board import Sent
-from beetle_omni_ros.nodes.target_stream import TargetStream
+from beetle_omni_ros.nodes.rotor_bridge_report import TargetStream
 
 PERIOD = 0.005
 NONE = np.zeros(4, dtype=bool)
