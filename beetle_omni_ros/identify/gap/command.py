@@ -69,7 +69,7 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
     check_apart([*runs, *holdout])
     believed, p = RobotParameters.load(robot), GapParameters.load(parameters)
     if any(run.suffix.lower() == '.csv' for run in runs):
-        made, html = analyse_joint_log(runs, holdout, believed, robot)
+        made, html = analyse_joint_log(runs, holdout, believed, robot, p)
     else:
         meta = {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                 'robot': str(robot) if robot else 'params/robot.yaml'}

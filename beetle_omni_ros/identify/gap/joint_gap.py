@@ -17,6 +17,7 @@ from beetle_omni_ros.identify.gap.joint_search import (
 )
 from beetle_omni_ros.identify.gap.keys import friction
 from beetle_omni_ros.identify.gap.page import AFTER, BEFORE, head
+from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.results import grids
 from beetle_omni_ros.identify.gap.sentence import summary
 from beetle_omni_ros.identify.joint import identify_joints
@@ -30,13 +31,9 @@ from beetle_omni_ros.pages.figures import legend, line, panels, STYLE, svg
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-# Error over that of the freest fit, up to which the file predicts what it did not see as well: a
-# log's last part differs from its first by as much where nothing has changed.
-AS_WELL = 1.5
-
 
 def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParameters,
-                      base: Path | None) -> tuple[dict, str]:
+                      base: Path | None, p: GapParameters | None = None) -> tuple[dict, str]:
     """
     Judge a response log, and compare it with others.
 
@@ -45,6 +42,7 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
         holdout: further logs.
         robot: as believed.
         base: its file, for the record.
+        p: parameters.
 
     Returns:
         results as for flights, and an HTML page.
@@ -55,7 +53,7 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
     """
     log = read_joint_log(runs[0])
     others = [read_joint_log(path) for path in [*runs[1:], *holdout]]
-    found = Search(log, robot).run()
+    found = Search(log, robot, p).run()
     models = identify_joints(log, robot.joints)
     identified = joint_results(log, others, models, robot.joints, file_servos(robot, log.joints))
     joints = identified['joints']
@@ -115,7 +113,7 @@ def gap_of(found: Found, log: JointLog, apart: list[dict] | tuple = ()) -> dict:
     best = np.minimum(found.errors['free'], found.errors['corrected'])
     if apart:
         best = np.minimum(best, [joint['heldout_rms_rad'] for joint in apart])
-    allowed = np.hypot(AS_WELL * best, found.tolerated)
+    allowed = np.hypot(found.p.log_as_well * best, found.tolerated)
     before, after, floor = (_rms(e) for e in (found.errors['believed'],
                                               found.errors['corrected'], best))
     closure = _closure(before, after, floor)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2 as chi_square
 
+from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.inference.blocks import block_masks, HeldOut
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.joint_servos import GROUPS, Servos
@@ -32,19 +33,9 @@ from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-# Probability that chance gains as much, for each entry tried: about a dozen are, so that one log
-# in a hundred without a change gets a name.
-CHANCE = 0.001
 BLOCKS = 5
-MOST_EFFECTS = 8
 QUICK = 5               # iterations that show what an entry gains; the accepted are fitted again
 MOST_PASSES = 3
-# Smallest changes that are named, where the catalogue's are not those of a response log. A zero:
-# three counts of a 12-bit encoder, 0.26 deg. Friction: gears and seals of one type differ by a
-# fifth, and change as much with wear and temperature.
-LEAST_OFFSET = 3 * 2 * np.pi / 4096     # [rad]
-LEAST_FRICTION = 0.2                    # of the believed
-LEAST_DEAD_BAND = 2 * np.pi / 4096      # [rad] one count
 # Delay and stiffness of a pair are told apart where both are known better than the smallest
 # change of each that matters; else they are one set.
 LATENCY = 'joint_command_latency'
@@ -76,6 +67,7 @@ class Trial:
         gain: fall of chi2 beside the accepted others, over the residuals' scatter.
         numbers: how many it has.
         samples: that were fitted.
+        needed: gain that chance hardly reaches, and that is worth its numbers (BIC).
         held: gains on blocks of the log that were left out.
         point: the fitted model with it.
         reason: why it is not accepted, or ''.
@@ -86,14 +78,10 @@ class Trial:
     gain: float
     numbers: int
     samples: int
+    needed: float
     held: HeldOut
     point: np.ndarray
     reason: str = ''
-
-    @property
-    def needed(self) -> float:
-        """Gain that chance hardly reaches, and that is worth its numbers (BIC)."""
-        return max(chi_square.isf(CHANCE, self.numbers), self.numbers * np.log(self.samples))
 
     @property
     def unlikely(self) -> bool:
@@ -112,6 +100,7 @@ class Found:
     The outcome of a search.
 
     Attributes:
+        p: parameters.
         servos: layout of the points.
         believed: (P,) the file's servos.
         point: (P,) corrected servos.
@@ -126,6 +115,7 @@ class Found:
 
     """
 
+    p: GapParameters
     servos: Servos
     believed: np.ndarray
     point: np.ndarray
@@ -145,11 +135,13 @@ class Search:
     Args:
         log: the whole log; only its first part is fitted.
         robot: as believed.
+        p: parameters; default the shipped ones.
 
     """
 
-    def __init__(self, log: JointLog, robot: RobotParameters):
+    def __init__(self, log: JointLog, robot: RobotParameters, p: GapParameters | None = None):
         """Fit the usual numbers once, for the noise; see the class."""
+        self.p = p or GapParameters.load()
         self.whole, self.log = log, log.first(FITTED_PART)
         self.servos = Servos(robot, log.joints)
         self.weight = fitted_samples(self.log)
@@ -250,7 +242,7 @@ class Search:
     def _grown(self, accepted, point):
         """Add entries while any is worth it: accepted, their model, and the trials of the rest."""
         trials = self._beside(accepted, point)
-        while len(accepted) < MOST_EFFECTS:
+        while len(accepted) < self.p.log_effects:
             fit = [t for t in trials if t.unlikely and self._matters(t)]
             if not fit:
                 break
@@ -273,8 +265,7 @@ class Search:
         for (entry, _), p, chi2 in zip(asked, solved.points[1:], solved.chi2[1:], strict=True):
             gain = (solved.chi2[0] - chi2) / self.scatter
             if entry not in best or gain > best[entry].gain:
-                best[entry] = Trial(entry, float(gain), self._count(entry), self.samples,
-                                    HeldOut(np.zeros(BLOCKS)), p)
+                best[entry] = self._trial(entry, gain, HeldOut(np.zeros(BLOCKS)), p)
         return list(best.values())
 
     def _within(self, entry, other):
@@ -295,8 +286,8 @@ class Search:
             force = [self.servos.friction(p) for p in (before, after)]
             bands = [f / self.servos.values(p)[self.servos.index('kp')]
                      for f, p in zip(force, (before, after), strict=True)]
-            return bool(np.any((np.abs(force[1] - force[0]) > LEAST_FRICTION * force[0])
-                               & (np.abs(bands[1] - bands[0]) > LEAST_DEAD_BAND)))
+            return bool(np.any((np.abs(force[1] - force[0]) > self.p.log_friction * force[0])
+                               & (np.abs(bands[1] - bands[0]) > self.p.log_dead_band)))
         if entry.name == 'joint_torque_limit':
             errors = np.abs(self.log.command - self.log.measured)
             limit = new[self.servos.index('effort_limit')] / new[self.servos.index('kp')]
@@ -305,7 +296,7 @@ class Search:
         mask = self.servos.mask(entry.name, entry.joint)
         for k in np.flatnonzero(mask):
             number = self.servos.numbers[k]
-            least = LEAST_OFFSET if number.name == 'offset' else \
+            least = self.p.log_offset if number.name == 'offset' else \
                 CATALOGUE[entry.name].parameters[number.name].smallest
             change = abs(np.log(new[k] / old[k])) if number.logarithmic else abs(new[k] - old[k])
             if change > least:
@@ -349,9 +340,8 @@ class Search:
         points = [point, *(self._kept(m, point) for m in models[1:])]
         solved = self._solve(points, models)
         unseen = self._unseen(solved.points, models)
-        return [Trial(e, float((chi2 - solved.chi2[0]) / self.scatter), self._count(e),
-                      self.samples, HeldOut((cost - unseen[0]) / self.scatter),
-                      solved.points[0])
+        return [self._trial(e, (chi2 - solved.chi2[0]) / self.scatter,
+                            HeldOut((cost - unseen[0]) / self.scatter), solved.points[0])
                 for e, chi2, cost in zip(each, solved.chi2[1:], unseen[1:], strict=True)]
 
     def _unseen(self, points, models):
@@ -374,8 +364,8 @@ class Search:
         for trial in rejected:
             trial.reason = self._reason(trial)
         strongest = sorted(trials, key=lambda t: -t.gain)
-        return Found(self.servos, self.servos.believed, point, strongest, sets, rejected, widths,
-                     self._errors(point), self._tolerated(), self._out_of_sight(point))
+        return Found(self.p, self.servos, self.servos.believed, point, strongest, sets, rejected,
+                     widths, self._errors(point), self._tolerated(), self._out_of_sight(point))
 
     def _out_of_sight(self, point):
         """Entries whose realistic size would change the log by less than chance gains."""
@@ -398,9 +388,13 @@ class Search:
         return [name for name, change in zip(GROUPS, changes, strict=True)
                 if change < self._needed(Entry(name))]
 
+    def _trial(self, entry, gain, held, point):
+        return Trial(entry, float(gain), self._count(entry), self.samples, self._needed(entry),
+                     held, point)
+
     def _needed(self, entry):
-        return Trial(entry, 0.0, self._count(entry), self.samples,
-                     HeldOut(np.zeros(BLOCKS)), self.servos.believed).needed
+        numbers = self._count(entry)
+        return max(chi_square.isf(self.p.log_chance, numbers), numbers * np.log(self.samples))
 
     def _reason(self, trial):
         if not trial.unlikely:
@@ -432,7 +426,7 @@ class Search:
             rival = Entry(CATALOGUE[entry.name].log_rival)
             if rival in self.entries and rival not in accepted:
                 own, other = self._alone(accepted, point, [entry, rival])
-                near = own.gain - other.gain < chi_square.isf(CHANCE, 1)
+                near = own.gain - other.gain < chi_square.isf(self.p.log_chance, 1)
                 if near and other.unlikely and other.agreed and self._matters(other):
                     sets[entry] = [own, other]
         return sets
@@ -474,7 +468,7 @@ class Search:
             total += self._moved(point)**2
         point = self.servos.believed.copy()
         for j in range(len(self.log.joints)):
-            point[self.servos.index('coulomb', j)] *= 1 + LEAST_FRICTION
+            point[self.servos.index('coulomb', j)] *= 1 + self.p.log_friction
             point[self.servos.index('offset', j)] += 0.5
         return np.sqrt(total + self._moved(point)**2)
 

@@ -176,6 +176,18 @@ class GapParameters:
     least_rotation: float = parameter(
         doc='Least RMS of the rate.', unit='rad/s', low=0, high=10)
 
+    log_chance: float = parameter(
+        doc='Probability that chance gains as much as an entry in a joint log.', unit='1',
+        low=1e-9, high=0.5)
+    log_effects: int = _count('Most entries that are named of a joint log.', high=50)
+    log_offset: float = parameter(
+        doc='Least zero that is named of a joint log.', unit='rad', low=0, high=1)
+    log_friction: float = _factor('Least change of friction that is named, of the believed.')
+    log_dead_band: float = parameter(
+        doc='Least change of its dead band.', unit='rad', low=0, high=1)
+    log_as_well: float = _factor(
+        'Error over that of the freest fit up to which a joint log shows no gap.')
+
     least_left: float = _chi2('What known effects could still explain, to say unknown.')
     least_remainder: float = _chi2('Gain of a generic regression, to say unknown.')
     least_channel: float = _chi2('The same, in one channel.')
