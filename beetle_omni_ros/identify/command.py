@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -20,7 +21,7 @@ from beetle_omni_ros.runs.json_file import check_writable, write_json
 from beetle_omni_ros.runs.table import print_grids
 
 
-def run_identify_joint(path: Path, *, validate: list[Path] = (), robot: Path | None = None,
+def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path | None = None,
                        json_path: Path | None = None, report: Path | None = None,
                        params: Path | None = None, console: Console | None = None) -> dict:
     """

@@ -159,8 +159,9 @@ def _models(log, noise, choices: list[Choice], sets, weight, start):
                 continue
             kept = choice.kept if name is None else (*choice.kept, name)
             values = sets[j].copy()
-            for member in CANDIDATES[name].members if name else ():
-                values[INDEX[member]] = choice.tried[name][INDEX[member]]
+            if name is not None:
+                for member in CANDIDATES[name].members:
+                    values[INDEX[member]] = choice.tried[name][INDEX[member]]
             rows.append(Problems.apart([j], values[None], free_mask(kept)[None],
                                        weight[j:j + 1]))
             owner.append((j, name))

@@ -43,6 +43,10 @@ class JointLog:
     period: float = field(init=False)
     start: np.ndarray = field(init=False)
     start_velocity: np.ndarray = field(init=False)
+    _command_t: np.ndarray = field(init=False, repr=False)
+    _command: np.ndarray = field(init=False, repr=False)
+    _once: np.ndarray = field(init=False, repr=False)
+    _twice: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self):
         """Derive sampling period [s], first positions [rad] and velocities [rad/s]."""
@@ -138,8 +142,8 @@ def read_joint_log(path: str | Path) -> JointLog:
     _check_times(table.path, t, table.rows)
     joints = tuple(k for k in JOINTS if f'q{k}_rad' in table.columns)
     measured = np.stack([table.columns[f'q{k}_rad'] for k in joints])
-    command = np.stack([table.columns.get(f'command{k}_rad', table.columns.get('command_rad'))
-                        for k in joints])
+    command = np.stack([table.columns[own if (own := f'command{k}_rad') in table.columns
+                                      else 'command_rad'] for k in joints])
     for k, position, wanted in zip(joints, measured, command, strict=True):
         _check_angles(table.path, k, position, wanted)
     return JointLog(table.path.name, t, joints, measured, command)

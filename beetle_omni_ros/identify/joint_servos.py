@@ -48,10 +48,13 @@ class Number:
 
 
 def _numbers(count):
-    shared, own = [], []
+    shared: list[Number] = []
+    own: list[Number] = []
     for name, parameters in GROUPS.items():
         for parameter in parameters:
             log = CATALOGUE[name].parameters[parameter].log
+            if log is None:
+                continue
             for joint in range(count) if log.each else (None,):
                 (own if log.each else shared).append(Number(
                     parameter, joint, log.scale, log.low, log.high, log.logarithmic))

@@ -40,8 +40,8 @@ def write_robot_file(path: Path, head: str, content: dict, base: Path | None) ->
 
     """
     if base:
-        beside = base.resolve().parent == path.resolve().parent
-        extends = base.name if beside else str(base.resolve())
+        together = base.resolve().parent == path.resolve().parent
+        extends = base.name if together else str(base.resolve())
     else:
         # A file of that name beside would win over the shipped one.
         beside = path.with_name(SHIPPED)

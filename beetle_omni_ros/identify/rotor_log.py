@@ -67,7 +67,8 @@ def read_rotor_log(path: str | Path) -> RotorLog:
 
     """
     table = read_table(path, _wanted, HEADER)
-    column = {wanted: next((table.columns[name] for name in names if name in table.columns), None)
+    # All are there: the table was refused where one had none of its names.
+    column = {wanted: next(table.columns[name] for name in names if name in table.columns)
               for wanted, names in ALTERNATIVES.items()}
     duty = column['pwm'] if 'duty_percent' in table.columns else 100 * column['pwm'] / FULL_PULSE
     if len(table) < LEAST_ROWS:
@@ -91,9 +92,9 @@ def read_rotor_log(path: str | Path) -> RotorLog:
     if stopped.sum() >= 5 and abs(np.median(column['force_N'][stopped])) > 0.2:
         warnings.append(f'at stop the stand reads {np.median(column["force_N"][stopped]):.2f} N: '
                         'tare it')
-    columns = [values[settled] for values in (column['voltage_V'], duty, column['force_N'],
-                                              torque)]
-    return RotorLog(table.path.name, _plateaus(path, *columns, warnings), warnings)
+    plateaus = _plateaus(path, column['voltage_V'][settled], duty[settled],
+                         column['force_N'][settled], torque[settled], warnings)
+    return RotorLog(table.path.name, plateaus, warnings)
 
 
 def _wanted(header):

@@ -43,6 +43,10 @@ class Choice:
     gain: dict[str, float]
 
 
+# (joint, any label) -> candidates in the model, and the one that is new, see _judge.
+Asked = dict[tuple[int, str | None], tuple[tuple[str, ...], str | None]]
+
+
 class Selector:
     """
     Forward selection, all joints side by side.
@@ -70,7 +74,7 @@ class Selector:
 
         """
         count = len(self.log.joints)
-        self.kept = [()] * count
+        self.kept: list[tuple[str, ...]] = [()] * count
         self.values = [np.where(free_mask(()), start, OFF)] * count
         self.tried: list[dict] = [{} for _ in range(count)]
         self.gains: list[dict] = [{} for _ in range(count)]
@@ -91,7 +95,7 @@ class Selector:
         """Add candidates of one tier while any helps."""
         growing = list(range(len(self.kept)))
         while growing:
-            asked = {(j, None): (self.kept[j], None) for j in growing}
+            asked: Asked = {(j, None): (self.kept[j], None) for j in growing}
             asked |= {(j, name): ((*self.kept[j], name), name) for j in growing
                       for name in self._open(tier, j)}
             answers = self._judge(asked)
@@ -128,7 +132,7 @@ class Selector:
 
     def _swap(self):
         """Exchange a term for its rival where that predicts better; tell whether any was."""
-        asked = {(j, None): (names, None) for j, names in enumerate(self.kept)}
+        asked: Asked = {(j, None): (names, None) for j, names in enumerate(self.kept)}
         for j, names in enumerate(self.kept):
             for name in names:
                 rival = RIVALS.get(name)
@@ -136,14 +140,13 @@ class Selector:
                     asked[j, name] = (tuple(rival if n == name else n for n in names
                                             if CANDIDATES[n].needs != name), rival)
         answers, swapped = self._judge(asked), False
-        for j, name in asked:
-            if name is None:
+        for (j, label), (_, rival) in asked.items():
+            if rival is None:
                 continue
-            found, costs = answers[j, name]
+            found, costs = answers[j, label]
             gain = float((answers[j, None][1] - costs).sum())
-            rival = RIVALS[name]
             if gain > LEAST_GAIN and self._matters(j, rival, found):
-                self.kept[j], self.values[j], swapped = asked[j, name][0], found, True
+                self.kept[j], self.values[j], swapped = asked[j, label][0], found, True
                 self.tried[j][rival] = found
         return swapped
 
@@ -151,12 +154,12 @@ class Selector:
         """Drop what a later term has made superfluous, the least useful first."""
         open_joints = list(range(len(self.kept)))
         while open_joints:
-            asked = {(j, drop): (tuple(n for n in self.kept[j] if n != drop), None)
-                     for j in open_joints for drop in (None, *self.kept[j])}
+            asked: Asked = {(j, drop): (tuple(n for n in self.kept[j] if n != drop), None)
+                            for j in open_joints for drop in (None, *self.kept[j])}
             answers = self._judge(asked)
             for j in list(open_joints):
                 self.values[j], full = answers[j, None]
-                least = {}
+                least: dict[str, float] = {}
                 for name in self.kept[j]:
                     self.tried[j][name] = self.values[j]
                     if name == 'delay':     # shared: the other joints vouch for it
@@ -168,10 +171,10 @@ class Selector:
                 if not least:
                     open_joints.remove(j)
                     continue
-                name = min(least, key=least.get)
+                name = min(least, key=lambda one: least[one])
                 self.values[j], self.kept[j] = answers[j, name][0], asked[j, name][0]
 
-    def _judge(self, asked):
+    def _judge(self, asked: Asked):
         """
         Fit models and predict the blocks left out.
 

@@ -81,7 +81,8 @@ class Problems:
     weight: np.ndarray
 
     @classmethod
-    def apart(cls, joint: np.ndarray, sets: np.ndarray, free: np.ndarray, weight: np.ndarray):
+    def apart(cls, joint: np.ndarray | list[int], sets: np.ndarray, free: np.ndarray,
+              weight: np.ndarray) -> Problems:
         """Problems of single joints (B,), from parameter sets (B, n)."""
         return cls(np.asarray(joint)[:, None], encode(sets), free, weight)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from io import BytesIO
+from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -16,7 +17,7 @@ INK, FAINT = '#22272e', '#8a939d'
 WIDTH = 9.6  # [in] of a page-wide figure
 POINTS = 1600  # of a drawn line; more would not be seen
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     'font.family': 'sans-serif', 'font.size': 9, 'axes.titlesize': 9.5, 'axes.titleweight': 'bold',
     'axes.titlelocation': 'left', 'axes.edgecolor': FAINT, 'axes.labelcolor': INK,
     'axes.spines.top': False, 'axes.spines.right': False, 'axes.linewidth': 0.7,

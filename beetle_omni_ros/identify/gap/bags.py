@@ -59,7 +59,7 @@ def read_recording(path: str | Path) -> Recording:
     data, when = defaultdict(list), defaultdict(list)
     known: dict[str, str | None] = {}
     bad: dict[str, int] = {}
-    namespaces = set()
+    namespaces: set[str] = set()
     for message in read_messages(path, warnings):
         if message.topic not in known:
             if not namespaces and is_ambiguous(message.topic):

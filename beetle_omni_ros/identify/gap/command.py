@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -28,7 +29,7 @@ BAD_DATA = 3        # exit status
 LEAST_FITTED = 2    # flights, above which the last one judges where nobody named one
 
 
-def run_gap(runs: list[Path], holdout: list[Path] = (), robot: Path | None = None,
+def run_gap(runs: list[Path], holdout: Sequence[Path] = (), robot: Path | None = None,
             apply: Path | None = None, json_path: Path | None = None, page: Path | None = None,
             console: Console | None = None, parameters: Path | None = None,
             fix: bool = False, tolerances: bool = False) -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 
@@ -79,7 +80,7 @@ class Key:
 
 def number_of(robot: RobotParameters, key: str) -> float | np.ndarray:
     """Number of the robot file at a dotted key."""
-    value = robot
+    value: Any = robot
     for part in key.split('.'):
         value = getattr(value, part)
     return value

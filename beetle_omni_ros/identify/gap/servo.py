@@ -72,7 +72,8 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
         return np.concatenate([column(f'{name}[{k}]', np.exp) for k in range(4)], axis=2)
 
     own = {'joint_friction': dict(zip(('coulomb', 'stiction'), friction(robot), strict=True))}
-    numbers, acting = {}, []
+    numbers: dict[str, np.ndarray] = {}
+    acting = []
     for name, effect in CATALOGUE.items():
         numbers |= {key.partition('.')[2]: column(f'{name}.{parameter}', np.exp)
                     for parameter, key in effect.settings.items() if key.startswith('joints.')}

@@ -55,12 +55,12 @@ def repaired(recording: Recording, robot: RobotParameters,
     done: list[str] = []
     for _ in range(MOST_REPAIRS):
         found = damages(recording, robot, limits)
-        certain = [damage for damage in found if damage.repair]
-        if not certain:
-            break
-        for damage in certain:
-            recording = damage.repair(recording)
-            done.append(f'{damage.text}; corrected: {damage.fix}')
+        for damage in found:
+            if damage.repair is not None:
+                recording = damage.repair(recording)
+                done.append(f'{damage.text}; corrected: {damage.fix}')
+                break
+        else:
             break
     else:
         found = damages(recording, robot, limits)

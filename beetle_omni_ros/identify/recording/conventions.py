@@ -61,14 +61,14 @@ class Meaning:
 
     """
 
-    quaternion: str = ''
-    rate_axes: np.ndarray = None
-    rate_unit: float = 1.0
-    force_axes: np.ndarray = None
-    force_unit: float = 1.0
-    up: np.ndarray = None
-    length_unit: float = 1.0
-    position_axes: np.ndarray = None
+    quaternion: str
+    rate_axes: np.ndarray
+    rate_unit: float
+    force_axes: np.ndarray
+    force_unit: float
+    up: np.ndarray
+    length_unit: float
+    position_axes: np.ndarray
 
     def rate(self, m: Motion) -> np.ndarray:
         """(N, 3) what the gyroscope should say."""
