@@ -12,8 +12,8 @@ from html import escape
 from math import isfinite
 
 from beetle_omni_ros.comparison.style import look
-
-ABSENT = '–'
+from beetle_omni_ros.pages import table
+from beetle_omni_ros.pages.table import ABSENT
 
 
 @dataclass(frozen=True)
@@ -155,10 +155,9 @@ def markdown(grid: Grid, results: dict) -> str:
     head = [f'{look(column.controller).label}'
             + (f' ({column.group})' if multiple and column.group != OURS else '')
             for column in grid.columns]
-    lines = [f'**{grid.title}**', '', _markdown_row(['', *head]),
-             '| --- |' + ' ---: |' * len(grid.columns)]
-    lines += [_markdown_row([name, *(_markdown_cell(cell, results) for cell in cells)])
-              for name, cells in grid.rows]
+    rows = [[name, *(_markdown_cell(cell, results) for cell in cells)]
+            for name, cells in grid.rows]
+    lines = [f'**{grid.title}**', '', table.markdown(['', *head], rows, numeric=True).rstrip()]
     lines += ['', ' '.join(grid.notes)] if grid.notes else []
     lines += ['', '```sh', *grid.commands, '```'] if grid.commands else []
     return '\n'.join(lines) + '\n'
@@ -169,7 +168,3 @@ def _markdown_cell(cell, results):
                            for part in parts) for parts in (cell.main, cell.small))
     main = f'**{main}**' if cell.best else main
     return f'{main} {small}'.strip()
-
-
-def _markdown_row(cells):
-    return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |'

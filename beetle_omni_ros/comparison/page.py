@@ -16,6 +16,7 @@ from beetle_omni_ros.comparison import figures_poses, figures_tasks, grid, grids
 from beetle_omni_ros.comparison.grid import Grid
 from beetle_omni_ros.comparison.style import CONDITIONS, look, task_title
 from beetle_omni_ros.pages import figures
+from beetle_omni_ros.pages.page import frame, shipped
 
 DOTS = 180  # per inch
 COLOURS = 128  # of a picture; its lines are few and their edges smooth
@@ -163,19 +164,8 @@ def page(results: dict, made: list[Section]) -> str:
                        for section in made)
     terms = ''.join(f'<dt>{escape(term)}</dt><dd>{escape(text)}</dd>'
                     for term, text in legend(results))
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{TITLE}</title>
-<style>{CSS}</style>
-</head>
-<body>
-<main>
-<header><h1>{TITLE}</h1>
-<p>{'<br>'.join(escape(line) for line in facts(results))}</p>
-<nav>{links}</nav></header>
+    return frame(TITLE, '', f"""<p class="note">{'<br>'.join(map(escape, facts(results)))}</p>
+<nav>{links}</nav>
 <section><p>Every number of ours is <b class="ours">simulated</b>: the same plant, sensors, EKF,
 supervisor, actuator models and limits for every controller. Published numbers are
 <b class="gazebo">simulated in Gazebo</b> or measured on the <b class="real">real robot</b>,
@@ -185,11 +175,7 @@ as each table says.</p><dl>{terms}</dl>
 <section><details><summary>All flights</summary><div class="scroll"><table class="flights">
 <thead><tr><th>task</th><th>conditions</th><th>controller</th><th>seed</th><th>end</th>
 <th>core s</th></tr></thead><tbody>{grids_other.flights(results)}</tbody></table></div></details>
-</section>
-</main>
-</body>
-</html>
-"""
+</section>""", shipped('comparison.css'))
 
 
 def _anchor(title):
@@ -198,8 +184,8 @@ def _anchor(title):
 
 def _html_section(section, results):
     blocks = ''.join(grid.html(block, results) if isinstance(block, Grid) else
-                     f'<figure><img alt="{escape(block.caption)}" src="data:image/png;base64,'
-                     f'{b64encode(block.data).decode()}">'
+                     f'<figure><div class="scroll"><img alt="{escape(block.caption)}" '
+                     f'src="data:image/png;base64,{b64encode(block.data).decode()}"></div>'
                      f'<p class="note">{escape(block.caption)}.</p></figure>'
                      for block in section.blocks)
     text = f'<p>{escape(section.text)}</p>' if section.text else ''
@@ -225,52 +211,3 @@ def markdown(results: dict, made: list[Section], how: str = '') -> str:
                   f'![{block.caption}]({block.name}.png)\n\n{block.caption}.\n'
                   for block in section.blocks]
     return '\n'.join(parts)
-
-
-CSS = """
-:root { --ink: #22272e; --faint: #66707b; --line: #e3e7ec; --paper: #fff; --wash: #f6f7f9;
-  --gazebo: #f7f3e6; --real: #eaf3ee; }
-* { box-sizing: border-box; }
-html { scroll-behavior: smooth; }
-body { margin: 0; background: var(--wash); color: var(--ink);
-  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", sans-serif; }
-main { max-width: 1180px; margin: 0 auto; padding: 40px 28px 80px; }
-header h1 { font-size: 28px; font-weight: 650; letter-spacing: -0.01em; margin: 0; }
-header p { color: var(--faint); margin: 4px 0 12px; font-size: 13.5px; }
-nav { margin: 0 0 22px; font-size: 14px; } a { color: #1b5fb4; text-decoration: none; }
-h2 { font-size: 19px; font-weight: 650; margin: 0 0 2px; }
-section { background: var(--paper); border: 1px solid var(--line); border-radius: 8px;
-  padding: 22px 26px; margin: 0 0 18px; }
-section > p { margin: 0 0 14px; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 3px 18px; margin: 0 0 14px;
-  font-size: 13.5px; } dt { font-weight: 600; } dd { margin: 0; color: var(--faint); }
-b.gazebo, b.real, b.ours { font-weight: 500; padding: 0 5px; border-radius: 3px; }
-b.gazebo, .gazebo { background: var(--gazebo); } b.real, .real { background: var(--real); }
-b.ours { background: var(--wash); }
-img { width: 100%; height: auto; display: block; }
-figure { margin: 14px 0 26px; } figure:last-child { margin-bottom: 0; }
-figcaption { font-weight: 600; margin: 0 0 6px; }
-.note { color: var(--faint); font-size: 13px; margin: 6px 0 0; }
-pre { background: var(--wash); font-size: 12px; padding: 8px 12px; border-radius: 5px;
-  margin: 8px 0 0; white-space: pre-wrap; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: 13.5px;
-  font-variant-numeric: tabular-nums; }
-th { font-weight: 500; }
-th, td { padding: 5px 10px; text-align: right; vertical-align: top; white-space: nowrap; }
-thead th { border-bottom: 1px solid var(--ink); vertical-align: bottom; white-space: normal;
-  max-width: 130px; }
-thead tr.groups th { border-bottom: 0; color: var(--faint); font-size: 12px; text-align: center; }
-th:first-child { text-align: left; padding-left: 0; }
-tbody th { color: var(--ink); font-weight: 400; white-space: normal; min-width: 250px; }
-thead i { display: inline-block; width: 9px; height: 9px; border-radius: 2px;
-  margin-right: 6px; }
-tbody td, tbody th { border-bottom: 1px solid var(--line); }
-td small { display: block; color: var(--faint); font-size: 11.5px; line-height: 1.3; }
-td.best { font-weight: 650; } td.best small { font-weight: 400; }
-td.first, th.first { border-left: 1px solid var(--line); }
-.flights td, .flights th { text-align: left; }
-summary { cursor: pointer; font-weight: 600; }
-@media print { body { background: none; } section { break-inside: auto; } figure
-  { break-inside: avoid; } }
-"""

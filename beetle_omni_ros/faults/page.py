@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from html import escape
-
 from beetle_omni_ros.pages.page import frame, section
+from beetle_omni_ros.pages.table import Grid, html, markdown
 
 BEGIN = '<!-- faults: begin, written by beetle_omni faults --docs -->'
 END = '<!-- faults: end -->'
@@ -51,13 +50,6 @@ def other_tables(results: dict) -> list[tuple[str, tuple[str, ...], list[list[st
               row['named'], _number(row['impact_m_s']), _number(row['stopped_s']),
               'lost' if row['bag_lost'] else 'kept'] for row in results['ros']]))
     return tables
-
-
-def markdown(header, rows) -> str:
-    """A Markdown table."""
-    lines = [header, ['---'] * len(header), *rows]
-    return ''.join('| ' + ' | '.join(cell.replace('|', '\\|') for cell in line) + ' |\n'
-                   for line in lines)
 
 
 def total_text(results: dict) -> str:
@@ -114,10 +106,7 @@ def in_docs(text: str, table: str) -> str:
 
 
 def _html(header, rows):
-    cells = ''.join(f'<th>{escape(cell)}</th>' for cell in header)
-    lines = ''.join('<tr>' + ''.join(f'<td>{escape(cell)}</td>' for cell in row) + '</tr>\n'
-                    for row in rows)
-    return f'<div class="scroll"><table><tr>{cells}</tr>\n{lines}</table></div>'
+    return html(Grid('', list(header), rows))
 
 
 def _counted(counts):

@@ -16,9 +16,9 @@ from beetle_omni_ros.identify.joint_servos import file_servos
 from beetle_omni_ros.identify.robot_file import check_not_base, write_text
 from beetle_omni_ros.identify.rotor import identify_rotor
 from beetle_omni_ros.identify.rotor_log import read_rotor_log
+from beetle_omni_ros.pages.table import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.json_file import check_writable, write_json
-from beetle_omni_ros.runs.table import print_grids
 
 
 def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path | None = None,

@@ -9,12 +9,11 @@ import numpy as np
 from beetle_omni_ros.identify.joint import JointModel
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.joint_servos import FileServos
-from beetle_omni_ros.identify.page import page
 from beetle_omni_ros.identify.servo_fit import FITTED_PART
 from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, line, panels, STYLE, svg
-from beetle_omni_ros.pages.page import section
-from beetle_omni_ros.runs.table import Grid
+from beetle_omni_ros.pages.page import page, section
+from beetle_omni_ros.pages.table import Grid
 
 MILLI = 1e3
 

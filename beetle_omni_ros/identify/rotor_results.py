@@ -9,14 +9,13 @@ from matplotlib.figure import Figure
 import numpy as np
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.page import page
 from beetle_omni_ros.identify.robot_file import write_robot_file
 from beetle_omni_ros.identify.rotor import crossings, inverse, MapRow, Ratio
 from beetle_omni_ros.identify.rotor_log import RotorLog
 from beetle_omni_ros.pages.figures import FAINT, INK, legend, panels, STYLE, svg
-from beetle_omni_ros.pages.page import section
+from beetle_omni_ros.pages.page import page, section
+from beetle_omni_ros.pages.table import Grid
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.table import Grid
 
 
 def rotor_results(log: RotorLog, rows: list[MapRow], ratio: Ratio) -> dict:

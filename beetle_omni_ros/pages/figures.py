@@ -76,4 +76,5 @@ def svg(figure: Figure, alternative: str) -> str:
     with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format='svg', metadata={'Date': None, 'Creator': None})
     data = base64.b64encode(buffer.getvalue()).decode()
-    return f'<img alt="{alternative}" src="data:image/svg+xml;base64,{data}">'
+    return (f'<div class="scroll"><img alt="{alternative}" '
+            f'src="data:image/svg+xml;base64,{data}"></div>')

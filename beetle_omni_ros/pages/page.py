@@ -5,6 +5,7 @@ from __future__ import annotations
 from html import escape
 from importlib.resources import files
 
+from beetle_omni_ros.pages.table import Grid, html
 from beetle_omni_ros.robot.resources import PACKAGE
 
 
@@ -19,20 +20,45 @@ def section(title: str, text: str, content: str) -> str:
     return f'<section><h2>{escape(title)}</h2>{paragraph}{content}</section>\n'
 
 
-def frame(title: str, subtitle: str, content: str) -> str:
-    """Return a whole page around ``content``, which is HTML; everything it needs is in it."""
+def verdict_head(word: str, colour: str, sentence: str, picture: str = '') -> str:
+    """Verdict, the sentence that says it, and the one picture that shows it, as HTML."""
+    return (f'<section class="verdict" style="border-left-color: {colour}">'
+            f'<h2>{escape(word)}</h2><p class="said">{escape(sentence)}</p>{picture}</section>\n')
+
+
+def page(title: str, subtitle: str, grids: list[Grid], notes: list[str],
+         sections: list[str], head: str = '') -> str:
+    """
+    Put a page of tables, notes and sections together.
+
+    Args:
+        title: of the page.
+        subtitle: below it.
+        grids: tables.
+        notes: sentences below the tables.
+        sections: HTML made by :func:`section`.
+        head: HTML above the tables, such as :func:`verdict_head`.
+
+    """
+    said = ''.join(f'<li>{escape(note)}</li>' for note in notes)
+    return frame(title, subtitle, f"""{head}<section>{''.join(map(html, grids))}
+{f'<ul>{said}</ul>' if said else ''}</section>
+{''.join(sections)}""")
+
+
+def frame(title: str, subtitle: str, content: str, css: str = '') -> str:
+    """Return a whole page around ``content``, which is HTML; ``css`` is added to the look."""
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<link rel="icon" href="data:,">
-<title>{escape(title)}: {escape(subtitle)}</title>
-<style>{shipped('page.css')}</style>
+<title>{escape(': '.join(filter(None, (title, subtitle))))}</title>
+<style>{shipped('page.css')}{css}</style>
 </head>
 <body>
 <main>
-<header><h1>{escape(title)}</h1><p>{escape(subtitle)}</p></header>
+<header><h1>{escape(title)}</h1>{f'<p>{escape(subtitle)}</p>' if subtitle else ''}</header>
 {content}
 </main>
 </body>

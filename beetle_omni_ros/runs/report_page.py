@@ -10,6 +10,7 @@ import numpy as np
 
 from beetle_omni_ros.pages import charts as kit
 from beetle_omni_ros.pages.page import frame, section
+from beetle_omni_ros.pages.table import Grid, html
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.yaml_file import shortened
@@ -60,10 +61,10 @@ def make_page(runs: list[Run], results: dict) -> str:
             sections.append(section(title, text,
                                     f'<div class="charts">{"".join(places)}</div>'))
     shown = table.grids(results, with_poses=True)
-    tables = ''.join(table.html(grid) for grid in shown if grid.title != 'Poses')
-    poses = ''.join(table.html(grid) for grid in shown if grid.title == 'Poses')
+    tables = ''.join(html(grid) for grid in shown if grid.title != 'Poses')
+    poses = ''.join(html(grid) for grid in shown if grid.title == 'Poses')
     folded = f'<section><details><summary>Every pose</summary>{poses}</details></section>'
-    faults = ''.join(f'<div data-of-run="{number}">{table.html(grid)}</div>'
+    faults = ''.join(f'<div data-of-run="{number}">{html(grid)}</div>'
                      for number, run in enumerate(runs)
                      for grid in (*supervisor_grids(run), *fault_grids(run)))
     content = f"""<div class="cards">{''.join(map(_card, range(len(runs)), runs))}</div>
@@ -201,18 +202,18 @@ def _scene(run, axis, numbers):
                         'pose': np.round(np.hstack([position, quaternion]), 5).ravel().tolist()}}
 
 
-def supervisor_grids(run: Run) -> list[table.Grid]:
+def supervisor_grids(run: Run) -> list[Grid]:
     """When the supervisor was in which state, and for which controller or fault."""
     rows: list[list[str]] = []
     for t, state in zip(run.log.state_t, run.log.states, strict=True):
         kind, _, what = (shortened(part) for part in state.partition(':'))
         if not rows or rows[-1][1:] != [kind, what]:
             rows.append([f'{t - run.start:.2f}', kind, what])
-    return [table.Grid(f'{run.label}: states of the supervisor',
+    return [Grid(f'{run.label}: states of the supervisor',
                        ['at [s]', 'state', 'controller or fault'], rows[:MOST_ROWS])] * bool(rows)
 
 
-def fault_grids(run: Run) -> list[table.Grid]:
+def fault_grids(run: Run) -> list[Grid]:
     """Warnings and errors of the nodes, and the counters of what they rejected."""
     faults: dict[tuple, list] = {}
     last: dict[str, dict] = {}
@@ -228,11 +229,11 @@ def fault_grids(run: Run) -> list[table.Grid]:
                 if ('reject' in key or 'refused' in key) and value not in ('0', '0.0', '', '{}')]
     made = []
     if rows:
-        made.append(table.Grid(f'{run.label}: warnings and errors',
+        made.append(Grid(f'{run.label}: warnings and errors',
                                ['node', 'level', 'text', 'first at [s]', 'reports'],
                                rows[:MOST_ROWS]))
     if rejected:
-        made.append(table.Grid(f'{run.label}: rejected', ['node', 'reason', 'count'], rejected))
+        made.append(Grid(f'{run.label}: rejected', ['node', 'reason', 'count'], rejected))
     if not made:
-        made.append(table.Grid(f'{run.label}: no fault, nothing rejected', [''], []))
+        made.append(Grid(f'{run.label}: no fault, nothing rejected', [''], []))
     return made

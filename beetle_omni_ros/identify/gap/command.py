@@ -20,10 +20,10 @@ from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.results import grids, headline, results
 from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.robot_file import check_not_base, write_text
+from beetle_omni_ros.pages.table import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import check_writable, write_json
-from beetle_omni_ros.runs.table import print_grids
 
 BAD_DATA = 3        # exit status
 LEAST_FITTED = 2    # flights, above which the last one judges where nobody named one

@@ -26,9 +26,9 @@ from beetle_omni_ros.identify.servo_fit import (
     ServoFitter,
 )
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, TERMS
+from beetle_omni_ros.pages.table import Grid
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.table import Grid
 
 FITTED = ('natural_frequency', 'damping_ratio', 'delay', 'coulomb_friction', 'offset')
 # Catalogue entry, parameter, unit. A log without a torque determines friction over stiffness (the

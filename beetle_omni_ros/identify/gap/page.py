@@ -11,11 +11,10 @@ from beetle_omni_ros.identify.gap.residual import CHANNELS
 from beetle_omni_ros.identify.gap.results import _evidence, CANDIDATES, grids, headline
 from beetle_omni_ros.identify.gap.rollouts import STATES
 from beetle_omni_ros.identify.gap.rollouts import UNITS as STATE_UNITS
-from beetle_omni_ros.identify.page import page, verdict_head
 from beetle_omni_ros.identify.recording.picture import damage_figure
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, legend, line, panels, STYLE, svg
-from beetle_omni_ros.pages.page import section
-from beetle_omni_ros.runs.table import Grid, html
+from beetle_omni_ros.pages.page import page, section, verdict_head
+from beetle_omni_ros.pages.table import Grid, html
 
 BARS = 16
 BEFORE, AFTER = COLOURS[1], COLOURS[0]

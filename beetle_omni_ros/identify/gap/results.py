@@ -14,9 +14,9 @@ from beetle_omni_ros.identify.gap.rollouts import HORIZONS
 from beetle_omni_ros.identify.gap.sentence import summary
 from beetle_omni_ros.identify.gap.trial import Trial
 from beetle_omni_ros.identify.gap.verdict import hidden
+from beetle_omni_ros.pages.table import ABSENT, Grid
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.runs.table import ABSENT, Grid
 
 MOST_ROWS = 12
 CANDIDATES = 'Candidates, after the last step'     # title of a table
