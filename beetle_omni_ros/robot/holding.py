@@ -47,6 +47,8 @@ class HoldingParameters:
                                  high=50)
     coast_time: float = parameter(0.1, doc='of a turn that is being stopped, at its first rate',
                                   unit='s', low=0, high=1)
+    escape_time: float = parameter(1.5, doc='for which the attitude reached soonest is held, '
+                                   'before a landing turns on', unit='s', low=0.01, high=20)
     holding_margin: float = parameter(1.0, doc='with which a wished attitude is held as it is',
                                       unit='m/s^2, rad/s^2', low=0, high=20)
 

@@ -22,6 +22,7 @@ from beetle_omni_ros.safety.turnover import find_turnover, Turnover
 from beetle_omni_ros.safety.vehicle import Vehicle
 
 FADING_STEPS = 10       # in which a rotor comes to rest
+AT_ONCE = 1e-3          # [s]
 STILL = 1.0     # [s] without IMU: it should sink and does not
 AHEAD, BETWEEN = 20.0, 0.1      # [s] how far ahead, and how densely, a way is told
 
@@ -195,13 +196,16 @@ class Landing:
             self._hover.set_health(self._health)
 
     def _way_with_what_is_left(self, state, rate):
-        """Towards the attitude nearest level that leaves a margin for control."""
+        """First where control is regained soonest, then to the attitude nearest level with it."""
         holding = Holding(self._robot, self._health)
-        margin = holding.parameters.flying_margin
+        p = holding.parameters
+        escape = holding.quickest(state.quaternion, state.angular_velocity, state.tilt,
+                                  p.flying_margin)
         level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(state.quaternion)[2])
-        goal = holding.nearest(level, margin)
-        turn = max(rotations.geodesic_angle(goal, state.quaternion) / rate, 1e-3)
-        return Way(np.array([0.0, turn]), np.array([state.quaternion, goal]))
+        goal = holding.nearest(level, p.flying_margin)
+        turn = max(rotations.geodesic_angle(goal, escape) / rate, 1e-3)
+        return Way(np.cumsum([0.0, AT_ONCE, p.escape_time, turn]),
+                   np.array([state.quaternion, escape, escape, goal]))
 
     @property
     def _without_mocap(self):
