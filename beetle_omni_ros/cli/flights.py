@@ -86,7 +86,8 @@ def fly(bag: Annotated[Path, typer.Option(
                        robot=robot, plant=plant, policy=policy,
                        allow_other_robot=allow_other_robot, standby=standby,
                        composed=composed, faults=faults, json_path=json_path,
-                       domain_id=domain_id, discovery=discovery)
+                       domain_id=domain_id, discovery=discovery,
+                       view=view, allow_targets=allow_targets)
     except FlightError as error:
         raise typer.Exit(fail(error, FAILED)) from None
     raise typer.Exit(code if isinstance(code, int) else 0)

@@ -183,3 +183,15 @@ def test_a_launch_is_found_on_this_computer_alone(bringup, monkeypatch):
 def test_the_ports_of_a_launch_lie_in_the_users_own_folder(bringup):
     nodes = {n.kwargs['name']: n.kwargs['parameters'][0] for n in bringup.start(composed='false')}
     assert Path(nodes['sim_node']['servo_port']).parent.parent == private.folder()
+
+
+def test_the_browser_viewer_is_a_process_of_its_own_that_asks_for_nothing_by_itself(bringup):
+    def viewers(**arguments):
+        return [action.kwargs['cmd'] for action in bringup.start(**arguments)
+                if 'view' in action.kwargs.get('cmd', ())]
+    assert not viewers()
+    (command,) = viewers(view='true', namespace='robot1')
+    assert command[command.index('--namespace') + 1] == 'robot1'
+    assert '--allow-targets' not in command
+    (command,) = viewers(view='true', allow_targets='true')
+    assert '--allow-targets' in command

@@ -72,3 +72,14 @@ def test_help_and_flights_without_it_load_no_viewer():
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True,
                           env={**os.environ, 'PYTHONPATH': str(ROOT)}, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_fly_hands_on_who_looks_and_who_may_ask(monkeypatch, tmp_path):
+    fly_module = pytest.importorskip('beetle_omni_ros.nodes.fly')
+    given = {}
+    monkeypatch.setattr(fly_module, 'run_fly', lambda **arguments: given.update(arguments) or 0)
+    base = ['fly', '--bag', str(tmp_path / 'bag')]
+    assert cli.main(base) == 0 and not given['view'] and not given['allow_targets']
+    assert cli.main([*base, '--view']) == 0 and given['view'] and not given['allow_targets']
+    assert cli.main([*base, '--view', '--allow-targets']) == 0 and given['allow_targets']
+    assert cli.main([*base, '--allow-targets']) == 2
