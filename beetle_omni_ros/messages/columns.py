@@ -45,9 +45,10 @@ def read_all(topic: Topic, messages: Sequence[bytes | memoryview]) -> tuple[
     parts, refused = [], Counter()
     for rows, message in _alike(topic.type, messages, refused):
         try:
-            parts.append((rows, topic.read(message)))
-        except (ValueError, TypeError) as error:
-            refused[str(error)] += len(rows)
+            with np.errstate(all='ignore'):     # of numbers that are none
+                parts.append((rows, topic.read(message)))
+        except Exception as error:      # whatever broken bytes provoke
+            refused[str(error) or type(error).__name__] += len(rows)
     if not parts:
         return np.zeros(0, dtype=int), None, refused
     rows = np.concatenate([part for part, _ in parts])
@@ -88,8 +89,8 @@ def _alike(name, messages, refused) -> Iterator[tuple[np.ndarray, SimpleNamespac
                     alike = (block[:, fixed] == block[0, fixed]).all(axis=1)
                 walk = _Walk(block[0].tobytes(), block[alike])
                 yield rows[alike], walk.message(name)
-            except (struct.error, UnicodeDecodeError, ValueError) as error:
-                refused[str(error)] += int(alike.sum())
+            except Exception as error:      # whatever broken bytes provoke
+                refused[str(error) or type(error).__name__] += int(alike.sum())
             block, rows = block[~alike], rows[~alike]
 
 

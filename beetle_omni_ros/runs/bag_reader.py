@@ -12,14 +12,22 @@ from typing import NamedTuple
 
 from mcap.exceptions import InvalidMagic
 from mcap.reader import NonSeekingReader
+import numpy as np
 
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.messages.bag_types import from_bytes
+from beetle_omni_ros.messages.columns import read_all
 from beetle_omni_ros.messages.conversions import from_nanoseconds
-from beetle_omni_ros.messages.topics import is_ambiguous, split_topic, topic_of, TOPICS
+from beetle_omni_ros.messages.topics import (
+    is_ambiguous,
+    requester,
+    split_topic,
+    topic_of,
+    TOPICS,
+)
 from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, YamlError
-from beetle_omni_ros.runs.log import FlightLog
+from beetle_omni_ros.runs.log import FlightLog, SERIES_OF
 from beetle_omni_ros.runs.recorder import LogRecorder
 
 META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
@@ -27,6 +35,7 @@ META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
 # Entries of it by which a flight is judged, and how long they may be.
 META_TEXTS = ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version')
 LONGEST_TEXT = 250
+AT_ONCE = 4096      # messages of a series that are read together
 
 
 class BagError(ValueError):
@@ -136,11 +145,14 @@ def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
         BagError: no such bag, unreadable, not MCAP, or several robots in it.
 
     """
-    recorder, warnings = LogRecorder(), []
-    for _ in replay(path, recorder, warnings, namespace=namespace):
-        pass
+    recorder = LogRecorder()
+    reading = _Reading(str(path), namespace, recorder)
+    for message in read_messages(path, reading.warnings):
+        reading.take(message, at_once=True)
+    reading.take_waiting()
+    recorder.write_meta(_metadata(path, reading.warnings))
     log = recorder.log()
-    log.warnings = warnings
+    log.warnings = reading.finish()
     log.source = str(path)
     return log
 
@@ -152,7 +164,7 @@ def replay(path: str | Path, recorder, warnings: list[str], *, namespace: str | 
 
     Args:
         path: rosbag2 folder, or one of its files.
-        recorder: takes ``write_*`` calls, see :class:`~beetle_omni_ros.runs.recorder.LogRecorder`.
+        recorder: see :class:`~beetle_omni_ros.runs.recorder.Recorder`.
         warnings: takes what was missing or wrong, at the end.
         namespace: of the robot, where the bag holds several.
         spacing: topic without namespace -> least time between two of its messages [s]; those
@@ -176,7 +188,7 @@ def replay(path: str | Path, recorder, warnings: list[str], *, namespace: str | 
 class _Reading:
     """Sorts messages by topic and namespace, and counts what cannot be used."""
 
-    def __init__(self, path, namespace, recorder, spacing):
+    def __init__(self, path, namespace, recorder, spacing=lambda _: 0.0):
         self.warnings: list[str] = []
         self._recorder, self._spacing = recorder, spacing
         self._taken: dict[str, float] = {}  # full topic -> time of the newest message taken
@@ -187,9 +199,14 @@ class _Reading:
         self._counts: Counter = Counter()
         self._bad: Counter = Counter()
         self._reason: dict[str, str] = {}
+        self._waiting: dict[str, list[RawMessage]] = {}
 
-    def take(self, message):
-        """Whether the recorder was given the message."""
+    def take(self, message, at_once=False):
+        """
+        Whether the recorder was given the message.
+
+        With ``at_once`` the series wait, and :meth:`take_waiting` reads many messages at once.
+        """
         if message.topic not in self._split:
             if self._namespace is None and is_ambiguous(message.topic):
                 return False    # until another topic shows in which namespace the robot is
@@ -201,6 +218,12 @@ class _Reading:
             topic = topic_of(name)
             if message.type != topic.type:
                 raise MessageError(f'type is {message.type}, not {topic.type}')
+            if at_once and (name in SERIES_OF or requester(name)):
+                waiting = self._waiting.setdefault(name, [])
+                waiting.append(message)
+                if len(waiting) >= AT_ONCE:
+                    self.take_waiting(name)
+                return False
             value = topic.read(from_bytes(message.data, message.type))
             self._recorder.write(name, _stamped(value, message.received), message.received)
             self._counts[name] += 1
@@ -210,6 +233,20 @@ class _Reading:
             return False
         self._taken[message.topic] = message.received
         return True
+
+    def take_waiting(self, *names):
+        """Read the messages that wait, of these topics or of all."""
+        for name in names or list(self._waiting):
+            waiting = self._waiting.pop(name)
+            rows, value, refused = read_all(topic_of(name), [one.data for one in waiting])
+            if len(rows):
+                received = np.array([waiting[row].received for row in rows])
+                stamp = np.where(value.stamp == 0, received, value.stamp)
+                self._recorder.write(name, replace(value, stamp=stamp), received)
+            self._counts[name] += len(rows)
+            for reason, count in refused.items():
+                self._bad[name] += count
+                self._reason.setdefault(name, reason)
 
     def _follows_closely(self, message, spacing):
         before = self._taken.get(message.topic, inf)    # a clock that was set back starts anew

@@ -148,6 +148,9 @@ class LogRecorder(Recorder):
                 self._take(entry)
 
     def _add(self, series, rows, value, received):
+        if np.ndim(value.stamp):
+            self._add_all(series, rows, value, received)
+            return
         row = [value.stamp]
         for channel, width in SERIES[series].items():
             part = getattr(value, channel) if channel != 'received' else \
@@ -159,6 +162,15 @@ class LogRecorder(Recorder):
         if len(row) != WIDTHS[series]:
             raise ValueError(f'{series}: expected {WIDTHS[series]} values, found {len(row)}')
         rows.extend(row)
+
+    def _add_all(self, series, rows, value, received):
+        """Add a value whose fields are arrays over many messages."""
+        count = len(value.stamp)
+        parts = [value.stamp]
+        for channel, width in SERIES[series].items():
+            part = received if channel == 'received' else getattr(value, channel)
+            parts.append(np.full((count, width), np.nan) if part is None else part)
+        rows.frombytes(np.column_stack(parts).astype(float).tobytes())
 
     def write_meta(self, meta: dict) -> None:
         """Add to what is known of the flight."""
