@@ -48,7 +48,8 @@ def main():
         picture = Image.open(io.BytesIO(browser.screenshot())).convert('RGB')
     player.stop()
     page.close()
-    picture.save(given.output, optimize=True)
+    picture.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE).save(
+        given.output, optimize=True)
 
 
 if __name__ == '__main__':

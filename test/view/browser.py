@@ -15,7 +15,7 @@ NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable'
 FLAGS = ('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
          '--disable-background-networking', '--disable-component-update', '--disable-sync',
          '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader')
-PATIENCE = 60.0        # [s] on a busy computer
+PATIENCE = 120.0        # [s] on a busy computer
 
 
 def chromium():
