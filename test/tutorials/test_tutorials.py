@@ -1,0 +1,124 @@
+"""
+Each tutorial runs from its own text: its files are written, its commands run in one folder.
+
+A comment before a block says how the test differs from what a reader does:
+``<!-- test: skip -->``, ``OLD -> NEW`` in the commands, ``prints TEXT``, ``fails STATUS``,
+``background NAME`` until the page ends, and ``waits FILE`` for what that makes.
+"""
+
+from dataclasses import dataclass, field
+import os
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+import time
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted((ROOT / 'docs' / 'tutorials').glob('*.md'))
+NAMES = ('beetle_omni', 'sim_node')
+TIMEOUT = 1000       # s of one block
+BLOCK = re.compile(r'(?P<before>[^\n]*)\n(?:\n<!-- test: (?P<told>[^\n]*) -->\n)?\n'
+                   r'```(?P<language>\w+)\n(?P<text>.*?)^```$', re.DOTALL | re.MULTILINE)
+
+
+@dataclass
+class Block:
+    """A fenced block: its language and text, the file that it is, what the test is told."""
+
+    language: str
+    text: str
+    file: str = ''
+    told: list[str] = field(default_factory=list)
+
+    def one(self, word):
+        """What is told behind a word; '' where it is not."""
+        return next((told.removeprefix(word).strip() for told in self.told
+                     if told.split(' ')[0] == word), '')
+
+    @property
+    def commands(self):
+        """The text with what the test replaces."""
+        text = self.text
+        for told in self.told:
+            old, arrow, new = told.partition(' -> ')
+            if arrow:
+                assert old in text, f'{old!r} is not in the block'
+                text = text.replace(old, new)
+        return text
+
+
+def blocks(page):
+    """Blocks of a page that are run or written, in their order."""
+    found = []
+    for match in BLOCK.finditer(page.read_text(encoding='utf-8')):
+        told = [part.strip() for part in (match['told'] or '').split(', ') if part]
+        file = re.search(r'as `([\w.]+)`:?$', match['before'])
+        if match['language'] == 'sh' or file:
+            found.append(Block(match['language'], match['text'], file[1] if file else '', told))
+    return found
+
+
+@pytest.fixture
+def shell(tmp_path):
+    """Environment in which the commands of this checkout are found."""
+    programs = tmp_path / 'programs'
+    programs.mkdir()
+    for name, arguments in {'python': '', **{
+            name: f'-m beetle_omni_ros.start {name}' for name in NAMES}}.items():
+        (programs / name).write_text(f'#!/bin/sh\nexec {sys.executable} {arguments} "$@"\n')
+        (programs / name).chmod(0o755)
+    environment = {**os.environ, 'PATH': f"{programs}:{os.environ['PATH']}", 'COLUMNS': '120',
+                   'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1'}
+    environment.pop('ROS_DOMAIN_ID', None)
+    return environment
+
+
+def run(block, folder, environment):
+    """Run one block as a reader would paste it."""
+    if block.one('waits'):
+        end = time.monotonic() + 60
+        while not (folder / block.one('waits')).exists() and time.monotonic() < end:
+            time.sleep(0.1)
+    done = subprocess.run(['bash', '-euo', 'pipefail', '-c', block.commands], cwd=folder,
+                          env=environment, capture_output=True, text=True, timeout=TIMEOUT,
+                          check=False)
+    said = f'{block.commands}\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}'
+    assert done.returncode == int(block.one('fails') or 0), said
+    assert block.one('prints') in done.stdout, said
+
+
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
+def test_a_tutorial_does_what_it_says(page, tmp_path, shell):
+    found = blocks(page)
+    if any('fly ' in block.text or block.one('background') for block in found):
+        pytest.importorskip('rclpy')
+    folder, background = tmp_path / 'reader', []
+    folder.mkdir()
+    try:
+        for block in found:
+            if 'skip' in block.told:
+                continue
+            if block.file:
+                (folder / block.file).write_text(block.commands)
+            elif block.one('background'):
+                background.append(subprocess.Popen(
+                    ['bash', '-c', f'exec {block.commands}'], cwd=folder, env=shell,
+                    stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+            else:
+                run(block, folder, shell)
+    finally:
+        for process in background:
+            process.terminate()
+            process.wait(20)
+    shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
+def test_a_tutorial_has_commands_that_are_run_and_a_picture(page):
+    assert any('skip' not in block.told and block.language == 'sh' for block in blocks(page))
+    assert re.search(r'!\[.*\]\(\S+\.(png|gif)\)', page.read_text())
