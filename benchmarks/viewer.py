@@ -35,7 +35,7 @@ from beetle_omni_ros.nodes.fly import run_fly
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / 'test' / 'view'))
-from browser import opened, until  # noqa: E402
+from view_browser import opened, until  # noqa: E402
 
 KINDS = ('without viewer', 'viewer', 'viewer and browser')
 ROWS = {'latency_median_ms': 'latency, median [ms]', 'latency_p99_ms': '99 %',

@@ -21,7 +21,7 @@ from beetle_omni_ros.view.recording import Recording
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / 'test' / 'view'))
-from browser import opened, rendered  # noqa: E402
+from view_browser import opened, rendered  # noqa: E402
 
 
 def main():

@@ -3,10 +3,10 @@
 from concurrent.futures import ThreadPoolExecutor
 import threading
 
-from browser import at_rest, opened, rendered, until
 import numpy as np
 import pytest
 from synthetic_flights import fly
+from view_browser import at_rest, opened, rendered, until
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
