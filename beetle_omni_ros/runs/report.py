@@ -13,6 +13,7 @@ from beetle_omni_ros.pages.figures import COLOURS
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import BagError, read_bag
+from beetle_omni_ros.runs.body import motion
 from beetle_omni_ros.runs.json_file import write_json
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.metrics import metrics_by_controller, task_of
@@ -48,9 +49,6 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     logs = []
     for path in paths:
         log = read_bag(path)
-        if not len(log.truth_t) and not len(log.odom_t):
-            raise BagError(f'{path}: no pose of the robot in it; expected '
-                           'ground_truth/odom or odom')
         for warning in log.warnings:
             print(f'{path}: {warning}', file=sys.stderr)
         logs.append(log)
@@ -76,9 +74,18 @@ def _name(path):
 
 
 def make_runs(logs: list[FlightLog], names: list[str]) -> list[Run]:
-    """Judge flights and give each its label and colour; equal names are numbered."""
+    """
+    Judge flights and give each its label and colour; equal names are numbered.
+
+    Raises:
+        BagError: a flight without a pose.
+
+    """
     runs = []
     for k, (log, name) in enumerate(zip(logs, names, strict=True)):
+        if not len(motion(log).t):
+            raise BagError(f'{name}: no pose of the robot in it; expected ground_truth/odom or '
+                           'odom')
         if names.count(name) > 1:
             name = f'{name} ({names[:k + 1].count(name)})'
         task = task_of(log)
