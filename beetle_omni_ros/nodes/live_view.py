@@ -22,7 +22,7 @@ from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.topics import requester, SENSOR, topic_of
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.discovery import confine
-from beetle_omni_ros.nodes.every_offer import EveryOffer
+from beetle_omni_ros.nodes.wire import EveryOffer
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.view.command import announce
