@@ -56,7 +56,10 @@ def y_up(made):
 
 def interleaved(made):
     other = columns(recording('published'), POSE, 0, 2, lambda v: -v)
-    other.times[POSE] = other.times[POSE] + 2e-3
+    # Each flight has its own date.
+    began = made.received[POSE][0] - other.received[POSE][0]
+    other.times[POSE] = other.times[POSE] + (began + 2e-3)
+    other.received[POSE] = other.received[POSE] + began
     for topic in (POSE,):
         order = np.argsort(np.concatenate([made.received[topic], other.received[topic] + 1e-3]))
         for a, b in ((made.times, other.times), (made.values, other.values),
