@@ -82,7 +82,8 @@ def test_a_bad_log_to_validate_is_refused_before_the_work(logs, tmp_path, capsys
     bad = tmp_path / 'bad.csv'
     bad.write_text('t_s,x\n1,2\n')
     assert 'bad.csv' in refused(capsys, 'identify', 'joint', logs[0], '--validate', bad)
-    assert 'follow --validate' in refused(capsys, 'identify', 'joint', logs[0], logs[1])
+    message = refused(capsys, 'identify', 'joint', logs[0], logs[1])
+    assert str(logs[1]) in message and 'after --validate' in message
 
 
 def test_help_tells_what_there_is(capsys):
