@@ -71,7 +71,7 @@ def test_an_unknown_argument_is_refused_and_help_is_given(ros_domain):
     assert status == 2 and "unknown node 'ekv_node'" in error
 
 
-def test_a_node_waits_quietly_is_alone_and_ends_cleanly(ros_domain):
+def test_a_node_says_what_it_waits_for_is_alone_and_ends_cleanly(ros_domain):
     first = start('ekf_node')
     try:
         wait_until_it_spins(first)
@@ -82,7 +82,9 @@ def test_a_node_waits_quietly_is_alone_and_ends_cleanly(ros_domain):
         first.send_signal(signal.SIGINT)
         first.send_signal(signal.SIGINT)     # as a launch system does
         status, error = finish(first)
-        assert status == 0 and not error
+        assert status == 0
+        told, = error.splitlines()
+        assert '[ekf_node]' in told and told.endswith('Waits for imu/data_raw, mocap/pose.')
     finally:
         first.kill()
         first.communicate()
