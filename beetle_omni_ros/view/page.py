@@ -6,6 +6,7 @@ import contextlib
 from dataclasses import dataclass
 import html
 import io
+import socket
 import time
 
 import numpy as np
@@ -81,9 +82,11 @@ class Page:
         """Serve it."""
         self._names, self._robot, self._model, self._title = names, robot, model, title
         try:
+            with socket.socket() as probe:      # where that fails, viser would wait for ever
+                probe.bind((host, 0))
             with contextlib.redirect_stdout(io.StringIO()):     # it prints its own addresses
                 self.server = viser.ViserServer(host, port, label='beetle_omni', verbose=False)
-        except (OSError, OverflowError, RuntimeError) as error:
+        except (OSError, OverflowError, RuntimeError, UnicodeError) as error:
             raise ParameterError(f'--host {host} --port {port}: cannot be served there '
                                  f'({error})') from None
         shown = 'localhost' if host in (LOCAL, '0.0.0.0') else host
