@@ -59,6 +59,8 @@ def pytest_collection_modifyitems(config, items):
     if config.getoption('markexpr').startswith('real_time'):
         # Devices, which wait, with each other; then processes of nodes, which compute.
         items.sort(key=lambda item: item.path.parent.name == 'nodes')
+    else:       # The longest file first: a worker that takes it last leaves the others idle.
+        items.sort(key=lambda item: item.path.parent.name != 'tutorials')
     # In real time a second chance is worth little beside others; .ci/test gives it alone.
     for item in [*waiting, *(() if WORKER else real_time)]:
         item.add_marker(pytest.mark.flaky(reruns=RERUNS))
