@@ -1,5 +1,6 @@
 """What the suite does with tests in real time: judged where the computer keeps time, else not."""
 
+import os
 from pathlib import Path
 import shutil
 import subprocess
@@ -57,7 +58,9 @@ def outcomes(tmp_path):
     done = subprocess.run(
         [sys.executable, '-m', 'pytest', '-rA', '-p', 'no:cacheprovider', '-c', '/dev/null',
          '--rootdir', str(tmp_path), '--import-mode=importlib', str(tmp_path)],
-        capture_output=True, text=True, timeout=120, check=False)
+        capture_output=True, text=True, timeout=120, check=False,
+        env={name: value for name, value in os.environ.items()     # no worker of an outer run
+             if not name.startswith('PYTEST_XDIST')})
     return done.stdout
 
 

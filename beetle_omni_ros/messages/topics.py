@@ -91,8 +91,8 @@ def _text(name, meaning, in_flight=False):
 def request(controller: str) -> Topic:
     """What a controller asks for."""
     return Topic(f'{controller}/command', JOINT_STATE, COMMAND, Command, c.read_command,
-                 c.write_command, 'command that a controller asks for: `nmpc/command`, '
-                 '`rl/command`', c.take_command)
+                 c.write_command, 'command that a controller asks for, under its own name',
+                 c.take_command)
 
 
 TABLE = (

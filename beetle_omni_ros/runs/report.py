@@ -49,6 +49,7 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     logs = []
     for path in paths:
         log = read_bag(path)
+        _has_a_pose(log, path)
         for warning in log.warnings:
             print(f'{path}: {warning}', file=sys.stderr)
         logs.append(log)
@@ -73,6 +74,11 @@ def _name(path):
     return path.parent.name if path.is_file() else path.name
 
 
+def _has_a_pose(log, name):
+    if not len(motion(log).t):
+        raise BagError(f'{name}: no pose of the robot in it; expected ground_truth/odom or odom')
+
+
 def make_runs(logs: list[FlightLog], names: list[str]) -> list[Run]:
     """
     Judge flights and give each its label and colour; equal names are numbered.
@@ -83,9 +89,7 @@ def make_runs(logs: list[FlightLog], names: list[str]) -> list[Run]:
     """
     runs = []
     for k, (log, name) in enumerate(zip(logs, names, strict=True)):
-        if not len(motion(log).t):
-            raise BagError(f'{name}: no pose of the robot in it; expected ground_truth/odom or '
-                           'odom')
+        _has_a_pose(log, name)
         if names.count(name) > 1:
             name = f'{name} ({names[:k + 1].count(name)})'
         task = task_of(log)

@@ -51,8 +51,7 @@ def test_a_take_off_from_the_floor_is_counted_and_a_bounce_is_none(monkeypatch):
 
     def at(seconds, height):
         now[0] = seconds
-        observer._on_truth(SimpleNamespace(pose=SimpleNamespace(pose=SimpleNamespace(
-            position=SimpleNamespace(z=height)))))
+        observer._on_truth(SimpleNamespace(position=(0.0, 0.0, height)))
 
     for moment in ((0.0, 1.0), (1.0, 0.2), (1.2, 0.4), (1.4, 0.2), (1.6, 1.0)):
         at(*moment)

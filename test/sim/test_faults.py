@@ -55,7 +55,8 @@ def flat(reading):
     """All numbers of a reading; () where there is none."""
     if reading is None:
         return ()
-    return np.concatenate([np.ravel(getattr(reading, name)) for name in reading.__slots__])
+    values = [getattr(reading, name) for name in reading.__slots__ if name != 'names']
+    return np.concatenate([np.ravel(value) for value in values if value is not None])
 
 
 def differing(frames, others, start=0):

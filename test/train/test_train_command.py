@@ -174,7 +174,7 @@ def test_a_gpu_where_there_is_none_is_one_line(tmp_path, capsys, device):
 
 
 @pytest.mark.parametrize(('arguments', 'named'), [
-    ([], '--output DIR'), (['--output', 'OUT', '--device', 'tpu'], "--device 'tpu'"),
+    ([], '--output: missing'), (['--output', 'OUT', '--device', 'tpu'], "--device 'tpu'"),
     (['--output', 'OUT', '--device', 'mps'], "--device 'mps'"),
     (['--output', 'OUT', '--set', 'ppo.robtos=4'], 'ppo.robtos: unknown'),
     (['--output', 'OUT', '--set', 'iterations'], 'expected key=value'),
@@ -192,7 +192,7 @@ def test_a_gpu_where_there_is_none_is_one_line(tmp_path, capsys, device):
     (['--output', 'OUT', '--config', 'none.yaml'], 'none.yaml'),
     (['--output', 'OUT', '--robot', 'none.yaml'], 'none.yaml'),
     (['--output', 'OUT', '--json', 'no/folder.json'], 'folder.json'),
-    (['--resume', 'nowhere'], '--resume nowhere: no checkpoint'),
+    (['--resume', 'nowhere'], '--resume nowhere: no model_N.pt there'),
     (['--output', 'file'], '--output file')])
 def test_unusable_input_is_one_line_before_anything_is_made(capsys, tmp_path, monkeypatch,
                                                             arguments, named):
