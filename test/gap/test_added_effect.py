@@ -30,10 +30,14 @@ def added(monkeypatch):
     monkeypatch.setitem(CATALOGUE, NAME, made['BODY'][NAME])
 
 
-def test_the_pages_own_test_passes():
+def test_the_pages_own_test_passes_with_its_entry_and_fails_without(monkeypatch):
     made = {}
     exec(compile(TEST, str(PAGE), 'exec'), made)
-    made['test_a_pack_of_50_degrees_takes_thrust']()
+    page_test = made['test_a_pack_of_50_degrees_takes_thrust']
+    assert page_test() is None
+    monkeypatch.delitem(CATALOGUE, NAME)
+    with pytest.raises((AssertionError, KeyError, ValueError)):
+        page_test()
 
 
 @pytest.mark.parametrize('consumer', ['nmpc', 'training', 'plant'])
