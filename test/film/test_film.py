@@ -113,21 +113,24 @@ def test_a_film_shows_the_robot_move(bag, tmp_path):
         pytest.skip(str(error))
     finally:
         os.environ.pop('MUJOCO_GL', None)
-    out = tmp_path / 'a.gif'
+    out, size = tmp_path / 'a.gif', 320
     model = share_path('params/robot.yaml')
     for given, panels in (((), 1), (('--model', model, '--model', model), 2)):
-        done = film(bag, '-o', out, '--size', 200, '--start', 1.4, '--duration', 0.5, *given)
+        done = film(bag, '-o', out, '--size', size, '--start', 1.4, '--duration', 0.5, *given)
         assert done.returncode == 0, done.stderr
         with Image.open(out) as made:
             frames = [np.asarray(frame.convert('RGB')).astype(int)
                       for frame in ImageSequence.Iterator(made)]
-        assert len(frames) == 7 and frames[0].shape[1] == 200 * panels
+        assert len(frames) == 7 and frames[0].shape[1] == size * panels
         for panel in range(panels):
-            first, last = (frame[60:170, 200 * panel:200 * (panel + 1)] for frame in
-                           (frames[0], frames[-1]))
-            assert (np.abs(first - last).max(axis=2) > 60).sum() > 30
-            red = first[..., 0] - first[..., 1:].max(axis=2) > 50
-            assert red.sum() > 5
+            first, last = (
+                frame[3 * size // 10:17 * size // 20, size * panel:size * (panel + 1)]
+                for frame in (frames[0], frames[-1]))
+            assert (np.abs(first - last).max(axis=2) > 60).sum() > 80
+            # Sky and floor are blue; the front rotors and arms alone are reddish. How bright
+            # they are depends on the computer's OpenGL, their hue does not.
+            reddish = first[..., 0] - first[..., 1:].max(axis=2) > 20
+            assert reddish.sum() > 80
 
 
 def test_without_graphics_one_line_says_what_to_install(bag, tmp_path):
