@@ -13,8 +13,8 @@ import threading
 from PIL import Image
 
 from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.view.command import names
-from beetle_omni_ros.view.model import Model
 from beetle_omni_ros.view.page import Page
 from beetle_omni_ros.view.playback import Player
 from beetle_omni_ros.view.recording import Recording

@@ -8,11 +8,18 @@ import time
 
 import numpy as np
 
-from beetle_omni_ros.bringup.finding import FAIL, Finding, graded, missing_library, OK, WARN
+from beetle_omni_ros.bringup.finding import (
+    bridge_findings,
+    FAIL,
+    Finding,
+    graded,
+    missing_library,
+    OK,
+    WARN,
+)
 from beetle_omni_ros.bringup.heard import Heard
 from beetle_omni_ros.bringup.limits import BatteryLimits, CheckLimits, LinkLimits
 from beetle_omni_ros.bringup.port import latency_finding, port_finding, PROC, SYS
-from beetle_omni_ros.bringup.reported import bridge_findings
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
 

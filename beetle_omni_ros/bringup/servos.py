@@ -5,11 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 import time
 
-from beetle_omni_ros.bringup.finding import FAIL, Finding, graded, missing_library, OK, WARN
+from beetle_omni_ros.bringup.finding import (
+    bridge_findings,
+    FAIL,
+    Finding,
+    graded,
+    missing_library,
+    OK,
+    WARN,
+)
 from beetle_omni_ros.bringup.heard import Heard
 from beetle_omni_ros.bringup.limits import CheckLimits, ServoLimits
 from beetle_omni_ros.bringup.port import latency_finding, port_finding, PROC, SYS
-from beetle_omni_ros.bringup.reported import bridge_findings
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.drivers.servo_turns import certain_limit, settle

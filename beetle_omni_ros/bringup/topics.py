@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from statistics import fmean
 
-from beetle_omni_ros.bringup.finding import FAIL, Finding, OK, WARN, worst
+from beetle_omni_ros.bringup.finding import FAIL, Finding, OK, reported, WARN, worst
 from beetle_omni_ros.bringup.heard import Heard, Stream
 from beetle_omni_ros.bringup.limits import CheckLimits, TopicLimits
-from beetle_omni_ros.bringup.reported import reported
 
 MOCAP, IMU, JOINTS, BATTERY = 'mocap/pose', 'imu/data_raw', 'joint_states', 'battery_state'
 # Topic -> name in the limits, whose driver it is, the bridge that publishes it.

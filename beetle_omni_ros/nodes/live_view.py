@@ -25,10 +25,10 @@ from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.wire import EveryOffer
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.view.command import announce
 from beetle_omni_ros.view.frames import Sampler
 from beetle_omni_ros.view.live import Live
-from beetle_omni_ros.view.model import Model
 
 # Of these the newest message counts, and no more than one is read for each picture; of the others
 # every message counts.

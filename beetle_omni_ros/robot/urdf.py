@@ -1,4 +1,4 @@
-"""The tree of frames that a URDF describes."""
+"""The robot as its URDF describes it: links, what is seen of them, and how joints move them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.resources import PACKAGE, share_path
 from beetle_omni_ros.robot.schema import ParameterError
 
 SHIPPED = 'description/beetle_omni.urdf'
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+GREY = (0.5, 0.5, 0.5, 1.0)
+SHAPES = {'box': 'size', 'cylinder': 'radius length', 'sphere': 'radius'}
+UNUSABLE = (ElementTree.ParseError, AttributeError, KeyError, TypeError, ValueError)
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,110 @@ class Joint:
         return rotations.multiply(self.quaternion, rotations.exp(angle * self.axis))
 
 
+@dataclass(frozen=True)
+class Visual:
+    """
+    One visible shape of a link.
+
+    Attributes:
+        shape: 'box', 'cylinder', 'sphere' or 'mesh'.
+        size: edges; radius and length; radius; scale along each axis [m, mesh: 1].
+        position, quaternion: (3,) [m], (4,) in the link's frame.
+        colour: red, green, blue, opacity, each 0 to 1.
+        file: of a mesh.
+
+    """
+
+    shape: str
+    size: tuple[float, ...]
+    position: np.ndarray
+    quaternion: np.ndarray
+    colour: tuple[float, ...] = GREY
+    file: Path | None = None
+
+
+@dataclass(frozen=True)
+class Link:
+    """
+    A link, the joint that holds it (None: the root), and what is seen of it.
+
+    Attributes:
+        name: of the link.
+        joint: that holds it.
+        visuals: its shapes.
+
+    """
+
+    name: str
+    joint: Joint | None
+    visuals: tuple[Visual, ...] = ()
+
+    @property
+    def moves(self) -> str:
+        """Name of the joint by which it moves; '' where it is fixed."""
+        return self.joint.name if self.joint is not None and self.joint.axis is not None else ''
+
+    def turned(self, angle: float = 0.0) -> np.ndarray:
+        """Quaternion of the link in its parent with the joint at ``angle`` [rad]."""
+        return IDENTITY if self.joint is None else self.joint.turned(angle)
+
+
+@dataclass(frozen=True)
+class Model:
+    """
+    Links of a robot, parents before children.
+
+    Attributes:
+        links: name -> link.
+        limits: joint -> lower and upper limit [rad].
+
+    """
+
+    links: dict[str, Link]
+    limits: dict[str, tuple[float, float]]
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> Model:
+        """
+        Read a URDF file; None: the shipped one.
+
+        Raises:
+            ParameterError: it cannot be read, or is no URDF; one line.
+
+        """
+        path = Path(path) if path else share_path(SHIPPED)
+        text = description(path)
+        try:
+            root = ElementTree.fromstring(text)
+            if root.tag != 'robot':
+                raise ValueError(f'expected <robot>, found <{root.tag}>')
+            return cls(_links(root, joints(text), path), _limits(root))
+        except UNUSABLE as error:
+            raise ParameterError(f'{path}: not a usable URDF: {error}') from None
+
+    def poses(self, angles: dict[str, float]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """
+        Place every link.
+
+        Args:
+            angles: joint -> angle [rad]; 0 where not given.
+
+        Returns:
+            Link -> (3,) position [m] and (4,) quaternion in the root's frame.
+
+        """
+        placed = {}
+        for link in self.links.values():
+            if link.joint is None:
+                placed[link.name] = np.zeros(3), IDENTITY
+                continue
+            position, quaternion = placed[link.joint.parent]
+            placed[link.name] = (
+                position + rotations.matrix(quaternion) @ link.joint.position,
+                rotations.multiply(quaternion, link.turned(angles.get(link.moves, 0.0))))
+        return placed
+
+
 def description(path: str | Path = '') -> str:
     """
     Text of a URDF; '' for the shipped one.
@@ -68,22 +176,81 @@ def joints(text: str) -> list[Joint]:
     try:
         root = ElementTree.fromstring(text)
         return [_joint(element) for element in root.findall('joint')]
-    except (ElementTree.ParseError, AttributeError, KeyError, TypeError, ValueError) as error:
+    except UNUSABLE as error:
         raise ParameterError(f'robot description: not usable ({error})') from None
 
 
 def _joint(element):
-    kind, at, axis = element.get('type'), element.find('origin'), element.find('axis')
+    kind, axis = element.get('type'), element.find('axis')
     if kind not in ('fixed', 'revolute', 'continuous'):
         raise ValueError(f"joint type '{kind}': expected fixed, revolute or continuous")
-    place = {} if at is None else at.attrib
     return Joint(element.attrib['name'], element.find('parent').attrib['link'],
-                 element.find('child').attrib['link'], _vector(place.get('xyz', '0 0 0')),
-                 rotations.from_rpy(*_vector(place.get('rpy', '0 0 0'))),
+                 element.find('child').attrib['link'], *_origin(element),
                  None if kind == 'fixed' else
-                 _vector('1 0 0' if axis is None else axis.attrib['xyz']))
+                 _numbers('1 0 0' if axis is None else axis.attrib['xyz'], 3))
 
 
-def _vector(text):
-    x, y, z = map(float, text.split())
-    return np.array([x, y, z])
+def _links(root, held, path):
+    colours = {entry.get('name'): _colour(entry, {}) for entry in root.findall('material')}
+    visuals = {link.get('name'): tuple(_visual(entry, colours, path)
+                                       for entry in link.findall('visual'))
+               for link in root.findall('link')}
+    by_child = {joint.child: joint for joint in held}
+    links = {name: Link(name, None, seen) for name, seen in visuals.items()
+             if name not in by_child}
+    if len(links) != 1:
+        raise ValueError(f'expected one root link, found {len(links)}')
+    while len(links) < len(visuals):
+        following = {name: Link(name, joint, visuals[name]) for name, joint in by_child.items()
+                     if joint.parent in links and name not in links}
+        if not following:
+            raise ValueError('links that hang on nothing')
+        links.update(following)
+    return links
+
+
+def _limits(root):
+    limits = {joint.get('name'): joint.find('limit') for joint in root.findall('joint')}
+    return {name: (float(limit.get('lower')), float(limit.get('upper')))
+            for name, limit in limits.items() if limit is not None and limit.get('upper')}
+
+
+def _visual(entry, colours, path):
+    position, quaternion = _origin(entry)
+    geometry = entry.find('geometry')[0]
+    material = entry.find('material')
+    colour = GREY if material is None else _colour(material, colours)
+    if geometry.tag == 'mesh':
+        return Visual('mesh', tuple(_numbers(geometry.get('scale', '1 1 1'), 3)), position,
+                      quaternion, colour, _mesh_file(geometry.get('filename'), path))
+    size = ' '.join(geometry.get(key) for key in SHAPES[geometry.tag].split())
+    return Visual(geometry.tag, tuple(map(float, size.split())), position, quaternion, colour)
+
+
+def _mesh_file(name, urdf):
+    place = name.removeprefix('file://')
+    if place.startswith(f'package://{PACKAGE}/'):
+        return share_path(place.removeprefix(f'package://{PACKAGE}/'))
+    return urdf.parent / place
+
+
+def _origin(entry):
+    origin = entry.find('origin')
+    if origin is None:
+        return np.zeros(3), IDENTITY
+    return (_numbers(origin.get('xyz', '0 0 0'), 3),
+            rotations.from_rpy(*_numbers(origin.get('rpy', '0 0 0'), 3)))
+
+
+def _colour(material, known):
+    colour = material.find('color')
+    if colour is None:
+        return known.get(material.get('name'), GREY)
+    return tuple(_numbers(colour.get('rgba'), 4))
+
+
+def _numbers(text, count):
+    numbers = np.array([float(part) for part in text.split()])
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise ValueError(f"expected {count} numbers, found '{text}'")
+    return numbers

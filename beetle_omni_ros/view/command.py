@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.view.model import Model
+from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.view.recording import Recording
 
 FIRST_ROWS = 60.0       # [s] at most until the first of a run is read

@@ -9,9 +9,9 @@ import numpy as np
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.urdf import Model, Visual
 from beetle_omni_ros.view import arrows
 from beetle_omni_ros.view.frames import COLUMNS, known, pose
-from beetle_omni_ros.view.model import Model, Visual
 
 Colour = tuple[int, int, int]
 THRUST, TORQUE, FORCE = (240, 140, 30), (120, 90, 220), (210, 40, 60)

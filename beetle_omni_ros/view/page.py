@@ -16,11 +16,11 @@ from viser import uplot
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.view import plots
 from beetle_omni_ros.view.arrows import WORLD_NEWTON_PER_METRE
 from beetle_omni_ros.view.drawing import FORCE, RobotDrawing, wxyz
 from beetle_omni_ros.view.frames import known, pose
-from beetle_omni_ros.view.model import Model
 
 RATE = 30.0             # [Hz] of the scene
 PANEL_RATE, PLOT_RATE = 4.0, 4.0

@@ -4,9 +4,8 @@ from looks import levels, LIMITS, named, ROBOT
 import numpy as np
 import pytest
 
-from beetle_omni_ros.bringup.finding import Finding
+from beetle_omni_ros.bringup.finding import bridge_findings, Finding
 from beetle_omni_ros.bringup.heard import Heard, Status, Stream
-from beetle_omni_ros.bringup.reported import bridge_findings
 from beetle_omni_ros.bringup.topics import check_topics
 
 

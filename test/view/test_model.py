@@ -6,6 +6,7 @@ import pytest
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
 from beetle_omni_ros.robot.schema import ParameterError
+from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.view.arrows import (
     NEWTON_PER_METRE,
     rotor_frames,
@@ -13,7 +14,6 @@ from beetle_omni_ros.view.arrows import (
     thrust_arrows,
     torque_arcs,
 )
-from beetle_omni_ros.view.model import Model
 
 SMALL = """<robot name="r">
 <material name="red"><color rgba="1 0 0 0.5"/></material>
