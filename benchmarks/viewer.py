@@ -1,17 +1,16 @@
 """
-What the viewer costs: ``python benchmarks/viewer.py [RUN] [--seconds 24] [--pairs 2]``.
+What the viewer costs: ``python benchmarks/viewer.py [RUN] [--seconds 24] [--rounds 6]``.
 
-Two parts, each on this computer with nothing else:
+Two parts, best on a computer that does nothing else:
 
-- Flights of the same poses without viewer, with it, and with a browser that looks on, one after
-  the other, in pairs: latency from the stamp of an IMU sample to its command at the actuators,
-  and CPU of all nodes.
+- Flights of the same poses without viewer, with it, and with a browser that looks on, in rounds
+  of three whose order turns: latency from the stamp of an IMU sample to its command at the
+  actuators, and CPU of all nodes. The noise is the range of the flights without viewer.
 - Playback of RUN, a long bag: time from the command to the first picture in a headless browser,
-  pictures a second after that, and CPU of reader, server and browser. The browser draws with the
-  processor.
+  after that moments of the scene that arrive and pictures that are drawn a second, and CPU of
+  reader, server and browser. The browser draws with the processor.
 
-Without RUN, the second part is left out. `beetle_omni evaluate --controllers rl --task random100
---bag long` makes a bag of 13 minutes.
+Without RUN, a bag of 13 minutes is flown first, in simulated time, and kept in runs_out/.
 """
 
 import argparse
@@ -21,6 +20,7 @@ import json
 import os
 from pathlib import Path
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -28,6 +28,7 @@ import threading
 import time
 
 from graph import POSE_SECONDS, POSES
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -116,6 +117,34 @@ def play(run: Path) -> dict:
         process.wait()
 
 
+def show_flights(flights: dict[str, list[dict]], console: Console) -> None:
+    """Print medians, ranges, and whether the viewer's latency is within the noise."""
+    table = Table('median (least to most)', *KINDS)
+    for key, text in ROWS.items():
+        table.add_row(text, *(
+            f'{np.median(values):.2f} ({min(values):.2f} to {max(values):.2f})'
+            for values in ([flight[key] for flight in flights[kind]] for kind in KINDS)))
+    console.print(table)
+    without, *others = (np.array([flight['latency_p99_ms'] for flight in flights[kind]])
+                        for kind in KINDS)
+    for kind, values in zip(KINDS[1:], others, strict=True):
+        more, noise = np.median(values) - np.median(without), np.ptp(without)
+        console.print(f'99th percentile with {kind}: {more:+.2f} ms; noise {noise:.2f} ms: '
+                      f"{'within' if more <= noise else 'ABOVE'}")
+
+
+def long_bag() -> Path:
+    """Bag of 13 minutes; flown where there is none."""
+    bag = ROOT / 'runs_out' / 'viewer' / 'long'
+    if not (bag / 'metadata.yaml').exists():
+        bag.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(bag, ignore_errors=True)
+        subprocess.run([sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'evaluate',
+                        '--controllers', 'rl', '--task', 'random100', '--bag', str(bag)],
+                       env={**os.environ, 'PYTHONPATH': str(ROOT)}, check=True)
+    return bag
+
+
 def tree(pid: int) -> list[int]:
     """Process and those that it has started."""
     found = [pid]
@@ -143,24 +172,22 @@ def main():
     arguments = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     arguments.add_argument('run', type=Path, nargs='?', help='long bag to play')
     arguments.add_argument('--seconds', type=float, default=24, help='flight time of each')
-    arguments.add_argument('--pairs', type=int, default=2, help='flights of each kind; 0: none')
+    arguments.add_argument('--rounds', type=int, default=6, help='flights of each kind; 0: none')
+    arguments.add_argument('--no-playback', action='store_true', help='leave the bag out')
     arguments.add_argument('--json', type=Path, help='file for the numbers')
     given = arguments.parse_args()
     console, measured = Console(), {}
-    if given.pairs:
+    if given.rounds:
         flights = {kind: [] for kind in KINDS}
         with tempfile.TemporaryDirectory() as folder:
-            for _ in range(given.pairs):
-                for kind in KINDS:
+            for turn in range(given.rounds):
+                for k in range(len(KINDS)):
+                    kind = KINDS[(k + turn) % len(KINDS)]
                     flights[kind].append(fly(Path(folder), kind, given.seconds))
-        table = Table('', *KINDS)
-        for key, text in ROWS.items():
-            table.add_row(text, *(', '.join(f'{flight[key]:.2f}' for flight in flights[kind])
-                                  for kind in KINDS))
-        console.print(table)
+        show_flights(flights, console)
         measured['flights'] = flights
-    if given.run:
-        measured['playback'] = play(given.run)
+    if not given.no_playback:
+        measured['playback'] = play(given.run or long_bag())
         console.print(*(f'{key}: {value:.3g}' for key, value in measured['playback'].items()),
                       sep='\n')
     if given.json:

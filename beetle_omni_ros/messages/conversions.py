@@ -70,8 +70,8 @@ def nanoseconds(t: float) -> int:
     return whole * 1_000_000_000 + round((t - whole) * 1e9)
 
 
-def from_nanoseconds(time: int) -> float:
-    """Integer nanoseconds to seconds, the inverse of :func:`nanoseconds`."""
+def from_nanoseconds(time: Any) -> Any:
+    """Integer nanoseconds, or an array of them, to seconds; the inverse of :func:`nanoseconds`."""
     whole, rest = divmod(time, 1_000_000_000)
     return whole + rest * 1e-9
 

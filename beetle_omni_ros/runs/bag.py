@@ -16,7 +16,8 @@ from beetle_omni_ros.messages.bag_types import BAG, offered, to_bytes, TYPESTORE
 from beetle_omni_ros.messages.conversions import nanoseconds
 from beetle_omni_ros.messages.topics import ALL, EVENT, Qos, topic_of, TOPICS
 from beetle_omni_ros.robot.yaml_file import read_yaml
-from beetle_omni_ros.runs.bag_reader import BagError, META_KEY, read_bag, read_messages
+from beetle_omni_ros.runs.bag_files import BagError, read_messages
+from beetle_omni_ros.runs.bag_reader import META_KEY, read_bag
 from beetle_omni_ros.runs.frames import FrameWriter
 from beetle_omni_ros.runs.log import RUN_STATUS
 from beetle_omni_ros.runs.recorder import Recorder

@@ -1,4 +1,4 @@
-"""Reading rosbag2 MCAP bags without ROS, also those that a crash cut off."""
+"""Flights from bags: by topic into a log, or message by message to a recorder."""
 
 from __future__ import annotations
 
@@ -8,16 +8,12 @@ from dataclasses import replace
 import json
 from math import inf
 from pathlib import Path
-from typing import NamedTuple
 
-from mcap.exceptions import InvalidMagic
-from mcap.reader import NonSeekingReader
 import numpy as np
 
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.columns import read_all
-from beetle_omni_ros.messages.conversions import from_nanoseconds
 from beetle_omni_ros.messages.topics import (
     is_ambiguous,
     requester,
@@ -27,6 +23,13 @@ from beetle_omni_ros.messages.topics import (
 )
 from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, YamlError
+from beetle_omni_ros.runs.bag_files import (
+    BagError,
+    Messages,
+    RawMessage,
+    read_messages,
+    read_together,
+)
 from beetle_omni_ros.runs.log import FlightLog, SERIES_OF
 from beetle_omni_ros.runs.recorder import LogRecorder
 
@@ -36,98 +39,6 @@ META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
 META_TEXTS = ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version')
 LONGEST_TEXT = 250
 AT_ONCE = 4096      # messages of a series that are read together
-
-
-class BagError(ValueError):
-    """A bag cannot be written or read; the text names the folder or file."""
-
-
-class RawMessage(NamedTuple):
-    """One message: full topic, ROS type, CDR bytes, time of recording [s]."""
-
-    topic: str
-    type: str
-    data: bytes
-    received: float
-
-
-class _WholeReads:
-    """A stream whose reads are complete or fail, so that a cut is seen where it is."""
-
-    def __init__(self, stream):
-        self._stream = stream
-
-    def read(self, size):
-        data = self._stream.read(size)
-        if len(data) < size:
-            raise EOFError
-        return data
-
-
-def bag_files(path: str | Path) -> list[Path]:
-    """
-    Find the MCAP files of a RUN.
-
-    Args:
-        path: a rosbag2 folder, its metadata.yaml or one of its ``.mcap`` files.
-
-    Raises:
-        BagError: nothing there that can be read.
-
-    """
-    path = Path(path)
-    if not path.exists():
-        raise BagError(f'{path}: no such bag')
-    if path.name == 'metadata.yaml':
-        path = path.absolute().parent
-    if path.is_file():
-        if path.suffix != '.mcap':
-            raise BagError(f'{path}: expected a rosbag2 folder or a .mcap file')
-        return [path]
-    files = sorted(path.glob('*.mcap'), key=_split_number)
-    if not files:
-        other = sorted(p.name for pattern in ('*.db3', '*.mcap.*', '*.bag')
-                       for p in path.glob(pattern))
-        hint = f' (found {other[0]}; convert it with ros2 bag convert)' if other else ''
-        raise BagError(f'{path}: no .mcap file in this folder{hint}')
-    return files
-
-
-def _split_number(file):
-    """Order of a split bag: name_2.mcap comes before name_10.mcap."""
-    number = file.stem.rpartition('_')[2]
-    return (int(number) if number.isdigit() else -1, file.name)
-
-
-def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterator[RawMessage]:
-    """
-    Yield the messages of a bag in the order in which they were recorded, up to a cut.
-
-    Args:
-        path: folder or file, see :func:`bag_files`.
-        warnings: takes a line for each file that ends early.
-
-    Raises:
-        BagError: no such bag, unreadable, or not MCAP.
-
-    """
-    warnings = [] if warnings is None else warnings
-    for file in bag_files(path):
-        try:
-            with file.open('rb') as stream:
-                reader = NonSeekingReader(_WholeReads(stream), validate_crcs=True)
-                for schema, channel, message in reader.iter_messages(log_time_order=False):
-                    yield RawMessage(channel.topic, schema.name if schema else '', message.data,
-                                     from_nanoseconds(message.log_time))
-        except OSError as error:
-            raise BagError(f'{file}: {error.strerror}') from None
-        except InvalidMagic:
-            raise BagError(f'{file}: not an MCAP file') from None
-        except GeneratorExit:
-            raise
-        except Exception as error:  # whatever broken bytes provoke in the library
-            kind = 'cut off' if isinstance(error, EOFError) else f'damaged ({error})'
-            warnings.append(f'{file.name}: {kind}; read up to there')
 
 
 def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
@@ -147,8 +58,10 @@ def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
     """
     recorder = LogRecorder()
     reading = _Reading(str(path), namespace, recorder)
-    for message in read_messages(path, reading.warnings):
-        reading.take(message, at_once=True)
+    for together in read_together(path, reading.warnings):
+        # Where a namespace is not yet known, names that leave it open wait for the others.
+        for messages in sorted(together, key=lambda one: is_ambiguous(one.topic)):
+            reading.take_together(messages)
     reading.take_waiting()
     recorder.write_meta(_metadata(path, reading.warnings))
     log = recorder.log()
@@ -199,54 +112,74 @@ class _Reading:
         self._counts: Counter = Counter()
         self._bad: Counter = Counter()
         self._reason: dict[str, str] = {}
-        self._waiting: dict[str, list[RawMessage]] = {}
+        self._waiting: dict[str, tuple[list[bytes], list[np.ndarray]]] = {}
 
-    def take(self, message, at_once=False):
-        """
-        Whether the recorder was given the message.
-
-        With ``at_once`` the series wait, and :meth:`take_waiting` reads many messages at once.
-        """
-        if message.topic not in self._split:
-            if self._namespace is None and is_ambiguous(message.topic):
-                return False    # until another topic shows in which namespace the robot is
-            self._split[message.topic] = self._recognise(message.topic)
-        name = self._split[message.topic]
+    def take(self, message: RawMessage) -> bool:
+        """Whether the recorder was given the message."""
+        name = self._name(message.topic)
         if name is None or self._follows_closely(message, self._spacing(name)):
             return False
         try:
-            topic = topic_of(name)
-            if message.type != topic.type:
-                raise MessageError(f'type is {message.type}, not {topic.type}')
-            if at_once and (name in SERIES_OF or requester(name)):
-                waiting = self._waiting.setdefault(name, [])
-                waiting.append(message)
-                if len(waiting) >= AT_ONCE:
-                    self.take_waiting(name)
-                return False
+            topic = self._topic(name, message.type)
             value = topic.read(from_bytes(message.data, message.type))
             self._recorder.write(name, _stamped(value, message.received), message.received)
             self._counts[name] += 1
         except Exception as error:  # one message that cannot be used must not lose the others
-            self._bad[name] += 1
-            self._reason.setdefault(name, str(error) or type(error).__name__)
+            self._refuse(name, str(error) or type(error).__name__)
             return False
         self._taken[message.topic] = message.received
         return True
 
-    def take_waiting(self, *names):
+    def take_together(self, messages: Messages) -> None:
+        """Take messages of a topic; those of a series wait until they are many."""
+        name = self._name(messages.topic)
+        if name is None:
+            return
+        if name not in SERIES_OF and not requester(name):
+            for data, received in zip(messages.data, messages.received.tolist(), strict=True):
+                self.take(RawMessage(messages.topic, messages.type, data, received))
+            return
+        try:
+            self._topic(name, messages.type)
+        except MessageError as error:
+            self._refuse(name, str(error), len(messages.data))
+            return
+        waiting, times = self._waiting.setdefault(name, ([], []))
+        waiting += messages.data
+        times.append(messages.received)
+        if len(waiting) >= AT_ONCE:
+            self.take_waiting(name)
+
+    def take_waiting(self, *names: str) -> None:
         """Read the messages that wait, of these topics or of all."""
         for name in names or list(self._waiting):
-            waiting = self._waiting.pop(name)
-            rows, value, refused = read_all(topic_of(name), [one.data for one in waiting])
+            waiting, times = self._waiting.pop(name)
+            rows, value, refused = read_all(topic_of(name), waiting)
             if len(rows):
-                received = np.array([waiting[row].received for row in rows])
+                received = np.concatenate(times)[rows]
                 stamp = np.where(value.stamp == 0, received, value.stamp)
                 self._recorder.write(name, replace(value, stamp=stamp), received)
             self._counts[name] += len(rows)
             for reason, count in refused.items():
-                self._bad[name] += count
-                self._reason.setdefault(name, reason)
+                self._refuse(name, reason, count)
+
+    def _name(self, topic):
+        """Name without namespace; None where it is not ours, or not known to be."""
+        if topic not in self._split:
+            if self._namespace is None and is_ambiguous(topic):
+                return None     # until another topic shows in which namespace the robot is
+            self._split[topic] = self._recognise(topic)
+        return self._split[topic]
+
+    def _topic(self, name, kind):
+        topic = topic_of(name)
+        if kind != topic.type:
+            raise MessageError(f'type is {kind}, not {topic.type}')
+        return topic
+
+    def _refuse(self, name, reason, count=1):
+        self._bad[name] += count
+        self._reason.setdefault(name, reason)
 
     def _follows_closely(self, message, spacing):
         before = self._taken.get(message.topic, inf)    # a clock that was set back starts anew

@@ -14,7 +14,8 @@ import threading
 import numpy as np
 
 import beetle_omni_ros
-from beetle_omni_ros.runs.bag_reader import bag_files, BagError, replay
+from beetle_omni_ros.runs.bag_files import bag_files, BagError
+from beetle_omni_ros.runs.bag_reader import replay
 from beetle_omni_ros.view.frames import Rows, Sampler
 
 STEP = 0.02         # [s] between rows

@@ -15,7 +15,8 @@ from beetle_omni_ros.messages.conversions import nanoseconds
 from beetle_omni_ros.messages.topics import split_topic, TOPICS
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.runs.bag import BagWriter
-from beetle_omni_ros.runs.bag_reader import META_KEY, read_messages
+from beetle_omni_ros.runs.bag_files import read_messages
+from beetle_omni_ros.runs.bag_reader import META_KEY
 
 MOCAP, IMU, JOINTS, COMMAND = 'mocap/pose', 'imu/data_raw', 'joint_states', 'command'
 BATTERY = 'battery_state'

@@ -17,7 +17,7 @@ from beetle_omni_ros.identify.gap.command import gap_results, run_gap
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import BagWriter
-from beetle_omni_ros.runs.bag_reader import read_messages
+from beetle_omni_ros.runs.bag_files import read_messages
 from beetle_omni_ros.runs.tasks import make_task
 
 TRUE = np.array([1.2, -0.8, 0.0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.columns import read_all
 from beetle_omni_ros.messages.topics import is_ambiguous, split_topic, TOPICS
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
-from beetle_omni_ros.runs.bag_reader import BagError, read_messages
+from beetle_omni_ros.runs.bag_files import BagError, read_together
 
 # Topic -> width of its table, and the parts of its values that are the columns.
 NEEDED = {'imu/data_raw': 6, 'mocap/pose': 7, 'joint_states': 4, 'command': 8}
@@ -60,27 +61,29 @@ def read_recording(path: str | Path) -> Recording:
     known: dict[str, str | None] = {}
     bad: dict[str, int] = {}
     namespaces: set[str] = set()
-    for message in read_messages(path, warnings):
-        if message.topic not in known:
-            if not namespaces and is_ambiguous(message.topic):
+    for together in read_together(path, warnings):
+        for messages in sorted(together, key=lambda one: is_ambiguous(one.topic)):
+            topic, count = messages.topic, len(messages.data)
+            if topic not in known:
+                if not namespaces and is_ambiguous(topic):
+                    continue
+                split = split_topic(topic, namespaces)
+                known[topic] = split[1] if split else None
+                if split and split[1] in NEEDED:
+                    namespaces.add(split[0])
+                    if len(namespaces) > 1:
+                        raise BagError(f'{path}: holds several robots '
+                                       f"({', '.join(map(repr, sorted(namespaces)))})")
+            name = known[topic]
+            if name not in PARTS and name != 'supervisor/state':
                 continue
-            split = split_topic(message.topic, namespaces)
-            known[message.topic] = split[1] if split else None
-            if split and split[1] in NEEDED:
-                namespaces.add(split[0])
-                if len(namespaces) > 1:
-                    raise BagError(f'{path}: holds several robots '
-                                   f"({', '.join(map(repr, sorted(namespaces)))})")
-        name = known[message.topic]
-        if name not in PARTS and name != 'supervisor/state':
-            continue
-        if message.type != TOPICS[name].type:
-            bad[name] = bad.get(name, 0) + 1
-        elif name in PARTS:
-            data[name].append(message.data)
-            when[name].append(message.received)
-        else:
-            _note(states, message)
+            if messages.type != TOPICS[name].type:
+                bad[name] = bad.get(name, 0) + count
+            elif name in PARTS:
+                data[name] += messages.data
+                when[name].append(messages.received)
+            else:
+                _note(states, messages)
     times, values, received = {}, {}, {}
     for name, width in {**NEEDED, **OPTIONAL}.items():
         rows, value, refused = read_all(TOPICS[name], data[name])
@@ -88,7 +91,7 @@ def read_recording(path: str | Path) -> Recording:
         times[name] = np.zeros(0) if value is None else value.stamp
         values[name] = np.column_stack([np.zeros((len(rows), 0)), *parts]) if len(rows) \
             else np.zeros((0, width))
-        received[name] = np.array(when[name], dtype=float)[rows]
+        received[name] = np.concatenate([np.zeros(0), *when[name]])[rows]
         if refused:
             bad[name] = bad.get(name, 0) + refused.total()
     if not any(len(times[name]) for name in NEEDED):
@@ -100,11 +103,11 @@ def read_recording(path: str | Path) -> Recording:
     return Recording(Path(path).name, times, values, states, warnings, received)
 
 
-def _note(states, message):
-    try:
-        states.append((message.received, from_bytes(message.data, message.type).data))
-    except Exception:       # whatever broken bytes provoke: one state is lost, no recording
-        pass
+def _note(states, messages):
+    for data, received in zip(messages.data, messages.received.tolist(), strict=True):
+        # Whatever broken bytes provoke: one state is lost, no recording.
+        with suppress(Exception):
+            states.append((received, from_bytes(data, messages.type).data))
 
 
 def _check_members(path, data, times):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag_reader import bag_files
+from beetle_omni_ros.runs.bag_files import bag_files
 
 
 def check_apart(runs: list[Path]) -> None:
