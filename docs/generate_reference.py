@@ -325,8 +325,7 @@ def _wrapped(text: str) -> str:
 
 def effects() -> str:
     """The catalogue of effects."""
-    from beetle_omni_ros.robot.consumers import CONSUMERS, stand
-    from beetle_omni_ros.robot.effects import CATALOGUE
+    from beetle_omni_ros.robot.effects import CATALOGUE, CONSUMERS, stand
     stands = {(name, key): stand(key, name) for name in CATALOGUE for key in CONSUMERS}
     apart: dict[tuple, list] = {}
     for (name, key), found in stands.items():

@@ -14,7 +14,7 @@ import typer
 from typer.main import get_command
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.cli import driving, flights, gaps, hardware, listing, training, viewing
+from beetle_omni_ros.cli import flights, live, models
 from beetle_omni_ros.cli.options import fail, INTERRUPTED, refuse_empty, UNUSABLE, usage_text
 from beetle_omni_ros.robot.resources import PACKAGE
 from beetle_omni_ros.robot.schema import ParameterError
@@ -28,12 +28,12 @@ HELP = {'help_option_names': ['-h', '--help']}
 app = typer.Typer(no_args_is_help=True, context_settings=HELP,
                   help='Fly, evaluate and report on the tiltable quadrotor.')
 for command in (flights.fly, flights.evaluate, flights.compare, flights.faults, flights.report,
-                flights.film, viewing.view, gaps.gap, training.train, hardware.check,
-                driving.drive, listing.controllers):
+                flights.film, live.view, models.gap, models.train, live.check, live.drive,
+                flights.controllers):
     app.command()(command)
 identify = typer.Typer(no_args_is_help=True, context_settings=HELP,
                        help='Fit the actuator models from measured data.')
-for command in (hardware.joint, hardware.rotor):
+for command in (models.joint, models.rotor):
     identify.command()(command)
 app.add_typer(identify, name='identify')
 
@@ -54,7 +54,7 @@ def main(args: list[str] | None = None) -> int:
     """Run the command and return its exit status."""
     args = list(sys.argv[1:] if args is None else args)
     if args[:1] == ['gap']:
-        args = ['gap', *gaps.spread(args[1:])]
+        args = ['gap', *models.spread(args[1:])]
     try:
         refuse_empty(args)
         status = get_command(app).main(args=args, prog_name='beetle_omni', standalone_mode=False)

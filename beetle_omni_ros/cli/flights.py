@@ -1,4 +1,4 @@
-"""Subcommands that fly or look at flights: fly, evaluate, compare, report."""
+"""Subcommands that fly or look at flights, and the list of controllers."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from beetle_omni_ros.cli.options import (
     SeedOption,
     TaskOption,
 )
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.registry import ControllerOptions, DEFAULT, owner
 from beetle_omni_ros.robot.schema import ParameterError
 
@@ -119,16 +120,13 @@ def evaluate(controllers: Annotated[str, typer.Option(
     Plant, sensors, estimator, controllers and actuators are those of the ROS graph.
     Example: beetle_omni evaluate --controllers nmpc --task random100 --json result.json
     """
-    names = [name.strip() for name in controllers.split(',') if name.strip()]
-    if not names or len(set(names)) != len(names):
-        raise ParameterError(f"--controllers '{controllers}': expected different names, "
-                             'separated by commas')
-    options = {name: ControllerOptions(allow_other_robot=allow_other_robot) for name in names}
+    chosen = names('--controllers', controllers)
+    options = {name: ControllerOptions(allow_other_robot=allow_other_robot) for name in chosen}
     for option, file, key in (('--nmpc', nmpc_file, 'parameters'), ('--policy', policy, 'policy')):
         name = owner(option)
-        if file and name not in names:
+        if file and name not in chosen:
             raise ParameterError(f"{option} {file}: for the controller '{name}', which is not "
-                                 f"among {', '.join(names)}")
+                                 f"among {', '.join(chosen)}")
         if file:
             options[name] = replace(options[name], **{key: file})
     check_flight(task=task, seed=seed, conditions=conditions, bag=bag, compression=compression,
@@ -136,7 +134,7 @@ def evaluate(controllers: Annotated[str, typer.Option(
     from beetle_omni_ros.evaluation.command import run_evaluate
     from beetle_omni_ros.evaluation.loop import FlightError
     try:
-        run_evaluate(controllers=names, task=task, conditions=conditions, robot=robot,
+        run_evaluate(controllers=chosen, task=task, conditions=conditions, robot=robot,
                      plant=plant, seed=seed, bag=bag, compression=compression, json_path=json_path,
                      faults=faults, options=options)
     except FlightError as error:
@@ -318,3 +316,44 @@ def film(runs: Annotated[list[Path], typer.Argument(
     from beetle_omni_ros.film.command import run_film
     run_film(runs, output, models=model or [], robot=robot, start=start, duration=duration,
              speed=speed, size=size)
+
+
+def controllers(json_path: JsonOption = None):
+    """
+    List the registered controllers.
+
+    Others fly as package.module:Class or path/to/file.py:Class, see docs/how-to/own_controller.md.
+    Example: beetle_omni controllers --json controllers.json
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from beetle_omni_ros.runs.json_file import check_writable, write_json
+    if json_path:
+        check_writable(json_path)
+    found = {name: _known(name) for name in registry.names()}
+    table = Table(box=None, header_style='dim', padding=(0, 2, 0, 0))
+    for column in ('name', 'what', 'rate [Hz]', 'parameters', 'policy', 'actuators lost',
+                   'guidance'):
+        table.add_column(column)
+    for name, known in found.items():
+        if 'error' in known:
+            table.add_row(name, known['error'])
+            continue
+        table.add_row(name, known['description'], f"{known['rate_hz']:g}",
+                      known['parameters_file'] or '–', known['policy_file'] or '–',
+                      'flies' if known['flies_degraded'] else '–', known['guidance'])
+    Console().print(table)
+    if json_path:
+        write_json(json_path, found)
+
+
+def _known(name):
+    """What is told of a controller; of one that cannot be loaded, why."""
+    try:
+        entry = registry.find(name)
+    except ParameterError as error:
+        return {'error': str(error)}
+    return {'description': entry.description, 'rate_hz': 1 / entry.period,
+            **{key: getattr(entry, key) for key in (
+                'parameters_file', 'policy_file', 'flies_degraded', 'guidance', 'stands_by')}}

@@ -31,6 +31,9 @@ SeedOption = Annotated[int, typer.Option(
 RobotOption = Annotated[Optional[Path], typer.Option(
     '--robot', metavar='FILE', help='What estimator and controller believe. '
                                     'Default: the shipped params/robot.yaml.')]
+PublishedOption = Annotated[Optional[Path], typer.Option(
+    '--robot', metavar='FILE', help='The robot as believed so far. '
+                                    'Default: the shipped params/robot.yaml.')]
 PlantOption = Annotated[Optional[Path], typer.Option(
     '--plant', metavar='FILE', help='What is true in the simulation. Default: as --robot.')]
 PolicyOption = Annotated[Optional[Path], typer.Option(

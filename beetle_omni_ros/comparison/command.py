@@ -20,14 +20,13 @@ from rich.table import Table
 from rich.text import Text
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.comparison import grids_other, page
+from beetle_omni_ros.comparison import grids, page
 from beetle_omni_ros.comparison.fingerprint import commit, file_digest, policy_file, versions
 from beetle_omni_ros.comparison.grid import Grid, Number
 from beetle_omni_ros.comparison.plan import CONDITIONS, Flight, plan, TASKS
-from beetle_omni_ros.comparison.store import Store
 from beetle_omni_ros.comparison.style import look
 from beetle_omni_ros.comparison.summary import summarise
-from beetle_omni_ros.comparison.sweep import check_backend, sweep
+from beetle_omni_ros.comparison.sweep import check_backend, Store, sweep
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.control.registry import ControllerOptions
@@ -221,7 +220,7 @@ def _write(results, flown, output, console):
     except OSError as error:
         raise ParameterError(f'{output}: cannot write the page ({error.strerror})') from None
     write_json(output / NUMBERS, results)
-    console.print(_rich(grids_other.glance(results), results, console.width))
+    console.print(_rich(grids.glance(results), results, console.width))
     failed = sum(bool(result['failure']) for result in flown.values())
     if failed:
         console.print(f'{failed} of {len(flown)} flights failed, see above and on the page',

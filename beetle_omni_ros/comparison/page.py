@@ -12,7 +12,7 @@ import matplotlib
 from matplotlib.figure import Figure
 from PIL import Image
 
-from beetle_omni_ros.comparison import figures_poses, figures_tasks, grid, grids, grids_other
+from beetle_omni_ros.comparison import grid, grids, plots
 from beetle_omni_ros.comparison.grid import Grid
 from beetle_omni_ros.comparison.style import CONDITIONS, look, task_title
 from beetle_omni_ros.pages import figures
@@ -50,14 +50,14 @@ def sections(results: dict, flown: dict) -> list[Section]:
         flown: flights and their results with traces.
 
     """
-    made = [Section('At a glance', '', [grids_other.glance(results)])]
+    made = [Section('At a glance', '', [grids.glance(results)])]
     with matplotlib.rc_context(figures.STYLE):
         for task, by_conditions in results['summary']['tasks'].items():
             blocks: list[Grid | Picture] = []
             for conditions in (c for c in by_conditions if c in CONDITIONS):
                 blocks += _blocks(results, flown, task, conditions)
             made.append(Section(task_title(task), TEXTS.get(_kind(task), ''), blocks))
-    made.append(Section('Compute time', '', [grids_other.compute(results)]))
+    made.append(Section('Compute time', '', [grids.compute(results)]))
     return made
 
 
@@ -87,32 +87,32 @@ def _blocks(results, flown, task, conditions):
     if kind == 'waypoints':
         return [grids.waypoints(results, conditions), *picture(
             'states', 'States in a round: mean of all rounds, least to largest as a band',
-            figures_poses.waypoints(flown, conditions))]
+            plots.waypoints(flown, conditions))]
     if kind == 'lemniscate':
         return [grids.lemniscate(results, conditions), *picture(
-            'path', 'Path, mean of all rounds', figures_tasks.lemniscate_path(flown, conditions)),
+            'path', 'Path, mean of all rounds', plots.lemniscate_path(flown, conditions)),
             *picture('errors', 'Tracking errors in a round: mean of all rounds, least to largest '
-                     'as a band', figures_tasks.lemniscate_errors(flown, conditions))]
+                     'as a band', plots.lemniscate_errors(flown, conditions))]
     if kind in ('force', 'torque'):
         return [*picture('errors', 'Errors in time, the disturbance dashed; × where control was '
                          'lost; thin lines: further seeds' + (
                              '; each torque lasts 0.05 s' if kind == 'torque' else ''),
-                         figures_tasks.disturbance(flown, kind, conditions)),
+                         plots.disturbance(flown, kind, conditions)),
                 grids.disturbance(results, kind, conditions)]
     if kind == 'payload':
         return [*picture('errors', 'Errors against the payload, range over the seeds; right: '
-                         'height in time', figures_tasks.payload(flown, conditions)),
-                grids_other.payload(results, conditions)]
+                         'height in time', plots.payload(flown, conditions)),
+                grids.payload(results, conditions)]
     if kind == 'hover':
-        return [grids_other.hover(results, conditions), *picture(
+        return [grids.hover(results, conditions), *picture(
             'commands', 'Commands at the end of the hover, four joints and four rotors',
-            figures_tasks.hover_commands(flown, conditions))]
+            plots.hover_commands(flown, conditions))]
     return [grids.poses(results, task, conditions),
             *picture('errors', 'Errors at the target; stars: published means, with their ranges',
-                     figures_poses.distributions(flown, task, conditions)),
+                     plots.distributions(flown, task, conditions)),
             *picture('convergence', 'Errors after a pose was asked for: median and 10 to '
                      '90 % band over all poses',
-                     figures_poses.convergence(flown, task, conditions))]
+                     plots.convergence(flown, task, conditions))]
 
 
 def pictures(made: list[Section]) -> list[Picture]:
@@ -174,7 +174,7 @@ as each table says.</p><dl>{terms}</dl>
 {body}
 <section><details><summary>All flights</summary><div class="scroll"><table class="flights">
 <thead><tr><th>task</th><th>conditions</th><th>controller</th><th>seed</th><th>end</th>
-<th>core s</th></tr></thead><tbody>{grids_other.flights(results)}</tbody></table></div></details>
+<th>core s</th></tr></thead><tbody>{grids.flights(results)}</tbody></table></div></details>
 </section>""", shipped('comparison.css'))
 
 

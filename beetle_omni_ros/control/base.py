@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import sqrt
+from math import inf, sqrt
 from typing import Any, Protocol
 
 import numpy as np
@@ -260,3 +260,8 @@ def checked(name: str, command: object) -> Command:
                 f"{f'of shape {shape}' if shape is not None else 'no array'}, expected a numpy "
                 f'array of {ROTORS}')
     return command
+
+
+def reach_of(controller: Controller) -> float:
+    """Farthest target that a controller flies to [m]; inf where it does not say."""
+    return float(getattr(controller, 'reach', inf))

@@ -14,8 +14,7 @@ import sys
 import traceback
 from typing import Any, TYPE_CHECKING
 
-from beetle_omni_ros.control.base import Controller
-from beetle_omni_ros.control.reach import reach_of
+from beetle_omni_ros.control.base import Controller, reach_of
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError

@@ -4,12 +4,43 @@ from __future__ import annotations
 
 import ctypes
 from ctypes import byref, c_double, c_int, c_size_t, c_void_p
+from pathlib import Path
 
+import casadi as ca
 import numpy as np
 
-from beetle_omni_ros.control.compiler import casadi_folder
+from beetle_omni_ros.robot.native import built, CompilerError, generated
 
 SPEED_MODE = 1  # enum hpipm_mode
+
+
+def casadi_folder() -> Path:
+    """Folder of the casadi wheel, which ships HPIPM and BLASFEO with their headers."""
+    return Path(ca.__file__).resolve().parent
+
+
+def compiled_library(functions: list[ca.Function]) -> ctypes.CDLL:
+    """
+    Load the real-time iteration with these stage functions, compiling it if new.
+
+    Raises:
+        CompilerError: no compiler, no write access to a cache, or compilation failed.
+
+    """
+    rti = (Path(__file__).parent / 'rti.c').read_text()
+    folder = casadi_folder()
+    return _load(built('nmpc', generated(functions) + '\n' + rti, (
+        f'-I{folder}/include', f'-L{folder}', '-l:libhpipm.so', '-l:libblasfeo.so.0', '-lm',
+        f'-Wl,-rpath,{folder}')))
+
+
+def _load(library: Path) -> ctypes.CDLL:
+    # HPIPM names BLASFEO only by soname; having it loaded first resolves that anywhere.
+    try:
+        ctypes.CDLL(str(casadi_folder() / 'libblasfeo.so.0'), mode=ctypes.RTLD_GLOBAL)
+        return ctypes.CDLL(str(library))
+    except OSError as error:
+        raise CompilerError(f'cannot load {library}: {error}') from None
 
 
 def _library():

@@ -6,8 +6,7 @@ from ctypes import c_double, c_int, c_void_p, POINTER
 
 import numpy as np
 
-from beetle_omni_ros.control.compiler import compiled_library
-from beetle_omni_ros.control.hpipm import OcpQp
+from beetle_omni_ros.control.hpipm import compiled_library, OcpQp
 from beetle_omni_ros.control.ocp import INPUT_SIZE, Ocp, REFERENCE_SIZE
 from beetle_omni_ros.robot.dynamics import TILT_OFFSET
 

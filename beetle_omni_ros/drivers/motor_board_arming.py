@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from beetle_omni_ros.drivers.motor_board import MotorBoard
-from beetle_omni_ros.drivers.motor_board_command import ArmCommand
+from beetle_omni_ros.drivers.motor_board import ArmCommand, MotorBoard
 from beetle_omni_ros.drivers.motor_board_messages import BLOCKS_ARMING
 
 DISARMED = 'disarmed'

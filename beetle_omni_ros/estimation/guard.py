@@ -6,7 +6,7 @@ from math import inf, isfinite, sqrt
 import numpy as np
 
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.robot.spikes import SpikeFilter
+from beetle_omni_ros.robot.readings import SpikeFilter
 
 Checked = tuple[float, np.ndarray, np.ndarray]   # stamp and two vectors of a sample
 

@@ -14,9 +14,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.control.base import guidance_of
+from beetle_omni_ros.control.base import guidance_of, reach_of
 from beetle_omni_ros.control.hover import HoverController
-from beetle_omni_ros.control.reach import reach_of
 from beetle_omni_ros.control.registry import ControllerOptions
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters

@@ -18,13 +18,13 @@ from beetle_omni_ros.control.base import (
     Controller,
     corrected,
     PoseTarget,
+    reach_of,
     State,
     Target,
     tell_health,
 )
-from beetle_omni_ros.control.reach import reach_of
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
-from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
+from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
 from beetle_omni_ros.evaluation.processes import Processes
 from beetle_omni_ros.messages.values import Odom, Wrench

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beetle_omni_ros.identify.candidates import CANDIDATES, free_mask, LINEAR
 from beetle_omni_ros.identify.joint_log import JointLog
-from beetle_omni_ros.identify.selection import Choice, Selector
+from beetle_omni_ros.identify.selection import CANDIDATES, Choice, free_mask, LINEAR, Selector
 from beetle_omni_ros.identify.servo_fit import (
     BEYOND,
     decode,

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros import __version__
-from beetle_omni_ros.identify.candidates import CANDIDATES, LINEAR
 from beetle_omni_ros.identify.joint import error_rms, JointModel
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.joint_servos import FileServos
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
+from beetle_omni_ros.identify.selection import CANDIDATES, LINEAR
 from beetle_omni_ros.identify.servo_fit import FITTED_PART
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, published_set, TERMS
 from beetle_omni_ros.robot.parameters import JointParameters

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.identify.inference.coordinates import Coordinates
-from beetle_omni_ros.identify.inference.least_squares import Steps
+from beetle_omni_ros.identify.inference.least_squares import Coordinates, Steps
 from beetle_omni_ros.identify.servo_model import INDEX, OFF, TERMS
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.effects_actuator import per_joint

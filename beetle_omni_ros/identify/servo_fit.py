@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from beetle_omni_ros.identify.inference.blocks import block_masks, gradient_scatter
-from beetle_omni_ros.identify.inference.coordinates import Coordinates
 from beetle_omni_ros.identify.inference.least_squares import (
+    Coordinates,
     covariance,
     Fits,
     huber,

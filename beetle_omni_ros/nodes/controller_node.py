@@ -13,10 +13,10 @@ from beetle_omni_ros.control.base import (
     corrected,
     guidance_of,
     PoseTarget,
+    reach_of,
     State,
     tell_health,
 )
-from beetle_omni_ros.control.reach import reach_of
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import health, runner

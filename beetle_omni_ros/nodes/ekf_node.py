@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
-from beetle_omni_ros.estimation.odometry import pose_covariance, twist_covariance
 from beetle_omni_ros.estimation.parameters import EkfParameters
+from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import health, runner
 from beetle_omni_ros.nodes.node import FlightNode

@@ -16,6 +16,7 @@ effect on by naming it. Its equation then acts where its kind says:
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from difflib import get_close_matches
 
 import numpy as np
@@ -26,6 +27,7 @@ from beetle_omni_ros.robot.effect_types import (
     EffectParameter,
     SensorErrors,
     ServoTerms,
+    Stand,
     Terms,
 )
 from beetle_omni_ros.robot.effects_actuator import ACTUATOR, SENSOR
@@ -41,6 +43,25 @@ MEMBERS = 4         # joints of this kind of robot
 
 __all__ = ['Asked', 'CATALOGUE', 'command_delays', 'delaying', 'Effect', 'EffectParameter',
            'sensor_errors', 'SensorErrors', 'ServoTerms', 'settings', 'Terms', 'validated']
+CONSUMERS = {'nmpc': 'NMPC and allocation', 'training': 'training', 'plant': 'simulated plant',
+             'estimator': 'estimator', 'buses': 'delays of the buses', 'gap': 'gap finder'}
+ACTS = Stand(True)
+_CORRECTED = Stand(False, 'the estimator corrects the readings first')
+_NO_MODEL = Stand(False, 'the filter follows the IMU and has no model of forces or servos')
+_NO_DELAY = Stand(False, 'the effect delays no command')
+_NO_JOINTS = Stand(False, 'the filter does not read the joints')
+_STANDS = {
+    'nmpc': {'sensor': _CORRECTED, 'play': Stand(
+        False, 'a play is an offset of the servos, which is estimated in flight')},
+    'training': {'sensor': _CORRECTED, 'play': Stand(
+        False, 'the model of the servos has no play: train with joint_deflection or '
+               'joint_friction, or take the effect out of the file', error=True)},
+    'plant': {'play': Stand(
+        False, 'MuJoCo has no play between encoder and rotor', error=True)},
+    'estimator': {**dict.fromkeys(('body', 'servo', 'number', 'command', 'play'), _NO_MODEL),
+                  'feedback': _NO_JOINTS},
+    'buses': dict.fromkeys(('body', 'servo', 'number', 'sensor', 'feedback', 'play'), _NO_DELAY),
+    'gap': {}}
 
 
 def settings(effects: dict[str, dict]) -> dict[str, float]:
@@ -115,3 +136,31 @@ def _value(at, spec, value):
         raise ParameterError(f'{at}: {quoted(value)} is outside '
                              f'{spec.low:g} to {spec.high:g} {spec.unit}')
     return tuple(map(float, array)) if shape else float(array)
+
+
+def stand(consumer: str, name: str) -> Stand:
+    """
+    Stand of a consumer on an effect.
+
+    Args:
+        consumer: one of ``CONSUMERS``.
+        name: of the catalogue.
+
+    """
+    effect = CATALOGUE[name]
+    return effect.stands.get(consumer) or _STANDS[consumer].get(effect.kind, ACTS)
+
+
+def check(consumer: str, effects: Iterable[str]) -> None:
+    """
+    Refuse effects of a robot file that the consumer cannot have.
+
+    Raises:
+        ParameterError: naming the effect and the reason.
+
+    """
+    for name in effects:
+        found = stand(consumer, name)
+        if found.error:
+            raise ParameterError(f'effects.{name}: the {CONSUMERS[consumer]} refuses this effect: '
+                                 f'{found.reason}')

@@ -14,7 +14,7 @@ from beetle_omni_ros.pages.table import Grid, html
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.yaml_file import shortened
-from beetle_omni_ros.runs import charts, charts_summary, table
+from beetle_omni_ros.runs import charts, table
 from beetle_omni_ros.runs.shown import Run, target_poses, TimeAxis
 
 MOST_ROWS = 40      # of states, faults and warnings
@@ -34,15 +34,15 @@ def make_page(runs: list[Run], results: dict) -> str:
          lambda: charts.errors_over_time(runs, axis)),
         ('Pose', 'Flown pose and target.', lambda: charts.pose(runs, axis)),
         ('Errors of a pose', 'Median and 10 to 90 % band over all poses of a run.',
-         lambda: charts_summary.errors_of_a_pose(runs)),
+         lambda: charts.errors_of_a_pose(runs)),
         ('Steady errors', 'Share of the poses with a U error below the value.',
-         lambda: charts_summary.steady_errors(runs)),
-        ('Disturbance', 'Largest error at each level.', lambda: charts_summary.disturbance(runs)),
+         lambda: charts.steady_errors(runs)),
+        ('Disturbance', 'Largest error at each level.', lambda: charts.disturbance(runs)),
         ('Payload', 'Height while payloads are attached.', lambda: charts.payload(runs, axis)),
         ('Commands', 'What the actuators were told: joints and rotors 1 to 4.',
          lambda: charts.commands(runs, axis)),
         ('Joint and thrust use', 'Share of the flight at each value; dashed: limits.',
-         lambda: charts_summary.use(runs, robot)),
+         lambda: charts.use(runs, robot)),
         ('Compute time', 'CPU time of one controller step since the start of the node.',
          lambda: charts.compute(runs, axis)),
         ('Estimate', 'Error of the state estimate against the truth.',

@@ -9,7 +9,7 @@ import numpy as np
 from beetle_omni_ros.control.base import Command, corrected, State
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.spikes import SpikeFilter
+from beetle_omni_ros.robot.readings import SpikeFilter
 from beetle_omni_ros.safety.actuators import Actuators
 from beetle_omni_ros.safety.events import EventLog, INFO, WARNING
 from beetle_omni_ros.safety.limits import JUMP

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from beetle_omni_ros.robot import consumers, dynamics, rotations
+from beetle_omni_ros.robot import dynamics, effects, rotations
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.effects import CatalogueForces, MotionForces
@@ -42,7 +42,7 @@ class Plant:
             ParameterError: an effect that the plant lacks, or impossible mass properties.
 
         """
-        consumers.check('plant', robot)
+        effects.check('plant', robot.effects)
         self._robot, self._parameters, self._variation = robot, parameters, variation
         self._forces, self._others = MotionForces(robot), CatalogueForces(robot)
         self._moved = self._forces.depends_on_motion or bool(self._others.names)

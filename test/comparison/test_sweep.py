@@ -14,7 +14,7 @@ from rich.console import Console
 from beetle_omni_ros.comparison import command, fingerprint, sweep
 from beetle_omni_ros.comparison import flight as flight_module
 from beetle_omni_ros.comparison.plan import CONDITIONS, Flight, plan, TASKS
-from beetle_omni_ros.comparison.store import Store
+from beetle_omni_ros.comparison.sweep import Store
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError

@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from beetle_omni_ros.drivers.servo_loop import Goal, PERIOD, ServoLoop
-from beetle_omni_ros.drivers.servo_pace import READ_AFTER, ServoPace
+from beetle_omni_ros.drivers.servo_loop import Goal, PERIOD, READ_AFTER, ServoLoop, ServoPace
 
 FOREVER = float('inf')
 VALID = np.ones(4, bool)

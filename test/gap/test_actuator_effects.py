@@ -10,9 +10,9 @@ import pytest
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import _torques, candidates
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
-from beetle_omni_ros.identify.gap.loads import spin_load
 from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.identify.gap.results import at_least
+from beetle_omni_ros.identify.gap.servo import spin_load
 
 MOTION = Motion(9, 12.0)
 FINE = 1e-4

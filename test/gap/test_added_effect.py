@@ -14,7 +14,7 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
 from beetle_omni_ros.identify.gap.residual import FlightModel
-from beetle_omni_ros.robot import consumers
+from beetle_omni_ros.robot import effects
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs/how-to/add_an_effect.md'
@@ -42,7 +42,7 @@ def test_the_pages_own_test_passes_with_its_entry_and_fails_without(monkeypatch)
 
 @pytest.mark.parametrize('consumer', ['nmpc', 'training', 'plant'])
 def test_what_flies_acts_on_it(consumer):
-    assert consumers.stand(consumer, NAME).acts
+    assert effects.stand(consumer, NAME).acts
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](with_effect(NAME))])
     assert not np.array_equal(found, plain(consumer))
 

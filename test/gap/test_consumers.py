@@ -12,7 +12,7 @@ from beetle_omni_ros.control.nmpc import redated, with_delays
 from beetle_omni_ros.control.nmpc_parameters import NmpcParameters
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReading
 from beetle_omni_ros.estimation.parameters import EkfParameters
-from beetle_omni_ros.robot import consumers, dynamics
+from beetle_omni_ros.robot import dynamics, effects
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.effects import Asked, CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -60,7 +60,7 @@ def states(count=30):
 
 def nmpc(robot):
     """Model, limits and delays of the NMPC, what it makes of the tilts, and the allocation."""
-    consumers.check('nmpc', robot)
+    effects.check('nmpc', robot.effects)
     x, u = states()
     derivative = dynamics.full_model(robot)
     settings = with_delays(robot, NmpcParameters.load()).model
@@ -79,7 +79,7 @@ def training(robot):
     from beetle_omni_ros.train.model import nominal_body, substep
     from beetle_omni_ros.train.parameters import TrainParameters
     from beetle_omni_ros.train.starts import latencies
-    consumers.check('training', robot)
+    effects.check('training', robot.effects)
     x, u = states()
     step, body, parameters = substep(robot, 0.0025), nominal_body(robot), TrainParameters()
     parameters = replace(parameters, random=replace(
@@ -165,7 +165,7 @@ def plain(consumer):
 @pytest.mark.parametrize('name', CATALOGUE)
 @pytest.mark.parametrize('consumer', OUTPUTS)
 def test_a_consumer_acts_on_an_effect_or_says_why_not(consumer, name):
-    stand, robot = consumers.stand(consumer, name), with_effect(name)
+    stand, robot = effects.stand(consumer, name), with_effect(name)
     if stand.error:
         with pytest.raises(ParameterError, match=f'effects.{name}: the .* refuses') as error:
             OUTPUTS[consumer](robot)
@@ -179,7 +179,7 @@ def test_a_consumer_acts_on_an_effect_or_says_why_not(consumer, name):
 
 @pytest.mark.parametrize('name', CATALOGUE)
 def test_the_gap_finder_acts_on_every_effect(name):
-    assert gap(name) and consumers.stand('gap', name).acts
+    assert gap(name) and effects.stand('gap', name).acts
 
 
 def test_training_refuses_delays_that_it_cannot_remember():

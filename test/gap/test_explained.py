@@ -7,7 +7,7 @@ from flights import KEYS, P, ROBOT
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.candidates import Candidate
+from beetle_omni_ros.identify.gap.candidates import Candidate, Trial
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.gates import at_bound, cross_validate, holds
 from beetle_omni_ros.identify.gap.keys import (
@@ -17,7 +17,6 @@ from beetle_omni_ros.identify.gap.keys import (
     tolerances,
 )
 from beetle_omni_ros.identify.gap.search import Search
-from beetle_omni_ros.identify.gap.trial import Trial
 from beetle_omni_ros.identify.inference.prior import Prior
 
 LAG, OTHER = 'rotor_lag.time_constant', 'inertia.inertia[0]'

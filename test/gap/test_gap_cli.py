@@ -3,7 +3,7 @@
 import pytest
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.cli.gaps import spread
+from beetle_omni_ros.cli.models import spread
 
 
 @pytest.mark.parametrize(('given', 'meant'), [

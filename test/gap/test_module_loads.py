@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.keys import all_keys
-from beetle_omni_ros.identify.gap.loads import module_load, undescribed_load
-from beetle_omni_ros.identify.gap.servo import simulate, Windows
+from beetle_omni_ros.identify.gap.servo import module_load, simulate, undescribed_load, Windows
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 

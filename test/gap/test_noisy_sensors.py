@@ -6,12 +6,11 @@ from flights import KEYS, model, Motion, P, ROBOT, solved
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.candidates import Candidate
+from beetle_omni_ros.identify.gap.candidates import Candidate, Found, Trial
 from beetle_omni_ros.identify.gap.fit import State
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.gap.servo import simulate, Windows
-from beetle_omni_ros.identify.gap.trial import Found, Trial
 
 MOTION = Motion(7)
 DELAY = 'joint_feedback_delay.delay'

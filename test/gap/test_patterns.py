@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.analysis import Analysis
-from beetle_omni_ros.identify.gap.candidates import Candidate
+from beetle_omni_ros.identify.gap.candidates import Candidate, Found, TOO_SMALL, Trial
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, Rhythm, rhythm, SWINGING
-from beetle_omni_ros.identify.gap.trial import Found, TOO_SMALL, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder
 from beetle_omni_ros.identify.gap.verdict import decide
 

@@ -6,10 +6,9 @@ from flights import KEYS, P
 import numpy as np
 import pytest
 
-from beetle_omni_ros.identify.gap.candidates import Candidate
+from beetle_omni_ros.identify.gap.candidates import Candidate, Found, Trial
 from beetle_omni_ros.identify.gap.fit import State
 from beetle_omni_ros.identify.gap.search import Search
-from beetle_omni_ros.identify.gap.trial import Found, Trial
 
 DEAD, LAG = ('rotor_dead_time', 'rotor_dead_time.delay'), ('rotor_lag', 'rotor_lag.time_constant')
 SAG = ('voltage_sag', 'voltage_sag.exponent')

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.analysis import Analysis
-from beetle_omni_ros.identify.gap.candidates import Candidate
+from beetle_omni_ros.identify.gap.candidates import Candidate, Found, Trial
 from beetle_omni_ros.identify.gap.certainty import liveliness, Visibility
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.search import Search
-from beetle_omni_ros.identify.gap.trial import Found, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder
 from beetle_omni_ros.identify.gap.verdict import decide
 

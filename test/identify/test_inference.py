@@ -16,8 +16,8 @@ from beetle_omni_ros.identify.inference.blocks import (
     HeldOut,
     ridge_held_out,
 )
-from beetle_omni_ros.identify.inference.coordinates import Coordinates
 from beetle_omni_ros.identify.inference.least_squares import (
+    Coordinates,
     covariance,
     differences,
     HUBER,

@@ -10,7 +10,7 @@ from rotor_logs import bench
 from rotor_logs import write as write_bench
 
 from beetle_omni_ros import cli
-from beetle_omni_ros.comparison import grids_other
+from beetle_omni_ros.comparison import grids
 from beetle_omni_ros.comparison.page import page as comparison_page
 from beetle_omni_ros.comparison.page import Section
 from beetle_omni_ros.faults.page import as_page
@@ -29,8 +29,8 @@ def rotor(folder):
 
 def comparison(folder):
     results = json.loads((ROOT / 'docs' / 'comparison' / 'comparison.json').read_text())
-    return comparison_page(results, [Section('At a glance', LONG, [grids_other.glance(results)]),
-                                     Section('Time', '', [grids_other.compute(results)])])
+    return comparison_page(results, [Section('At a glance', LONG, [grids.glance(results)]),
+                                     Section('Time', '', [grids.compute(results)])])
 
 
 def faults(folder):

@@ -17,6 +17,7 @@ from beetle_omni_ros.control.base import (
     Command,
     Controller,
     PoseTarget,
+    reach_of,
     State,
     Target,
     tell_health,
@@ -25,7 +26,6 @@ from beetle_omni_ros.control.guidance.routing import Routing, RoutingParameters
 from beetle_omni_ros.control.guidance.trimming import Trimming, TrimmingParameters
 from beetle_omni_ros.control.guidance.turning import Turning, TurningParameters
 from beetle_omni_ros.control.guidance.unwinding import Unwinding, UnwindingParameters
-from beetle_omni_ros.control.reach import reach_of
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.schema import group
 

@@ -10,7 +10,7 @@ import numpy as np
 from beetle_omni_ros.identify.gap.absolute import ceilings, Loud, too_loud
 from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.candidates import candidates
+from beetle_omni_ros.identify.gap.candidates import candidates, Found, Trial
 from beetle_omni_ros.identify.gap.certainty import (
     deviations,
     limits_out_of_sight,
@@ -32,7 +32,6 @@ from beetle_omni_ros.identify.gap.rollouts import (
     trimmed,
 )
 from beetle_omni_ros.identify.gap.search import Search
-from beetle_omni_ros.identify.gap.trial import Found, Trial
 from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
 from beetle_omni_ros.identify.gap.verdict import decide, disagreement, not_met, withdraw
 from beetle_omni_ros.identify.gap.workers import Workers

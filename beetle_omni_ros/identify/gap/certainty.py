@@ -8,8 +8,9 @@ import numpy as np
 from scipy.stats import t as student
 
 from beetle_omni_ros.identify.gap.bands import by_band
-from beetle_omni_ros.identify.gap.candidates import Candidate, LIMITS
+from beetle_omni_ros.identify.gap.candidates import Candidate
 from beetle_omni_ros.identify.gap.fit import Problem, State
+from beetle_omni_ros.identify.gap.keys import LIMITS
 from beetle_omni_ros.identify.gap.residual import THIN
 from beetle_omni_ros.identify.gap.series import matrices
 from beetle_omni_ros.identify.inference.least_squares import solved

@@ -11,8 +11,13 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from beetle_omni_ros.identify.gap.analysis import analyse, Analysis
 from beetle_omni_ros.identify.gap.apply import write_corrected
 from beetle_omni_ros.identify.gap.bags import read_recording
-from beetle_omni_ros.identify.gap.given import check_apart, check_flights, names_of
-from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
+from beetle_omni_ros.identify.gap.ingest import (
+    check_apart,
+    check_flights,
+    load_flight,
+    names_of,
+    UnusableFlight,
+)
 from beetle_omni_ros.identify.gap.joint_changes import change_grids
 from beetle_omni_ros.identify.gap.joint_gap import analyse_joint_log
 from beetle_omni_ros.identify.gap.page import gap_page

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.candidates import LIMITS
-from beetle_omni_ros.identify.gap.keys import Key
+from beetle_omni_ros.identify.gap.keys import Key, LIMITS
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.residual import FlightModel

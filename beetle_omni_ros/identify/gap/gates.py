@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bands import aside, in_part_alone
-from beetle_omni_ros.identify.gap.candidates import LIMITS
+from beetle_omni_ros.identify.gap.candidates import Found, Trial
 from beetle_omni_ros.identify.gap.fit import HALVINGS, Problem, State
-from beetle_omni_ros.identify.gap.keys import delays_of, Key
+from beetle_omni_ros.identify.gap.keys import delays_of, Key, LIMITS
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.trial import Found, Trial
 from beetle_omni_ros.identify.inference.blocks import HeldOut
 from beetle_omni_ros.robot.effects import CATALOGUE
 

@@ -21,6 +21,8 @@ from beetle_omni_ros.robot.effects import CATALOGUE, delaying
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 MODULES = 'module_reaction'
+# Effects without a slope at their neutral value: they need a start where they already act.
+LIMITS = tuple(name for name, effect in CATALOGUE.items() if effect.starts)
 TILT_BUS, THRUST_BUS = 'base.tilt_delay', 'base.thrust_delay'   # of commands on their way
 
 

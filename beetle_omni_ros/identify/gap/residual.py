@@ -17,10 +17,15 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.filters import channel_filters, THIN
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import delays_of, Key
-from beetle_omni_ros.identify.gap.loads import module_load, spin_load, undescribed_load
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import matrices
-from beetle_omni_ros.identify.gap.servo import simulate, Windows
+from beetle_omni_ros.identify.gap.servo import (
+    module_load,
+    simulate,
+    spin_load,
+    undescribed_load,
+    Windows,
+)
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 

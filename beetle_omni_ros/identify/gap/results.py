@@ -9,10 +9,10 @@ import numpy as np
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.gap.analysis import Analysis, JUDGED
+from beetle_omni_ros.identify.gap.candidates import Trial
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.rollouts import HORIZONS
 from beetle_omni_ros.identify.gap.sentence import summary
-from beetle_omni_ros.identify.gap.trial import Trial
 from beetle_omni_ros.identify.gap.verdict import hidden
 from beetle_omni_ros.pages.table import ABSENT, Grid
 from beetle_omni_ros.robot.effects import CATALOGUE

@@ -14,10 +14,15 @@ import numpy as np
 from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.filters import low_pass
-from beetle_omni_ros.identify.gap.loads import module_load, spin_load, undescribed_load
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
-from beetle_omni_ros.identify.gap.servo import simulate, Windows
+from beetle_omni_ros.identify.gap.servo import (
+    module_load,
+    simulate,
+    spin_load,
+    undescribed_load,
+    Windows,
+)
 from beetle_omni_ros.identify.gap.signals import FINE, matrices
 from beetle_omni_ros.robot.servo import play
 

@@ -7,7 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.candidates import Candidate
+from beetle_omni_ros.identify.gap.candidates import (
+    Candidate,
+    FOUGHT,
+    Found,
+    IMPOSSIBLE,
+    NOT_HELD,
+    TOO_SMALL,
+)
 from beetle_omni_ros.identify.gap.certainty import liveliness
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.gates import (
@@ -21,7 +28,6 @@ from beetle_omni_ros.identify.gap.gates import (
     neither_holds,
 )
 from beetle_omni_ros.identify.gap.proposals import Proposals
-from beetle_omni_ros.identify.gap.trial import FOUGHT, Found, IMPOSSIBLE, NOT_HELD, TOO_SMALL
 
 
 class Search:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from beetle_omni_ros.identify.gap.candidates import FOUGHT, NOT_HELD, TOO_SMALL
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.patterns import SWINGING
-from beetle_omni_ros.identify.gap.trial import FOUGHT, NOT_HELD, TOO_SMALL
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 if TYPE_CHECKING:

@@ -1,19 +1,222 @@
-"""Figures of disturbances, payload, the lemniscate and the smoothness of a hover."""
+"""Figures of poses, waypoints, disturbances, payload, the lemniscate and a hover."""
 
 from __future__ import annotations
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 import numpy as np
 
-from beetle_omni_ros.comparison.figures_poses import label_once, of, STEP, UNITS
+from beetle_omni_ros.comparison.plan import Flight
 from beetle_omni_ros.comparison.style import FAINT, INK, look
+from beetle_omni_ros.comparison.summary import PUBLISHED
 from beetle_omni_ros.pages.figures import panels, WIDTH
 from beetle_omni_ros.runs import lemniscate as curve
-from beetle_omni_ros.runs.tasks import make_task, POSE_DURATION
+from beetle_omni_ros.runs import published
+from beetle_omni_ros.runs.body import roll_pitch_yaw
+from beetle_omni_ros.runs.metrics import (
+    L_WINDOW,
+    REACHED_ORIENTATION,
+    REACHED_POSITION,
+    U_WINDOW,
+)
+from beetle_omni_ros.runs.tasks import make_task, POSE_DURATION, WAYPOINTS
 
+FLOOR = {'position': 2e-4, 'orientation': 1e-2}  # of logarithmic errors [m], [deg]
+UNITS = {'position': 'm', 'orientation': 'deg'}
+STEP = 0.05  # [s] between points of a folded curve
+BINS = 28  # edges of a histogram
 BEFORE = 2.0  # [s] of hover shown before the first disturbance
 SHOWN = {'position': 2.0, 'orientation': 180.0}  # most that a disturbance's axes show [m], [deg]
 HOVER_SHOWN = 0.5  # [s] of commands
+
+
+def of(flown: dict[Flight, dict], task: str, conditions: str) -> dict[str, list[dict]]:
+    """Results with a trace: controller -> one for each seed."""
+    chosen: dict[str, list[dict]] = {}
+    for flight, result in flown.items():
+        if (flight.task, flight.conditions) == (task, conditions) and result['trace']:
+            chosen.setdefault(flight.controller, []).append(result)
+    return chosen
+
+
+def plain_ticks(axis) -> None:
+    """Write a logarithmic axis as 0.01, 0.1, 1 rather than as powers."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+
+
+def label_once(figure: Figure, axes, columns: int = 6) -> None:
+    """One legend above the figure, each name once."""
+    handles, labels = axes.get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    figure.legend(unique.values(), unique.keys(), loc='outside upper left', ncols=columns,
+                  handlelength=2.4, columnspacing=1.4, borderaxespad=0.2)
+
+
+def distributions(flown: dict, task: str, conditions: str) -> Figure | None:
+    """Errors at the target: one against the other, and how they are distributed."""
+    groups = of(flown, task, conditions)
+    points = {name: _points(results) for name, results in groups.items()}
+    points = {name: values for name, values in points.items() if len(values)}
+    if not points:
+        return None
+    figure, axes = panels(1, 3, height=3.3, width_ratios=(1.25, 1, 1))
+    scatter, *histograms = axes[0]
+    for name, values in points.items():
+        style = look(name)
+        scatter.scatter(*values.T, s=13, color=style.colour, marker=style.marker, alpha=0.65,
+                        linewidths=0, label=style.label)
+    _published_points(scatter, task)
+    _reached_box(scatter)
+    for panel, (what, floor), column in zip(histograms, FLOOR.items(), (0, 1), strict=True):
+        high = max(values[:, column].max() for values in points.values()) * 1.3
+        low = max(floor, min(values[:, column].min() for values in points.values()) * 0.8)
+        edges = np.geomspace(low, max(high, low * 10), BINS)
+        for name, values in points.items():
+            share = np.histogram(np.maximum(values[:, column], low), edges)[0] / len(values)
+            style = look(name)
+            panel.stairs(share, edges, color=style.colour, lw=1.4)
+            panel.stairs(share, edges, color=style.colour, alpha=0.16, fill=True, lw=0)
+        panel.set_xscale('log')
+        plain_ticks(panel.xaxis)
+        panel.set_xlabel(f'U {what} error [{UNITS[what]}]')
+        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{100 * value:.0f} %'))
+        panel.axvline((REACHED_POSITION, REACHED_ORIENTATION)[column], color=FAINT, lw=1,
+                      ls=(0, (3, 2)))
+    histograms[0].set_ylabel('share of the poses')
+    label_once(figure, scatter)
+    return figure
+
+
+def _points(results):
+    """(N, 2) U errors of all poses that were flown, not below the floor of the axes."""
+    values = np.array([[pose['U_position_m'], pose['U_orientation_deg']]
+                       for result in results for pose in result['metrics']['poses']
+                       if pose['U_position_m'] is not None]).reshape(-1, 2)
+    return np.maximum(values[np.all(np.isfinite(values), axis=1)], list(FLOOR.values()))
+
+
+def _published_points(panel, task):
+    if not task.startswith('random'):
+        return
+    for column, name in PUBLISHED.items():
+        numbers = published.RANDOM_POSES[name]
+        x, y = (numbers['mean'][key] for key in ('U_position_m', 'U_orientation_deg'))
+        spans = [[[value - numbers['min'][key]], [numbers['max'][key] - value]]
+                 for value, key in ((x, 'U_position_m'), (y, 'U_orientation_deg'))]
+        style = look(column)
+        panel.errorbar(x, y, xerr=spans[0], yerr=spans[1], color=style.colour, lw=0.8, alpha=0.55,
+                       zorder=1)
+        panel.plot(x, y, marker='*', ms=13, color=style.colour, mec='white', mew=0.8, ls='',
+                   label=f'published {name}', zorder=5)
+
+
+def _reached_box(panel):
+    panel.set_xscale('log')
+    panel.set_yscale('log')
+    plain_ticks(panel.xaxis)
+    plain_ticks(panel.yaxis)
+    (left, _), (bottom, _) = panel.get_xlim(), panel.get_ylim()
+    panel.plot([REACHED_POSITION, REACHED_POSITION, left],
+               [bottom, REACHED_ORIENTATION, REACHED_ORIENTATION], color=FAINT, lw=1,
+               ls=(0, (3, 2)))
+    panel.set_xlim(left=left)
+    panel.set_ylim(bottom=bottom)
+    panel.text(left, REACHED_ORIENTATION, '  reached', color=FAINT, fontsize=8, va='bottom')
+    panel.set_xlabel('U position error [m]')
+    panel.set_ylabel('U orientation error [deg]')
+
+
+def convergence(flown: dict, task: str, conditions: str) -> Figure | None:
+    """Errors in the 8 s of a pose: median and 10 to 90 % band over all poses."""
+    groups = of(flown, task, conditions)
+    if not groups:
+        return None
+    figure, axes = panels(1, 2, height=2.8)
+    grid = np.arange(0.0, POSE_DURATION, STEP)
+    for name, results in groups.items():
+        style = look(name)
+        for panel, (what, floor) in zip(axes[0], FLOOR.items(), strict=True):
+            folded = _folded(results, f'{what}_error', grid)
+            if not len(folded):
+                continue
+            low, middle, high = np.maximum(np.percentile(folded, (10, 50, 90), axis=0), floor)
+            panel.fill_between(grid, low, high, color=style.colour, alpha=0.13, lw=0)
+            panel.plot(grid, middle, color=style.colour, ls=style.dashes, lw=1.7,
+                       label=style.label)
+    for panel, what in zip(axes[0], FLOOR, strict=True):
+        for window, colour, name in ((L_WINDOW, '#eef1f5', 'L'), (U_WINDOW, '#d5e6d9', 'U')):
+            panel.axvspan(*window, color=colour, lw=0, zorder=0)
+            panel.text(np.mean(window), 0.985, name, transform=panel.get_xaxis_transform(),
+                       va='top', ha='center', color=FAINT, fontsize=8)
+        panel.set_yscale('log')
+        plain_ticks(panel.yaxis)
+        panel.set_xlim(0, POSE_DURATION)
+        panel.set_ylabel(f'{what} error [{UNITS[what]}]')
+        panel.set_xlabel('time since the pose was asked for [s]')
+    label_once(figure, axes[0, 0])
+    return figure
+
+
+def _folded(results, key, grid):
+    """(P, len(grid)) errors of each pose that was flown to its end."""
+    rows = []
+    for result in results:
+        t, values = result['trace']['t'], result['trace'][key]
+        for k in range(len(result['metrics']['poses'])):
+            inside = (t >= k * POSE_DURATION - 1e-3) & (t < (k + 1) * POSE_DURATION - 1e-3)
+            if np.any(inside) and t[inside][-1] >= k * POSE_DURATION + U_WINDOW[1]:
+                rows.append(np.interp(grid, t[inside] - k * POSE_DURATION, values[inside]))
+    return np.array(rows)
+
+
+def waypoints(flown: dict, conditions: str) -> Figure | None:
+    """State over one round of the waypoints: mean of all rounds, least to largest as a band."""
+    groups = of(flown, 'waypoints', conditions)
+    if not groups:
+        return None
+    duration = len(WAYPOINTS) * POSE_DURATION
+    grid = np.arange(0.0, duration, STEP)
+    figure, axes = panels(4, 2, height=1.35, sharex=True)
+    targets = WAYPOINTS[np.minimum((grid / POSE_DURATION).astype(int), len(WAYPOINTS) - 1)]
+    for row in range(3):
+        for column in range(2):
+            axes[row, column].plot(grid, targets[:, row + 3 * column], color=INK, lw=0.9,
+                                   ls=(0, (3, 2)), label='target')
+    for name, results in groups.items():
+        style = look(name)
+        rounds = _rounds(results, grid, duration)
+        flown = ~np.all(np.isnan(rounds[:, :, 0]), axis=0)
+        for panel, values in zip(axes.T.ravel(), np.moveaxis(rounds[:, flown], 2, 0),
+                                 strict=True):
+            panel.fill_between(grid[flown], np.nanmin(values, axis=0), np.nanmax(values, axis=0),
+                               color=style.colour, alpha=0.2, lw=0)
+            panel.plot(grid[flown], np.nanmean(values, axis=0), color=style.colour,
+                       ls=style.dashes, lw=1.2, label=style.label)
+    for panel, label in zip(axes.T.ravel(), (
+            'x [m]', 'y [m]', 'z [m]', '‖v‖ [m/s]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]',
+            '‖ω‖ [rad/s]'), strict=True):
+        panel.set_ylabel(label)
+        panel.set_xlim(0, duration)
+        panel.set_xticks(np.arange(0, duration + 1, POSE_DURATION))
+    for panel in axes[-1]:
+        panel.set_xlabel('time in the round [s]')
+    label_once(figure, axes[0, 0])
+    return figure
+
+
+def _rounds(results, grid, duration):
+    """(R, len(grid), 8) x, y, z, speed, roll, pitch, yaw, rate of rounds; NaN after the end."""
+    rounds = []
+    for result in results:
+        trace = result['trace']
+        t = trace['t']
+        angles = np.degrees(np.unwrap(np.radians(roll_pitch_yaw(trace['quaternion'])), axis=0))
+        states = np.column_stack([trace['position'], trace['speed'], angles, trace['rate']])
+        for k in range(max(1, int(np.ceil(t[-1] / duration - 0.01)))):
+            rounds.append(np.column_stack([
+                np.interp(grid + k * duration - 1e-3, t, column, right=np.nan)
+                for column in states.T]))
+    return np.array(rounds)
 
 
 def disturbance(flown: dict, kind: str, conditions: str) -> Figure | None:
@@ -122,7 +325,7 @@ def _mark_masses(panel):
     panel.set_xlabel('time [s]')
 
 
-def _rounds(results, keys):
+def _laps(results, keys):
     """Phase grid (N,) [s] in a round and (R, N, len(keys)) values of all complete rounds."""
     grid = np.arange(0.0, curve.PERIOD, STEP)
     rounds = []
@@ -139,7 +342,7 @@ def _rounds(results, keys):
 def lemniscate_path(flown: dict, conditions: str) -> Figure | None:
     """The path in space, from above and from the side, mean of all rounds."""
     groups = {name: rounds for name, results in of(flown, 'lemniscate', conditions).items()
-              if len((rounds := _rounds(results, ('position',))[1]))}
+              if len((rounds := _laps(results, ('position',))[1]))}
     if not groups:
         return None
     figure = Figure(figsize=(WIDTH, 4.1), layout='constrained')
@@ -181,7 +384,7 @@ def lemniscate_errors(flown: dict, conditions: str) -> Figure | None:
     drawn = False
     for name, results in groups.items():
         style = look(name)
-        grid, rounds = _rounds(results, ('position_error', 'orientation_error'))
+        grid, rounds = _laps(results, ('position_error', 'orientation_error'))
         for column in range(2 if len(rounds) else 0):
             values, panel, drawn = rounds[:, :, column], axes[column, 0], True
             panel.fill_between(grid, values.min(axis=0), values.max(axis=0), color=style.colour,

@@ -1,0 +1,138 @@
+"""Subcommands that learn from data: gap, identify joint, identify rotor, train."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from beetle_omni_ros.cli.options import fail, FAILED, JsonOption, PublishedOption, RobotOption
+from beetle_omni_ros.robot.schema import ParameterError
+
+PageOption = Annotated[Optional[Path], typer.Option(
+    '--report', metavar='FILE', help='Write a self-contained HTML page with plots there.')]
+ParamsOption = Annotated[Optional[Path], typer.Option(
+    '--params', metavar='FILE', help='Write a robot file with the result there.')]
+HOLDOUT = '--holdout'
+
+
+def gap(runs: Annotated[list[Path], typer.Argument(
+            metavar='RUN...', help='Recorded flights (bags), or one joint log (CSV).')],
+        holdout: Annotated[Optional[list[Path]], typer.Option(
+            HOLDOUT, metavar='RUN...', help='Flights that only judge. Default: the last run, '
+                                            'where there are three or more.')] = None,
+        robot: RobotOption = None,
+        apply: Annotated[Optional[Path], typer.Option(
+            '--apply', metavar='FILE', help='Write the robot file with what was named.')] = None,
+        page: Annotated[Optional[Path], typer.Option(
+            '--report', metavar='FILE', help='Write an HTML page with the plots.')] = None,
+        parameters: Annotated[Optional[Path], typer.Option(
+            '--gap', metavar='FILE', help='Changes to params/gap.yaml.')] = None,
+        fix: Annotated[bool, typer.Option(
+            '--fix', help='Correct damaged recordings where the correction is certain; the bags '
+                          'stay as they are.')] = False,
+        tolerances: Annotated[bool, typer.Option(
+            '--tolerances', help="With --apply: also write this robot's own mass, inertia, gains, "
+                                 'lags and rotor positions, as fitted within tolerance.')] = False,
+        json_path: JsonOption = None):
+    """
+    Find where model and measurement disagree, name the effect, add it, show the gap shrink.
+
+    Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
+    """
+    from beetle_omni_ros.identify.gap.command import run_gap
+    raise typer.Exit(run_gap(runs, holdout or [], robot, apply, json_path, page,
+                             parameters=parameters, fix=fix, tolerances=tolerances))
+
+
+def spread(arguments: list[str]) -> list[str]:
+    """
+    Let `gap RUN... --holdout RUN RUN` mean two flights that judge, not a third that is fitted.
+
+    Without a run before it, `--holdout` takes one, and the runs follow.
+    """
+    spread, runs, holding = [], 0, False
+    for k, argument in enumerate(arguments):
+        if argument == HOLDOUT:
+            holding = True
+        elif argument.startswith('-'):
+            holding = False
+        elif arguments[k - 1].startswith('-') and k and arguments[k - 1] != HOLDOUT:
+            pass            # the value of another option
+        elif holding and arguments[k - 1] != HOLDOUT and runs:
+            spread.append(HOLDOUT)
+        elif not holding:
+            runs += 1
+        spread.append(argument)
+    return spread
+
+
+def joint(logs: Annotated[list[Path], typer.Argument(
+              metavar='LOG', help='Response log (CSV) or recorded run (bag), see '
+                                  'docs/how-to/identification.md.')],
+          validate: Annotated[Optional[list[Path]], typer.Option(
+              '--validate', metavar='LOG.csv...', help='Further logs, which only judge.')] = None,
+          robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,
+          json_path: JsonOption = None):
+    """
+    Identify the tilt servos from the first 60 % of a response log; the rest judges.
+
+    Example: beetle_omni identify joint slow.csv --validate fast.csv --report servos.html
+    """
+    log, *more = logs      # `--validate a.csv b.csv` leaves b.csv here
+    if more and not validate:
+        raise ParameterError(f'{more[0]}: one log is identified from; expected further ones after '
+                             '--validate')
+    from beetle_omni_ros.identify.command import run_identify_joint
+    run_identify_joint(log, validate=[*(validate or []), *more], robot=robot, report=report,
+                       params=params, json_path=json_path)
+
+
+def rotor(log: Annotated[Path, typer.Argument(
+              metavar='LOG.csv', help='Bench log, see docs/how-to/identification.md.')],
+          robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,
+          json_path: JsonOption = None):
+    """
+    Identify thrust map and torque ratio of a rotor from a force-torque log.
+
+    Example: beetle_omni identify rotor bench.csv --params my_robot.yaml --report rotor.html
+    """
+    from beetle_omni_ros.identify.command import run_identify_rotor
+    run_identify_rotor(log, robot=robot, report=report, params=params, json_path=json_path)
+
+
+def train(output: Annotated[Path, typer.Option(
+              '--output', metavar='DIR', help='Folder for checkpoints, TensorBoard log and '
+                                              'policy.onnx. Default: that of --resume.')] = None,
+          config: Annotated[Optional[Path], typer.Option(
+              '--config', metavar='FILE', help='Other parameters than params/train.yaml.')] = None,
+          changes: Annotated[Optional[list[str]], typer.Option(
+              '--set', metavar='KEY=VALUE', help='Replace a parameter, e.g. iterations=5000 or '
+                                                 'ppo.robots=8192; may be repeated.')] = None,
+          seed: Annotated[Optional[int], typer.Option(
+              '--seed', min=0, max=2**31 - 1, help='Of everything random.')] = None,
+          memory: Annotated[Optional[bool], typer.Option(
+              '--memory', help='The policy also sees the estimated disturbance.')] = None,
+          device: Annotated[str, typer.Option('--device', help='auto, cpu, cuda[:N].')] = 'auto',
+          resume: Annotated[Optional[Path], typer.Option(
+              '--resume', metavar='DIR', help="Go on from a run's last checkpoint, or from a "
+                                              'model_N.pt.')] = None,
+          smoke: Annotated[bool, typer.Option(
+              '--smoke', help='Tiny sizes: does everything fit together?')] = False,
+          stop_after: Annotated[Optional[float], typer.Option(
+              '--stop-after', min=0, metavar='SECONDS', help='Stop training early.')] = None,
+          robot: RobotOption = None, json_path: JsonOption = None):
+    """
+    Train a policy and export it to ONNX; needs the extra 'train', and a GPU to be useful.
+
+    Several GPUs: torchrun --nproc-per-node N -m beetle_omni_ros.cli train --output DIR
+    """
+    from beetle_omni_ros.train.command import run_train, TrainingError
+    from beetle_omni_ros.train.run_folder import parse_changes
+    try:
+        run_train(output=output, config=config, robot=robot, device=device, resume=resume,
+                  changes=parse_changes(changes or [], seed=seed, memory=memory),
+                  smoke=smoke, stop_after=stop_after, json_path=json_path)
+    except TrainingError as error:
+        raise typer.Exit(fail(error, FAILED)) from None
