@@ -83,7 +83,7 @@ class Analysis:
     found: Found = field(default_factory=Found)
     widths: dict[str, float] = field(default_factory=dict)
     visible: dict[str, Visibility] = field(default_factory=dict)
-    rest: Remainder | None = None
+    rest: Remainder = field(default_factory=Remainder)
     patterns: list[Pattern] = field(default_factory=list)
     rhythm: Rhythm = Rhythm(0.0, 0.0, 0.0)
     where: list[dict] = field(default_factory=list)
@@ -100,6 +100,13 @@ class Analysis:
     loud: list[Loud] = field(default_factory=list)
     unseen: list[str] = field(default_factory=list)
     damaged: tuple[Recording, Damage] | None = None
+
+    @property
+    def fit(self) -> Problem:
+        """The problem; where the recordings are bad there is none."""
+        if self.problem is None:
+            raise ValueError('no flight was fitted: the recordings are bad')
+        return self.problem
 
     @property
     def accepted(self) -> list[Trial]:

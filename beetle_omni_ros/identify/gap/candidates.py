@@ -152,7 +152,8 @@ class Found:
     rivals: dict[str, list[Trial]] = field(default_factory=dict)
     base: dict[str, float] = field(default_factory=dict)
     theta: dict[str, float] = field(default_factory=dict)
-    state: State | None = None
+    state: State = field(
+        default_factory=lambda: State({}, np.zeros(0), np.zeros((0, 0)), []))
     cost: tuple[float, float, float] = (0.0, 0.0, 0.0)
     still: bool = False
 

@@ -139,7 +139,7 @@ def visibility(problem: Problem, state: State, always: list[str],
         weight = np.concatenate([
             [0.0 if n in loose else w for n, w, m in zip(always, prior, mask, strict=True) if m],
             np.zeros(len(other) - int(mask.sum()))])
-        mine = [index[n] for n in own]
+        mine = np.array([index[n] for n in own])
         cross = data[np.ix_(other, mine)]
         inner = data[np.ix_(other, other)] + np.diag(weight + 1e-9)
         schur = data[np.ix_(mine, mine)] - cross.T @ np.linalg.solve(inner, cross)

@@ -46,8 +46,8 @@ class State:
 
     def beside(self, other: State) -> Difference:
         """What of this state differs from another one with the same names."""
-        changed = [] if self.slopes is other.slopes else np.flatnonzero(
-            (self.slopes != other.slopes).any(axis=0))
+        changed = np.flatnonzero((self.slopes != other.slopes).any(axis=0)) \
+            if self.slopes is not other.slopes else np.zeros(0, dtype=int)
         return self.theta, self.r, changed, self.slopes[:, changed]
 
     def with_difference(self, difference: Difference) -> State:
@@ -89,7 +89,7 @@ class Problem:
         self.everyone = [*models, *others]
         self._guides: list[tuple[dict[str, float], list[int]]] = []
         self.noise = Noise.white(p)
-        self._raw: list | None = None
+        self._raw: list[tuple] = []     # of each flight, as the last state found them
         self._label()
 
     def _label(self):

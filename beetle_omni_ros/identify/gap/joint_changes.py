@@ -36,7 +36,7 @@ FITTED = ('natural_frequency', 'damping_ratio', 'delay', 'coulomb_friction', 'of
 ROWS = tuple(
     row for name, parameters in GROUPS.items() for parameter in parameters
     for spec in [CATALOGUE[name].parameters[parameter]]
-    if spec.log.each or not CATALOGUE[name].starts
+    if spec.log and (spec.log.each or not CATALOGUE[name].starts)
     for row in ((name, parameter, spec.unit), *((name, *more) for more in spec.log.better)))
 WRONG = 0.05            # probability that any row of two logs is called significant by chance
 # One standard deviation of frequency and damping about the median joint: a factor, which keeps a
@@ -99,7 +99,7 @@ def estimate(log: JointLog, robot: RobotParameters) -> tuple[np.ndarray, np.ndar
     for _ in range(2):
         # Frequency and damping within a factor of the median joint's keep a fit in place.
         prior = prior_of(np.median(problems.points, axis=0), dict.fromkeys(
-            ('natural_frequency', 'damping_ratio'), np.log(FACTOR)))
+            ('natural_frequency', 'damping_ratio'), float(np.log(FACTOR))))
         fits = ServoFitter(log, noise, prior=prior).solve(problems, 15)
         problems = replace(problems, points=fits.points)
         noise = noise_around(log, decode(problems.points), weight[0])

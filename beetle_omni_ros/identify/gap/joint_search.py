@@ -163,12 +163,13 @@ class Search:
         usual = [e for e in self.entries if e.name == 'joint_offset' or (
             e.name in ('joint_friction', 'joint_velocity_limit', *PAIR) and e.joint is None)]
         starts = [self._started(self.servos.believed, usual, k) for k in range(2)]
-        for noise in (first_noise(self.log), None):
-            self.fitter = self._fitter(noise or self._noise(self.full))
+        noise = first_noise(self.log)
+        for _ in range(2):
+            self.fitter = self._fitter(noise)
             solved = self._solve(starts, [usual] * len(starts), 12)
             self.full = solved.points[solved.chi2.argmin()]
-            starts = [self.full]
-        self.noise = self._noise(self.full)
+            starts, noise = [self.full], self._noise(self.full)
+        self.noise = noise
         self.fitter = self._fitter(self.noise)
         self.scatter = self.fitter.certainty(self._problems([self.full], [usual]))[0][1]
 
@@ -228,7 +229,8 @@ class Search:
 
     def run(self) -> Found:
         """Select, drop what became superfluous, find what does as well."""
-        kept, point = [], self.servos.believed.copy()
+        kept: list[Entry] = []
+        point = self.servos.believed.copy()
         for _ in range(MOST_PASSES):
             accepted, point, trials = self._grown(kept, point)
             kept, point = self._pruned(accepted, point)
@@ -443,13 +445,11 @@ class Search:
         others = [e for e in accepted if e not in members]
         found = []
         for member in members:
-            best = None
-            for k in range(self._starts(member)):
-                start = self._kept([*others, member], point) if member in accepted and not k \
-                    else self._started(self._kept(others, point), [member], k)
-                solved = self._solve([start], [[*others, member]])
-                if best is None or solved.chi2[0] < best.chi2[0]:
-                    best = solved
+            starts = [self._kept([*others, member], point) if member in accepted and not k
+                      else self._started(self._kept(others, point), [member], k)
+                      for k in range(self._starts(member))]
+            best = min((self._solve([start], [[*others, member]]) for start in starts),
+                       key=lambda solved: solved.chi2[0])
             found.append(self._dropped([*others, member], best.points[0], [member])[0])
         return found
 

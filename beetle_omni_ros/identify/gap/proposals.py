@@ -110,7 +110,8 @@ def _refined(problem, begun, state, involved, free):
 def _promising(problem, trials):
     """Indices of the trials, best first, that are worth a fit of their own."""
     best = max(trials[0].gain, 1.0) if trials else 1.0
-    chosen, p = [], problem.p
+    p = problem.p
+    chosen: list[int] = []
     for k, trial in enumerate(trials):
         curved = any(problem.keys[n].curved for n in trial.candidate.keys)
         if trial.gain < (p.promising_curved if curved else p.promising) * best \

@@ -102,7 +102,7 @@ def parameters(a: Analysis, name: str, free: tuple[str, ...], theta: dict[str, f
                 and (not member or key.name in free)]
         values = [key.value(theta.get(key.name, 0.0)) for key in keys]
         bases = [key.base for key in keys]
-        entry = {'value': values if len(values) > 1 else values[0], 'unit': spec.unit,
+        entry: dict = {'value': values if len(values) > 1 else values[0], 'unit': spec.unit,
                  'file': bases if len(bases) > 1 else bases[0]}
         if with_intervals:
             widths = [key.width(theta.get(key.name, 0.0), a.widths.get(key.name, 0.0))
@@ -129,7 +129,7 @@ def at_least(stiction: dict, coulomb: dict) -> None:
 
 def evidence(a: Analysis, trial: Trial) -> dict:
     """Numbers behind a decision."""
-    count = len(a.problem.time)
+    count = len(a.fit.time)
     held = trial.held
     return {'delta_bic': trial.gain - len(trial.candidate.keys) * math.log(count),
             'delta_chi2': trial.gain, 'cv_gain': held.total, 'cv_gain_se': held.sigmas,

@@ -50,7 +50,7 @@ class Search:
         self.wide = {name: problem.p.wide * problem.keys[name].typical for name in self.names}
         self.always = [name for name in problem.beliefs if name in problem.keys]
 
-    _proposals: Proposals | None = None     # of the present step
+    _proposals: Proposals       # of the present step
 
     def run(self) -> Found:
         """Search; see the module."""
@@ -68,7 +68,7 @@ class Search:
             for trial in trials:
                 found.trials[trial.candidate.label] = trial
             best = self._judge(trials, cost, floor, [t.candidate for t in found.accepted])
-            while best is None and self._proposals and (more := self._proposals.fit_more()):
+            while best is None and (more := self._proposals.fit_more()):
                 best = self._judge(more, cost, floor, [t.candidate for t in found.accepted])
                 found.trials |= {trial.candidate.label: trial for trial in more}
             if best is None or len(found.accepted) >= self.p.most_effects:

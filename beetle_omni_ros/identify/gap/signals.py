@@ -189,15 +189,15 @@ class Signals:
             if gap > 0:
                 fine = play(fine, gap / 2)
             if self.guide is not None:
-                return *self._guided(raw, gap), raw
+                return *self._guided(self.guide, raw, gap), raw
             return tuple(self._smooth(fine, self.p.smooth_joint, k) for k in range(3)) + (raw,)
         return self._cached('joints', theta, names, make)
 
-    def _guided(self, raw, gap):
+    def _guided(self, guide, raw, gap):
         """Angle, rate, acceleration (N, 4): slow motion as read, quick motion as expected."""
-        guide = play(self.guide, gap / 2) if gap > 0 else self.guide
         p, expected = self.p, self._expected
         if gap > 0:
+            guide = play(guide, gap / 2)
             expected = derivatives(guide, p.smooth_joint, p.grid)
         slow = [within(low_pass(p.guide_edge, 1, p.grid), raw - guide, 0)]
         for _ in range(2):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import orth
@@ -33,12 +33,12 @@ class Remainder:
 
     """
 
-    gain: float
-    positive: float
-    channels: list[tuple[str, float]]
-    terms: list[tuple[str, float]]
-    frame: str
-    size: dict[str, float]
+    gain: float = 0.0
+    positive: float = 0.0
+    channels: list[tuple[str, float]] = field(default_factory=list)
+    terms: list[tuple[str, float]] = field(default_factory=list)
+    frame: str = 'body'
+    size: dict[str, float] = field(default_factory=dict)
 
     @property
     def text(self) -> str:
@@ -94,7 +94,8 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
         names: keys that were fitted; their slopes are taken out first.
 
     """
-    labels, columns = None, []
+    labels: list[str] = []
+    columns = []
     for model in problem.models:
         made = features(model, state.theta)
         labels = labels or list(made)

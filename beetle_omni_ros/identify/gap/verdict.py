@@ -37,10 +37,10 @@ def _out_of_sight(a, p):
 
 def decide(a: Analysis, p: GapParameters) -> None:
     """Set verdict, reason, what explains only a part, and what to fly next."""
-    found, count = a.found, len(a.problem.time)
+    found, count = a.found, len(a.fit.time)
     before, after, floor = found.cost
     # Everything at once also fits some noise: a chi2 of one for each number without a belief.
-    floor += sum(name not in a.problem.beliefs for name in found.state.names)
+    floor += sum(name not in a.fit.beliefs for name in found.state.names)
     # A latency of a millisecond is no unknown, however clearly it shows; nor is a gust, which
     # differs from flight to flight, or the answers to it.
     small = max((t.gain for t in found.trials.values()
@@ -99,10 +99,10 @@ def disagreement(a: Analysis, gap: float) -> None:
     """
     if a.verdict != 'no_gap':
         return
-    if not gap <= a.problem.p.agreement:
+    if not gap <= a.fit.p.agreement:
         a.verdict = 'unknown'
         a.reason = (f'free runs are {gap:.2f} noise floors off, and no known effect explains it; '
-                    f'flights without a gap have at most {a.problem.p.agreement:g}')
+                    f'flights without a gap have at most {a.fit.p.agreement:g}')
         a.experiment = _experiment(a, [], [])
 
 
