@@ -11,13 +11,19 @@ parameter sets, so that many starts, terms and blocks are fitted at once.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+import ctypes
 from dataclasses import dataclass
+from functools import cache
+import logging
 
+import casadi as ca
 import numpy as np
 
 from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.robot.native import built, CompilerError, EXACT, generated
 from beetle_omni_ros.robot.parameters import JointParameters
-from beetle_omni_ros.robot.servo import NUMPY, play, Servo, Step
+from beetle_omni_ros.robot.servo import CASADI, NUMPY, play, Servo, Step
 
 LONGEST_STEP = 0.0025   # [s]; with (wn step)^2 / 24 the frequency is true to 0.3 % at 100 rad/s
 NEVER = 1e3             # a limit that is never reached
@@ -63,6 +69,28 @@ TERMS = {
 NAMES = tuple(TERMS)
 INDEX = {name: k for k, name in enumerate(NAMES)}
 OFF = np.array([term.off for term in TERMS.values()])
+# Those that act in a step; delay and offset act before, play after it.
+MOVING = tuple(name for name in NAMES if name not in ('delay', 'offset', 'backlash'))
+# Arrays of (steps, sets), of states one row more; numbers: (NUMBERS, sets).
+LOOP = """
+void servo_run(long steps, long sets, double step, const double *command, const double *early,
+         const double *numbers, double *middle, double *velocity) {
+    const double *arguments[ARGUMENTS];
+    double *results[RESULTS], work[WORK];
+    for (long at = 0; at < steps * sets; at++) {
+        arguments[0] = command + at;
+        arguments[1] = early + at;
+        arguments[2] = middle + at;
+        arguments[3] = velocity + at;
+        arguments[4] = &step;
+        for (long k = 0; k < NUMBERS; k++)
+            arguments[5 + k] = numbers + k * sets + at % sets;
+        results[0] = middle + at + sets;
+        results[1] = velocity + at + sets;
+        servo_step(arguments, results, 0, work, 0);
+    }
+}
+"""
 
 
 def published_set(joint: JointParameters) -> np.ndarray:
@@ -121,37 +149,73 @@ def _commands(log, joint, delay, edges, held):
 
 def _integrate(value, command, early, q, v, step):
     """Positions (K + 1, B); ``early``: where within a step the command changes."""
-    stiffness = value['natural_frequency']**2
-    damping = 2 * value['damping_ratio'] * value['natural_frequency']
-    coulomb, stiction = value['coulomb_friction'] * stiffness, value['stiction'] * stiffness
-    torque, speed = value['torque_limit'], value['velocity_limit']
-    sticky, weak, slow = (coulomb + stiction).any(), (torque < 0.9 * NEVER).any(), \
-        (speed < 0.9 * NEVER).any()
-    servo = Servo(1.0, stiffness, damping, speed if slow else None,
-                  torque * stiffness if weak else None, coulomb=coulomb if sticky else None,
-                  stiction=coulomb + stiction, fading_rate=value['stribeck_velocity'],
-                  gaussian=False)
-    move = Step(NUMPY, servo, step)
-    sine, cosine = value['load_sine'] * stiffness, value['load_cosine'] * stiffness
-    loaded = sine.any() or cosine.any()
     # Positions half a step ahead of their velocities: one addition moves both halves.
     middle, velocity = np.empty((2, len(command) + 1, len(q)))
     middle[0], velocity[0] = q + 0.5 * step * v, v
-    jumps, jump = early.any(axis=1).tolist(), early * (move.gain * stiffness * step)
-    for k, (target, here, before) in enumerate(zip(command, middle, velocity)):
-        load = -sine * np.sin(here) - cosine * np.cos(here) if loaded else None
-        after = velocity[k + 1] = move.kick(target, here, before, load)
-        middle[k + 1] = here + step * after
-        if jumps[k]:
-            # A joint that friction or a limit holds does not feel when the command changed.
-            free = after != 0
-            if slow:
-                free &= np.abs(after) < speed
-            if weak:
-                free &= np.abs(target - here) < torque
-            middle[k + 1] += jump[k] * free
+    if (run := _compiled()) is not None:
+        run(*command.shape, step, *(np.ascontiguousarray(x) for x in (
+            command, early, [value[name] for name in MOVING])), middle, velocity)
+    else:
+        acting = {name: value[name] if (value[name] != TERMS[name].off).any() else None
+                  for name in MOVING}
+        advance = _advance(NUMPY, acting, step)
+        for k, (target, part) in enumerate(zip(command, early, strict=True)):
+            middle[k + 1], velocity[k + 1] = advance(target, part, middle[k], velocity[k])
     positions = middle - 0.5 * step * velocity
     return play(positions, value['backlash']) if value['backlash'].any() else positions
+
+
+def _advance(space, value, step):
+    """Motion over one step; of ``value`` what is None has no effect."""
+    stiffness = value['natural_frequency']**2
+    damping = 2 * value['damping_ratio'] * value['natural_frequency']
+    torque, speed = value['torque_limit'], value['velocity_limit']
+    coulomb, above, sine, cosine = (
+        0.0 if value[name] is None else value[name] * stiffness
+        for name in ('coulomb_friction', 'stiction', 'load_sine', 'load_cosine'))
+    rubs = value['coulomb_friction'] is not None or value['stiction'] is not None
+    loaded = value['load_sine'] is not None or value['load_cosine'] is not None
+    fading = value['stribeck_velocity']
+    move = Step(space, Servo(
+        1.0, stiffness, damping, speed, None if torque is None else torque * stiffness,
+        coulomb=coulomb if rubs else None, stiction=coulomb + above,
+        fading_rate=TERMS['stribeck_velocity'].off if fading is None else fading,
+        gaussian=False), step)
+    jump = move.gain * stiffness * step
+
+    def advance(target, early, here, before):
+        load = -sine * space.sin(here) - cosine * space.cos(here) if loaded else None
+        after = move.kick(target, here, before, load)
+        # A joint that friction or a limit holds does not feel when the command changed.
+        free = after != 0
+        if speed is not None:
+            free = free * (space.maximum(after, -after) < speed)
+        if torque is not None:
+            error = target - here
+            free = free * (space.maximum(error, -error) < torque)
+        return here + step * after + jump * early * free, after
+    return advance
+
+
+@cache
+def _compiled() -> Callable | None:
+    """All steps of all sets in C; None where nothing compiles, and numpy takes its place."""
+    step, *state = (ca.SX.sym(name) for name in ('step', 'target', 'early', 'here', 'before'))
+    numbers = [ca.SX.sym(name) for name in MOVING]
+    advance = ca.Function('servo_step', [*state, step, *numbers], list(
+        _advance(CASADI, dict(zip(MOVING, numbers, strict=True)), step)(*state)))
+    sizes = {'ARGUMENTS': advance.sz_arg(), 'RESULTS': advance.sz_res(),
+             'WORK': max(advance.sz_w(), 1), 'NUMBERS': len(MOVING)}
+    source = '\n'.join([generated([advance]), *(
+        f'#define {name} {size}' for name, size in sizes.items()), LOOP])
+    try:
+        run = ctypes.CDLL(str(built('servo', source, EXACT))).servo_run
+    except (CompilerError, OSError) as error:
+        logging.getLogger(__name__).info('servos move in numpy: %s', str(error).splitlines()[0])
+        return None
+    array = np.ctypeslib.ndpointer(float, flags='C_CONTIGUOUS')
+    run.restype, run.argtypes = None, [ctypes.c_long, ctypes.c_long, ctypes.c_double, *[array] * 5]
+    return run
 
 
 def _at_samples(positions, places):

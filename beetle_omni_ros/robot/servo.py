@@ -30,10 +30,12 @@ class Namespace(NamedTuple):
     exp: Any
     sqrt: Any
     where: Any
+    sin: Any
+    cos: Any
 
 
-NUMPY = Namespace(np.minimum, np.maximum, np.exp, np.sqrt, np.where)
-CASADI = Namespace(ca.fmin, ca.fmax, ca.exp, ca.sqrt, ca.if_else)
+NUMPY = Namespace(np.minimum, np.maximum, np.exp, np.sqrt, np.where, np.sin, np.cos)
+CASADI = Namespace(ca.fmin, ca.fmax, ca.exp, ca.sqrt, ca.if_else, ca.sin, ca.cos)
 
 
 @dataclass(frozen=True)

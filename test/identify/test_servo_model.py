@@ -5,6 +5,7 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 from servo_logs import servo, sweep
 
+from beetle_omni_ros.identify import servo_model
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.servo_model import INDEX, OFF, published_set, simulate
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -97,3 +98,19 @@ def test_the_published_set_has_the_frequency_of_the_robot_file():
     frequency, damping = values[INDEX['natural_frequency']], values[INDEX['damping_ratio']]
     assert joint.inertia * frequency**2 == pytest.approx(joint.kp)
     assert 2 * damping * frequency * joint.inertia == pytest.approx(joint.kd)
+
+
+@pytest.mark.parametrize('values', [
+    {}, {'coulomb_friction': 0.013, 'stiction': 0.01}, {'velocity_limit': 3.0},
+    {'torque_limit': 0.12, 'load_sine': 0.05, 'load_cosine': -0.02}, {'backlash': 0.02}])
+def test_without_a_compiler_the_numbers_are_the_same(values, monkeypatch):
+    log = log_for(*sweep(duration=1.0))
+    compiled = simulate(log, 0, parameter_set(delay=0.0137, **values))
+    monkeypatch.setattr(servo_model, '_compiled', lambda: None)
+    assert np.allclose(simulate(log, 0, parameter_set(delay=0.0137, **values)), compiled,
+                       rtol=0, atol=1e-9)
+
+
+def test_where_nothing_compiles_numpy_takes_its_place(monkeypatch):
+    monkeypatch.setenv('CC', '/nowhere/cc')
+    assert servo_model._compiled.__wrapped__() is None
