@@ -184,8 +184,9 @@ def _joint(element):
     kind, axis = element.get('type'), element.find('axis')
     if kind not in ('fixed', 'revolute', 'continuous'):
         raise ValueError(f"joint type '{kind}': expected fixed, revolute or continuous")
+    position, quaternion = _origin(element)
     return Joint(element.attrib['name'], element.find('parent').attrib['link'],
-                 element.find('child').attrib['link'], *_origin(element),
+                 element.find('child').attrib['link'], position, quaternion,
                  None if kind == 'fixed' else
                  _numbers('1 0 0' if axis is None else axis.attrib['xyz'], 3))
 

@@ -57,7 +57,8 @@ def read_recording(path: str | Path) -> Recording:
     """
     warnings: list[str] = []
     states: list[tuple[float, str]] = []
-    data, when = defaultdict(list), defaultdict(list)
+    data: dict[str, list] = defaultdict(list)
+    when: dict[str, list] = defaultdict(list)
     known: dict[str, str | None] = {}
     bad: dict[str, int] = {}
     namespaces: set[str] = set()
