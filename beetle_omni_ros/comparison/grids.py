@@ -23,7 +23,6 @@ class Task:
     """Where a table finds its numbers: a task under one set of conditions."""
 
     def __init__(self, results: dict, task: str, conditions: str):
-        """See the class."""
         self.results, self.task, self.conditions = results, task, conditions
         self.numbers = results['summary']['tasks'][task]
         self.ours = [name for name in results['meta']['controllers']

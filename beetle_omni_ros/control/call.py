@@ -21,7 +21,6 @@ class FunctionCall:
     """
 
     def __init__(self, function: ca.Function, library: ctypes.CDLL | None):
-        """Bind the buffers; see the class."""
         self._arguments = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
         self._result = np.zeros(function.numel_out(0))
         if library is None:

@@ -45,7 +45,6 @@ class DisturbanceEstimator:
 
     def __init__(self, robot: RobotParameters, parameters: DisturbanceParameters,
                  command_delay: float, advance: FunctionCall):
-        """See the class."""
         self._robot, self._advance = robot, advance
         self._delay = command_delay
         p = parameters

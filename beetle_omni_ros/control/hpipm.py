@@ -73,7 +73,6 @@ class OcpQp:
 
     def __init__(self, state_sizes, input_sizes, state_bounds, soft, tolerance, max_iterations,
                  general):
-        """Allocate HPIPM's structures; see the class."""
         self._lib = lib = _library()
         self._memory = []
         horizon = len(state_sizes) - 1

@@ -85,7 +85,6 @@ class PolicyController:
     """
 
     def __init__(self, robot: RobotParameters, parameters: PolicyParameters | None = None):
-        """Load the policy and run it a few times."""
         p = self._parameters = parameters or PolicyParameters.load()
         self.network = PolicyNetwork(p.policy, robot, p.allow_other_robot)
         self.contract = contract = self.network.contract

@@ -44,7 +44,6 @@ class PolicyNetwork:
 
     def __init__(self, path: str | Path, robot: RobotParameters,
                  allow_other_robot: bool = False):
-        """Load, check, warm up."""
         path = find(path)
         try:
             data = _content(path)

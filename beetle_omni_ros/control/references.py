@@ -42,7 +42,6 @@ class ReferencePlanner:
 
     def __init__(self, robot: RobotParameters, times: np.ndarray, unwind: float,
                  servo_lag: float):
-        """See the class."""
         self._times, self._unwind, self._robot = times, unwind, robot
         self._allocator = Allocator(robot)
         self._movable = np.ones(4, dtype=bool)
@@ -139,7 +138,6 @@ class EffectWrench:
     """
 
     def __init__(self, robot: RobotParameters, allocator: Allocator, nodes: int):
-        """Build the function; nothing is compiled."""
         self.needed = any(CATALOGUE[name].apply is not None and not CATALOGUE[name].allocated
                           for name in robot.effects)
         if not self.needed:

@@ -34,7 +34,6 @@ class CompiledRti:
     """
 
     def __init__(self, ocp: Ocp, intervals, soft, tolerance, max_iterations, reaches=0, extra=()):
-        """Compile (or load) and allocate; see the class."""
         self.library = lib = compiled_library([ocp.stage, ocp.terminal, *extra])
         lib.rti_create.restype = c_void_p
         lib.rti_create.argtypes = [c_int, _DOUBLES, c_int, c_int, _DOUBLES, c_double, c_int,
@@ -58,7 +57,6 @@ class CompiledRti:
         self.inputs = np.ctypeslib.as_array(lib.rti_inputs(self._handle), (n, INPUT_SIZE))
 
     def __del__(self):
-        """Free the C side."""
         if getattr(self, '_handle', None):
             self.library.rti_free(self._handle)
             self._handle = None

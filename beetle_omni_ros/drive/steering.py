@@ -32,7 +32,6 @@ class Steering:
     def __init__(self, parameters: DriveParameters,
                  why_not: Callable[[np.ndarray, np.ndarray], str], position: np.ndarray,
                  quaternion: np.ndarray):
-        """See the class."""
         self._p, self._why_not = parameters, why_not
         self.position, self.quaternion = np.array(position, dtype=float), np.array(quaternion)
         self.goal = self.position, self.quaternion

@@ -169,12 +169,10 @@ class MotorBoard:
         self._link.close()
 
     def __enter__(self) -> MotorBoard:
-        """Open."""
         self.open()
         return self
 
     def __exit__(self, *_) -> None:
-        """Close."""
         self.close()
 
     @property

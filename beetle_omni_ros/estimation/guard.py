@@ -23,7 +23,6 @@ class InputGuard:
     """
 
     def __init__(self, parameters: EkfParameters):
-        """Take limits from the parameters."""
         self._imu, self._mocap = parameters.imu, parameters.mocap
         self.rejected: Counter = Counter()
         self.clock_jumped = False

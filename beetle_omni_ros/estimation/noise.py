@@ -21,7 +21,6 @@ class RunningMedian:
     """Median of the last ``WINDOW`` values."""
 
     def __init__(self):
-        """Begin empty."""
         self._recent: deque = deque()
         self._sorted: list[float] = []
 
@@ -49,7 +48,6 @@ class NoiseMonitor:
     """
 
     def __init__(self, mocap: MocapParameters):
-        """Begin with the parameters' claim."""
         self._claims = [MEDIAN * GAIN * mocap.position_noise ** 2,
                         MEDIAN * GAIN * mocap.orientation_noise ** 2]
         self._limit = mocap.noise_scale_limit ** 2

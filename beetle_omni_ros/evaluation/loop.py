@@ -70,7 +70,6 @@ class FlightLoop:
                  controllers: dict[str, Controller], supervisor: Supervisor, recorder,
                  gyroscope_noise: float, faults: Sequence[Fault] = (),
                  check_target: Callable[[Target], str] = lambda target: ''):
-        """See the class."""
         self._gyroscope_noise = gyroscope_noise
         self._faults, self._check_target = tuple(faults), check_target
         self._processes = Processes(simulator.tick, supervisor)

@@ -34,7 +34,6 @@ class Table:
     rows: np.ndarray
 
     def __len__(self):
-        """Count the rows."""
         return len(self.rows)
 
 

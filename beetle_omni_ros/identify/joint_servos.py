@@ -79,7 +79,6 @@ class Servos:
     steps = Steps(2e-4, 8.0, (0.2, 20.0), 5.0, 50.0)
 
     def __init__(self, robot: RobotParameters, joints: tuple[int, ...]):
-        """Lay out the numbers; see the class."""
         self.robot, self.joints = robot, joints
         self.numbers = _numbers(len(joints))
         self.coordinates = Coordinates(self.numbers)

@@ -118,7 +118,6 @@ class Selector:
 
     def __init__(self, fitter: ServoFitter, weight: np.ndarray,
                  allowed: tuple[str, ...] = tuple(CANDIDATES)):
-        """Cut the blocks; see the class."""
         self.fitter, self.log, self.allowed = fitter, fitter.log, allowed
         self.blocks = block_masks(weight, BLOCKS)
         self.all = self.blocks.sum(axis=0)

@@ -128,7 +128,6 @@ class ServoFitter:
 
     def __init__(self, log: JointLog, noise: Noise, layout=APART,
                  prior: Prior = UNKNOWN):
-        """Keep the four; see the class."""
         self.log, self.noise, self.layout, self.prior = log, noise, layout, prior
         self._limits = layout.coordinates.low, layout.coordinates.high
 

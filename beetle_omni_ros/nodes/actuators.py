@@ -39,7 +39,6 @@ class BridgeCounts:
     """
 
     def __init__(self, values: Callable[[str], dict[str, str]]):
-        """Begin the stretch now."""
         self._values = values
         self._first = self._cycles()
 

@@ -51,7 +51,6 @@ class Driver(Operator):
     """
 
     def __init__(self, domain: int, parameters: DriveParameters, robot: RobotParameters):
-        """Join ``domain``."""
         super().__init__(domain)
         self._p, self._checks = parameters, TargetChecks(robot)
         self.odom: Odom | None = None

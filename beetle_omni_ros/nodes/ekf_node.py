@@ -32,7 +32,6 @@ class EkfNode(FlightNode):
     real_time = True
 
     def __init__(self):
-        """Wait for the first poses."""
         super().__init__('ekf_node', EkfNodeParameters, 'params/ekf.yaml', 'ekf_file')
         robot = RobotParameters.load(self.parameters.robot_file or None)
         self._ekf = ErrorStateEkf(self.parameters.of_robot(robot), robot.gravity)

@@ -56,7 +56,6 @@ class Flight:
 
     def __init__(self, graph: Graph, operator: Operator, task: Task, bars: Progress,
                  may_be_slow: bool = True, faults: str = ''):
-        """Prepare the bar."""
         self._graph, self._operator, self._task = graph, operator, task
         self._bridges = [node for node in graph.nodes if node in BRIDGES]
         self._bars, self._faults, self._may_be_slow = bars, faults, may_be_slow

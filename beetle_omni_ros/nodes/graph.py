@@ -37,7 +37,6 @@ class Graph:
 
     def __init__(self, parameters: dict[str, dict], folder: Path, domain: int,
                  composed: bool = True, simulated: bool = False):
-        """Prepare; :meth:`start` starts."""
         if simulated:
             parameters = plan.in_simulated_time(parameters)
         self.folder, self.domain = Path(folder), domain

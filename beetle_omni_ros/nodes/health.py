@@ -24,7 +24,6 @@ class Distribution:
     LOW, RATIO, BINS = 1e-6, 1.02, 1000     # 1 us to 400 s
 
     def __init__(self):
-        """Start empty."""
         self.counts = np.zeros(self.BINS, dtype=np.int64)
         self.count, self.max = 0, 0.0
 
@@ -72,7 +71,6 @@ class Health:
     """
 
     def __init__(self, node: Node):
-        """Attach to ``node``."""
         self._node = node
         self._inputs: dict[str, Input] = {}
         self._compute: Distribution | None = None

@@ -28,7 +28,6 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
     refusals: tuple[type[Exception], ...] = ()
 
     def __init__(self, *args, **kwargs):
-        """Take the arguments of FlightNode."""
         FlightNode.__init__(self, *args, **kwargs)
         LifecycleNodeMixin.__init__(self)
         self.refusal = ''

@@ -57,7 +57,6 @@ class Listener:
 
     def __init__(self, namespace: str = '', domain: int | None = None,
                  discovery: str | None = None, speaks: bool = False):
-        """Join the graph."""
         confine(asked=discovery)
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context, domain_id=domain,

@@ -10,7 +10,6 @@ class NmpcNode(ControllerNode):
     """Publishes nmpc/command, stamped with the state that it answers."""
 
     def __init__(self):
-        """Load (and compile, the first time) the controller."""
         super().__init__('nmpc')
 
 

@@ -40,7 +40,6 @@ class RecorderNode(FlightNode):
     real_time = True        # the times of arrival in the bag are measurements
 
     def __init__(self):
-        """Create the bag, then listen."""
         super().__init__('recorder_node', RecorderNodeParameters)
         topics = topics_with(self.parameters.controllers)
         try:

@@ -40,7 +40,6 @@ class ReferenceNode(FlightNode):
     """
 
     def __init__(self):
-        """Read the task; wait for take-off."""
         super().__init__('reference_node', ReferenceNodeParameters)
         self._task = make_task(self.parameters.task, self.parameters.seed)
         self._player = self._odom = self._trajectory = None

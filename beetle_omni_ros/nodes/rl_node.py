@@ -10,7 +10,6 @@ class RlNode(ControllerNode):
     """Publishes rl/command, stamped with the state that it answers."""
 
     def __init__(self):
-        """Load the policy and compare it with robot and package."""
         super().__init__('rl')
 
 

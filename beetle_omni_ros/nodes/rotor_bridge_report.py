@@ -71,7 +71,6 @@ class RotorBridgeReport:
     """Gathers what the board tells and answers when diagnostics are due."""
 
     def __init__(self, reports: health.Health, arming: Arming, stream: TargetStream):
-        """Add the statuses to the node's ``reports``."""
         self._arming, self._stream = arming, stream
         self._update: BoardUpdate | None = None
         self._battery = self._rotors = None

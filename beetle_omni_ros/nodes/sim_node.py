@@ -82,7 +82,6 @@ class SimNode(FlightNode):
     real_time = True
 
     def __init__(self):
-        """Build the plant at rest on the ground."""
         self._devices: EmulatedActuators | None = None
         self._clock_publisher = None
         super().__init__('sim_node', SimNodeParameters, on_change=self._changed)

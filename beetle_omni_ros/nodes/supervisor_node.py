@@ -50,7 +50,6 @@ class SupervisorNode(FlightNode):
     real_time = True
 
     def __init__(self):
-        """Begin disarmed."""
         super().__init__('supervisor_node', SupervisorNodeParameters, 'params/supervisor.yaml',
                          'supervisor_file', self._changed, changeable=('controller',))
         robot = RobotParameters.load(self.parameters.robot_file or None)

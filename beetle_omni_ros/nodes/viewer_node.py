@@ -43,7 +43,6 @@ class ViewerNode(FlightNode):
     """Publishes robot_description (latched), tf and markers; reads, never commands."""
 
     def __init__(self):
-        """Publish the description at once, the rest as it comes."""
         super().__init__('viewer_node', ViewerNodeParameters, on_change=self._changed)
         given = self.parameters
         self._robot = RobotParameters.load(given.robot_file or None)

@@ -89,7 +89,6 @@ class Publisher:
     """
 
     def __init__(self, node: Node, topic: str, qos: Qos | None = None):
-        """Advertise the topic."""
         entry, self._topic = topic_of(topic), topic
         self._publisher = node.create_publisher(message_class(entry.type), topic,
                                                 profile(qos or entry.qos))

@@ -85,7 +85,6 @@ class Numbers:
     """All series of a page, as the script reads them."""
 
     def __init__(self):
-        """Begin without any."""
         self._parts: list[np.ndarray] = []
         self._count = 0
 

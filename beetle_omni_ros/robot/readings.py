@@ -98,7 +98,6 @@ class SpikeFilter:
     """
 
     def __init__(self, force_change: float, rate_change: float):
-        """See the class."""
         self._limits = force_change**2, rate_change**2
         self.reset()
 

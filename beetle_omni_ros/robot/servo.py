@@ -121,7 +121,6 @@ class Step:
     """
 
     def __init__(self, space: Namespace, servo: Servo, duration: float):
-        """Work out what is the same in every step."""
         self._space, self._servo, self._half = space, servo, 0.5 * duration
         per_torque = duration / servo.inertia
         damping = 0.5 * per_torque * servo.kd

@@ -73,7 +73,6 @@ class BagWriter(Recorder):
             self.write_meta(meta)
 
     def __enter__(self) -> BagWriter:
-        """Return self."""
         return self
 
     def __exit__(self, *exception) -> None:

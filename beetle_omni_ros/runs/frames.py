@@ -36,7 +36,6 @@ class FrameWriter:
 
     def __init__(self, write: Callable[[str, str, bytes, float], None], description: str,
                  prefix: str = '/'):
-        """Read the tree."""
         self._write, self._text = write, description
         self._odom, self._joints = f'{prefix}odom', f'{prefix}joint_states'
         self.topics = {'/tf': (TRANSFORMS, EVENT), '/tf_static': (TRANSFORMS, LATCHED),

@@ -33,7 +33,6 @@ class ChunkIndex:
     """
 
     def __init__(self, folder: Path):
-        """Open the file in ``folder``."""
         self._file = tempfile.TemporaryFile(dir=folder)
         self._sizes = array('L')
 
@@ -51,7 +50,6 @@ class ChunkIndex:
             yield record
 
     def __len__(self) -> int:
-        """How many there are."""
         return len(self._sizes)
 
     def close(self) -> None:

@@ -69,7 +69,6 @@ class TargetChecks:
     """
 
     def __init__(self, robot: RobotParameters, limits: TargetLimits | None = None):
-        """See the class."""
         self._p = p = limits or TargetLimits.load()
         feet = [(x * p.feet_spread, y * p.feet_spread, -p.feet) for x in (1, -1) for y in (1, -1)]
         # The joints' axes pass through the rotors' centres and tell where the main body is.

@@ -15,7 +15,6 @@ class Actuators:
     """
 
     def __init__(self):
-        """Nothing heard."""
         self._told: dict[str, str] = {}
 
     def tell(self, name: str, text: str) -> bool:

@@ -51,7 +51,6 @@ class Way:
     """
 
     def __init__(self, times: np.ndarray, quaternions: np.ndarray, lost: float = 0.0):
-        """See the class."""
         self._times, self._quaternions, self.lost = times, quaternions, lost
         self._turns = [rotations.log(rotations.multiply(rotations.conjugate(a), b))
                        for a, b in zip(quaternions[:-1], quaternions[1:])]

@@ -24,7 +24,6 @@ class Battery:
     """
 
     def __init__(self, robot: RobotParameters, pack: PackParameters):
-        """Tabulate the discharge curve and the thrust limit."""
         self._pack = pack
         self._resistance = robot.battery.resistance
         self._levels = pack.charge_levels.tolist()

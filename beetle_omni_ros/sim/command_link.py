@@ -27,7 +27,6 @@ class CommandLink:
 
     def __init__(self, robot: RobotParameters, timing: ActuatorTimingParameters,
                  conditions: Conditions):
-        """Start with tilts at zero and rotors off."""
         self._limit = robot.joints.position_limit
         self._thrust_range = robot.rotors.thrust_min, robot.rotors.thrust_max
         self._timing = timing

@@ -19,7 +19,6 @@ class MotionForces:
     """Aerodynamic forces of one robot, to be added at its base_link."""
 
     def __init__(self, robot: RobotParameters):
-        """Take the coefficients from the robot's effects."""
         effects = robot.effects
         self.wind = np.array(effects.get('wind', {}).get('force', (0.0,) * 3))
         self.body_drag = effects.get('body_drag', {}).get('coefficient', 0.0)
@@ -105,7 +104,6 @@ class CatalogueForces:
     """
 
     def __init__(self, robot: RobotParameters):
-        """Compile the equations, if there are any."""
         self.names = [name for name in robot.effects
                       if CATALOGUE[name].apply and not CATALOGUE[name].plant]
         if self.names:

@@ -55,11 +55,9 @@ class EmulatedActuators:
         board.set_battery(simulator.voltage, simulator.current)
 
     def __enter__(self) -> EmulatedActuators:
-        """Return itself; it works since it was made."""
         return self
 
     def __exit__(self, *_) -> None:
-        """Close."""
         self.close()
 
     def close(self) -> None:

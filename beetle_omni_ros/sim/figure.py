@@ -51,7 +51,6 @@ class Figure:
     """
 
     def __init__(self, robot: RobotParameters, plant: PlantParameters):
-        """Take sizes and places from the robot and its simulated contact geometry."""
         self._robot, self._plant = robot, plant
         self._parts = mass_properties(robot)
         self._look = Look()

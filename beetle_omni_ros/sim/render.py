@@ -84,7 +84,6 @@ class Stage:
 
     def __init__(self, robot: RobotParameters, looks: Sequence[Look], width: int, height: int,
                  field_of_view: float = 30.0, plant: PlantParameters | None = None):
-        """See the class."""
         figure = Figure(robot, plant or SimulatorParameters.load().plant)
         scene = _scene(''.join(map(figure.body, looks)), field_of_view, width, height)
         self._spin = robot.rotors.spin
@@ -105,11 +104,9 @@ class Stage:
                 from error
 
     def __enter__(self) -> Stage:
-        """Return itself."""
         return self
 
     def __exit__(self, *exception) -> None:
-        """Free the graphics context."""
         self._renderer.close()
 
     def draw(self, poses: Sequence[Pose | None], camera: Camera,

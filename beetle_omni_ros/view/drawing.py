@@ -41,7 +41,6 @@ class RobotDrawing:
 
     def __init__(self, scene, name: str, model: Model, robot: RobotParameters,
                  tint: tuple[Colour, float] | None = None):
-        """Add the nodes; nothing is seen before :meth:`show`."""
         self._robot, self._model = robot, model
         self._root = scene.add_frame(name, show_axes=False, visible=False)
         self._joints, self._rotors, paths = [], {}, {}

@@ -58,7 +58,6 @@ class Sampler(Recorder):
     """
 
     def __init__(self):
-        """Know nothing."""
         self.clock = np.nan
         self.remarks: list[tuple[str, str]] = []
         self._row = np.full(WIDTH, np.nan)
@@ -159,12 +158,10 @@ class Rows:
     """
 
     def __init__(self, longest: float = np.inf):
-        """Hold nothing."""
         self._table, self._begin, self._end = np.empty((1024, WIDTH)), 0, 0
         self._longest = longest
 
     def __len__(self) -> int:
-        """Count the rows."""
         return self._end - self._begin
 
     @property

@@ -54,7 +54,6 @@ class Live:
     """
 
     def __init__(self, page: Page, graph: Graph, robot: RobotParameters, allow_targets: bool):
-        """Add the controls."""
         self._page, self._graph = page, graph
         self._checks = TargetChecks(robot)
         self._sampler, self._rows = Sampler(), Rows(KEPT)

@@ -79,7 +79,6 @@ class Page:
 
     def __init__(self, names: list[str], model: Model, robot: RobotParameters, *,
                  title: str = 'Playback', host: str = LOCAL, port: int = 8080, dark: bool = False):
-        """Serve it."""
         self._names, self._robot, self._model, self._title = names, robot, model, title
         try:
             with socket.socket() as probe:      # where that fails, viser would wait for ever

@@ -32,7 +32,6 @@ class Player:
 
     def __init__(self, page: Page, recordings: list[Recording], start: float = 0.0,
                  play: bool = True):
-        """Add the controls."""
         self._page, self._runs = page, recordings
         self.time, self._stop = start, threading.Event()
         gui = page.server.gui

@@ -32,7 +32,6 @@ class BodyModel:
 
     def __init__(self, robot: RobotParameters, keys: dict[str, Key],
                  modules: tuple[float, float]):
-        """See the class."""
         self.names = [name for name, key in keys.items() if key.body]
         self._index = {name: k for k, name in enumerate(self.names)}
         self._p = p = ca.SX.sym('p', len(self.names))

@@ -41,7 +41,6 @@ class State:
     index: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self):
-        """Index the columns."""
         self.index = {name: k for k, name in enumerate(self.names)}
 
     def beside(self, other: State) -> Difference:
@@ -84,7 +83,6 @@ class Problem:
     def __init__(self, models: list[FlightModel], keys: dict[str, Key],
                  beliefs: dict[str, Prior], p: GapParameters,
                  others: list[FlightModel] | tuple = ()):
-        """See the class."""
         self.models, self.keys, self.beliefs, self.p = models, keys, beliefs, p
         self.everyone = [*models, *others]
         self._guides: list[tuple[dict[str, float], list[int]]] = []

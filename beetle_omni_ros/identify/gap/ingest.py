@@ -28,7 +28,6 @@ class UnusableFlight(ValueError):
     """
 
     def __init__(self, text: str, problems: list[Damage] | tuple = ()):
-        """See the class."""
         # Both go to the parent's process, too, which cannot take functions.
         super().__init__(text, [replace(damage, repair=None) for damage in problems])
 
@@ -38,7 +37,6 @@ class UnusableFlight(ValueError):
         return self.args[1]
 
     def __str__(self) -> str:
-        """Return the text alone."""
         return self.args[0]
 
 

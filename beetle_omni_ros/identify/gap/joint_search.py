@@ -140,7 +140,6 @@ class Search:
     """
 
     def __init__(self, log: JointLog, robot: RobotParameters, p: GapParameters | None = None):
-        """Fit the usual numbers once, for the noise; see the class."""
         self.p = p or GapParameters.load()
         self.whole, self.log = log, log.first(FITTED_PART)
         self.servos = Servos(robot, log.joints)

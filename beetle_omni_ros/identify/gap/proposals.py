@@ -32,7 +32,6 @@ class Proposals:
 
     def __init__(self, problem: Problem, candidates: list[Candidate], state: State, cost: float,
                  involved: list[str], free: frozenset[str]):
-        """Estimate all of them from slopes."""
         self.problem, self.state, self.cost = problem, state, cost
         self.involved, self.free = involved, free
         normal = (state.slopes.T @ state.slopes, state.slopes.T @ state.r,

@@ -61,7 +61,6 @@ class FlightModel:
 
     def __init__(self, flight: Flight, robot: RobotParameters, body: BodyModel,
                  keys: dict[str, Key], p: GapParameters):
-        """Prepare signals and servo windows."""
         self.flight, self.robot, self.keys, self.p, self._body = flight, robot, keys, p, body
         self.modules = 0.0
         self.signals = Signals(flight, robot, p)

@@ -43,7 +43,6 @@ class Search:
 
     def __init__(self, problem: Problem, candidates: list[Candidate],
                  progress: Callable[[str], None] = lambda text: None):
-        """See the class."""
         self.problem, self.candidates, self.progress = problem, candidates, progress
         self.p = problem.p
         self.names = [name for name, key in problem.keys.items() if not key.form]

@@ -51,7 +51,6 @@ class Signals:
     """
 
     def __init__(self, flight: Flight, robot: RobotParameters, p: GapParameters):
-        """Splines and integrals that all evaluations share."""
         self.flight, self.robot, self.p = flight, robot, p
         steps = int((flight.duration - 2 * EDGE) / p.grid)
         self.t = EDGE + p.grid * np.arange(steps)

@@ -53,7 +53,6 @@ class Workers:
     """
 
     def __init__(self, subject: Any = None):
-        """Fork nothing yet."""
         self.subject, self.width = subject, width()
         self._pool: ProcessPoolExecutor | None = None
         self._stack = ExitStack()

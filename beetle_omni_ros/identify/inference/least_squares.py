@@ -39,7 +39,6 @@ class Coordinates:
     high: np.ndarray = field(init=False)
 
     def __post_init__(self):
-        """Collect scales and bounds."""
         for name in ('scale', 'logarithmic'):
             object.__setattr__(self, name, np.array([getattr(one, name) for one in self.each]))
         for side in ('low', 'high'):

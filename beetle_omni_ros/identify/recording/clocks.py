@@ -127,7 +127,6 @@ class Ages:
     """
 
     def __init__(self, recording: Recording, limits: RecordingLimits):
-        """Take medians over bins of time."""
         self.recording, self.limits, self.medians = recording, limits, {}
         known = {topic: recording.received[topic] for topic in NEEDED
                  if len(recording.received.get(topic, ())) == len(recording.times[topic]) > 1}

@@ -42,7 +42,6 @@ class FaultWatch:
     """
 
     def __init__(self, parameters: Detection, robot: RobotParameters, allocator: Allocator):
-        """See the class."""
         self._p, self._limit = parameters, robot.joints.position_limit
         self._thrust_max = self._limit_now = robot.rotors.thrust_max
         self._map = ThrustMap(robot.rotors) if len(robot.rotors.map) > 1 else None

@@ -33,7 +33,6 @@ class JointWatch:
     """
 
     def __init__(self, limits: ServoLimits, robot: RobotParameters):
-        """See the class."""
         joints = robot.joints
         self._p, self._rate_limit = limits, joints.velocity_limit
         self._lag = joints.kd / joints.kp

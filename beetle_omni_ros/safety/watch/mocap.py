@@ -28,7 +28,6 @@ class MocapWatch:
     """
 
     def __init__(self, limits: MocapLimits):
-        """See the class."""
         self._p = limits
         self.reset()
 

@@ -39,7 +39,6 @@ class SpeedWatch:
     """
 
     def __init__(self, limits: RotorLimits, robot: RobotParameters):
-        """See the class."""
         self._p, self._lag = limits, robot.rotors.time_constant
         self.reset()
 

@@ -46,7 +46,6 @@ class WrenchWatch:
 
     def __init__(self, rotor: RotorLimits, contact: ContactLimits, robot: RobotParameters,
                  allocator: Allocator):
-        """See the class."""
         self._p, self._contact, self._robot, self._allocator = rotor, contact, robot, allocator
         rotors = robot.rotors
         self._reach = ROTORS * rotors.thrust_max / allocator.mass
@@ -165,7 +164,6 @@ class ContactWatch:
     """
 
     def __init__(self, limits: ContactLimits, gravity: float):
-        """See the class."""
         self._limits, self._gravity = limits, gravity
         self.reset()
 

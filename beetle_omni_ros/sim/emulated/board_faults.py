@@ -40,7 +40,6 @@ class Line:
     """One direction of a cable: loses, spoils and delays pieces, seeded, in order."""
 
     def __init__(self, seed: int):
-        """Start empty."""
         self._random = random.Random(seed)
         self._waiting: list = []
         self._count = 0

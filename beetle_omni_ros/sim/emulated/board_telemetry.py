@@ -44,7 +44,6 @@ class BoardTelemetry:
     """
 
     def __init__(self, parameters: EmulatedBoardParameters, cells: int):
-        """Measure nothing yet."""
         self._arm_voltage = cells * parameters.arm_cell_voltage
         self._heartbeat = Timer(parameters.heartbeat_rate)
         self._reception = Timer(parameters.reception_rate)

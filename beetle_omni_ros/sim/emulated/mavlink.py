@@ -81,7 +81,6 @@ class Parser:
     """
 
     def __init__(self):
-        """Start with nothing."""
         self._buffer = bytearray()
         self._expected = None
         self.bad_crc = self.lost = 0

@@ -85,11 +85,9 @@ class EmulatedMotorBoard:
         self._terminal.close()
 
     def __enter__(self) -> EmulatedMotorBoard:
-        """Already on."""
         return self
 
     def __exit__(self, *_) -> None:
-        """Power off."""
         self.close()
 
     @property

@@ -129,11 +129,9 @@ class EmulatedServoBus:
         self._thread.start()
 
     def __enter__(self):
-        """Return itself; it runs since it was made."""
         return self
 
     def __exit__(self, *_):
-        """Stop."""
         self.close()
 
     @property
