@@ -8,7 +8,9 @@ import tempfile
 
 import numpy as np
 
-from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.control.base import Command, PoseTarget
+from beetle_omni_ros.messages.values import Odom
+from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
 from beetle_omni_ros.runs.bag import BagWriter, read_bag, read_messages
 from beetle_omni_ros.runs.report import make_page, make_runs, results_of
 
@@ -25,14 +27,16 @@ def bags(folder: Path) -> dict[str, bytes]:
                                        stamp=1.5))
         for k in range(60):
             t = 1 + 0.05 * k
-            writer.write_truth(t, ZERO, LEVEL, ZERO, ZERO)
-            writer.write_odom(t, ZERO, LEVEL, ZERO, ZERO)
-            writer.write_imu(t, ZERO, ZERO)
-            writer.write_mocap(t, ZERO, LEVEL)
-            writer.write_joints(t, np.zeros(4), np.zeros(4))
-            writer.write_battery(t, 24.0, -10.0)
-            writer.write_command(t, np.zeros(4), np.ones(4))
-            writer.write_state(t, 'flying:nmpc')
+            for topic, value in (
+                    ('ground_truth/odom', Odom(t, ZERO, ZERO, LEVEL, ZERO)),
+                    ('odom', Odom(t, ZERO, ZERO, LEVEL, ZERO)),
+                    ('imu/data_raw', ImuReading(t, ZERO, ZERO)),
+                    ('mocap/pose', PoseReading(t, ZERO, LEVEL)),
+                    ('joint_states', JointReading(t, np.zeros(4), np.zeros(4))),
+                    ('battery_state', BatteryReading(t, 24.0, -10.0)),
+                    ('command', Command(t, np.zeros(4), np.ones(4)))):
+                writer.write(topic, value)
+            writer.write('supervisor/state', 'flying:nmpc', t)
             writer.write_diagnostic(t, 'nmpc_node', {'rejected': '3'}, 1, 'late')
     return {'bag': next((folder / 'bag').glob('*.mcap')).read_bytes()}
 

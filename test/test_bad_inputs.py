@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from synthetic_flights import write_imu
 
 from beetle_omni_ros import cli
 from beetle_omni_ros.robot.resources import share_path
@@ -214,7 +215,7 @@ def inputs(tmp_path_factory):
     (folder / DB3).parent.mkdir()
     (folder / DB3).touch()
     with BagWriter(folder / 'imu_only') as writer:
-        writer.write_imu(1.0, (0, 0, 9.8), (0, 0, 0))
+        write_imu(writer, 1.0, (0, 0, 9.8), (0, 0, 0))
     return folder
 
 

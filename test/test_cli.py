@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from synthetic_flights import fly
+from synthetic_flights import fly, write_imu
 
 from beetle_omni_ros import __version__, cli
 from beetle_omni_ros.runs.bag import BagWriter
@@ -177,7 +177,7 @@ def test_report_refuses_what_is_no_flight(capsys, bag, tmp_path):
     out = ['-o', tmp_path / 'page.html']
     assert 'no such bag' in refused(capsys, 'report', tmp_path / 'none', *out)
     with BagWriter(tmp_path / 'imu_only') as writer:
-        writer.write_imu(1.0, (0, 0, 9.8), (0, 0, 0))
+        write_imu(writer, 1.0, (0, 0, 9.8), (0, 0, 0))
     assert 'ground_truth/odom' in refused(capsys, 'report', tmp_path / 'imu_only', *out)
     assert 'at most' in refused(capsys, 'report', *[bag] * 7, *out)
     assert 'page.html' in refused(capsys, 'report', bag, '-o', tmp_path / 'no' / 'page.html')

@@ -48,7 +48,7 @@ class BagWriter(Recorder):
             topics: names to declare, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
             compression: of the chunks in the file, 'none' or 'zstd'.
             description: URDF of the robot, whose frames then come into the bag; '' for none.
-            epoch: UNIX time [s] at which the times of the ``write_*`` calls begin: a flight that
+            epoch: UNIX time [s] at which the times of the ``write`` calls begin: a flight that
                 begins at 0 s gets a real date.
 
         Raises:

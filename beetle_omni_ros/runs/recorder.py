@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.control.base import Command, PoseTarget, Target
+from beetle_omni_ros.control.base import PoseTarget, Target
 from beetle_omni_ros.messages.topics import requester
-from beetle_omni_ros.messages.values import Diagnostic, Odom, Wrench
-from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
+from beetle_omni_ros.messages.values import Diagnostic
 from beetle_omni_ros.runs.log import (
     Commands,
     COMPUTE_KEYS,
@@ -30,7 +29,7 @@ from beetle_omni_ros.runs.log import (
 
 class Recorder:
     """
-    What takes a flight: :meth:`write` for every topic, and shorter calls that lead to it.
+    What takes a flight: :meth:`write` for every topic, and shorter calls for some.
 
     Attributes:
         keeps_covariances: whether those of ``odom`` go anywhere.
@@ -55,52 +54,10 @@ class Recorder:
         """Add to what is known of the flight: task, conditions, seed, robot, version."""
         raise NotImplementedError
 
-    def write_truth(self, t, position, quaternion, velocity, angular_velocity) -> None:
-        """Simulated truth; velocity in world, angular velocity in base_link."""
-        self.write('ground_truth/odom', Odom(t, position, velocity, quaternion, angular_velocity))
-
-    def write_odom(self, t, position, quaternion, velocity, angular_velocity, *covariances,
-                   ) -> None:
-        """Record an estimate; velocity in world; covariances as :class:`Odom` has them."""
-        self.write('odom', Odom(t, position, velocity, quaternion, angular_velocity,
-                                *covariances))
-
-    def write_imu(self, t, specific_force, angular_velocity) -> None:
-        """One IMU sample in base_link."""
-        self.write('imu/data_raw', ImuReading(t, specific_force, angular_velocity))
-
-    def write_mocap(self, t, position, quaternion, received=None) -> None:
-        """One MoCap pose, captured at ``t``, available at ``received``."""
-        self.write('mocap/pose', PoseReading(t, position, quaternion), received)
-
-    def write_joints(self, t, position, velocity, effort=None, received=None) -> None:
-        """One joint feedback, captured at ``t``, available at ``received``."""
-        self.write('joint_states', JointReading(t, position, velocity, effort), received)
-
-    def write_battery(self, t, voltage, current) -> None:
-        """Pack voltage [V] and current [A, negative when discharging]."""
-        self.write('battery_state', BatteryReading(t, voltage, current))
-
-    def write_command(self, t, tilt, thrust, received=None) -> None:
-        """Record the selected command; ``t`` is the stamp of the estimate that it answers."""
-        self.write('command', Command(t, tilt, thrust), received)
-
-    def write_request(self, controller: str, t, tilt, thrust, received=None) -> None:
-        """What one controller asked for, before the supervisor."""
-        self.write(f'{controller}/command', Command(t, tilt, thrust), received)
-
-    def write_wrench(self, t, force_world, torque_body) -> None:
-        """External wrench from ``t`` until the next."""
-        self.write('disturbance', Wrench(t, force_world, torque_body))
-
     def write_target(self, target: Target, received=None) -> None:
         """One pose or trajectory target, in force from its stamp."""
         self.write('target_pose' if isinstance(target, PoseTarget) else 'target_trajectory',
                    target, received)
-
-    def write_state(self, t, state: str) -> None:
-        """Record the supervisor's state, e.g. 'flying:nmpc', whenever it changes."""
-        self.write('supervisor/state', state, t)
 
     def write_compute(self, t, controller: str, **times) -> None:
         """

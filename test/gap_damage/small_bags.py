@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from synthetic_flights import write_battery, write_command, write_imu, write_joints, write_mocap
 
 from beetle_omni_ros.runs.bag import BagWriter
 
@@ -15,13 +16,13 @@ def small_bag(path, phase=0.0):
             t = 1.0 + k / 200
             s = np.sin(t * np.array([1.1, 1.7, 2.3]) + phase)
             turn = Rotation.from_rotvec(1.5 * s)
-            bag.write_imu(t, turn.inv().apply([0.1 * s[0], 0, GRAVITY]), 2.5 * s[::-1])
+            write_imu(bag, t, turn.inv().apply([0.1 * s[0], 0, GRAVITY]), 2.5 * s[::-1])
             if k % 2:
                 continue
             q = 0.3 + 0.2 * np.sin(t * np.array([1.0, 1.3, 1.6, 1.9]) + phase)
-            bag.write_mocap(t, [s[0], 2 * s[1], 1.5 + 0.3 * s[2]], turn.as_quat())
-            bag.write_joints(t, q, q - 0.3)
-            bag.write_command(t, q + 0.01, 7 + q)
+            write_mocap(bag, t, [s[0], 2 * s[1], 1.5 + 0.3 * s[2]], turn.as_quat())
+            write_joints(bag, t, q, q - 0.3)
+            write_command(bag, t, q + 0.01, 7 + q)
             if k % 40 == 0:
-                bag.write_battery(t, 24.0, -20.0)
+                write_battery(bag, t, 24.0, -20.0)
     return path

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from servo_logs import sweep
+from synthetic_flights import write_command, write_joints
 
 from beetle_omni_ros.identify import joint_bag
 from beetle_omni_ros.identify.csv_table import LogError
@@ -15,11 +16,11 @@ def recorded(folder, t, command, sent=None, joints=True):
     with BagWriter(folder) as bag:
         for k, (now, wanted) in enumerate(zip(t.tolist(), command.tolist())):
             if sent is None or sent[k]:
-                bag.write_command(now - 0.003, np.array([wanted, -wanted, 0.5 * wanted, wanted]),
-                                  np.full(4, 7.0), received=now - 0.001)
+                write_command(bag, now - 0.003, np.array([wanted, -wanted, 0.5 * wanted, wanted]),
+                              np.full(4, 7.0), received=now - 0.001)
             if joints:
-                bag.write_joints(now, 0.9 * np.array([wanted, -wanted, 0.5 * wanted, wanted]),
-                                 np.zeros(4))
+                write_joints(bag, now, 0.9 * np.array([wanted, -wanted, 0.5 * wanted, wanted]),
+                             np.zeros(4))
     return folder
 
 

@@ -6,7 +6,7 @@ from browser import browser, cut_off, opened, WIDTHS
 import numpy as np
 import pytest
 from rich.console import Console
-from synthetic_flights import fly
+from synthetic_flights import fly, write_state
 
 from beetle_omni_ros.runs.bag import BagWriter
 from beetle_omni_ros.runs.report import run_report
@@ -21,7 +21,7 @@ def page_file(tmp_path_factory):
         with BagWriter(folder / name, {'task': 'waypoints', 'seed': 0}) as writer:
             fly(writer, make_task('waypoints'), offset=offset, duration=24.5)
             if name == 'far':
-                writer.write_state(25.6, 'landing:rotor2_lost')
+                write_state(writer, 25.6, 'landing:rotor2_lost')
     run_report([folder / 'near', folder / 'far'], folder / 'page.html',
                console=Console(file=io.StringIO()))
     return folder / 'page.html'

@@ -2,8 +2,10 @@
 
 import numpy as np
 
-from beetle_omni_ros.control.base import PoseTarget
+from beetle_omni_ros.control.base import Command, PoseTarget
+from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.readings import BatteryReading, ImuReading, JointReading, PoseReading
 
 TICK = 0.005
 
@@ -29,8 +31,8 @@ def fly(recorder, task, *, start=1.0, controller='nmpc', offset=0.02, angle=3.0,
     rng = np.random.default_rng(seed)
     targets = task.targets(start)
     length = (task.duration if duration is None else duration) + after
-    recorder.write_state(start - 1.0, 'takeoff')
-    recorder.write_state(start - 0.01, f'flying:{controller}')
+    write_state(recorder, start - 1.0, 'takeoff')
+    write_state(recorder, start - 0.01, f'flying:{controller}')
     target, previous, current = None, np.array([0.0, 0.0, 1.0]), -1
     for k in range(-20, round(length / TICK) + 1):
         t = start + k * TICK
@@ -49,25 +51,76 @@ def fly(recorder, task, *, start=1.0, controller='nmpc', offset=0.02, angle=3.0,
         turn = rotations.exp(np.array([0, 0, np.radians(angle)]))
         quaternion = rotations.multiply(reference.quaternion, turn)
         _record(recorder, t, k, rng, position, quaternion, reference, controller)
-    recorder.write_state(start + length, 'landing')
+    write_state(recorder, start + length, 'landing')
 
 
 def _record(recorder, t, k, rng, position, quaternion, reference, controller):
     velocity, rate = reference.velocity, reference.angular_velocity
-    recorder.write_truth(t, position, quaternion, velocity, rate)
-    recorder.write_odom(t, position + 1e-3 * rng.normal(size=3), quaternion, velocity, rate)
-    recorder.write_imu(t, np.array([0, 0, 9.8]) + 0.05 * rng.normal(size=3), rate)
+    write_truth(recorder, t, position, quaternion, velocity, rate)
+    write_odom(recorder, t, position + 1e-3 * rng.normal(size=3), quaternion, velocity, rate)
+    write_imu(recorder, t, np.array([0, 0, 9.8]) + 0.05 * rng.normal(size=3), rate)
     tilt = 0.3 * np.sin(0.5 * t + np.arange(4.0))
-    recorder.write_joints(t - 0.01, tilt - 0.005, np.zeros(4), np.full(4, 0.01), received=t)
+    write_joints(recorder, t - 0.01, tilt - 0.005, np.zeros(4), np.full(4, 0.01), received=t)
     if k % 2 == 0:
         thrust = 7.45 + 0.1 * rng.normal(size=4)
-        recorder.write_mocap(t - 0.01, position, quaternion, received=t)
-        recorder.write_request(controller, t, tilt, thrust, received=t + 0.002)
-        recorder.write_command(t, tilt, thrust, received=t + 0.003)
+        write_mocap(recorder, t - 0.01, position, quaternion, received=t)
+        write_request(recorder, controller, t, tilt, thrust, received=t + 0.002)
+        write_command(recorder, t, tilt, thrust, received=t + 0.003)
     if k % 20 == 0:
-        recorder.write_battery(t, 25.0 - 0.001 * k * TICK, -20.0)
+        write_battery(recorder, t, 25.0 - 0.001 * k * TICK, -20.0)
     if k % 200 == 0:
         recorder.write_compute(t, controller, median=0.2, p99=0.4, max=0.9, deadline_misses=0,
                                count=max(0, k // 2))
         recorder.write_diagnostic(t, 'ekf_node: estimator', {'rejected_mocap': max(0, k) // 400},
                                   1 if k == 400 else 0, 'one MoCap pose was no unit quaternion')
+
+
+def write_truth(recorder, t, position, quaternion, velocity, angular_velocity):
+    """Simulated truth; velocity in world, angular velocity in base_link."""
+    recorder.write('ground_truth/odom', Odom(t, position, velocity, quaternion, angular_velocity))
+
+
+def write_odom(recorder, t, position, quaternion, velocity, angular_velocity, *covariances):
+    """Record an estimate; velocity in world; covariances as :class:`Odom` has them."""
+    recorder.write('odom', Odom(t, position, velocity, quaternion, angular_velocity,
+                                *covariances))
+
+
+def write_imu(recorder, t, specific_force, angular_velocity):
+    """One IMU sample in base_link."""
+    recorder.write('imu/data_raw', ImuReading(t, specific_force, angular_velocity))
+
+
+def write_mocap(recorder, t, position, quaternion, received=None):
+    """One MoCap pose, captured at ``t``, available at ``received``."""
+    recorder.write('mocap/pose', PoseReading(t, position, quaternion), received)
+
+
+def write_joints(recorder, t, position, velocity, effort=None, received=None):
+    """One joint feedback, captured at ``t``, available at ``received``."""
+    recorder.write('joint_states', JointReading(t, position, velocity, effort), received)
+
+
+def write_battery(recorder, t, voltage, current):
+    """Pack voltage [V] and current [A, negative when discharging]."""
+    recorder.write('battery_state', BatteryReading(t, voltage, current))
+
+
+def write_command(recorder, t, tilt, thrust, received=None):
+    """Record the selected command; ``t`` is the stamp of the estimate that it answers."""
+    recorder.write('command', Command(t, tilt, thrust), received)
+
+
+def write_request(recorder, controller, t, tilt, thrust, received=None):
+    """What one controller asked for, before the supervisor."""
+    recorder.write(f'{controller}/command', Command(t, tilt, thrust), received)
+
+
+def write_wrench(recorder, t, force_world, torque_body):
+    """External wrench from ``t`` until the next."""
+    recorder.write('disturbance', Wrench(t, force_world, torque_body))
+
+
+def write_state(recorder, t, state):
+    """Record the supervisor's state, e.g. 'flying:nmpc', whenever it changes."""
+    recorder.write('supervisor/state', state, t)

@@ -14,7 +14,16 @@ from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from synthetic_flights import fly
+from synthetic_flights import (
+    fly,
+    write_battery,
+    write_command,
+    write_imu,
+    write_joints,
+    write_request,
+    write_state,
+    write_wrench,
+)
 import yaml
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
@@ -47,7 +56,7 @@ def recorded(tmp_path_factory):
     memory = LogRecorder(META)
     with BagWriter(folder, META) as writer:
         fly(Tee(memory, writer), make_task('lemniscate'), duration=4.0, start=50.0)
-        Tee(memory, writer).write_wrench(53.0, [0, 0, 3.0], [0.5, 0, 0])
+        write_wrench(Tee(memory, writer), 53.0, [0, 0, 3.0], [0.5, 0, 0])
         counts = writer.counts
     return folder, memory.log(), counts
 
@@ -234,8 +243,10 @@ def test_a_bag_cut_at_any_byte_reads_up_to_the_cut(recorded, tmp_path):
 def test_flushed_messages_survive_a_sigkill(tmp_path):
     program = (
         'import sys, time; from beetle_omni_ros.runs.bag import BagWriter\n'
+        'from beetle_omni_ros.robot.readings import ImuReading\n'
         'w = BagWriter(sys.argv[1])\n'
-        'for k in range(50): w.write_imu(k * 0.005, (0, 0, 9.8), (0, 0, 0))\n'
+        'for k in range(50): w.write("imu/data_raw", ImuReading(k * 0.005, (0, 0, 9.8), '
+        '(0, 0, 0)))\n'
         'w.flush(); print("flushed", flush=True); time.sleep(60)\n')
     root = Path(__file__).parents[2]
     process = subprocess.Popen([sys.executable, '-c', program, str(tmp_path / 'killed')],
@@ -290,7 +301,7 @@ def test_what_is_no_bag_is_refused_by_name(tmp_path):
 
 def test_missing_topics_are_named(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
-        writer.write_imu(1.0, (0, 0, 9.8), (0, 0, 0))
+        write_imu(writer, 1.0, (0, 0, 9.8), (0, 0, 0))
     warning = read_bag(tmp_path / 'bag').warnings[0]
     for name in ('mocap/pose', 'joint_states', 'odom', 'command', 'target_pose'):
         assert name in warning
@@ -316,10 +327,10 @@ def joint_states(t, names, position, velocity=()):
 
 def test_a_message_that_cannot_be_used_is_counted_and_loses_no_other(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
-        writer.write_joints(1.0, np.ones(4), np.zeros(4))
+        write_joints(writer, 1.0, np.ones(4), np.zeros(4))
         writer.write_raw('/joint_states', *joint_states(2.0, ['wheel'], [1.0], [0.0]), 2.0)
         writer.write_raw('/odom', 'nav_msgs/msg/Odometry', b'\x00\x01\x00\x00', 2.5)
-        writer.write_joints(3.0, np.ones(4), np.zeros(4))
+        write_joints(writer, 3.0, np.ones(4), np.zeros(4))
     log = read_bag(tmp_path / 'bag')
     assert log.joint_t.tolist() == [1.0, 3.0]
     assert any('joint_states: 1 messages not used' in w and 'gimbal1' in w for w in log.warnings)
@@ -336,9 +347,9 @@ def test_joints_are_found_by_name_in_any_order(tmp_path):
 def test_raw_messages_and_late_topics_stay_readable_by_both_readers(tmp_path):
     text = to_bytes(conversions.write_text(BAG, 'hello'), 'std_msgs/msg/String')
     with BagWriter(tmp_path / 'bag', topics=['imu/data_raw']) as writer:
-        writer.write_imu(1.0, (0, 0, 9.8), (0, 0, 0))
+        write_imu(writer, 1.0, (0, 0, 9.8), (0, 0, 0))
         writer.write_raw('/notes', 'std_msgs/msg/String', text, 2.0)
-        writer.write_imu(3.0, (0, 0, 9.8), (0, 0, 0))
+        write_imu(writer, 3.0, (0, 0, 9.8), (0, 0, 0))
         with pytest.raises(BagError, match='unknown type'):
             writer.write_raw('/odd', 'odd_msgs/msg/Odd', b'', 3.0)
     with open(tmp_path / 'bag' / 'bag.mcap', 'rb') as stream:
@@ -350,8 +361,8 @@ def test_raw_messages_and_late_topics_stay_readable_by_both_readers(tmp_path):
 
 def test_namespaces_are_taken_off_and_several_robots_need_a_choice(tmp_path):
     with BagWriter(tmp_path / 'one', namespace='robot1') as writer:
-        writer.write_command(1.0, np.ones(4), np.ones(4))
-        writer.write_request('nmpc', 1.0, np.zeros(4), np.ones(4))
+        write_command(writer, 1.0, np.ones(4), np.ones(4))
+        write_request(writer, 'nmpc', 1.0, np.zeros(4), np.ones(4))
         imu = to_bytes(conversions.write_imu(BAG, ImuReading(2.0, (0, 0, 1), (0, 0, 0))),
                        'sensor_msgs/msg/Imu')
         writer.write_raw('/robot2/imu/data_raw', 'sensor_msgs/msg/Imu', imu, 2.0)
@@ -390,7 +401,7 @@ def test_compute_times_and_the_run_come_from_the_diagnostics_of_the_nodes(tmp_pa
 
 def test_meta_data_can_be_added_to_a_finished_bag(tmp_path):
     with BagWriter(tmp_path / 'bag', {'task': 'hover'}) as writer:
-        writer.write_imu(1.0, (0, 0, 9.8), (0, 0, 0))
+        write_imu(writer, 1.0, (0, 0, 9.8), (0, 0, 0))
     add_meta(tmp_path / 'bag', {'seed': 3})
     assert read_bag(tmp_path / 'bag').meta == {'task': 'hover', 'seed': 3}
     with AnyReader([tmp_path / 'bag'], default_typestore=TYPESTORE) as reader:
@@ -407,15 +418,15 @@ def test_closing_twice_and_writing_after_the_end_are_harmless(tmp_path):
     writer.close()
     writer.flush()
     with pytest.raises(BagError, match='closed'):
-        writer.write_imu(time.time(), (0, 0, 9.8), (0, 0, 0))
+        write_imu(writer, time.time(), (0, 0, 9.8), (0, 0, 0))
 
 
 def test_a_long_recording_takes_no_memory_and_its_index_is_complete(tmp_path):
     def record(count, begin):
         for k in range(count):
             for name in ('state', 'battery'):
-                (writer.write_state(begin + k, 'flying:nmpc') if name == 'state' else
-                 writer.write_battery(begin + k, 24.0, -9.0))
+                (write_state(writer, begin + k, 'flying:nmpc') if name == 'state' else
+                 write_battery(writer, begin + k, 24.0, -9.0))
             writer.flush()
 
     with BagWriter(tmp_path / 'bag') as writer:

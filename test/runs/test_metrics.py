@@ -5,7 +5,14 @@ import json
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic_flights import fly
+from synthetic_flights import (
+    fly,
+    write_command,
+    write_joints,
+    write_odom,
+    write_state,
+    write_truth,
+)
 
 from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.robot import rotations
@@ -41,14 +48,14 @@ def test_roll_pitch_yaw_agrees_with_the_scalar_form():
 def ramp_log(stamp=100.0):
     """One pose whose position error is the time since the target in cm, orientation in deg."""
     recorder = LogRecorder()
-    recorder.write_state(stamp - 1, 'flying:nmpc')
+    write_state(recorder, stamp - 1, 'flying:nmpc')
     recorder.write_target(pose_target(np.array([1, 2, 3, 0, 0, 90.0]), stamp))
     turn = rotations.from_rpy(0, 0, np.pi / 2)
     for k in range(1601):
         t = 0.005 * k
-        recorder.write_truth(stamp + t, np.array([1, 2 - 0.01 * t, 3]),
-                             rotations.multiply(turn, rotations.exp([np.radians(t), 0, 0])),
-                             np.array([0.3, 0, 0.4]), np.array([0, 0.2, 0]))
+        write_truth(recorder, stamp + t, np.array([1, 2 - 0.01 * t, 3]),
+                    rotations.multiply(turn, rotations.exp([np.radians(t), 0, 0])),
+                    np.array([0.3, 0, 0.4]), np.array([0, 0.2, 0]))
     return recorder.log()
 
 
@@ -78,12 +85,12 @@ def test_reached_means_within_10_cm_and_10_deg(offset, angle, reached):
 def test_mean_median_and_max_are_over_the_poses():
     task = make_task('random3')
     recorder = LogRecorder()
-    recorder.write_state(0.0, 'flying:nmpc')
+    write_state(recorder, 0.0, 'flying:nmpc')
     for k, target in enumerate(task.targets(1.0)):
         recorder.write_target(target)
         for t in target.stamp + np.arange(0, 8, 0.005):
-            recorder.write_truth(t, target.position + [0.01 * (k + 1) ** 2, 0, 0],
-                                 target.quaternion, np.zeros(3), np.zeros(3))
+            write_truth(recorder, t, target.position + [0.01 * (k + 1) ** 2, 0, 0],
+                        target.quaternion, np.zeros(3), np.zeros(3))
     result = metrics(recorder.log(), task)
     assert result['mean']['U_position_m'] == pytest.approx((0.01 + 0.04 + 0.09) / 3)
     assert result['median']['U_position_m'] == pytest.approx(0.04)
@@ -93,15 +100,15 @@ def test_mean_median_and_max_are_over_the_poses():
 
 def test_the_lowest_point_is_told_with_the_pose_that_was_flown_then():
     task, recorder = make_task('random3'), LogRecorder()
-    recorder.write_state(0.0, 'flying:nmpc')
+    write_state(recorder, 0.0, 'flying:nmpc')
     for k, target in enumerate(task.targets(1.0)):
         recorder.write_target(target)
         for t in target.stamp + np.arange(0, 8, 0.005):
             dip = 0.4 if k == 1 and 3 < t - target.stamp < 3.1 else 0.0
-            recorder.write_truth(t, np.array([0, 0, 0.7 - dip]), target.quaternion, np.zeros(3),
-                                 np.zeros(3))
+            write_truth(recorder, t, np.array([0, 0, 0.7 - dip]), target.quaternion, np.zeros(3),
+                        np.zeros(3))
     # on the ground before and after, which says nothing of the flight
-    recorder.write_truth(30.0, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
+    write_truth(recorder, 30.0, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
     result = metrics(recorder.log(), task)
     assert result['lowest'] == {'height_m': pytest.approx(0.3), 'pose': 1}
     assert metrics(LogRecorder().log())['lowest'] == {}
@@ -112,11 +119,11 @@ def test_effort_is_command_minus_joint_and_mean_thrust():
     recorder.write_target(pose_target(np.array([0, 0, 1, 0, 0, 0.0]), 0.0))
     for k in range(1601):
         t = 0.005 * k
-        recorder.write_truth(t, np.array([0, 0, 1]), LEVEL, np.zeros(3), np.zeros(3))
-        recorder.write_joints(t, np.full(4, 0.1), np.zeros(4))
+        write_truth(recorder, t, np.array([0, 0, 1]), LEVEL, np.zeros(3), np.zeros(3))
+        write_joints(recorder, t, np.full(4, 0.1), np.zeros(4))
         if k % 2 == 0:
-            recorder.write_command(t, np.array([0.1, 0.2, 0.0, 0.1]),
-                                   np.full(4, 7.0 + 0.5 * (k // 2 % 2)))
+            write_command(recorder, t, np.array([0.1, 0.2, 0.0, 0.1]),
+                          np.full(4, 7.0 + 0.5 * (k // 2 % 2)))
     result = metrics(recorder.log())
     assert result['joint_error_mean_rad'] == pytest.approx(0.05)
     assert result['thrust_mean_N'] == pytest.approx(7.25, abs=1e-3)
@@ -128,8 +135,8 @@ def test_a_command_repeated_between_answers_counts_once():
     recorder.write_target(pose_target(np.array([0, 0, 1, 0, 0, 0.0]), 0.0))
     for k in range(1601):
         t, stamp = 0.005 * k, 0.01 * (k // 2)
-        recorder.write_truth(t, np.array([0, 0, 1]), LEVEL, np.zeros(3), np.zeros(3))
-        recorder.write_command(stamp, np.zeros(4), np.full(4, 7.0 + (k // 2) % 2), received=t)
+        write_truth(recorder, t, np.array([0, 0, 1]), LEVEL, np.zeros(3), np.zeros(3))
+        write_command(recorder, stamp, np.zeros(4), np.full(4, 7.0 + (k // 2) % 2), received=t)
     assert metrics(recorder.log())['hover_command_change_rms']['thrust_N'] == pytest.approx(1.0)
 
 
@@ -178,7 +185,7 @@ def test_a_pose_replaced_before_its_time_does_not_count():
     for stamp in (0.0, 3.0):
         recorder.write_target(pose_target(np.array([0, 0, 1, 0, 0, 0.0]), stamp))
     for t in np.arange(0, 11.2, 0.005):
-        recorder.write_truth(t, np.array([0, 0, 1]), LEVEL, np.zeros(3), np.zeros(3))
+        write_truth(recorder, t, np.array([0, 0, 1]), LEVEL, np.zeros(3), np.zeros(3))
     assert len(metrics(recorder.log())['poses']) == 1
 
 
@@ -187,11 +194,11 @@ def test_a_crash_is_seen_in_the_flight(how):
     recorder = LogRecorder()
     fly(recorder, make_task('waypoints'), duration=20.0)
     if how == 'fall':
-        recorder.write_truth(15.001, np.array([0, 0, 0.16]), LEVEL, np.zeros(3), np.zeros(3))
+        write_truth(recorder, 15.001, np.array([0, 0, 0.16]), LEVEL, np.zeros(3), np.zeros(3))
     elif how == 'nan':
-        recorder.write_truth(15.001, np.full(3, np.nan), LEVEL, np.zeros(3), np.zeros(3))
+        write_truth(recorder, 15.001, np.full(3, np.nan), LEVEL, np.zeros(3), np.zeros(3))
     else:
-        recorder.write_state(15.0, 'emergency_stop')
+        write_state(recorder, 15.0, 'emergency_stop')
     assert metrics(recorder.log())['crashed'] is True
     assert metrics(flown(make_task('waypoints'), duration=20.0))['crashed'] is False
 
@@ -200,9 +207,9 @@ def test_landing_after_the_task_is_no_crash():
     recorder = LogRecorder()
     fly(recorder, make_task('random2'))
     for k in range(200):
-        recorder.write_truth(17.3 + 0.005 * k, np.array([0, 0, 0.16]), LEVEL, np.zeros(3),
-                             np.zeros(3))
-    recorder.write_state(18.5, 'disarmed')
+        write_truth(recorder, 17.3 + 0.005 * k, np.array([0, 0, 0.16]), LEVEL, np.zeros(3),
+                    np.zeros(3))
+    write_state(recorder, 18.5, 'disarmed')
     result = metrics(recorder.log(), make_task('random2'))
     assert result['crashed'] is False
     assert result['success_rate'] == 1.0
@@ -212,9 +219,9 @@ def test_each_controller_is_judged_by_the_poses_that_it_flew():
     task = make_task('waypoints')
     recorder = LogRecorder()
     fly(recorder, task, duration=39.0)
-    recorder.write_state(17.2, 'flying:rl')
-    recorder.write_state(20.0, 'fallback')
-    recorder.write_state(21.0, 'flying:rl')
+    write_state(recorder, 17.2, 'flying:rl')
+    write_state(recorder, 20.0, 'fallback')
+    write_state(recorder, 21.0, 'flying:rl')
     results = metrics_by_controller(recorder.log(), task)
     assert list(results) == ['nmpc', 'rl']
     assert [len(result['poses']) for result in results.values()] == [2, 3]
@@ -225,7 +232,7 @@ def test_the_estimate_judges_where_there_is_no_truth():
     recorder = LogRecorder()
     recorder.write_target(pose_target(np.array([0, 0, 1, 0, 0, 0.0]), 0.0))
     for t in np.arange(0, 8.1, 0.005):
-        recorder.write_odom(t, np.array([0.05, 0, 1]), LEVEL, np.zeros(3), np.zeros(3))
+        write_odom(recorder, t, np.array([0.05, 0, 1]), LEVEL, np.zeros(3), np.zeros(3))
     result = metrics(recorder.log())
     assert result['poses'][0]['U_position_m'] == pytest.approx(0.05)
     assert 'estimation' not in result
@@ -278,7 +285,7 @@ def test_the_level_at_which_control_was_lost_is_reported():
 def test_a_robot_far_from_its_target_has_lost_control():
     task, recorder = make_task('torque'), LogRecorder()
     fly(recorder, task, start=0.0)
-    recorder.write_truth(11.0011, np.array([1.6, 0, 1.5]), LEVEL, np.zeros(3), np.zeros(3))
+    write_truth(recorder, 11.0011, np.array([1.6, 0, 1.5]), LEVEL, np.zeros(3), np.zeros(3))
     result = metrics(recorder.log(), task)['torque']
     assert (result['withstood_N_m'], result['lost_at_N_m']) == (2.5, 5.0)
     assert result['levels'][-1]['peak_position_m'] == pytest.approx(1.6, abs=1e-6)
@@ -286,12 +293,12 @@ def test_a_robot_far_from_its_target_has_lost_control():
 
 def test_payloads_report_the_steady_height_error_of_each_mass():
     task, recorder = make_task('payload'), LogRecorder()
-    recorder.write_state(0.0, 'flying:nmpc')
+    write_state(recorder, 0.0, 'flying:nmpc')
     for target, segment in zip(task.targets(0.0), task.segments, strict=True):
         recorder.write_target(target)
         for t in target.stamp + np.arange(0, 8, 0.005):
-            recorder.write_truth(t, np.array([0, 0, 1 - 0.1 * segment.payload]), LEVEL,
-                                 np.zeros(3), np.zeros(3))
+            write_truth(recorder, t, np.array([0, 0, 1 - 0.1 * segment.payload]), LEVEL,
+                        np.zeros(3), np.zeros(3))
     payload = metrics(recorder.log(), task)['payload']
     assert [entry['payload_kg'] for entry in payload] == [0, 0.25, 0.5, 0.75, 1.0]
     assert [entry['height_error_m'] for entry in payload] == pytest.approx(

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from rich.console import Console
+from synthetic_flights import write_odom, write_state, write_truth
 import yaml
 
 from beetle_omni_ros.control.base import PoseTarget
@@ -20,9 +21,9 @@ def record(folder, *, task, body='truth', targets=0):
     with BagWriter(folder, {'task': task, 'seed': 0}) as writer:
         for k in range(80):
             t = 10 + 0.05 * k
-            write = writer.write_truth if body == 'truth' else writer.write_odom
-            write(t, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
-            writer.write_state(t, 'flying:nmpc')
+            write = write_truth if body == 'truth' else write_odom
+            write(writer, t, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
+            write_state(writer, t, 'flying:nmpc')
         for k in range(targets):
             writer.write_target(PoseTarget(position=np.array([0, 0, 1.0]), quaternion=LEVEL,
                                            stamp=10.5 + k))
@@ -84,9 +85,9 @@ def test_a_fault_that_the_supervisor_named_stands_in_the_page(tmp_path):
     with BagWriter(tmp_path / 'bag', {'task': 'hover', 'seed': 0}) as writer:
         for k in range(80):
             t = 10 + 0.05 * k
-            writer.write_truth(t, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
-            writer.write_state(t, 'flying:nmpc' if k < 30 else 'fallback:joint1_astray' if k < 40
-                               else 'landing:rotor2_lost' if k < 70 else 'disarmed:<b>')
+            write_truth(writer, t, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
+            write_state(writer, t, 'flying:nmpc' if k < 30 else 'fallback:joint1_astray' if k < 40
+                        else 'landing:rotor2_lost' if k < 70 else 'disarmed:<b>')
         writer.write_diagnostic(13.0, 'supervisor_node: supervisor', {
             'fault.joint3_slipped': '12.5', 'nmpc.refused.stale stamp': '7'}, 1, 'landing')
     log = read_bag(tmp_path / 'bag')

@@ -14,7 +14,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from scipy.spatial.transform import Rotation
-from synthetic_flights import fly
+from synthetic_flights import fly, write_odom
 import yaml
 
 from beetle_omni_ros import cli
@@ -223,10 +223,10 @@ def test_odd_joint_states_cost_frames_and_nothing_else(tmp_path):
     odd.name, odd.position = ['gimbal1'], BAG.doubles([0.1])
     with BagWriter(tmp_path / 'bag', description=description()) as writer:
         writer.write_raw('/joint_states', kind, b'\x00\x01\x00\x00\xff', 1.0)
-        writer.write_odom(1.0, np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3))
+        write_odom(writer, 1.0, np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3))
         writer.write_raw('/joint_states', kind, to_bytes(odd, kind), 1.1)
-        writer.write_odom(1.1, np.full(3, np.nan), np.array([0, 0, 0, 1.0]), np.zeros(3),
-                          np.zeros(3))
+        write_odom(writer, 1.1, np.full(3, np.nan), np.array([0, 0, 0, 1.0]), np.zeros(3),
+                   np.zeros(3))
         assert writer.counts['/tf'] == 0 and writer.counts['/odom'] == 2
 
 

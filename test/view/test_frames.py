@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from synthetic_flights import fly
+from synthetic_flights import fly, write_battery, write_odom, write_state, write_truth
 
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.robot import rotations
@@ -75,7 +75,7 @@ def test_an_unusable_bag_is_refused_in_one_line(tmp_path):
     with pytest.raises(BagError, match='not an MCAP file'):
         recording.wait(60.0)
     with BagWriter(tmp_path / 'empty') as writer:
-        writer.write_battery(1.0, 24.0, -3.0)
+        write_battery(writer, 1.0, 24.0, -3.0)
     with pytest.raises(BagError, match='no pose of the robot'):
         list(parts(tmp_path / 'empty'))
 
@@ -83,10 +83,10 @@ def test_an_unusable_bag_is_refused_in_one_line(tmp_path):
 def test_the_estimate_stands_for_a_truth_that_nobody_knows():
     sampler = Sampler()
     assert not sampler.placed and sampler.row(1.0)[T] == 1.0
-    sampler.write_odom(1.0, [1, 2, 3], UP, None, None)
+    write_odom(sampler, 1.0, [1, 2, 3], UP, None, None)
     assert sampler.placed and pose(sampler.row(1.0), 'estimate_') is None
-    sampler.write_truth(1.0, [1, 2, 4], UP, None, None)
-    sampler.write_odom(2.0, [1, 2, 5], UP, None, None)
+    write_truth(sampler, 1.0, [1, 2, 4], UP, None, None)
+    write_odom(sampler, 2.0, [1, 2, 5], UP, None, None)
     row = sampler.row(2.0)
     assert row[COLUMNS['position']][2] == 4 and row[COLUMNS['estimate_position']][2] == 5
     assert sampler.clock == 2.0
@@ -94,10 +94,10 @@ def test_the_estimate_stands_for_a_truth_that_nobody_knows():
 
 def test_faults_and_remarks_are_kept_with_their_time():
     sampler = Sampler()
-    sampler.write_state(1.0, 'flying:nmpc')
+    write_state(sampler, 1.0, 'flying:nmpc')
     sampler.write_diagnostic(2.0, 'supervisor_node: supervisor', {'fault.rotor_1': '1.8'})
     sampler.write_diagnostic(3.0, 'supervisor_node: supervisor', {'fault.rotor_1': '1.8'})
-    sampler.write_state(4.0, 'landing:mocap_lost')
+    write_state(sampler, 4.0, 'landing:mocap_lost')
     assert sampler.faults == {'rotor_1': 2.0, 'mocap_lost': 4.0}
     assert [state_at(sampler.states, t) for t in (0.5, 1.0, 3.9, 5.0)] == \
         ['', 'flying:nmpc', 'flying:nmpc', 'landing:mocap_lost']

@@ -5,7 +5,7 @@ import threading
 
 import numpy as np
 import pytest
-from synthetic_flights import fly
+from synthetic_flights import fly, write_command, write_joints, write_state, write_truth
 from view_browser import at_rest, opened, rendered, until
 
 from beetle_omni_ros.robot import rotations
@@ -54,10 +54,10 @@ class Graph:
 
     def take(self, sampler):
         self.t += 0.03
-        sampler.write_state(self.t, 'flying:nmpc') if not sampler.states else None
-        sampler.write_truth(self.t, np.array([0.0, 0.0, 1.0]), UP, np.zeros(3), np.zeros(3))
-        sampler.write_joints(self.t, np.zeros(4), np.zeros(4))
-        sampler.write_command(self.t, np.zeros(4), np.full(4, 7.5))
+        write_state(sampler, self.t, 'flying:nmpc') if not sampler.states else None
+        write_truth(sampler, self.t, np.array([0.0, 0.0, 1.0]), UP, np.zeros(3), np.zeros(3))
+        write_joints(sampler, self.t, np.zeros(4), np.zeros(4))
+        write_command(sampler, self.t, np.zeros(4), np.full(4, 7.5))
         if self.refuses and self.targets:
             sampler.write_diagnostic(self.t, 'nmpc_node: inputs', {}, 1, self.refuses)
 
