@@ -43,7 +43,28 @@ ROWS = {'latency_median_ms': 'latency, median [ms]', 'latency_p99_ms': '99 %',
         'latency_max_ms': 'max', 'cpu_percent': 'CPU of all nodes [%]'}
 SETTLE, WATCH = 4.0, 15.0       # [s] of playback before and while pictures are counted
 ADDRESS = re.compile(r'http://localhost:\d+')
-PICTURES = '() => window.__viserTestpoints?.rendererInfo?.render?.frame ?? 0'
+PICTURES = '(window.__viserTestpoints?.rendererInfo?.render?.frame ?? 0)'
+# Each moment places the robot once; the page takes the messages of a moment from its queue.
+COUNT_MOMENTS = """() => {
+    window.moments = window.seen = 0;
+    const queue = window.__viserMutable.messageQueue, push = queue.push.bind(queue);
+    let arrived = 0, picture = FRAME;
+    queue.push = (...messages) => {
+        window.moments += messages.filter(
+            one => one.type == 'SetPositionMessage' && one.name == '/run0').length;
+        return push(...messages);
+    };
+    const look = () => {
+        if (FRAME != picture) {
+            picture = FRAME;
+            window.seen += window.moments > arrived ? 1 : 0;
+            arrived = window.moments;
+        }
+        requestAnimationFrame(look);
+    };
+    look();
+}""".replace('FRAME', PICTURES)
+COUNTS = f'[{PICTURES}, window.moments, window.seen]'
 
 
 def fly(folder: Path, kind: str, seconds: float) -> dict:
@@ -80,8 +101,14 @@ def looking_on(told):
         thread.join()
 
 
-def play(run: Path) -> dict:
-    """Play a bag in a headless browser; return what was measured."""
+def play(run: Path, ratio: float) -> dict:
+    """Play a bag in a headless browser that runs already; return what was measured."""
+    with opened('about:blank', 1280, 720) as (browser, _):
+        return watch(run, browser, f'/?fixedDpr={ratio}' if ratio else '')
+
+
+def watch(run, browser, query):
+    """Measure from the command on."""
     begin = time.monotonic()
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view', str(run)],
@@ -92,25 +119,30 @@ def play(run: Path) -> dict:
         if url is None:
             sys.exit(f'{run}: not shown')
         served = time.monotonic() - begin
-        with opened(url.group(), 1280, 720) as (browser, _):
-            until(lambda: browser.evaluate(PICTURES) > 1, 'a picture')
-            first = time.monotonic() - begin
-            browser.wait_for_timeout(1e3 * SETTLE)
-            reading = bool(browser.get_by_text('reading').count())
-            mine, start = tree(os.getpid()), time.monotonic()
-            pictures = browser.evaluate(PICTURES)
-            cpu = {pid: cpu_seconds(pid) for pid in mine}
-            browser.wait_for_timeout(1e3 * WATCH)
-            pictures = browser.evaluate(PICTURES) - pictures
-            passed = time.monotonic() - start
-            spent = {pid: cpu_seconds(pid) - cpu[pid] for pid in mine if pid != os.getpid()}
-        viewer = set(tree(process.pid))
-        return {'served_s': served, 'first_picture_s': first, 'still_reading': reading,
+        mine = set(tree(process.pid))
+        spent = sum(map(cpu_seconds, mine))
+        before = browser_cpu(mine)
+        browser.goto(url.group() + query)
+        browser.wait_for_function(f'{PICTURES} > 1', polling=50)
+        first, drawing = time.monotonic() - begin, browser_cpu(mine) - before
+        browser.wait_for_timeout(1e3 * SETTLE)
+        reading = bool(browser.get_by_text('reading').count())
+        browser.evaluate(COUNT_MOMENTS)
+        at, mine = time.monotonic(), set(tree(process.pid))
+        counts = [browser.evaluate(COUNTS)]
+        cpu = [(sum(map(cpu_seconds, mine)), browser_cpu(mine))]
+        browser.wait_for_timeout(1e3 * WATCH)
+        counts.append(browser.evaluate(COUNTS))
+        cpu.append((sum(map(cpu_seconds, mine)), browser_cpu(mine)))
+        passed = time.monotonic() - at
+        pictures, moments, seen = np.diff(counts, axis=0)[0]
+        viewer, browsing = np.diff(cpu, axis=0)[0]
+        return {'served_s': served, 'served_cpu_s': spent, 'first_picture_s': first,
+                'first_picture_browser_cpu_s': drawing, 'still_reading': reading,
+                'moments_arrived_per_s': moments / passed, 'moments_seen_per_s': seen / passed,
                 'pictures_per_s': pictures / passed,
-                'viewer_cpu_percent': 100 * sum(v for k, v in spent.items() if k in viewer)
-                / passed,
-                'browser_cpu_ms_per_picture': 1e3 * sum(
-                    v for k, v in spent.items() if k not in viewer) / max(1, pictures),
+                'viewer_cpu_percent': 100 * viewer / passed,
+                'browser_cpu_ms_per_picture': 1e3 * browsing / max(1, pictures),
                 'load': os.getloadavg()[0]}
     finally:
         process.kill()
@@ -158,6 +190,12 @@ def tree(pid: int) -> list[int]:
     return found
 
 
+def browser_cpu(viewer: set[int]) -> float:
+    """CPU time of all that this benchmark has started, without itself and the viewer [s]."""
+    return sum(cpu_seconds(pid) for pid in tree(os.getpid())
+               if pid != os.getpid() and pid not in viewer)
+
+
 def cpu_seconds(pid: int) -> float:
     """User and system time of a process [s]; 0 of one that has ended."""
     try:
@@ -173,6 +211,8 @@ def main():
     arguments.add_argument('run', type=Path, nargs='?', help='long bag to play')
     arguments.add_argument('--seconds', type=float, default=24, help='flight time of each')
     arguments.add_argument('--rounds', type=int, default=6, help='flights of each kind; 0: none')
+    arguments.add_argument('--ratio', type=float, help="pixels drawn for each of the window's; "
+                           'default: as the page chooses')
     arguments.add_argument('--no-playback', action='store_true', help='leave the bag out')
     arguments.add_argument('--json', type=Path, help='file for the numbers')
     given = arguments.parse_args()
@@ -187,7 +227,7 @@ def main():
         show_flights(flights, console)
         measured['flights'] = flights
     if not given.no_playback:
-        measured['playback'] = play(given.run or long_bag())
+        measured['playback'] = play(given.run or long_bag(), given.ratio)
         console.print(*(f'{key}: {value:.3g}' for key, value in measured['playback'].items()),
                       sep='\n')
     if given.json:

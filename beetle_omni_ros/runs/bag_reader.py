@@ -1,12 +1,11 @@
-"""Flights from bags: by topic into a log, or message by message to a recorder."""
+"""Flights from bags: into a log, or bit by bit to a recorder."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Container, Iterator
 from dataclasses import replace
 import json
-from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +20,10 @@ from beetle_omni_ros.messages.topics import (
     topic_of,
     TOPICS,
 )
-from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, YamlError
-from beetle_omni_ros.runs.bag_files import (
-    BagError,
-    Messages,
-    RawMessage,
-    read_messages,
-    read_together,
-)
+from beetle_omni_ros.runs.bag_files import BagError, Messages, read_together
 from beetle_omni_ros.runs.log import FlightLog, SERIES_OF
-from beetle_omni_ros.runs.recorder import LogRecorder
+from beetle_omni_ros.runs.recorder import LogRecorder, Recorder
 
 META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
 
@@ -59,9 +51,7 @@ def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
     recorder = LogRecorder()
     reading = _Reading(str(path), namespace, recorder)
     for together in read_together(path, reading.warnings):
-        # Where a namespace is not yet known, names that leave it open wait for the others.
-        for messages in sorted(together, key=lambda one: is_ambiguous(one.topic)):
-            reading.take_together(messages)
+        reading.take(together)
     reading.take_waiting()
     recorder.write_meta(_metadata(path, reading.warnings))
     log = recorder.log()
@@ -70,30 +60,31 @@ def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
     return log
 
 
-def replay(path: str | Path, recorder, warnings: list[str], *, namespace: str | None = None,
-           spacing: Callable[[str], float] = lambda _: 0.0) -> Iterator[float]:
+def replay(path: str | Path, recorder: Recorder, warnings: list[str], *,
+           namespace: str | None = None, leave_out: Container[str] = ()) -> Iterator[np.ndarray]:
     """
-    Pass the messages of a bag on to a recorder, in the order in which they were recorded.
+    Pass the messages of a bag on to a recorder, a few seconds at a time.
 
     Args:
         path: rosbag2 folder, or one of its files.
-        recorder: see :class:`~beetle_omni_ros.runs.recorder.Recorder`.
+        recorder: takes series as values whose fields are arrays, the rest one by one.
         warnings: takes what was missing or wrong, at the end.
         namespace: of the robot, where the bag holds several.
-        spacing: topic without namespace -> least time between two of its messages [s]; those
-            between, and all after an infinite one, are left out. For readers in a hurry.
+        leave_out: topics without namespace that the recorder does not need; neither does it need
+            what controllers ask for.
 
     Yields:
-        The time of recording of each message, once the recorder has it [s].
+        (N,) times of recording of what the recorder was given [s].
 
     Raises:
         BagError: no such bag, unreadable, not MCAP, or several robots in it.
 
     """
-    reading = _Reading(str(path), namespace, recorder, spacing)
-    for message in read_messages(path, reading.warnings):
-        if reading.take(message):
-            yield message.received
+    reading = _Reading(str(path), namespace, recorder, leave_out)
+    for together in read_together(path, reading.warnings):
+        reading.take(together)
+        reading.take_waiting()
+        yield np.concatenate([np.zeros(0), *(messages.received for messages in together)])
     recorder.write_meta(_metadata(path, reading.warnings))
     warnings += reading.finish()
 
@@ -101,10 +92,9 @@ def replay(path: str | Path, recorder, warnings: list[str], *, namespace: str | 
 class _Reading:
     """Sorts messages by topic and namespace, and counts what cannot be used."""
 
-    def __init__(self, path, namespace, recorder, spacing=lambda _: 0.0):
+    def __init__(self, path, namespace, recorder, leave_out=None):
         self.warnings: list[str] = []
-        self._recorder, self._spacing = recorder, spacing
-        self._taken: dict[str, float] = {}  # full topic -> time of the newest message taken
+        self._recorder, self._left_out = recorder, leave_out
         self._path = path
         self._namespace = None if namespace is None else _rooted(namespace)
         self._chosen = namespace is not None
@@ -114,41 +104,38 @@ class _Reading:
         self._reason: dict[str, str] = {}
         self._waiting: dict[str, tuple[list[bytes], list[np.ndarray]]] = {}
 
-    def take(self, message: RawMessage) -> bool:
-        """Whether the recorder was given the message."""
-        name = self._name(message.topic)
-        if name is None or self._follows_closely(message, self._spacing(name)):
-            return False
+    def take(self, together: list[Messages]) -> None:
+        """Take messages; those of a series wait until they are many."""
+        # Where a namespace is not yet known, names that leave it open wait for the others.
+        for messages in sorted(together, key=lambda one: is_ambiguous(one.topic)):
+            name = self._name(messages.topic)
+            if name is None:
+                continue
+            if self._left_out is not None and (name in self._left_out or requester(name)):
+                self._counts[name] += len(messages.data)
+                continue
+            kind = topic_of(name).type
+            if messages.type != kind:
+                self._refuse(name, f'type is {messages.type}, not {kind}', len(messages.data))
+            elif name in SERIES_OF or requester(name):
+                waiting, times = self._waiting.setdefault(name, ([], []))
+                waiting += messages.data
+                times.append(messages.received)
+                if len(waiting) >= AT_ONCE:
+                    self.take_waiting(name)
+            else:
+                for data, received in zip(messages.data, messages.received.tolist(),
+                                          strict=True):
+                    self._take_one(name, data, received)
+
+    def _take_one(self, name, data, received):
+        topic = topic_of(name)
         try:
-            topic = self._topic(name, message.type)
-            value = topic.read(from_bytes(message.data, message.type))
-            self._recorder.write(name, _stamped(value, message.received), message.received)
+            value = topic.read(from_bytes(data, topic.type))
+            self._recorder.write(name, _stamped(value, received), received)
             self._counts[name] += 1
         except Exception as error:  # one message that cannot be used must not lose the others
             self._refuse(name, str(error) or type(error).__name__)
-            return False
-        self._taken[message.topic] = message.received
-        return True
-
-    def take_together(self, messages: Messages) -> None:
-        """Take messages of a topic; those of a series wait until they are many."""
-        name = self._name(messages.topic)
-        if name is None:
-            return
-        if name not in SERIES_OF and not requester(name):
-            for data, received in zip(messages.data, messages.received.tolist(), strict=True):
-                self.take(RawMessage(messages.topic, messages.type, data, received))
-            return
-        try:
-            self._topic(name, messages.type)
-        except MessageError as error:
-            self._refuse(name, str(error), len(messages.data))
-            return
-        waiting, times = self._waiting.setdefault(name, ([], []))
-        waiting += messages.data
-        times.append(messages.received)
-        if len(waiting) >= AT_ONCE:
-            self.take_waiting(name)
 
     def take_waiting(self, *names: str) -> None:
         """Read the messages that wait, of these topics or of all."""
@@ -171,19 +158,9 @@ class _Reading:
             self._split[topic] = self._recognise(topic)
         return self._split[topic]
 
-    def _topic(self, name, kind):
-        topic = topic_of(name)
-        if kind != topic.type:
-            raise MessageError(f'type is {kind}, not {topic.type}')
-        return topic
-
     def _refuse(self, name, reason, count=1):
         self._bad[name] += count
         self._reason.setdefault(name, reason)
-
-    def _follows_closely(self, message, spacing):
-        before = self._taken.get(message.topic, inf)    # a clock that was set back starts anew
-        return before <= message.received < before + spacing
 
     def _recognise(self, topic):
         split = split_topic(topic, () if self._namespace is None else (self._namespace,))

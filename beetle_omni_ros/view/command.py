@@ -54,11 +54,11 @@ def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None =
             stack.callback(recordings[-1].close)
         from beetle_omni_ros.view.page import Page  # while the first seconds are read
         from beetle_omni_ros.view.playback import Player
-        for recording in recordings:
-            recording.wait(FIRST_ROWS)
         page = Page([recording.name for recording in recordings], model, parameters, host=host,
                     port=port, dark=dark)
         stack.callback(page.close)
+        for recording in recordings:
+            recording.wait(FIRST_ROWS)
         player = Player(page, recordings, start, play)
         player.look()
         player.draw()

@@ -27,6 +27,13 @@ COLUMNS = {name: slice(int(end) - width, int(end))
 WIDTH = int(_ENDS[-1])
 T = COLUMNS['t'].start
 INPUTS = ': inputs'   # ending of the status in which a node tells what it refused
+SHOWN = {'ground_truth/odom': {'position': 'position', 'quaternion': 'quaternion'},
+         'odom': {'estimate_position': 'position', 'estimate_quaternion': 'quaternion'},
+         'joint_states': {'tilt': 'position'},
+         'command': {'tilt_command': 'tilt', 'thrust': 'thrust'},
+         'battery_state': {'voltage': 'voltage', 'current': 'current'},
+         'disturbance': {'force': 'force'}}     # topic -> column -> part of its value
+POSED = ('ground_truth/odom', 'odom')
 STEPPED = ('target_position', 'target_quaternion', 'force')   # hold until the next row
 QUATERNIONS = ('quaternion', 'estimate_quaternion')
 
@@ -60,9 +67,10 @@ class Sampler(Recorder):
     def __init__(self):
         self.clock = np.nan
         self.remarks: list[tuple[str, str]] = []
-        self._row = np.full(WIDTH, np.nan)
-        self._truth = False
+        self._row = np.full(WIDTH, np.nan)      # newest, truth and estimate each in its place
+        self._series: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []   # since rows()
         self.target: Target | None = None
+        self._targets: list[tuple[float, Target | None]] = [(-np.inf, None)]
         self._told = FlightLog()
         self._named: frozenset = frozenset()
         self.meta: dict = {}
@@ -72,58 +80,66 @@ class Sampler(Recorder):
     @property
     def placed(self) -> bool:
         """Whether it is known where the robot is."""
-        return pose(self._row) is not None
+        return pose(self._row) is not None or pose(self._row, 'estimate_') is not None
 
     def row(self, t: float) -> np.ndarray:
         """(WIDTH,) newest values at ``t`` [s]."""
-        row = self._row.copy()
-        row[T] = t
-        if self.target is not None:
-            reference = self.target.at(t)
-            row[COLUMNS['target_position']] = reference.position
-            row[COLUMNS['target_quaternion']] = reference.quaternion
-        return row
+        return _table(self._row, np.array([t]), [self.target])[0]
 
-    def _set(self, **values):
-        for name, value in values.items():
-            self._row[COLUMNS[name]] = value
+    def rows(self, times: np.ndarray) -> np.ndarray:
+        """
+        Give the values of each time; those that came for earlier ones are forgotten.
 
-    def write(self, topic: str, value: Any, received: float | None = None) -> None:
-        """Take one value, as the table of topics has it; nothing of other topics is shown."""
-        taker = self._TAKERS.get(topic)
-        if taker is not None:
-            taker(self, value, received)
+        Args:
+            times: (N,) increasing [s], later than those of the call before.
+
+        Returns:
+            (N, WIDTH) newest values, by their times of receipt.
+
+        """
+        received = [t for t, _ in self._targets]
+        table = _table(self._row, times, [self._targets[k - 1][1]
+                                          for k in np.searchsorted(received, times, 'right')])
+        for received, columns in self._series:
+            newest = np.searchsorted(np.maximum.accumulate(received), times, 'right') - 1
+            there = newest >= 0
+            for name, values in columns.items():
+                table[there, COLUMNS[name]] = values[newest[there]]
+                self._row[COLUMNS[name]] = values[-1]
+        self._series, self._targets = [], [(-np.inf, self._targets[-1][1])]
+        return _stand_in(table)
+
+    def write(self, topic: str, value: Any, received: float | np.ndarray | None = None) -> None:
+        """
+        Take one value, as the table of topics has it; nothing of other topics is shown.
+
+        Those of a series may have fields that are arrays over many messages.
+        """
+        if topic not in SHOWN:
+            taker = self._TAKERS.get(topic)
+            if taker is not None:
+                taker(self, value, received)
+            return
+        columns = {name: np.nan if getattr(value, part) is None else getattr(value, part)
+                   for name, part in SHOWN[topic].items()}
+        if np.ndim(value.stamp):
+            self._series.append((received, {
+                name: np.reshape(values, (len(received), -1)) for name, values in columns.items()
+                if np.ndim(values)}))
+        else:
+            for name, values in columns.items():
+                self._row[COLUMNS[name]] = values
+        if topic in POSED:
+            self.clock = float(np.ravel(value.stamp)[-1])
 
     def write_meta(self, meta: dict) -> None:
         """Add to what is known of the flight."""
         self.meta.update(meta)
 
-    def _take_truth(self, odom, _):
-        self._truth, self.clock = True, float(odom.stamp)
-        self._set(position=odom.position, quaternion=odom.quaternion)
-
-    def _take_odom(self, odom, _):
-        self.clock = float(odom.stamp)
-        if self._truth:
-            self._set(estimate_position=odom.position, estimate_quaternion=odom.quaternion)
-        else:       # it stands for the body while no truth is known
-            self._set(position=odom.position, quaternion=odom.quaternion)
-
-    def _take_joints(self, joints, _):
-        self._set(tilt=joints.position)
-
-    def _take_command(self, command, _):
-        self._set(tilt_command=command.tilt, thrust=command.thrust)
-
-    def _take_battery(self, battery, _):
-        self._set(voltage=battery.voltage, current=battery.current)
-
-    def _take_wrench(self, wrench, _):
-        self._set(force=wrench.force if np.any(wrench.force) else np.nan)
-
-    def _take_target(self, target, _):
+    def _take_target(self, target, received):
         if self.target is None or target.stamp >= self.target.stamp:
             self.target = target
+            self._targets.append((received, target))
 
     def _take_state(self, state, received):
         self.states.append((float(received), state))
@@ -141,11 +157,30 @@ class Sampler(Recorder):
                 self._told.diagnostics.append(status)
                 self.faults = self._told.named_faults()
 
-    _TAKERS = {'ground_truth/odom': _take_truth, 'odom': _take_odom,
-               'joint_states': _take_joints, 'command': _take_command,
-               'battery_state': _take_battery, 'disturbance': _take_wrench,
-               'target_pose': _take_target, 'target_trajectory': _take_target,
+    _TAKERS = {'target_pose': _take_target, 'target_trajectory': _take_target,
                'supervisor/state': _take_state, 'diagnostics': _take_diagnostics}
+
+
+def _table(row, times, targets):
+    """(N, WIDTH) of one row at times, each with its target."""
+    table = np.tile(row, (len(times), 1))
+    table[:, T] = times
+    for k, target in enumerate(targets):
+        if target is not None:
+            reference = target.at(times[k])
+            table[k, COLUMNS['target_position']] = reference.position
+            table[k, COLUMNS['target_quaternion']] = reference.quaternion
+    return _stand_in(table)
+
+
+def _stand_in(table):
+    """Where no truth is known the estimate stands for it; a force of nothing is no force."""
+    unknown = np.isnan(table[:, COLUMNS['position']]).any(axis=1)
+    for name in ('position', 'quaternion'):
+        table[unknown, COLUMNS[name]] = table[unknown, COLUMNS[f'estimate_{name}']]
+        table[unknown, COLUMNS[f'estimate_{name}']] = np.nan
+    table[~table[:, COLUMNS['force']].any(axis=1), COLUMNS['force']] = np.nan
+    return table
 
 
 class Rows:

@@ -16,7 +16,7 @@ from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.view import plots
 from beetle_omni_ros.view.drawing import wxyz
 from beetle_omni_ros.view.frames import pose, Rows, Sampler, T
-from beetle_omni_ros.view.page import Page, RATE, Shown
+from beetle_omni_ros.view.page import moments, Page, Shown
 
 KEPT = 60.0             # [s] of rows
 ANSWER_TIME = 3.0       # [s] in which nodes tell that they refused a target: a diagnostic is 1 s
@@ -81,11 +81,8 @@ class Live:
 
     def run(self) -> None:
         """Draw until :meth:`stop`."""
-        last = time.monotonic()
-        while not self._stop.wait(max(0.0, last + 1 / RATE - time.monotonic())):
-            now = time.monotonic()
-            self.step(now - last)
-            last = now
+        for _, passed in moments(self._stop):
+            self.step(passed)
 
     def stop(self) -> None:
         """End :meth:`run`."""

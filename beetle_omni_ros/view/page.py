@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import contextlib
 from dataclasses import dataclass
 import html
 import io
 import socket
+import threading
 import time
 
 import numpy as np
@@ -35,9 +37,23 @@ NARROW, PHONE_DISTANCE, PANEL_SHARE = 0.8, 1.6, 0.35
 SETTLING = 5.0      # [s] in which the page of a newcomer comes to rest
 NUDGE = 1e-6        # [s]
 ROOM = 3.5          # [m]
+SKY = 4.0           # brightness, in place of reflections
+FLOOR = 10.0        # [m] to each side, with a line at each metre
 LABEL_HEIGHT, LABEL_STEP = 0.38, 0.1    # [m] above base_link, for each further run
 ESTIMATE_SEEN = 0.01, 1.0   # [m], [deg] by which an estimate is off when it is drawn
 LOCAL = '127.0.0.1'
+
+
+def moments(stop: threading.Event) -> Iterator[tuple[float, float]]:
+    """Yield time and time since the last [s], at RATE until ``stop``; late ones are left out."""
+    last = due = time.monotonic()
+    while True:
+        due = max(due + 1 / RATE, time.monotonic())
+        if stop.wait(due - time.monotonic()):
+            return
+        now = time.monotonic()
+        yield now, now - last
+        last = now
 
 
 @dataclass(frozen=True)
@@ -110,8 +126,10 @@ class Page:
 
     def _add_scene(self, dark):
         scene = self.server.scene
-        scene.configure_default_lights(cast_shadow=False)    # half the cost of a picture
-        self._grid = None
+        # Shadows, reflections and an infinite floor are most of the cost of a picture.
+        scene.configure_default_lights(cast_shadow=False)
+        scene.configure_environment_map(None)
+        scene.add_light_ambient('/sky', intensity=SKY)
         self._set_theme(dark)
         self._robots = [RobotDrawing(
             scene, f'/run{k}', self._model, self._robot,
@@ -135,12 +153,11 @@ class Page:
             dark_mode=dark, show_logo=False, show_share_button=False, control_width='medium',
             brand_color=(228, 87, 46))
         scene = self.server.scene
-        ground, cell, section = ((32, 35, 41), (52, 56, 64), (84, 90, 102)) if dark else \
-            ((238, 240, 243), (214, 218, 224), (176, 182, 191))
-        self._grid = scene.add_grid(
-            '/floor', infinite_grid=True, cell_size=0.5, section_size=1.0, cell_color=cell,
-            section_color=section, plane_color=ground, plane_opacity=1.0, shadow_opacity=0.0,
-            fade_distance=25.0, position=(0, 0, -0.002))
+        k = np.arange(-FLOOR, FLOOR + 1.0)
+        along = np.array([[[x, -FLOOR, 0], [x, FLOOR, 0]] for x in k])
+        scene.add_line_segments('/floor', np.concatenate([along, along[:, :, [1, 0, 2]]]),
+                                (84, 90, 102) if dark else (196, 201, 209), thickness=1.0,
+                                thickness_units='screen')
 
     def look_at(self, centre: np.ndarray, size: float) -> None:
         """Set the camera of those who open the page: at a centre, for a size [m]."""
@@ -160,7 +177,8 @@ class Page:
         lines = np.stack([points[:-1], points[1:]], axis=1)
         self._trails[k] = self.server.scene.add_line_segments(
             f'/trail{k}', lines, plots.RUN_COLOURS[k % 4] if len(self._names) > 1
-            else (150, 158, 170), thickness=0.006, visible=self._show_trail.value)
+            else (150, 158, 170), thickness=1.5, thickness_units='screen',
+            visible=self._show_trail.value)
 
     # -- panel -----------------------------------------------------------------------------
 

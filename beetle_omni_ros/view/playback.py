@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import threading
-import time
 
 import numpy as np
 
 from beetle_omni_ros.view import plots
 from beetle_omni_ros.view.frames import COLUMNS, state_at, T
-from beetle_omni_ros.view.page import Page, RATE, Shown
+from beetle_omni_ros.view.page import moments, Page, RATE, Shown
 from beetle_omni_ros.view.recording import Recording
 
 SPEEDS = {'x 1/4': 0.25, 'x 1/2': 0.5, 'x 1': 1.0, 'x 2': 2.0, 'x 5': 5.0, 'x 10': 10.0}
@@ -61,10 +60,8 @@ class Player:
 
     def run(self) -> None:
         """Play until :meth:`stop`."""
-        last, moved = time.monotonic(), 0.0
-        while not self._stop.wait(max(0.0, last + 1 / RATE - time.monotonic())):
-            now = time.monotonic()
-            passed, last = now - last, now
+        moved = 0.0
+        for now, passed in moments(self._stop):
             playing = self._play.value
             if playing:
                 self.time = min(self.time + passed * SPEEDS[self._speed.value], self.length)

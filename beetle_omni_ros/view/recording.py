@@ -15,14 +15,12 @@ import numpy as np
 
 import beetle_omni_ros
 from beetle_omni_ros.runs.bag_files import bag_files, BagError
-from beetle_omni_ros.runs.bag_reader import replay
-from beetle_omni_ros.view.frames import Rows, Sampler
+from beetle_omni_ros.view.frames import COLUMNS, Rows, Sampler
 
 STEP = 0.02         # [s] between rows
 GAP = 1.0           # [s] without any message that is not filled with rows
-FIRST, PART = 100, 1000     # rows that are handed on at a time
-SKIPPED = ('imu/data_raw', 'mocap/pose')
-HELD = ('odom', 'ground_truth/odom', 'joint_states', 'command')
+PART = 1000         # rows that are handed on at a time; the first ones come as soon as read
+SKIPPED = ('imu/data_raw', 'mocap/pose', 'rotor_states')
 
 
 @dataclass
@@ -50,33 +48,35 @@ class Part:
 
 def parts(path: str | Path) -> Iterator[Part]:
     """
-    Read a bag in parts, the first one a short one.
+    Read a bag in parts, the first one a short one: what stands in the first chunk of the file.
 
     Raises:
         BagError: it cannot be read, or tells nowhere where the robot is.
 
     """
-    sampler, rows, warnings, due, size = Sampler(), [], [], None, FIRST
-    for t in replay(path, sampler, warnings, spacing=_spacing):
-        if due is None or not due - GAP < t < due + GAP:
-            due = t
-        while due <= t:
-            if sampler.placed:
-                rows.append(sampler.row(due))
-            due += STEP
-        if len(rows) >= size:
-            yield Part(np.array(rows), list(sampler.states), dict(sampler.faults))
-            rows, size = [], PART
+    from beetle_omni_ros.runs.bag_reader import replay  # the page does without its 0.1 s
+    sampler, warnings, size = Sampler(), [], 0
+    tables, due = [], None
+    for times in replay(path, sampler, warnings, leave_out=SKIPPED):
+        if not len(times):
+            continue
+        times = np.sort(times)
+        if due is None or not due - GAP < times[0] < due + GAP:
+            due = times[0]
+        grid = due + STEP * np.arange(np.ceil(max(0.0, times[-1] - due) / STEP))
+        grid = grid[grid < times[-1]]
+        if len(grid):
+            due = grid[-1] + STEP
+        following = times[np.searchsorted(times, grid)]
+        rows = sampler.rows(grid[following - grid < GAP])
+        tables.append(rows[~np.isnan(rows[:, COLUMNS['position']]).any(axis=1)])
+        if sum(map(len, tables)) > size:
+            yield Part(np.concatenate(tables), list(sampler.states), dict(sampler.faults))
+            tables, size = [], PART
     if not sampler.placed:
         raise BagError(f'{path}: holds no pose of the robot (odom or ground_truth/odom)')
-    yield Part(np.array(rows) if rows else Rows().table, list(sampler.states),
+    yield Part(np.concatenate([Rows().table, *tables]), list(sampler.states),
                dict(sampler.faults), dict(sampler.meta), warnings)
-
-
-def _spacing(topic):
-    if topic in SKIPPED or topic.endswith('/command'):
-        return np.inf
-    return 0.9 * STEP if topic in HELD else 0.0
 
 
 class Recording:

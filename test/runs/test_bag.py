@@ -88,16 +88,19 @@ def test_a_flight_comes_back_from_its_bag_as_it_was_recorded(recorded):
     assert log.warnings == []
 
 
-def test_a_replay_leaves_out_what_follows_closely(recorded):
+def test_a_replay_comes_bit_by_bit_without_what_is_left_out(recorded):
     folder, memory, _ = recorded
-    recorder, warnings = LogRecorder(), []
-    spacing = {'odom': 0.1, 'imu/data_raw': np.inf}
-    times = list(replay(folder, recorder, warnings, spacing=lambda name: spacing.get(name, 0.0)))
+    recorder, warnings, known = LogRecorder(), [], []
+    times = []
+    for part in replay(folder, recorder, warnings, leave_out=('imu/data_raw',)):
+        times.append(part)
+        known.append(len(recorder.log().odom_t))
     log = recorder.log()
-    assert len(log.imu_t) == 1 and np.diff(log.odom_t).min() > 0.095
-    assert len(log.odom_t) == pytest.approx(10 * (memory.odom_t[-1] - memory.odom_t[0]), abs=3)
+    assert not len(log.imu_t) and not log.requests and memory.requests
+    assert 0 < known[0] < known[-1] == len(memory.odom_t)
     np.testing.assert_allclose(log.joint_t, memory.joint_t, rtol=0, atol=1e-9)
-    assert log.meta == memory.meta and not warnings and max(times) >= memory.end
+    assert log.meta == memory.meta and not warnings
+    assert np.concatenate(times).max() >= memory.end
 
 
 def test_a_trajectory_comes_back_from_its_bag(tmp_path):

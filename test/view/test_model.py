@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters, ROTOR_NAMES
+from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.view.arrows import (
@@ -14,6 +16,7 @@ from beetle_omni_ros.view.arrows import (
     thrust_arrows,
     torque_arcs,
 )
+from beetle_omni_ros.view.drawing import _mesh
 
 SMALL = """<robot name="r">
 <material name="red"><color rgba="1 0 0 0.5"/></material>
@@ -96,3 +99,18 @@ def test_torque_arcs_turn_as_the_reaction_torque_on_the_body():
     swept = [np.linalg.norm(np.diff(torque_arcs(robot, np.zeros(4), np.full(4, f))[:SEGMENTS],
                                     axis=1), axis=2).sum() for f in (5.0, 10.0)]
     assert swept[1] == pytest.approx(2 * swept[0], rel=1e-2)
+
+
+@pytest.mark.parametrize('file', sorted(share_path('description/meshes').glob('*.stl')),
+                         ids=lambda file: file.stem)
+def test_meshes_are_those_that_another_reader_finds(file):
+    vertices, faces = _mesh(file)
+    other = trimesh.load_mesh(file)
+    assert len(faces) == len(other.faces) and len(vertices) == len(other.vertices)
+    np.testing.assert_array_equal(vertices[faces], other.triangles)
+
+
+def test_a_broken_mesh_is_refused_by_name(tmp_path):
+    (tmp_path / 'b.stl').write_bytes(b'no mesh at all')
+    with pytest.raises(ParameterError, match=r'b\.stl: not a usable mesh'):
+        _mesh(tmp_path / 'b.stl')
