@@ -164,6 +164,8 @@ def _mesh(file):
             return vertices, faces.reshape(-1, 3)
         import trimesh  # for all but binary STL: its import alone takes 0.6 s
         mesh = trimesh.load_mesh(file)
+        if not len(mesh.faces):
+            raise ValueError('no triangles')
         return mesh.vertices, mesh.faces
     except Exception as error:      # whatever a missing or broken file provokes in the library
         raise ParameterError(f'{file}: not a usable mesh: {error}') from None
