@@ -163,7 +163,7 @@ class HoverController:
         rate, inertia = state.angular_velocity, self._robot.inertia
         model = np.concatenate([
             (rotations.matrix(state.quaternion) @ force - self._allocator.weight)
-            / self._allocator.mass, (torque - np.cross(rate, inertia * rate)) / inertia])
+            / self._allocator.mass, (torque - rotations.cross(rate, inertia * rate)) / inertia])
         measured = np.concatenate([state.velocity - before.velocity,
                                    rate - before.angular_velocity]) / dt
         self._disturbance += -np.expm1(-dt / self.parameters.disturbance_time) \
@@ -203,7 +203,7 @@ class HoverController:
                       relative @ reference.angular_velocity - state.angular_velocity) \
             - self._disturbance[3:]
         inertia, rate = self._robot.inertia, state.angular_velocity
-        gyroscopic = np.cross(rate, inertia * rate)
+        gyroscopic = rotations.cross(rate, inertia * rate)
         return self._allocator.mass * acceleration, inertia * angular + gyroscopic
 
     def _follow_thrust(self, in_force, dt):

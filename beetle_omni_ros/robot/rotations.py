@@ -73,6 +73,12 @@ def skew(vector: Vector) -> np.ndarray:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def cross(a: Vector, b: Vector) -> np.ndarray:
+    """Cross product of two vectors (3,)."""
+    (ax, ay, az), (bx, by, bz) = _floats(a), _floats(b)
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
 def geodesic_angle(a: Vector, b: Vector) -> float:
     """Angle [rad] of R(b)^T R(a), the package's orientation error, 0 to pi."""
     bx, by, bz, bw = _floats(b)

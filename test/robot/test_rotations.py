@@ -53,3 +53,4 @@ def test_skew_is_the_cross_product():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 3))
     assert np.allclose(rotations.skew(a) @ b, np.cross(a, b))
+    assert np.array_equal(rotations.cross(a, b), np.cross(a, b))

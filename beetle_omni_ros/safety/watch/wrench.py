@@ -7,6 +7,7 @@ from math import exp
 
 import numpy as np
 
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -104,7 +105,7 @@ class WrenchWatch:
             * (commanded - self._thrust)
         inertia = self._robot.inertia
         measured = np.concatenate([force, (rate - self._rate) / dt
-                                   + np.cross(rate, inertia * rate) / inertia])
+                                   + rotations.cross(rate, inertia * rate) / inertia])
         self._rate = rate
         vectors = np.stack([np.cos(tilt), np.sin(tilt)], axis=1) * self._thrust[:, None]
         modelled = self._allocator.matrix @ vectors.ravel() / self._units
