@@ -339,7 +339,8 @@ def effects() -> str:
             'effect](../how-to/add_an_effect.md) shows how\na new one is declared.\n\n'
             '*Typical* is a realistic deviation from the neutral value. *Smallest* is the '
             'smallest deviation\nworth naming. Where the neutral value is the number of the robot '
-            'file, both are fractions of it.\n\n## Who acts on what\n\n'
+            'file, both are fractions of it.\nA robot file may leave out a parameter that has a '
+            '*default*.\n\n## Who acts on what\n\n'
             'A consumer acts on an effect, leaves it to another, or refuses a robot file that has '
             'it. The test\n`test/gap/test_consumers.py` tries every pair. The reasons stand '
             'below the table.\n\n'
@@ -353,9 +354,11 @@ def effects() -> str:
                             for (who, what, reason), names in sorted(apart.items())])]
     for name, entry in CATALOGUE.items():
         rows = [[f'`{key}`', spec.unit, _neutral(spec.neutral),
-                 f'{_number(spec.low)} to {_number(spec.high)}', _known(spec.typical),
-                 _known(spec.smallest), entry.settings.get(key) and f'`{entry.settings[key]}`'
-                 or '', '4, one for each ' + entry.each if entry.each
+                 f'{_number(spec.low)} to {_number(spec.high)}', 'not fitted' if spec.form
+                 else _known(spec.typical), _known(spec.smallest),
+                 '' if spec.default is None else _number(spec.default),
+                 entry.settings.get(key) and f'`{entry.settings[key]}`' or '',
+                 '4, one for each ' + entry.each if entry.each
                  else '1, or 4 for each joint' if spec.of_each
                  else str(len(spec.neutral)) if isinstance(spec.neutral, tuple) else '1']
                 for key, spec in entry.parameters.items()]
@@ -368,7 +371,7 @@ def effects() -> str:
                                            for other in entry.confused_with)],
                                        ['separated by', entry.separated_by]])
                     + '\n' + table(['parameter', 'unit', 'neutral', 'range', 'typical',
-                                    'smallest', 'replaces', 'numbers'], rows))
+                                    'smallest', 'default', 'replaces', 'numbers'], rows))
     return ''.join(text)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from beetle_omni_ros.cli.options import fail, FAILED, JsonOption, PublishedOption, RobotOption
+from beetle_omni_ros.cli.options import fail, FAILED, JsonOption, PublishedOption
 from beetle_omni_ros.robot.schema import ParameterError
 
 PageOption = Annotated[Optional[Path], typer.Option(
@@ -22,7 +22,9 @@ def gap(runs: Annotated[list[Path], typer.Argument(
         holdout: Annotated[Optional[list[Path]], typer.Option(
             HOLDOUT, metavar='RUN...', help='Flights that only judge. Default: the last run, '
                                             'where there are three or more.')] = None,
-        robot: RobotOption = None,
+        robot: Annotated[Optional[Path], typer.Option(
+            '--robot', metavar='FILE', help='What the flights are compared with. '
+                                            'Default: the shipped params/robot.yaml.')] = None,
         apply: Annotated[Optional[Path], typer.Option(
             '--apply', metavar='FILE', help='Write the robot file with what was named.')] = None,
         page: Annotated[Optional[Path], typer.Option(
@@ -122,7 +124,10 @@ def train(output: Annotated[Path, typer.Option(
               '--smoke', help='Tiny sizes: does everything fit together?')] = False,
           stop_after: Annotated[Optional[float], typer.Option(
               '--stop-after', min=0, metavar='SECONDS', help='Stop training early.')] = None,
-          robot: RobotOption = None, json_path: JsonOption = None):
+          robot: Annotated[Optional[Path], typer.Option(
+              '--robot', metavar='FILE', help='The robot that is trained, with its effects. '
+                                              'Default: the shipped params/robot.yaml.')] = None,
+          json_path: JsonOption = None):
     """
     Train a policy and export it to ONNX; needs the extra 'train', and a GPU to be useful.
 

@@ -16,7 +16,7 @@ effect on by naming it. Its equation then acts where its kind says:
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 import numpy as np
@@ -42,7 +42,8 @@ CATALOGUE: dict[str, Effect] = {'joint_offset': ACTUATOR['joint_offset'], **BODY
 MEMBERS = 4         # joints of this kind of robot
 
 __all__ = ['Asked', 'CATALOGUE', 'command_delays', 'delaying', 'Effect', 'EffectParameter',
-           'sensor_errors', 'SensorErrors', 'ServoTerms', 'settings', 'Terms', 'validated']
+           'sensor_errors', 'SensorErrors', 'separating', 'ServoTerms', 'settings', 'Terms',
+           'validated']
 CONSUMERS = {'nmpc': 'NMPC and allocation', 'training': 'training', 'plant': 'simulated plant',
              'estimator': 'estimator', 'buses': 'delays of the buses', 'gap': 'gap finder'}
 ACTS = Stand(True)
@@ -68,6 +69,12 @@ def settings(effects: dict[str, dict]) -> dict[str, float]:
     """Dotted keys of the robot file that checked effects replace, with the new values."""
     return {key: effects[name][parameter] for name in effects
             for parameter, key in CATALOGUE[name].settings.items()}
+
+
+def separating(names: Sequence[str]) -> str:
+    """Experiment that tells entries apart: of the one that names most others as confused."""
+    return CATALOGUE[max(names, key=lambda name: len(
+        set(CATALOGUE[name].confused_with) & set(names) - {name}))].separated_by
 
 
 def delaying(*what: str) -> tuple[str, ...]:

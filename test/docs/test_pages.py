@@ -74,6 +74,14 @@ def test_every_page_is_in_the_navigation_and_every_entry_is_a_page():
     assert sorted(listed) == sorted(page for page in PAGES if page.startswith('docs/'))
 
 
+def test_the_start_page_links_every_tutorial_how_to_page_and_explanation():
+    start = read('docs/index.md')
+    missing = [page for page in PAGES if page.startswith(
+        ('docs/tutorials/', 'docs/how-to/', 'docs/reference/', 'docs/explanation/'))
+        and f"({page.removeprefix('docs/')})" not in start]
+    assert not missing
+
+
 def test_every_page_that_the_code_names_is_there():
     for path in [*(ROOT / 'beetle_omni_ros').rglob('*.py'), *(ROOT / 'params').glob('*.yaml'),
                  *(ROOT / 'benchmarks').rglob('*.py'), ROOT / 'Makefile', ROOT / 'package.xml',

@@ -15,11 +15,11 @@ from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
 from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.robot import effects
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.effects import CATALOGUE, separating
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs/how-to/add_an_effect.md'
 ENTRY, TEST = re.findall(r'```python\n(.*?)```', PAGE.read_text(), flags=re.S)
-NAME = 'battery_heat'
+NAME = 'motor_heat'
 
 
 @pytest.fixture(autouse=True)
@@ -27,13 +27,13 @@ def added(monkeypatch):
     """The catalogue with the page's entry."""
     made = {}
     exec(compile(ENTRY, str(PAGE), 'exec'), made)
-    monkeypatch.setitem(CATALOGUE, NAME, made['BODY'][NAME])
+    monkeypatch.setitem(CATALOGUE, NAME, made['ACTUATOR'][NAME])
 
 
 def test_the_pages_own_test_passes_with_its_entry_and_fails_without(monkeypatch):
     made = {}
     exec(compile(TEST, str(PAGE), 'exec'), made)
-    page_test = made['test_a_pack_of_50_degrees_takes_thrust']
+    page_test = made['test_motors_of_50_degrees_take_thrust']
     assert page_test() is None
     monkeypatch.delitem(CATALOGUE, NAME)
     with pytest.raises((AssertionError, KeyError, ValueError)):
@@ -45,6 +45,11 @@ def test_what_flies_acts_on_it(consumer):
     assert effects.stand(consumer, NAME).acts
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](with_effect(NAME))])
     assert not np.array_equal(found, plain(consumer))
+
+
+def test_the_experiment_that_separates_it_is_its_own():
+    assert separating(['thrust_coefficient', NAME]) == CATALOGUE[NAME].separated_by
+    assert separating(['mass', 'thrust_coefficient']) == CATALOGUE['mass'].separated_by
 
 
 def test_the_gap_finder_looks_for_it_and_finds_its_size(monkeypatch):

@@ -76,6 +76,17 @@ def test_no_interval_holds_what_cannot_be(name, deviation, expected):
     assert found['interval'] == pytest.approx(expected) and found['file'] == 0.0
 
 
+def test_the_table_states_the_sizes_of_a_whole_set_and_what_no_fit_determined():
+    one = effect(['mass', 'wind'], 3.2, [3.1, 3.3], 3.0, 'kg')
+    one['parameters']['y'] = {'value': 50.0, 'interval': [50.0, 50.0], 'file': 50.0,
+                              'unit': 'degC'}
+    one['rivals'] = [{'name': 'wind', 'parameters': {
+        'force': {'value': [0.0, 0.0, -2.0], 'file': [0.0] * 3, 'unit': 'N'}}}]
+    rows = next(g.rows for g in grids(made(one)) if g.title == 'Effects')
+    assert [row[3] for row in rows] == ['3.1..3.3', 'not fitted', '']
+    assert rows[2][:3] == ['or wind', 'force [N]', '0, 0, -2']
+
+
 @pytest.mark.parametrize('name', CATALOGUE)
 def test_every_entry_states_each_of_its_parameters(name):
     own = {key.name: key for key in KEYS.values() if key.effect == name}

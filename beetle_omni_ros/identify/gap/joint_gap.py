@@ -28,7 +28,7 @@ from beetle_omni_ros.identify.joint_servos import file_servos
 from beetle_omni_ros.identify.servo_fit import FITTED_PART
 from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.pages.figures import legend, line, panels, STYLE, svg
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.effects import CATALOGUE, separating
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 
@@ -210,7 +210,7 @@ def _effects(found: Found):
             effect['rivals'] = [{'name': t.entry.name, 'gain': t.gain, 'evidence': _evidence(t),
                                  'parameters': _parameters(found, t.entry, t.point)}
                                 for t in members[1:]]
-            effect['separated_by'] = CATALOGUE[members[0].entry.name].separated_by
+            effect['separated_by'] = separating(effect['names'])
         also = _also(found, members)
         if also:
             effect['also'] = also

@@ -15,7 +15,7 @@ from beetle_omni_ros.identify.gap.rollouts import HORIZONS
 from beetle_omni_ros.identify.gap.sentence import summary
 from beetle_omni_ros.identify.gap.verdict import hidden
 from beetle_omni_ros.pages.table import ABSENT, Grid
-from beetle_omni_ros.robot.effects import CATALOGUE
+from beetle_omni_ros.robot.effects import CATALOGUE, separating
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 MOST_ROWS = 12
@@ -87,7 +87,7 @@ def _effect(a, trial, robot):
                if t.candidate.member else {}),
             'parameters': parameters(a, t.candidate.name, t.candidate.keys, t.theta, robot,
                                      with_intervals=False)} for t in rivals]
-        made['separated_by'] = CATALOGUE[c.name].separated_by
+        made['separated_by'] = separating(names)
     return made
 
 
@@ -174,6 +174,10 @@ def grids(made: dict) -> list[Grid]:
                              _numbers(entry['value']), _spans(entry.get('interval')),
                              _numbers(entry['file']),
                              f"{effect['evidence']['delta_bic']:.0f}" if k == 0 else ''])
+            rows += [[f'or {_label(rival)}' if k == 0 else '', f"{parameter} [{entry['unit']}]",
+                      _numbers(entry['value']), '', _numbers(entry['file']), '']
+                     for rival in effect.get('rivals', [])
+                     for k, (parameter, entry) in enumerate(rival['parameters'].items())]
         title = 'Effects' if made['effects'] else 'Explains a part only, not accepted'
         tables.append(Grid(
             title, ['effect', 'parameter', 'value', '95 %', 'in the file', 'delta BIC'], rows,
@@ -258,6 +262,8 @@ def _numbers(value):
 def _spans(interval):
     if interval is None:
         return ABSENT
+    if not np.ptp(interval, axis=-1).any():
+        return 'not fitted'
     if isinstance(interval[0], list):
         return ', '.join(f'{a:.3g}..{b:.3g}' for a, b in interval)
     return f'{interval[0]:.4g}..{interval[1]:.4g}'
