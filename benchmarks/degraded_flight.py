@@ -24,11 +24,13 @@ from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.holding import Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.tasks import pose_target, random_poses
+from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.sim.command_link import CommandLink
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.readings import Drive
 from beetle_omni_ros.sim.simulator import Simulator
 
+LEVELLING_RATE = SupervisorParameters.load().landing.level.rate     # [rad/s]
 NEWS = 0.02             # [rad] a stuck joint that is found elsewhere is told anew
 SETTLE = 4.0            # [s] to reach the first pose
 POSE_TIME = 8.0         # [s] between two poses of random100
@@ -169,7 +171,7 @@ class Flight:
         truth = self.body.sim.truth
         margin = self.holding.parameters.flying_margin
         wish = self.holding.quickest(truth.quaternion, truth.angular_velocity, truth.tilt,
-                                     margin)
+                                     margin, LEVELLING_RATE)
         target = PoseTarget(self.case.second.position, wish)
         lost_at = len(self.trace)
         alive = alive and self.fly(target, self.case.loss + RECOVERY, watch=True)

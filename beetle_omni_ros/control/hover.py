@@ -103,6 +103,7 @@ class HoverController:
         """Fly with what is left, from the next step on; callable in flight."""
         self._health = health
         self._allocator = allocator(self._robot, health)
+        self._thrust_max = health.limited(self._robot.rotors.thrust_max)
         self._scaled = self._allocator.matrix / np.concatenate(
             [np.full(3, self._allocator.mass), self._robot.inertia])[:, None]
 
@@ -230,7 +231,7 @@ class HoverController:
         if state.command is not None:
             reach = p.thrust_rate * dt
             thrust = np.clip(thrust, state.command.thrust - reach, state.command.thrust + reach)
-        thrust = np.clip(thrust, rotors.thrust_min, rotors.thrust_max)
+        thrust = np.clip(thrust, rotors.thrust_min, self._thrust_max)
         return (tilt, thrust) if self._health.healthy else self._health.possible(tilt, thrust)
 
     def _thrust_on_the_way(self, wished, tilt):
@@ -254,8 +255,8 @@ class HoverController:
             rest = wrench - now[:, ~free] @ thrust[~free]
             thrust[free] = np.linalg.solve(columns.T @ columns + DAMPING * np.eye(free.sum()),
                                            columns.T @ rest + DAMPING * helpful[free])
-            outside = (thrust < rotors.thrust_min) | (thrust > rotors.thrust_max)
-            thrust = np.clip(thrust, rotors.thrust_min, rotors.thrust_max)
+            outside = (thrust < rotors.thrust_min) | (thrust > self._thrust_max)
+            thrust = np.clip(thrust, rotors.thrust_min, self._thrust_max)
             if not np.any(outside & free):
                 break
             free &= ~outside

@@ -83,8 +83,8 @@ class NmpcController:
         """
         Fly with what is left, from the next step on; callable in flight.
 
-        Lost rotors are bounded to no thrust, those that hold a thrust to that, and stuck joints
-        to their angle, in prediction, reference and plan.
+        Lost rotors are bounded to no thrust, those that hold a thrust to that, the others to what
+        the pack allows, and stuck joints to their angle, in prediction, reference and plan.
         """
         if health == self._health:
             return
@@ -92,6 +92,7 @@ class NmpcController:
         self._estimator.set_health(health)
         self._planner.set_health(health)
         lower, upper = self._bounds[:8], self._bounds[8:16]
+        upper[4:] = [health.limited(thrust) for thrust in upper[4:]]
         for i, (turns, angle, held) in enumerate(zip(health.rotors, health.stuck, health.held)):
             if angle is not None:
                 lower[i], upper[i] = angle - NARROW, angle + NARROW

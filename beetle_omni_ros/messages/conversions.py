@@ -360,7 +360,8 @@ def read_health(message: Any) -> ToldHealth:
         rotors=tuple(effort != 0 for effort in efforts),
         stuck=tuple(None if isnan(a) else float(a) for a in stuck),
         held=tuple(None if isnan(f) or f == 0 else float(f) for f in efforts),
-        zeros=tuple(map(float, zeros))))
+        zeros=tuple(map(float, zeros)),
+        thrust_limit=None if isnan(message.effort[8]) else float(message.effort[8])))
 
 
 def write_health(kind: Kind, value: ToldHealth) -> Any:
@@ -368,7 +369,8 @@ def write_health(kind: Kind, value: ToldHealth) -> Any:
     Which actuators work.
 
     Positions: angles of stuck joints, NaN of others, then the encoders' zeros, as if they were
-    joints. Efforts: NaN of rotors that obey, 0 of lost ones, else the thrust that one holds.
+    joints. Efforts: NaN of rotors that obey, 0 of lost ones, else the thrust that one holds. The
+    four last efforts are the thrust that the pack allows each rotor, NaN where it allows all.
     """
     health = value.health
     stuck = [np.nan if angle is None else float(angle) for angle in health.stuck]
@@ -377,7 +379,8 @@ def write_health(kind: Kind, value: ToldHealth) -> Any:
     message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
     message.name = HEALTH_NAMES
     message.position = kind.doubles([*stuck, *NO_VALUE, *map(float, health.zeros)])
-    message.effort = kind.doubles([*NO_VALUE, *efforts, *NO_VALUE])
+    limit = np.nan if health.thrust_limit is None else float(health.thrust_limit)
+    message.effort = kind.doubles([*NO_VALUE, *efforts, *[limit] * 4])
     return message
 
 

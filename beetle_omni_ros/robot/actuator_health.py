@@ -19,6 +19,8 @@ class ActuatorHealth:
         stuck: for each joint the true angle at which it is stuck [rad], or None where it moves.
         held: for each rotor the thrust that it gives whatever it is asked [N], or None.
         zeros: reading minus true tilt of each joint that was found in flight [rad].
+        thrust_limit: largest thrust that the pack still allows every rotor [N], or None where
+            that is no less than the robot's own limit.
 
     Raises:
         ValueError: not four of each.
@@ -29,6 +31,7 @@ class ActuatorHealth:
     stuck: tuple[float | None, ...] = (None,) * 4
     held: tuple[float | None, ...] = (None,) * 4
     zeros: tuple[float, ...] = NO_ZEROS
+    thrust_limit: float | None = None
 
     def __post_init__(self):
         """Refuse anything but one entry for each rotor and each joint."""
@@ -39,18 +42,29 @@ class ActuatorHealth:
     @property
     def healthy(self) -> bool:
         """Whether every actuator obeys; a joint whose zero moved does."""
-        return all(self.rotors) and self.stuck == self.held == (None,) * 4
+        return all(self.rotors) and self.stuck == self.held == (None,) * 4 \
+            and self.thrust_limit is None
 
     def same_actuators(self, other: ActuatorHealth) -> bool:
-        """Whether the same ones obey; angles, thrusts and zeros may differ."""
+        """Whether the same ones obey; angles, thrusts, limit and zeros may differ."""
         return self.rotors == other.rotors and all(
-            (a is None) == (b is None) for a, b in zip((*self.stuck, *self.held),
-                                                       (*other.stuck, *other.held)))
+            (a is None) == (b is None) for a, b in zip(
+                (*self.stuck, *self.held, self.thrust_limit),
+                (*other.stuck, *other.held, other.thrust_limit)))
+
+    def limited(self, thrust: float) -> float:
+        """The robot's largest thrust [N], or less where the pack allows less."""
+        return thrust if self.thrust_limit is None else min(thrust, self.thrust_limit)
 
     def possible(self, tilt: np.ndarray, thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Tilts (4,) [rad] and thrusts (4,) [N] with stuck joints and lost rotors as they are."""
+        """
+        Tilts (4,) [rad] and thrusts (4,) [N] with stuck joints and lost rotors as they are.
+
+        No thrust exceeds what the pack allows.
+        """
         angles = [own if angle is None else angle for own, angle in zip(tilt, self.stuck)]
-        thrusts = [own if held is None else held for own, held in zip(thrust, self.held)]
+        thrusts = [self.limited(own) if held is None else held
+                   for own, held in zip(thrust, self.held)]
         return np.array(angles, dtype=float), np.where(self.rotors, thrusts, 0.0)
 
     def true(self, tilt: np.ndarray) -> np.ndarray:

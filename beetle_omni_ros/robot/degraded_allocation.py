@@ -65,6 +65,7 @@ class DegradedAllocator(Allocator):
     def __init__(self, robot: RobotParameters, health: ActuatorHealth):
         super().__init__(robot)
         self._health = health
+        self._thrust_max = health.limited(self._thrust_max)
         lost = np.repeat(~np.array(health.rotors), 2)
         self.matrix[:, lost] = 0.0
         self._scale = 1 / np.r_[np.full(3, self.mass), robot.inertia]

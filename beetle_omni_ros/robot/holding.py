@@ -27,8 +27,10 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter
 
+WAY = 9                 # points of the way to level that are looked at, 22 deg apart at most
 BISECTIONS = 5          # towards a wished attitude: 6 deg / 2^5
 LITTLE = 1.0            # [N] a rotor with less may turn its joint later
+NEARLY = 0.8            # [-] of the largest margin, where none is large enough
 GOLDEN = np.pi * (1 + np.sqrt(5))
 
 
@@ -81,6 +83,7 @@ class Holding:
         self._robot, self._health = robot, health
         self._allocator = DegradedAllocator(robot, health)
         self._scale = 1 / np.r_[np.full(3, self._allocator.mass), robot.inertia]
+        self._thrust_max = health.limited(robot.rotors.thrust_max)
         self.directions = sphere(self.parameters.directions)
         self.tilts, self._thrusts, met = self._held(self.directions)
         self.margins = self._measured(self.tilts, self._thrusts, met)
@@ -91,7 +94,7 @@ class Holding:
 
     def nearest(self, quaternion: np.ndarray, margin: float) -> np.ndarray:
         """
-        Nearest attitude with a margin; the one with the largest margin where none has it.
+        Nearest attitude with a margin, or with nearly the largest where none has it.
 
         Args:
             quaternion: (4,) wished.
@@ -101,15 +104,13 @@ class Holding:
             (4,) quaternion: the wished one turned about a horizontal axis.
 
         """
+        margin = self._attainable(margin)
         if self.margin(quaternion) >= margin:
             return rotations.normalized(quaternion)
         wished = up(quaternion)
         firm = np.flatnonzero(self.margins >= margin)
-        best = firm[np.argmax(self.directions[firm] @ wished)] if firm.size else \
-            np.argmax(self.margins)
+        best = firm[np.argmax(self.directions[firm] @ wished)]
         turn = leaned(quaternion, self.directions[best])
-        if not firm.size:
-            return turn
         whole = rotations.log(rotations.multiply(rotations.conjugate(quaternion), turn))
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
@@ -119,15 +120,18 @@ class Holding:
         return rotations.normalized(rotations.multiply(quaternion, rotations.exp(high * whole)))
 
     def quickest(self, quaternion: np.ndarray, angular_velocity: np.ndarray, tilt: np.ndarray,
-                 margin: float) -> np.ndarray:
+                 margin: float, levelling_rate: float) -> np.ndarray:
         """
         Attitude with a margin that is reached soonest: how far body and joints have to turn.
+
+        The way on from there to level counts as far as it cannot be held.
 
         Args:
             quaternion: (4,) present.
             angular_velocity: (3,) in base_link [rad/s]; the turn that it leads to counts.
             tilt: (4,) present [rad].
             margin: [m/s^2, rad/s^2].
+            levelling_rate: at which it will turn on to level [rad/s].
 
         Returns:
             (4,) quaternion: where the present turn comes to a stop, leaned.
@@ -136,14 +140,28 @@ class Holding:
         p = self.parameters
         quaternion = rotations.multiply(quaternion,
                                         rotations.exp(p.coast_time * angular_velocity))
-        firm = np.flatnonzero(self.margins >= margin)
-        if not firm.size:
-            firm = np.array([np.argmax(self.margins)])
+        firm = np.flatnonzero(self.margins >= self._attainable(margin))
         angle = np.arccos(np.clip(self.directions[firm] @ up(quaternion), -1.0, 1.0))
         travel = np.abs(self._on_nearest_turn(self.tilts[firm], tilt) - tilt)
         travel[self._thrusts[firm] < LITTLE] = 0.0
-        time = angle / p.turn_rate + travel.max(axis=1) / p.tilt_rate
+        time = angle / p.turn_rate + travel.max(axis=1) / p.tilt_rate \
+            + self._falling(self.directions[firm]) / levelling_rate
         return leaned(quaternion, self.directions[firm[np.argmin(time)]])
+
+    def _attainable(self, margin):
+        """A margin [m/s^2, rad/s^2], or most of the largest where no attitude has it."""
+        return min(margin, NEARLY * float(self.margins.max()))
+
+    def _falling(self, directions):
+        """Angles (N,) [rad] of the straight ways from directions (N, 3) of up to level unheld."""
+        angle = np.arccos(np.clip(directions[:, 2], -1.0, 1.0))
+        side = directions[:, :2] / np.maximum(np.linalg.norm(directions[:, :2], axis=1), 1e-9)[
+            :, None]
+        passed = angle[:, None] * np.linspace(0.0, 1.0, WAY)
+        way = np.concatenate([np.sin(passed)[:, :, None] * side[:, None],
+                              np.cos(passed)[:, :, None]], axis=2).reshape(-1, 3)
+        nearest = np.argmax(way @ self.directions.T, axis=1)
+        return angle * (self.margins[nearest] <= 0.0).reshape(passed.shape).mean(axis=1)
 
     def _on_nearest_turn(self, tilt, present):
         """Tilts (N, 4) on the legal turn nearest the present ones (4,)."""
@@ -155,12 +173,11 @@ class Holding:
         return self._measured(*self._held(directions))
 
     def _measured(self, tilt, thrust, met):
-        limit = self._robot.rotors.thrust_max
         jacobian = self._jacobian(tilt, thrust)
         squared = jacobian @ jacobian.transpose(0, 2, 1) + 1e-9 * np.eye(6)
         needed = jacobian.transpose(0, 2, 1) @ np.linalg.inv(squared)
         margins = 1 / np.maximum(np.linalg.norm(needed, axis=2).max(axis=1), 1e-6)
-        return np.where(met & (thrust.max(axis=1) <= limit), margins, 0.0)
+        return np.where(met & (thrust.max(axis=1) <= self._thrust_max), margins, 0.0)
 
     def _held(self, directions):
         """Tilts (N, 4), thrusts (N, 4) that carry the weight, and whether they do."""
@@ -188,7 +205,7 @@ class Holding:
         matrix, p = self._scale[:, None] * self._allocator.matrix, self.parameters
         up_part, side_part = matrix[:, 0::2], matrix[:, 1::2]
         cos, sin = np.cos(tilt)[:, None], np.sin(tilt)[:, None]
-        room = np.minimum(thrust, self._robot.rotors.thrust_max - thrust).clip(0)
+        room = np.minimum(thrust, self._thrust_max - thrust).clip(0)
         room[:, list(self._allocator.held)] = 0.0
         swing = thrust * min(p.tilt_rate * p.reach_time, 1.0) \
             * [float(angle is None) for angle in self._health.stuck]

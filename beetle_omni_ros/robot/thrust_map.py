@@ -67,11 +67,11 @@ class ThrustMap:
         """Largest thrust [N] at ``voltage`` [V], of its shape; as at the ends beyond the rows."""
         return np.interp(voltage, self.voltages, self.thrust_limits)
 
-    def thrust_limit_below(self, voltage: float) -> float:
+    def thrust_limit_below(self, voltage):
         """As :meth:`thrust_limit` [N], continued along the lowest two rows, at least zero."""
         (v, w), (f, g) = self.voltages[:2], self.thrust_limits[:2]
         low = f + (voltage - v) * (g - f) / (w - v)
-        return max(0.0, float(low if voltage < v else self.thrust_limit(voltage)))
+        return np.maximum(0.0, np.where(voltage < v, low, self.thrust_limit(voltage)))
 
     def saturated(self, thrust, voltage) -> np.ndarray:
         """Whether ``thrust`` [N] cannot be given at ``voltage`` [V]; shapes broadcast."""

@@ -185,7 +185,8 @@ class Inputs:
         if not (isfinite(voltage) and voltage >= 0):
             return False
         self.vehicle.voltage = float(voltage)
-        self.watch.on_voltage(self.vehicle.voltage)
+        if self._now is not None:
+            self.watch.on_voltage(self._now, self.vehicle.voltage)
         return True
 
     def on_actuators(self, name: str, text: str, now: float) -> bool:

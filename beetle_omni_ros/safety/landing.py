@@ -200,7 +200,7 @@ class Landing:
         holding = Holding(self._robot, self._health)
         p = holding.parameters
         escape = holding.quickest(state.quaternion, state.angular_velocity, state.tilt,
-                                  p.flying_margin)
+                                  p.flying_margin, rate)
         level = rotations.from_rpy(0.0, 0.0, rotations.to_rpy(state.quaternion)[2])
         goal = holding.nearest(level, p.flying_margin)
         turn = max(rotations.geodesic_angle(goal, escape) / rate, 1e-3)

@@ -37,6 +37,7 @@ class CommandStream:
 
     Attributes:
         accepted: the last good command, or None.
+        cut: the last command that was refused for a range, cut to the limits, or None.
         refused: reason -> count.
         last_refusal: reason of the last refusal, '' after a good command.
         silence: since the last good command.
@@ -48,9 +49,11 @@ class CommandStream:
         self._limits, self._rotors = limits, robot.rotors
         self._tilt_limit = robot.joints.position_limit
         self.accepted: Command | None = None
+        self.cut: Command | None = None
         self.refused: Counter = Counter()
         self.last_refusal = ''
         self.silence = Silence(limits.timeout)
+        self._overstepping = Silence(limits.timeout)
         self.good_for = 0.0
         self._offered: Command | None = None
         self._same = 0
@@ -59,6 +62,22 @@ class CommandStream:
     def good(self) -> bool:
         """Whether it may be given control."""
         return not self.silence.silent and self.good_for >= self._limits.return_after - 1e-9
+
+    @property
+    def in_force(self) -> Command | None:
+        """
+        What of it can be executed: its last good command, or a newer one cut to the limits.
+
+        None where it is silent. A controller that asks for somewhat more than there is, in a
+        manoeuvre and for a short while, is better executed at the limits than replaced: wrong
+        units are farther beyond them, and one that has lost its way stays there longer.
+        """
+        cut, good = self.cut, self.accepted
+        if cut is not None and (good is None or cut.stamp > good.stamp) \
+                and not self._overstepping.silent \
+                and self.silence.elapsed <= self._limits.overstep_time:
+            return cut
+        return None if self.silence.silent else good
 
     @property
     def complaint(self) -> str:
@@ -84,6 +103,9 @@ class CommandStream:
             # one that is none of that is soon silent.
             if reason != JUMP:
                 self.good_for = 0.0
+            if reason in (THRUST, TILT) and self._slightly(command, clean):
+                self.cut = clean
+                self._overstepping.heard()
             return reason
         self.accepted, self.last_refusal = clean, ''
         self.silence.heard()
@@ -92,13 +114,22 @@ class CommandStream:
     def tick(self, dt: float) -> None:
         """``dt`` seconds passed."""
         self.silence.tick(dt)
+        self._overstepping.tick(dt)
         self.good_for = 0.0 if self.silence.silent else self.good_for + dt
 
     def clock_went_back(self, now: float) -> None:
         """Stamps from before a clock step must not block the stream."""
         if self.accepted is not None and self.accepted.stamp > now:
-            self.accepted = self._offered = None
+            self.accepted = self._offered = self.cut = None
             self.silence.elapsed = float('inf')
+
+    def _slightly(self, command, clean):
+        """Whether a command oversteps by no more than a share of the ranges."""
+        share, rotors = self._limits.overstep, self._rotors
+        return _farthest(np.asarray(command.thrust, dtype=float), clean.thrust) \
+            <= share * (rotors.thrust_max - rotors.thrust_min) \
+            and _farthest(np.asarray(command.tilt, dtype=float), clean.tilt) \
+            <= share * self._tilt_limit
 
     def _check(self, command, now):
         """Reason and, without one, the copy with limits applied exactly."""

@@ -28,6 +28,11 @@ class CommandLimits:
                                        low=0, high=1)
     return_after: float = parameter(0.5, doc='good time before a controller gets control',
                                     unit='s', low=0.05, high=60)
+    overstep: float = parameter(
+        0.25, doc='overstep of a limit, as a share of the range, that is executed at the limit',
+        low=0, high=1)
+    overstep_time: float = parameter(0.5, doc='for at most this long without a good command',
+                                     unit='s', low=0, high=5)
     limit_tolerance: float = parameter(0.001, doc='overstep of a limit that is cut off instead',
                                        unit='rad or N', low=0, high=0.1)
     tilt_step: float = parameter(2.0, doc='a lone larger jump of a tilt target is refused',

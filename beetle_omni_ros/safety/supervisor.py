@@ -386,7 +386,8 @@ class Supervisor(Inputs):
 
     def _fly(self, now, dt):
         stream = self._selection.stream
-        if stream.silence.silent or stream.accepted is None:
+        command = stream.in_force
+        if command is None:
             estimate = self.vehicle.estimate
             cause = f' (ekf_node {estimate.text} too)' if estimate.elapsed > 0.5 * estimate.limit \
                 else ''
@@ -396,7 +397,7 @@ class Supervisor(Inputs):
             return self._hold(now, dt)
         self.source = self.active
         self._hover.observe(self.vehicle.seen(self._in_force))
-        return self._handover.limit(stream.accepted, self._in_force)
+        return self._handover.limit(command, self._in_force)
 
     def _hold(self, now, dt):
         if self._selection.stream.good and not self.vehicle.lost and self._resuming <= 0:

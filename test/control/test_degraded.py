@@ -18,6 +18,7 @@ ROBOT = RobotParameters.load()
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 LOST = ActuatorHealth(rotors=(True, False, True, True))
 STUCK = ActuatorHealth(stuck=(None, None, 0.8, None))
+WEAK = ActuatorHealth(thrust_limit=8.8)
 PLACE = np.array([0.0, 0.0, 2.0])
 
 
@@ -58,7 +59,7 @@ def controller(request, nmpc):
     return chosen
 
 
-@pytest.mark.parametrize('health', [LOST, STUCK])
+@pytest.mark.parametrize('health', [LOST, STUCK, WEAK])
 def test_recovers_from_hover_and_holds_the_attitude_to_fly_in(controller, health):
     body = Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.5)
     body.broken = health
@@ -71,7 +72,7 @@ def test_recovers_from_hover_and_holds_the_attitude_to_fly_in(controller, health
     assert rotations.geodesic_angle(body.x[6:10], target.quaternion) < np.radians(2)
 
 
-@pytest.mark.parametrize('health', [LOST, STUCK])
+@pytest.mark.parametrize('health', [LOST, STUCK, WEAK])
 def test_commands_keep_to_what_is_left_from_the_first_step(controller, health):
     body = Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.2)
     controller.set_health(health)

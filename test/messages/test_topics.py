@@ -53,7 +53,7 @@ def value(topic, seed=0, stamp=STAMP):
         Command: lambda: Command(stamp, draw(size=4), draw(size=4)),
         Wish: lambda: Wish.of(path),
         ToldHealth: lambda: ToldHealth(stamp, ActuatorHealth(
-            (True, False, True, True), (None, 0.5, None, None))),
+            (True, False, True, True), (None, 0.5, None, None), thrust_limit=8.75)),
         Wrench: lambda: Wrench(stamp, draw(size=3), draw(size=3)),
         str: lambda: 'flying:nmpc',
         Diagnostic: lambda: [Diagnostic(stamp, 'ekf_node: inputs', 2, 'silent', {'a': '1'}),

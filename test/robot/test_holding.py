@@ -71,15 +71,22 @@ def test_an_attitude_that_is_firm_stays(holdings):
     np.testing.assert_allclose(holdings[LOST].nearest(firm, 2.0), firm)
 
 
-def test_without_any_firm_one_the_firmest_is_taken(holdings):
-    got = holdings[LOST].nearest(LEVEL, 15.0)
-    assert holdings[LOST].margin(got) == pytest.approx(holdings[LOST].margins.max(), rel=1e-6)
+def test_without_any_firm_one_the_nearest_of_the_firmest_is_taken(holdings):
+    holding = holdings[LOST]
+    nearly = 0.8 * holding.margins.max()
+    for wished in (LEVEL, *attitudes(10)):
+        got = holding.nearest(wished, 15.0)
+        assert holding.margin(got) >= nearly - 1e-9
+        firm = holding.directions[holding.margins >= nearly]
+        least = np.arccos(np.clip((firm @ up(wished)).max(), -1, 1))
+        assert rotations.geodesic_angle(got, wished) <= least + 1e-6
 
 
 def test_the_quickest_attitude_needs_no_turn_where_all_is_firm(holdings):
-    got = holdings[ALL_WELL].quickest(LEVEL, np.zeros(3), np.zeros(4), 1.0)
+    got = holdings[ALL_WELL].quickest(LEVEL, np.zeros(3), np.zeros(4), 1.0, 0.8)
     assert rotations.geodesic_angle(got, LEVEL) < 0.2
-    turning = holdings[ALL_WELL].quickest(LEVEL, np.array([5.0, 0, 0]), np.zeros(4), 1.0)
+    turning = holdings[ALL_WELL].quickest(LEVEL, np.array([5.0, 0, 0]), np.zeros(4), 1.0,
+                                            0.8)
     assert rotations.log(turning)[0] > rotations.log(got)[0] + 0.05
 
 
@@ -97,3 +104,26 @@ def test_leaned_is_the_shortest_turn():
             np.arccos(np.clip(up(quaternion) @ direction, -1, 1)), abs=1e-6)
     upside_down = leaned(LEVEL, np.array([0.0, 0.0, -1.0]))
     np.testing.assert_allclose(up(upside_down), [0, 0, -1], atol=1e-9)
+
+
+@pytest.mark.parametrize('lost, up_now, rate, tilt', [
+    # Two random flights, as the rotor was named. By angle and travel alone the choice was an
+    # attitude upside down, from which level cannot be reached but by falling; they fell by 2 m.
+    (3, (0.99, 0.14, -0.04), -1.9, (1.6, 1.6, -1.6, -1.5)),
+    (2, (-0.97, 0.24, -0.07), 1.8, (-1.6, -1.6, 1.6, 1.7))])
+def test_on_its_side_the_escape_leads_towards_level(lost, up_now, rate, tilt):
+    holding = Holding(ROBOT, ActuatorHealth(rotors=tuple(i != lost for i in range(4))))
+    start = leaned(LEVEL, np.array(up_now) / np.linalg.norm(up_now))
+    got = holding.quickest(start, np.array([0.0, 0.0, rate]), np.array(tilt), 2.0, 0.8)
+    assert holding.margin(got) >= 2.0 - 1e-9
+    assert up(got)[2] > 0.8
+
+
+def test_less_thrust_leaves_no_attitude_firmer_and_level_the_firmest(holdings):
+    weak = Holding(ROBOT, ActuatorHealth(thrust_limit=8.8))
+    assert np.all(weak.margins <= holdings[ALL_WELL].margins + 1e-9)
+    on_its_side = np.abs(weak.directions[:, 2]) < 0.5
+    assert np.all(weak.margins[on_its_side] == 0.0)
+    got = weak.quickest(rotations.from_rpy(np.radians(170.0), 0, 0), np.zeros(3), np.zeros(4),
+                        2.0, 0.8)
+    assert up(got)[2] > 0.9     # upside down it could not turn on

@@ -69,6 +69,39 @@ def test_rounding_beyond_a_limit_is_cut_off_not_refused():
     assert checked.accepted.thrust[0] == 0.0 and checked.accepted.thrust[3] == top
 
 
+def test_a_small_overstep_is_executed_at_the_limits_for_half_a_second_and_no_longer():
+    checked, top = stream(), ROBOT.rotors.thrust_max
+    checked.offer(command(), NOW)
+    executed = []
+    for k in range(1, 101):
+        checked.tick(0.01)
+        stamp = NOW + 0.01 * k
+        over = command(stamp, (0.1, 0.2, 0.3, 4.5), (7.0, -3.0, 7.0, top + 3.0))
+        assert checked.offer(over, stamp) == limits.THRUST      # refused and counted as before
+        executed.append(checked.in_force)
+    until = round(LIMITS.overstep_time / 0.01)
+    assert all(one is not None for one in executed[:until - 1])
+    assert executed[until + 1:] == [None] * (99 - until)
+    for k, one in enumerate(executed[:until - 1], 1):
+        assert one.stamp == NOW + 0.01 * k      # each as soon as it came, not the last good one
+        assert one.thrust.tolist() == [7.0, 0.0, 7.0, top]
+        assert one.tilt[3] == ROBOT.joints.position_limit
+    assert not checked.good
+
+
+@pytest.mark.parametrize('numbers', [{'thrust': [7, 7, 7, 760.0]}, {'thrust': [-8.0, 7, 7, 7]},
+                                     {'tilt': [57.3, 0, 0, 0]}])
+def test_another_unit_is_never_executed(numbers):
+    checked = stream()
+    checked.offer(command(), NOW)
+    good = checked.accepted
+    for k in range(1, 10):
+        checked.tick(0.01)
+        checked.offer(command(stamp=NOW + 0.01 * k, **numbers), NOW + 0.01 * k)
+        assert checked.in_force is good or k > 3
+    assert checked.in_force is None
+
+
 def test_lone_spike_is_refused_but_a_real_step_costs_one_command():
     checked, far = stream(), (0.1 + LIMITS.tilt_step + 0.1, 0.2, 0.3, 0.4)
     checked.offer(command(), NOW)

@@ -92,6 +92,20 @@ def test_controller_that_sends_only_rubbish_counts_as_silent_and_the_reason_is_n
     assert puppet.supervisor.diagnostics()['nmpc.refused.not finite'] == 20
 
 
+def test_controller_that_shakes_at_the_limits_of_a_manoeuvre_goes_on_flying():
+    puppet = Puppet().fly()
+    puppet.alive.discard('nmpc')
+    top = ROBOT.rotors.thrust_max
+    for k in range(30):
+        puppet.supervisor.on_command('nmpc', Command(
+            puppet.now, 0.01 * np.arange(4) + 1e-6 * k, np.array([top + 2.0, 7.0, 7.0, -2.0])),
+            puppet.now)
+        puppet.run(TICK)
+        assert puppet.supervisor.state == 'flying'
+    assert puppet.command.thrust[0] == top and puppet.command.thrust[3] == 0.0
+    assert puppet.supervisor.diagnostics()['nmpc.refused.thrust out of range'] >= 29
+
+
 def test_controller_that_is_not_there_at_hand_over_is_waited_for_in_hover():
     puppet = Puppet()
     puppet.alive.discard('nmpc')
@@ -227,7 +241,10 @@ def test_fault_before_lift_off_just_stops_the_motors():
 
 
 def test_low_battery_warns_then_lands():
-    puppet = Puppet().fly()
+    # By the voltage alone: no resistance makes a pack sag that suddenly and recover.
+    detection = replace(PARAMETERS.detection, battery=replace(
+        PARAMETERS.detection.battery, time=10.0))
+    puppet = Puppet(replace(PARAMETERS, detection=detection)).fly()
     full = puppet.voltage
     puppet.voltage = (PARAMETERS.battery.land - 0.05) * ROBOT.battery.cells
     puppet.run(PARAMETERS.battery.time / 2)     # the sag of a manoeuvre
@@ -242,6 +259,18 @@ def test_low_battery_warns_then_lands():
     assert puppet.supervisor.state == 'flying'
     puppet.run(0.2)
     assert puppet.supervisor.state == 'landing'
+
+
+def test_a_pack_that_sags_under_the_same_load_leads_to_a_landing_within_half_a_second():
+    puppet = Puppet().fly()
+    puppet.run(1.0)
+    assert puppet.supervisor.health.healthy
+    puppet.voltage -= 6.0
+    puppet.run(0.5)
+    assert puppet.supervisor.state == 'landing' and 'battery_weak' in puppet.supervisor.faults
+    limit = puppet.supervisor.health.thrust_limit
+    assert ROBOT.hover_thrust < limit < 2 * ROBOT.hover_thrust
+    assert all(command.thrust.max() <= limit + 1e-9 for command in puppet.run(0.5))
 
 
 @pytest.mark.parametrize('reaction, state', [

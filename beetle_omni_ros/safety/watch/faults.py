@@ -13,6 +13,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.safety.watch.joints import JointWatch
 from beetle_omni_ros.safety.watch.mocap import MocapWatch
+from beetle_omni_ros.safety.watch.pack import PackWatch
 from beetle_omni_ros.safety.watch.parameters import Detection
 from beetle_omni_ros.safety.watch.speeds import SpeedWatch
 from beetle_omni_ros.safety.watch.wrench import ContactWatch, WrenchWatch
@@ -20,7 +21,7 @@ from beetle_omni_ros.safety.watch.wrench import ContactWatch, WrenchWatch
 CRASH, DISPLACED = 'crash', 'mocap_jumped'
 BUILD_UP = 0.5          # [s] five time constants of a rotor
 RACES = 2.0             # [-] of the largest thrust: the speed of a motor without propeller
-NOTICEABLE = 0.3        # [N] by which the thrust of a rotor that obeys nobody may drift untold
+NOTICEABLE = 0.3        # [N] by which a held thrust or the pack's limit may drift untold
 
 
 class FaultWatch:
@@ -50,6 +51,8 @@ class FaultWatch:
         self._joints = JointWatch(parameters.servo, robot)
         self._speeds = SpeedWatch(parameters.rotor, robot)
         self._mocap = MocapWatch(parameters.mocap)
+        self._pack = None if self._map is None else PackWatch(parameters.battery, robot, allocator,
+                                                              self._map)
         self.reset()
 
     def reset(self) -> None:
@@ -57,6 +60,8 @@ class FaultWatch:
         self.faults: dict[str, float] = {}
         self.health: ActuatorHealth = ALL_WELL
         self._new: list[str] = []
+        if self._pack is not None:
+            self._pack.reset()
         self.restart(-np.inf)
 
     def restart(self, now: float) -> None:
@@ -79,10 +84,17 @@ class FaultWatch:
         news, self._new = self._new, []
         return news
 
-    def on_voltage(self, voltage: float) -> None:
+    def on_voltage(self, stamp: float, voltage: float) -> None:
         """Take the pack's voltage [V]: a low one limits every rotor, which is no fault of one."""
-        if self._map is not None:
-            self._limit_now = self._map.thrust_limit_below(voltage)
+        if self._map is None or self._pack is None:
+            return
+        self._limit_now = self._map.thrust_limit_below(voltage)
+        self._pack.on_voltage(stamp, voltage)
+        limit, known = self._pack.limit, self.health.thrust_limit
+        if limit is not None and (known is None or abs(limit - known) > NOTICEABLE):
+            self._name('battery_weak', stamp, f'the pack sags to {voltage:.1f} V under load: it '
+                       f'allows {limit:.1f} N a rotor, too little for some attitudes')
+            self.health = replace(self.health, thrust_limit=limit)
 
     def _possible(self, thrust):
         """Thrusts (4,) [N] that the present voltage allows."""
@@ -124,7 +136,10 @@ class FaultWatch:
     def on_command(self, command: Command) -> None:
         """Take what goes out."""
         self._joints.on_command(command.stamp, command.tilt)
-        self._speeds.on_command(command.stamp, self._possible(command.thrust))
+        thrust = self._possible(command.thrust)
+        self._speeds.on_command(command.stamp, thrust)
+        if self._pack is not None:
+            self._pack.on_command(command.stamp, thrust)
 
     def on_joints(self, stamp: float, tilt: np.ndarray, trusted: bool) -> None:
         """

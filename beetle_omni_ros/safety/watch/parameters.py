@@ -112,6 +112,19 @@ class ImuLimits:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PackLimits:
+    """When the pack sags so far that the robot cannot hold every attitude."""
+
+    noise: float = parameter(0.02, doc='standard deviation of a reading', unit='V', low=1e-4,
+                             high=1)
+    load_error: float = parameter(
+        0.1, doc='share by which the modelled load differs from the true one', low=0, high=1)
+    discharge: float = parameter(
+        0.03, doc='random walk of the rest voltage', unit='V/s^0.5', low=0, high=1)
+    time: float = parameter(0.2, doc='for this long', unit='s', low=0, high=10)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Detection:
     """All detectors."""
 
@@ -120,3 +133,4 @@ class Detection:
     servo: ServoLimits = group(ServoLimits)
     mocap: MocapLimits = group(MocapLimits)
     imu: ImuLimits = group(ImuLimits)
+    battery: PackLimits = group(PackLimits)

@@ -1,0 +1,114 @@
+"""The thrust that a sagging pack still allows, from its voltage under the rotors' load."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beetle_omni_ros.robot.allocation import Allocator, ROTORS
+from beetle_omni_ros.robot.holding import sphere
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.thrust_map import ThrustMap
+from beetle_omni_ros.safety.watch.parameters import PackLimits
+
+DIRECTIONS = 200        # of up in the body whose hover load is looked at, 14 deg apart
+BISECTIONS = 20
+SURPRISE = 3.0          # [-] standard deviations of a reading that only a fault explains
+UNKNOWN = 1.0           # [ohm W/N^1.5] of a pack that was not yet loaded; a good one has 0.4
+
+
+class PackWatch:
+    """
+    Tells the rest voltage of the pack from its resistance while the load varies.
+
+    A rotor draws power with thrust to the power of 1.5, so the voltage under load is
+    ``V = rest - drop * load / V`` with the load being the sum of those powers. A Kalman filter
+    estimates ``rest`` and ``drop``. Charge falls slowly; a reading far from the expected one is a
+    resistance (a contact, a cell) that has changed.
+
+    The pack is weak where it cannot hold every attitude: at one of them the voltage that its load
+    leaves gives less than the thrust that it needs.
+
+    Args:
+        limits: noise and times.
+        robot: as believed.
+        allocator: of the robot.
+        rotor_map: thrust limits by voltage.
+
+    Attributes:
+        limit: thrust that all rotors can give together [N], None while the pack is strong enough.
+
+    """
+
+    def __init__(self, limits: PackLimits, robot: RobotParameters, allocator: Allocator,
+                 rotor_map: ThrustMap):
+        """See the class."""
+        self._p, self._map = limits, rotor_map
+        self._lag, self._thrust_max = robot.rotors.time_constant, robot.rotors.thrust_max
+        _, thrusts = allocator.upright(sphere(DIRECTIONS))
+        self._loads = _load(thrusts)
+        self._needs = np.minimum(thrusts.max(axis=1), self._thrust_max)
+        self.reset()
+
+    def reset(self) -> None:
+        """A new flight, perhaps on another pack."""
+        self.limit: float | None = None
+        self._thrust, self._commanded_at = np.zeros(ROTORS), -np.inf
+        self._state = np.array([np.nan, 0.0])      # rest [V], drop [ohm W/N^1.5]
+        self._covariance = np.diag([self._p.noise ** 2, UNKNOWN ** 2])
+        self._read_at, self._weak_for = -np.inf, 0.0
+
+    def on_command(self, stamp: float, thrust: np.ndarray) -> None:
+        """Take thrusts (4,) [N] that are asked for from ``stamp`` [s] on, as far as possible."""
+        since = max(0.0, stamp - self._commanded_at)
+        self._thrust = self._thrust - np.expm1(-since / self._lag) * (thrust - self._thrust)
+        self._commanded_at = stamp
+
+    def on_voltage(self, stamp: float, voltage: float) -> None:
+        """Take a reading [V]."""
+        since, self._read_at = min(stamp - self._read_at, 1.0), stamp
+        if since <= 0 or voltage <= 0:
+            return
+        if np.isnan(self._state[0]):
+            self._state[0] = voltage
+        self._estimate(voltage, since)
+        # Once weak, always weak: a pack that recovers is not trusted in the same flight.
+        weak = bool(np.any(self._allowed(self._loads) < self._needs))
+        self._weak_for = self._weak_for + since if weak else 0.0
+        if self.limit is not None or self._weak_for > self._p.time:
+            self.limit = self._together()
+
+    def _estimate(self, voltage, since):
+        """One step of the filter."""
+        load = float(_load(self._thrust)) / voltage
+        sensitivity = np.array([1.0, -load])
+        self._covariance[0, 0] += self._p.discharge ** 2 * since
+        noise = self._p.noise ** 2 + (self._p.load_error * self._state[1] * load) ** 2
+        error = voltage - float(sensitivity @ self._state)
+        variance = float(sensitivity @ self._covariance @ sensitivity) + noise
+        if load > 0 and error ** 2 > SURPRISE ** 2 * variance:
+            self._covariance[1, 1] += (error / load) ** 2
+            variance = float(sensitivity @ self._covariance @ sensitivity) + noise
+        gain = self._covariance @ sensitivity / variance
+        self._state = np.maximum(self._state + gain * error, 0.0)
+        self._covariance -= np.outer(gain, gain) * variance
+
+    def _allowed(self, load):
+        """Largest thrust of a rotor [N] at the voltage that loads [N^1.5] leave."""
+        rest, drop = self._state
+        # V (rest - V) = drop * load; beyond the pack's largest power V is half of rest.
+        voltage = 0.5 * (rest + np.sqrt(np.maximum(rest * rest - 4 * drop * load, 0.0)))
+        return self._map.thrust_limit_below(voltage)
+
+    def _together(self):
+        """Thrust [N] that all rotors can give at the same time."""
+        low, high = 0.0, self._thrust_max
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            enough = self._allowed(ROTORS * middle ** 1.5) >= middle
+            low, high = (middle, high) if enough else (low, middle)
+        return low
+
+
+def _load(thrust):
+    """Sum (...) of thrusts (..., 4) to the power of 1.5, proportional to electric power."""
+    return (np.maximum(thrust, 0.0) ** 1.5).sum(axis=-1)

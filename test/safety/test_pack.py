@@ -1,0 +1,112 @@
+"""The pack's resistance and the thrust that it allows, against the simulated pack."""
+
+import numpy as np
+import pytest
+
+from beetle_omni_ros.robot.allocation import Allocator
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.robot.thrust_map import ThrustMap
+from beetle_omni_ros.safety.parameters import SupervisorParameters
+from beetle_omni_ros.safety.watch.pack import PackWatch
+from beetle_omni_ros.sim.battery import Battery
+from beetle_omni_ros.sim.parameters import SimulatorParameters
+
+ROBOT = RobotParameters.load()
+PACK = SimulatorParameters.load().battery
+TICK = 0.01
+LAG = ROBOT.rotors.time_constant
+
+
+class Flight:
+    """A simulated pack under four rotors, and the watch that hears its readings."""
+
+    def __init__(self, seed=0):
+        self.battery = Battery(ROBOT, PACK)
+        self.watch = PackWatch(SupervisorParameters.load().detection.battery, ROBOT,
+                               Allocator(ROBOT), ThrustMap(ROBOT.rotors))
+        self.random, self.ticks = np.random.default_rng(seed), 0
+        self.thrust, self.seen = np.zeros(4), ROBOT.battery.full_voltage
+
+    def fly(self, duration, command, faster=1.0):
+        """Go on; ``command`` (4,) [N] or a function of time. Charge is drawn ``faster``."""
+        for _ in range(round(duration / TICK)):
+            time = self.ticks * TICK
+            asked = command(time) if callable(command) else command
+            given = np.minimum(asked, self.battery.thrust_limit)
+            self.thrust = self.thrust - np.expm1(-TICK / LAG) * (given - self.thrust)
+            self.battery.step(self.thrust, TICK * faster)
+            possible = self.watch._map.thrust_limit_below(self.seen)
+            self.watch.on_command(time, np.minimum(asked, possible))
+            self.ticks += 1
+            if self.ticks % 10 == 0:
+                self.seen = self.battery.voltage + PACK.voltage_noise * self.random.normal()
+                self.watch.on_voltage(self.ticks * TICK, self.seen)
+            if self.watch.limit is not None:
+                return self.ticks * TICK - time
+        return None
+
+
+def hover(time=0.0):
+    return np.full(4, ROBOT.hover_thrust)
+
+
+def manoeuvres(time):
+    """Between half and twice the hover thrust, faster and slower than the rotors' lag."""
+    phases = np.array([0.0, 1.0, 2.5, 4.0])
+    return ROBOT.hover_thrust * (1.2 + 0.5 * np.sin(2.0 * time + phases)
+                                 + 0.3 * np.sin(9.0 * time + 2 * phases))
+
+
+def all_together(extra):
+    """Thrust of four saturated rotors [N], by the simulated pack alone."""
+    battery = Battery(ROBOT, PACK)
+    battery.extra_resistance = extra
+    thrust = np.full(4, ROBOT.hover_thrust)
+    for _ in range(2000):
+        battery.step(thrust, 1e-6)
+        thrust = thrust + 0.05 * (battery.thrust_limit - thrust)
+    return float(thrust[0])
+
+
+@pytest.mark.parametrize('command', [hover, manoeuvres])
+@pytest.mark.parametrize('extra', [0.15, 0.2, 0.3])
+def test_a_worn_contact_is_told_within_half_a_second_with_the_thrust_that_is_left(command, extra):
+    flight = Flight()
+    assert flight.fly(0.5, np.zeros(4)) is None
+    assert flight.fly(6.0, command) is None
+    start = flight.ticks
+    flight.battery.extra_resistance = extra
+    flight.fly(2.0, command)
+    assert flight.watch.limit is not None
+    assert (flight.ticks - start) * TICK <= 0.5
+    for _ in range(150):        # the watch goes on, the loop of fly() stops at a limit
+        flight.fly(0.01, command)
+    assert flight.watch.limit == pytest.approx(all_together(extra), rel=0.1)
+
+
+@pytest.mark.parametrize('command', [hover, manoeuvres])
+@pytest.mark.parametrize('seed', [0, 1])
+def test_a_good_pack_that_empties_is_never_weak(command, seed):
+    flight = Flight(seed)
+    assert flight.fly(0.5, np.zeros(4)) is None
+    # Four times the simulated current: a real pack of this size is empty after 12 minutes.
+    while flight.battery.charge > 0.2:
+        assert flight.fly(20.0, command, faster=4.0) is None
+
+
+def test_an_empty_pack_is_weak():
+    flight = Flight()
+    flight.battery.charge = 0.02
+    flight.fly(0.5, np.zeros(4))
+    flight.fly(3.0, hover)
+    assert flight.watch.limit is not None and flight.watch.limit < 15.0
+
+
+def test_a_new_flight_knows_nothing_of_the_last():
+    flight = Flight()
+    flight.battery.extra_resistance = 0.3
+    flight.fly(0.5, np.zeros(4))
+    flight.fly(3.0, hover)
+    assert flight.watch.limit is not None
+    flight.watch.reset()
+    assert flight.watch.limit is None
