@@ -22,70 +22,56 @@ class RotorEffect(Effect):
 
 @kind('rotor_stops')
 class RotorStops(RotorEffect):
-    """Its ESC gives up; the thrust fades with the rotor's lag."""
-
-    doc = 'a rotor stops; its thrust fades with the rotor lag'
+    """A rotor stops; its thrust fades with the rotor lag."""
 
     def drive(self, drive):
-        """No thrust."""
         drive.thrust[self._k] = 0.0
 
 
 @kind('rotor_weak')
 class RotorWeak(RotorEffect):
-    """It turns slower than asked."""
+    """A rotor turns slower and gives only a share of the thrust asked for."""
 
-    doc = 'a rotor turns slower and gives only a share of the thrust asked for'
     numbers = {**RotorEffect.numbers, 'share': share('of the thrust asked for')}
 
     def drive(self, drive):
-        """Less thrust."""
         drive.thrust[self._k] *= self._numbers['share']
 
 
 @kind('propeller_broken')
 class PropellerBroken(RotorEffect):
-    """It turns as asked, and its blades give less."""
+    """A rotor turns at the speed asked for and its propeller gives only a share of the thrust."""
 
-    doc = 'a rotor turns at the speed asked for and its propeller gives only a share of the thrust'
     numbers = {**RotorEffect.numbers, 'share': share('of the thrust at that speed')}
 
     def drive(self, drive):
-        """Less thrust at the same speed."""
         drive.thrust[self._k] *= self._numbers['share']
         drive.wear[self._k] *= max(self._numbers['share'], 1e-6)
 
 
 @kind('rotor_sticks')
 class RotorSticks(RotorEffect):
-    """It no longer hears commands and keeps its thrust."""
-
-    doc = 'a rotor keeps the thrust that it has'
+    """A rotor keeps the thrust that it has."""
 
     def start(self, world):
-        """Remember the thrust."""
         self._thrust = float(world.truth.thrust[self._k])
 
     def drive(self, drive):
-        """The thrust of then."""
         drive.thrust[self._k] = self._thrust
 
 
 @kind('rotor_slow')
 class RotorSlow(RotorEffect):
-    """Another first-order lag before its own."""
+    """A rotor follows through one more lag."""
 
-    doc = 'a rotor follows through one more lag'
     numbers = {**RotorEffect.numbers,
                'time_constant': Number('of the additional lag', 's', low=0.005, high=10)}
 
     def start(self, world):
-        """Begin where it is."""
         self._thrust = float(world.truth.thrust[self._k])
         self._gain = 1 - exp(-self._tick / self._numbers['time_constant'])
 
     def drive(self, drive):
-        """Towards what is asked."""
         self._thrust += self._gain * (drive.thrust[self._k] - self._thrust)
         drive.thrust[self._k] = self._thrust
 
@@ -111,20 +97,17 @@ class ServoEffect(Effect):
 
 @kind('servo_jammed')
 class ServoJammed(ServoEffect):
-    """The joint is held by force, where it is or after a slip."""
+    """A joint jams where it is, or after it has slipped by an angle."""
 
-    doc = 'a joint jams where it is, or after it has slipped by an angle'
     numbers = {**ServoEffect.numbers,
                'offset': Number('by which it slips first', 'rad', 0.0, -8, 8),
                'rate': Number('of the slip', 'rad/s', 10.0, 0.1, 100)}
 
     def start(self, world):
-        """Hold from here."""
         self._angle = float(world.truth.tilt[self._k])
         self._left = self._numbers['offset']
 
     def drive(self, drive):
-        """Slip, then hold."""
         most = self._numbers['rate'] * self._tick
         step = float(np.clip(self._left, -most, most))
         self._left -= step
@@ -135,29 +118,23 @@ class ServoJammed(ServoEffect):
 
 @kind('servo_limp')
 class ServoLimp(ServoEffect):
-    """No torque."""
-
-    doc = 'a servo loses its torque, the joint swings freely'
+    """A servo loses its torque, the joint swings freely."""
 
     def drive(self, drive):
-        """Not powered."""
         drive.powered[self._k] = False
 
 
 @kind('servo_slow')
 class ServoSlow(ServoEffect):
-    """It turns slowly."""
+    """A servo turns at most at a rate."""
 
-    doc = 'a servo turns at most at a rate'
     numbers = {**ServoEffect.numbers,
                'rate': Number('that it reaches', 'rad/s', low=0.01, high=100)}
 
     def start(self, world):
-        """Begin where it is."""
         self._angle = float(world.truth.tilt[self._k])
 
     def drive(self, drive):
-        """A target that moves slowly."""
         step = self._numbers['rate'] * self._tick
         self._angle += float(np.clip(drive.tilt[self._k] - self._angle, -step, step))
         drive.tilt[self._k] = self._angle
@@ -165,46 +142,37 @@ class ServoSlow(ServoEffect):
 
 @kind('servo_deaf')
 class ServoDeaf(ServoEffect):
-    """It hears no new target."""
-
-    doc = 'a servo holds the target that it had'
+    """A servo holds the target that it had."""
 
     def start(self, world):
-        """Remember the target."""
         self._target = float(world.tilt[self._k])
 
     def drive(self, drive):
-        """The target of then."""
         drive.tilt[self._k] = self._target
 
 
 @kind('encoder_shifted')
 class EncoderShifted(ServoEffect):
-    """The magnet slips; the servo regulates by what it reads, so the joint moves away."""
+    """An encoder reads too much by an angle, and its servo regulates by that."""
 
-    doc = 'an encoder reads too much by an angle, and its servo regulates by that'
     numbers = {**ServoEffect.numbers,
                'angle': Number('reading minus true tilt', 'rad', low=-8, high=8)}
 
     def drive(self, drive):
-        """The servo turns until its reading is the target."""
         drive.tilt[self._k] -= self._numbers['angle']
 
     def joints(self, reading, now):
-        """Read too much."""
         return reading and self._shown(reading,
                                        reading.position[self._k] + self._numbers['angle'])
 
 
 @kind('encoder_frozen')
 class EncoderFrozen(ServoEffect):
-    """Its last angle is told again and again; the servo itself works."""
+    """The told angle of a servo stays as it is, the servo works."""
 
-    doc = 'the told angle of a servo stays as it is, the servo works'
     _angle: float | None = None
 
     def joints(self, reading, now):
-        """The first reading since it began."""
         if reading is None:
             return None
         if self._angle is None:
@@ -214,21 +182,15 @@ class EncoderFrozen(ServoEffect):
 
 @kind('joints_lost')
 class JointsLost(Effect):
-    """No feedback of any joint."""
-
-    doc = 'no joint feedback arrives'
+    """No joint feedback arrives."""
 
     def joints(self, reading, now):
-        """Nothing."""
         return None
 
 
 @kind('rotor_speed_lost')
 class RotorSpeedLost(Effect):
-    """No ESC telemetry."""
-
-    doc = 'no rotor speed arrives'
+    """No rotor speed arrives."""
 
     def rotors(self, reading, now):
-        """Nothing."""
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
@@ -12,6 +13,7 @@ import numpy as np
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.yaml_file import quoted
 
+ROUNDING = 1e-9     # [s] sums of ticks differ from their product by less
 LARGEST = 1e9       # of any number; what is beyond is a slip of the pen
 KINDS: dict[str, type[Effect]] = {}
 """Name of a kind -> what it does."""
@@ -122,14 +124,12 @@ class Effect:
     What a fault does while it is on. A kind overrides the hooks it needs.
 
     Attributes:
-        doc: one line for the docs.
         numbers: of the kind, by name.
         process: whether a process of the flight stack is struck, see
             :class:`~beetle_omni_ros.sim.faults.processes.ProcessEffect`.
 
     """
 
-    doc: ClassVar[str] = ''
     numbers: ClassVar[dict[str, Number]] = {}
     process: ClassVar[bool] = False
 
@@ -225,6 +225,24 @@ class Actuation:
     powered: np.ndarray
     jammed: np.ndarray
     wear: np.ndarray
+
+
+class Late(Effect):
+    """Holds what passes for a while."""
+
+    numbers = {'delay': Number('in addition', 's', low=0, high=5)}
+
+    def start(self, world):
+        self._way: deque = deque()
+
+    def _arrived(self, item: Any, now: float, most: float = inf) -> list:
+        """What has arrived by ``now`` [s], at most so many, where ``item`` (or None) sets out."""
+        if item is not None:
+            self._way.append((now + self._numbers['delay'], item))
+        arrived: list = []
+        while len(arrived) < most and self._way and self._way[0][0] <= now + ROUNDING:
+            arrived.append(self._way.popleft()[1])
+        return arrived
 
 
 def kind(name: str):

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.sim.faults.base import Effect, kind, Number, vector
-
-ROUNDING = 1e-9     # [s]
+from beetle_omni_ros.sim.faults.base import Effect, kind, Late, Number, vector
 
 
 class ProcessEffect(Effect):
@@ -36,38 +33,31 @@ class ProcessEffect(Effect):
 
 @kind('clock_jumps')
 class ClockJumps(ProcessEffect):
-    """Somebody sets the flight computer's clock."""
+    """The flight computer's clock is set."""
 
-    doc = "the flight computer's clock is set"
     numbers = {'step': Number('by which', 's', low=-100, high=100)}
 
     @property
     def clock_step(self):
-        """The step."""
         return self._numbers['step']
 
 
 @kind('estimator_dead')
 class EstimatorDead(ProcessEffect):
-    """No estimate."""
-
-    doc = 'the estimator gives nothing'
+    """The estimator gives nothing."""
 
     def estimate(self, state):
-        """Nothing."""
         return None
 
 
 @kind('estimator_diverges')
 class EstimatorDiverges(ProcessEffect):
-    """The position estimate runs away."""
+    """The estimated position and velocity run away along world x."""
 
-    doc = 'the estimated position and velocity run away along world x'
     numbers = {'acceleration': Number('of the error', 'm/s^2', 1.0, 0, 1000)}
     _time = 0.0
 
     def estimate(self, state):
-        """More and more off."""
         self._time += self._tick
         gain = self._numbers['acceleration']
         away = np.array([1.0, 0.0, 0.0])
@@ -77,23 +67,17 @@ class EstimatorDiverges(ProcessEffect):
 
 @kind('estimator_nan')
 class EstimatorNan(ProcessEffect):
-    """The estimate is no number."""
-
-    doc = 'the estimator gives NaN'
+    """The estimator gives NaN."""
 
     def estimate(self, state):
-        """No numbers."""
         return replace(state, position=np.full(3, np.nan))
 
 
 @kind('estimator_rubbish')
 class EstimatorRubbish(ProcessEffect):
-    """The estimate is anything."""
-
-    doc = 'the estimator gives a random state each time'
+    """The estimator gives a random state each time."""
 
     def estimate(self, state):
-        """Any state."""
         row = self._random.standard_normal(13)
         return replace(state, position=3 * row[:3], velocity=3 * row[3:6],
                        quaternion=rotations.normalized(row[6:10]), angular_velocity=3 * row[10:])
@@ -101,25 +85,20 @@ class EstimatorRubbish(ProcessEffect):
 
 @kind('estimator_frozen')
 class EstimatorFrozen(ProcessEffect):
-    """The same estimate with new stamps."""
+    """The estimator gives the same state with new stamps."""
 
-    doc = 'the estimator gives the same state with new stamps'
     _first = None
 
     def estimate(self, state):
-        """The first state since it began."""
         self._first = self._first or state
         return replace(self._first, stamp=state.stamp)
 
 
 @kind('controller_silent')
 class ControllerSilent(ProcessEffect):
-    """No command of the active controller."""
-
-    doc = 'the active controller gives nothing'
+    """The active controller gives nothing."""
 
     def request(self, command, now):
-        """Nothing."""
         return []
 
 
@@ -127,15 +106,12 @@ class _Answer(ProcessEffect):
     """Changes each command of the active controller."""
 
     def request(self, command, now):
-        """Another command with the same stamp."""
         return [] if command is None else [self._change(command)]
 
 
 @kind('controller_nan')
 class ControllerNan(_Answer):
-    """No numbers."""
-
-    doc = 'the active controller gives NaN'
+    """The active controller gives NaN."""
 
     def _change(self, command):
         return replace(command, thrust=np.full(4, np.nan))
@@ -143,9 +119,7 @@ class ControllerNan(_Answer):
 
 @kind('controller_rubbish')
 class ControllerRubbish(_Answer):
-    """Anything within the limits."""
-
-    doc = 'the active controller gives random tilts within 3 rad and thrusts within 20 N'
+    """The active controller gives random tilts within 3 rad and thrusts within 20 N."""
 
     def _change(self, command):
         return replace(command, tilt=self._random.uniform(-3, 3, 4),
@@ -154,9 +128,8 @@ class ControllerRubbish(_Answer):
 
 @kind('controller_constant')
 class ControllerConstant(_Answer):
-    """The same numbers with new stamps."""
+    """The active controller gives the same command with new stamps."""
 
-    doc = 'the active controller gives the same command with new stamps'
     _first = None
 
     def _change(self, command):
@@ -166,9 +139,8 @@ class ControllerConstant(_Answer):
 
 @kind('controller_noisy')
 class ControllerNoisy(_Answer):
-    """Commands that shake, as of a controller that is not stable."""
+    """The active controller shakes: white noise on its commands, standard deviations."""
 
-    doc = 'the active controller shakes: white noise on its commands, standard deviations'
     numbers = {'tilt': Number('noise', 'rad', 0.0, 0, 3),
                'thrust': Number('noise', 'N', 0.0, 0, 20)}
 
@@ -179,44 +151,30 @@ class ControllerNoisy(_Answer):
 
 
 @kind('controller_slow')
-class ControllerSlow(ProcessEffect):
-    """Its answers come late, with the stamps of the states that they answer."""
+class ControllerSlow(Late, ProcessEffect):
+    """The active controller answers late, with the stamps of the states that it answers."""
 
-    doc = 'the active controller answers late'
     numbers = {'delay': Number('of its answers', 's', low=0, high=5)}
 
-    def start(self, world):
-        """Nothing on its way."""
-        self._way: deque = deque()
-
     def request(self, command, now):
-        """What has arrived by now."""
-        if command is not None:
-            self._way.append((now + self._numbers['delay'], command))
-        arrived = []
-        while self._way and self._way[0][0] <= now + ROUNDING:
-            arrived.append(self._way.popleft()[1])
-        return arrived
+        return self._arrived(command, now)
 
 
 @kind('supervisor_waits')
 class SupervisorWaits(ProcessEffect):
-    """It is not scheduled; its inputs wait in their queues."""
+    """The supervisor is not scheduled; the newest ten messages of each topic wait."""
 
-    doc = 'the supervisor is not scheduled; the newest ten messages of each topic wait'
     supervisor_waits = True
 
 
 @kind('target')
 class Target(ProcessEffect):
-    """Somebody asks for another pose."""
+    """Somebody asks for a pose in world."""
 
-    doc = 'somebody asks for a pose in world'
     numbers = {**vector('m', 'in world', x=0.0, y=0.0, z=1.0),
                **vector('rad', 'in world', roll=0.0, pitch=0.0, yaw=0.0)}
 
     def target(self):
-        """The pose."""
         n = self._numbers
         return (np.array([n['x'], n['y'], n['z']]),
                 rotations.from_rpy(n['roll'], n['pitch'], n['yaw']))
@@ -224,15 +182,13 @@ class Target(ProcessEffect):
 
 @kind('motor_board_lost')
 class MotorBoardLost(ProcessEffect):
-    """rotor_bridge_node says that it lost its board; use with the faults of its rotors."""
+    """The rotor bridge says 'lost'."""
 
-    doc = "the rotor bridge says 'lost'"
     bridges = {'rotor': 'lost: motor board silent'}
 
 
 @kind('servo_bus_lost')
 class ServoBusLost(ProcessEffect):
-    """joint_bridge_node says that it lost a servo; use with the faults of its servos."""
+    """The joint bridge says 'lost'."""
 
-    doc = "the joint bridge says 'lost'"
     bridges = {'joint': 'lost: a servo is silent'}

@@ -7,9 +7,7 @@ from math import inf
 
 import numpy as np
 
-from beetle_omni_ros.sim.faults.base import Effect, Fault, KINDS
-
-ROUNDING = 1e-9     # [s] sums of ticks differ from their product by less
+from beetle_omni_ros.sim.faults.base import Effect, Fault, KINDS, ROUNDING
 
 
 class Schedule:

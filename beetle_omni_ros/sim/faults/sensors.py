@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.sim.faults.base import Effect, kind, Number, share, vector
-
-ROUNDING = 1e-9     # [s]
+from beetle_omni_ros.sim.faults.base import Effect, kind, Late, Number, ROUNDING, share, vector
 
 
 @kind('mocap_lost')
 class MocapLost(Effect):
-    """No pose."""
-
-    doc = 'no pose arrives'
+    """No pose arrives."""
 
     def mocap(self, reading, now):
-        """Nothing."""
         return None
 
 
 @kind('mocap_drops')
 class MocapDrops(Effect):
-    """Some poses are lost."""
+    """A share of the poses is lost."""
 
-    doc = 'a share of the poses is lost'
     numbers = {'share': share('of the poses that are lost')}
 
     def mocap(self, reading, now):
-        """Sometimes nothing."""
         if reading is None or self._random.uniform() < self._numbers['share']:
             return None
         return reading
@@ -40,13 +32,11 @@ class MocapDrops(Effect):
 
 @kind('mocap_frozen')
 class MocapFrozen(Effect):
-    """The same pose with new stamps."""
+    """The same pose arrives with new stamps."""
 
-    doc = 'the same pose arrives with new stamps'
     _first = None
 
     def mocap(self, reading, now):
-        """The first pose since it began."""
         if reading is None:
             return None
         self._first = self._first or reading
@@ -55,26 +45,22 @@ class MocapFrozen(Effect):
 
 @kind('mocap_jumps')
 class MocapJumps(Effect):
-    """Another origin."""
+    """The position jumps and stays off."""
 
-    doc = 'the position jumps and stays off'
     numbers = vector('m', 'of the jump in world', x=0.0, y=0.0, z=0.0)
 
     def mocap(self, reading, now):
-        """Shifted."""
         return reading and replace(reading, position=reading.position + np.array(
             [self._numbers[axis] for axis in 'xyz']))
 
 
 @kind('mocap_turned')
 class MocapTurned(Effect):
-    """Markers are taken for others."""
+    """The orientation jumps about base_link axes and stays off."""
 
-    doc = 'the orientation jumps about base_link axes and stays off'
     numbers = vector('rad', 'of the turn', roll=0.0, pitch=0.0, yaw=0.0)
 
     def mocap(self, reading, now):
-        """Turned in base_link."""
         if reading is None:
             return None
         turn = rotations.from_rpy(*(self._numbers[axis] for axis in ('roll', 'pitch', 'yaw')))
@@ -83,14 +69,12 @@ class MocapTurned(Effect):
 
 @kind('mocap_noisy')
 class MocapNoisy(Effect):
-    """More noise."""
+    """More noise on the pose, standard deviations of an axis."""
 
-    doc = 'more noise on the pose, standard deviations of an axis'
     numbers = {'position': Number('noise', 'm', 0.0, 0, 10),
                'orientation': Number('noise', 'rad', 0.0, 0, 3)}
 
     def mocap(self, reading, now):
-        """Pose with white noise."""
         if reading is None:
             return None
         noise = self._random.standard_normal(6)
@@ -99,56 +83,31 @@ class MocapNoisy(Effect):
                        quaternion=rotations.multiply(reading.quaternion, turn))
 
 
-class _Late(Effect):
-    """Poses arrive later than they did."""
-
-    numbers = {'delay': Number('in addition', 's', low=0, high=5)}
-
-    def start(self, world):
-        """Nothing on its way."""
-        self._way: deque = deque()
-
-    def _arrived(self, reading, now):
-        if reading is not None:
-            self._way.append((now + self._numbers['delay'], reading))
-        if self._way and self._way[0][0] <= now + ROUNDING:
-            return self._way.popleft()[1]
-        return None
-
-
 @kind('mocap_delayed')
-class MocapDelayed(_Late):
-    """Late, with the stamp of the capture."""
-
-    doc = 'poses arrive late, stamped at capture'
+class MocapDelayed(Late):
+    """Poses arrive late, stamped at capture."""
 
     def mocap(self, reading, now):
-        """An older one."""
-        return self._arrived(reading, now)
+        return next(iter(self._arrived(reading, now, 1)), None)
 
 
 @kind('mocap_lags')
-class MocapLags(_Late):
-    """Late, and the stamp does not tell."""
-
-    doc = 'poses arrive late, and their stamps do not tell'
+class MocapLags(MocapDelayed):
+    """Poses arrive late, and their stamps do not tell."""
 
     def mocap(self, reading, now):
-        """An older one with a newer stamp."""
-        late = self._arrived(reading, now)
+        late = super().mocap(reading, now)
         return late and replace(late, stamp=late.stamp + self._numbers['delay'])
 
 
 @kind('mocap_slow')
 class MocapSlow(Effect):
-    """A low rate."""
+    """Poses arrive at a lower rate."""
 
-    doc = 'poses arrive at a lower rate'
     numbers = {'period': Number('between two poses', 's', low=0.01, high=5)}
     _next = -np.inf
 
     def mocap(self, reading, now):
-        """One in each period."""
         if reading is None or now < self._next - ROUNDING:
             return None
         self._next = now + self._numbers['period']
@@ -157,36 +116,29 @@ class MocapSlow(Effect):
 
 @kind('mocap_clock')
 class MocapClock(Effect):
-    """Its computer's clock is set."""
+    """The stamps of the poses jump and stay off."""
 
-    doc = 'the stamps of the poses jump and stay off'
     numbers = {'step': Number('of the stamps', 's', low=-100, high=100)}
 
     def mocap(self, reading, now):
-        """Another stamp."""
         return reading and replace(reading, stamp=reading.stamp + self._numbers['step'])
 
 
 @kind('imu_lost')
 class ImuLost(Effect):
-    """No sample."""
-
-    doc = 'no IMU sample arrives'
+    """No IMU sample arrives."""
 
     def imu(self, reading, now):
-        """Nothing."""
         return None
 
 
 @kind('imu_frozen')
 class ImuFrozen(Effect):
-    """The same numbers with new stamps."""
+    """The same IMU sample arrives with new stamps."""
 
-    doc = 'the same IMU sample arrives with new stamps'
     _first = None
 
     def imu(self, reading, now):
-        """The first sample since it began."""
         if reading is None:
             return None
         self._first = self._first or reading
@@ -195,13 +147,11 @@ class ImuFrozen(Effect):
 
 @kind('imu_clock')
 class ImuClock(Effect):
-    """Its clock is set."""
+    """The stamps of the IMU jump and stay off."""
 
-    doc = 'the stamps of the IMU jump and stay off'
     numbers = {'step': Number('of the stamps', 's', low=-100, high=100)}
 
     def imu(self, reading, now):
-        """Another stamp."""
         return reading and replace(reading, stamp=reading.stamp + self._numbers['step'])
 
 
@@ -209,7 +159,6 @@ class _Motion(Effect):
     """Changes the six numbers of a sample."""
 
     def imu(self, reading, now):
-        """Sample with other numbers."""
         if reading is None:
             return None
         changed = self._change(np.concatenate([reading.specific_force, reading.angular_velocity]),
@@ -219,9 +168,8 @@ class _Motion(Effect):
 
 @kind('gyroscope_bias')
 class GyroscopeBias(_Motion):
-    """A step of the bias."""
+    """The gyroscope bias steps."""
 
-    doc = 'the gyroscope bias steps'
     numbers = vector('rad/s', 'of the step', x=0.0, y=0.0, z=0.0)
 
     def _change(self, motion, now):
@@ -231,9 +179,8 @@ class GyroscopeBias(_Motion):
 
 @kind('accelerometer_bias')
 class AccelerometerBias(_Motion):
-    """A step of the bias."""
+    """The accelerometer bias steps."""
 
-    doc = 'the accelerometer bias steps'
     numbers = vector('m/s^2', 'of the step', x=0.0, y=0.0, z=0.0)
 
     def _change(self, motion, now):
@@ -243,9 +190,8 @@ class AccelerometerBias(_Motion):
 
 @kind('imu_saturated')
 class ImuSaturated(_Motion):
-    """A small range."""
+    """The IMU saturates."""
 
-    doc = 'the IMU saturates'
     numbers = {'specific_force': Number('largest value', 'm/s^2', 1000.0, 0, 1000),
                'rate': Number('largest value', 'rad/s', 1000.0, 0, 1000)}
 
@@ -256,9 +202,7 @@ class ImuSaturated(_Motion):
 
 @kind('imu_nan')
 class ImuNan(_Motion):
-    """No numbers."""
-
-    doc = 'the IMU gives NaN'
+    """The IMU gives NaN."""
 
     def _change(self, motion, now):
         return np.full(6, np.nan)
@@ -266,9 +210,8 @@ class ImuNan(_Motion):
 
 @kind('imu_spikes')
 class ImuSpikes(_Motion):
-    """Single wrong samples."""
+    """Single IMU samples are off, each in a random direction."""
 
-    doc = 'single IMU samples are off, each in a random direction'
     numbers = {'period': Number('mean time between two', 's', 0.1, 0.005, 100),
                'specific_force': Number('of a spike', 'm/s^2', 0.0, 0, 1000),
                'rate': Number('of a spike', 'rad/s', 0.0, 0, 1000)}
@@ -283,9 +226,8 @@ class ImuSpikes(_Motion):
 
 @kind('imu_axis_dead')
 class ImuAxisDead(_Motion):
-    """One axis reads zero."""
+    """One axis of the IMU reads zero: 1 to 3 specific force, 4 to 6 rate."""
 
-    doc = 'one axis of the IMU reads zero: 1 to 3 specific force, 4 to 6 rate'
     numbers = {'axis': Number('of six', '', None, 1, 6, whole=True)}
 
     def _change(self, motion, now):
