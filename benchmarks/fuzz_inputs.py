@@ -37,6 +37,7 @@ from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters 
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters  # noqa: E402
 from beetle_omni_ros.estimation.parameters import EkfParameters  # noqa: E402
 from beetle_omni_ros.identify.gap.parameters import GapParameters  # noqa: E402
+from beetle_omni_ros.identify.parameters import IdentifyParameters  # noqa: E402
 from beetle_omni_ros.identify.recording.limits import RecordingLimits  # noqa: E402
 from beetle_omni_ros.robot.holding import HoldingParameters  # noqa: E402
 from beetle_omni_ros.robot.parameters import RobotParameters  # noqa: E402
@@ -59,6 +60,7 @@ PARAMETER_FILES = {
     'check.yaml': CheckLimits, 'degraded.yaml': HoldingParameters, 'ekf.yaml': EkfParameters,
     'faults.yaml': FaultList, 'gap.yaml': GapParameters,
     'emulated_board.yaml': EmulatedBoardParameters, 'hover.yaml': HoverParameters,
+    'identify.yaml': IdentifyParameters,
     'motor_board.yaml': MotorBoardParameters, 'nmpc.yaml': NmpcParameters,
     'nmpc_published.yaml': NmpcParameters,
     'recording.yaml': RecordingLimits, 'rl.yaml': PolicyParameters, 'robot.yaml': RobotParameters,

@@ -61,6 +61,8 @@ FILES = {
                        'Limits of the checks of a recording against itself.'),
     'train.yaml': ('train.parameters:TrainParameters', 'The training of a policy.'),
     'faults.yaml': ('sim.faults.listed:FaultList', 'The listed faults.'),
+    'identify.yaml': ('identify.parameters:IdentifyParameters',
+                      'Identification of servos and rotors from logs.'),
     'gap.yaml': ('identify.gap.parameters:GapParameters', 'The gap finder.')}
 
 # Nodes whose code is not in a file of their own name; '' is no node of its own.

@@ -21,6 +21,7 @@ from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.parameters import IdentifyParameters
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.robot.holding import HoldingParameters
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -51,6 +52,7 @@ PARAMETER_CLASSES = {
     'motor_board.yaml': MotorBoardParameters,
     'nmpc.yaml': NmpcParameters,
     'nmpc_published.yaml': NmpcParameters, 'rl.yaml': PolicyParameters,
+    'identify.yaml': IdentifyParameters,
     'recording.yaml': RecordingLimits,
     'robot.yaml': RobotParameters, 'robot_weak_and_heavy.yaml': RobotParameters,
     'servo_bus.yaml': ServoBusParameters,

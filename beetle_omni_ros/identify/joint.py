@@ -7,15 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.selection import CANDIDATES, Choice, free_mask, LINEAR, Selector
 from beetle_omni_ros.identify.servo_fit import (
-    BEYOND,
     decode,
     encode,
     first_noise,
-    FITTED_PART,
     fitted_samples,
-    NEARLY,
     noise_around,
     prior_of,
     Problems,
@@ -32,13 +30,8 @@ from beetle_omni_ros.identify.uncertainty import (
 from beetle_omni_ros.robot.parameters import JointParameters
 
 MOST_PASSES = 3         # of selection, while the noise falls
-# Priors, as standard deviations. The published frequency and damping are right within a factor of
-# 1.6; servos of one type and one bus differ by 10 % and 3 ms.
-PUBLISHED_DEVIATION = {'natural_frequency': 0.5, 'damping_ratio': 0.5}
-COMMON_DEVIATION = {'natural_frequency': 0.1, 'damping_ratio': 0.1, 'delay': 0.003}
+P = shipped().servo
 MOST_ROUNDS, RESTING = 10, 0.2    # of refits; change of the median, in scales, that ends them
-RESTARTS = ((32.0, 0.003), (45.0, 0.015), (70.0, 0.025))    # [rad/s], [s]
-LEAST_COMMON = 3        # joints, below which nothing is called common
 CERTAIN = ('delay', 'coulomb_friction')   # in the model that estimates the noise
 
 
@@ -70,7 +63,7 @@ class JointModel:
 
 
 def identify_joints(log: JointLog, published: JointParameters,
-                    fitted: float = FITTED_PART) -> list[JointModel]:
+                    fitted: float = P.fitted) -> list[JointModel]:
     """
     Identify every joint of a log from its first part.
 
@@ -84,7 +77,7 @@ def identify_joints(log: JointLog, published: JointParameters,
     start = published_set(published)
     weight = np.tile(fitted_samples(log), (len(log.joints), 1))
     noise = _first_noise(log, start, weight)
-    prior = prior_of(encode(start), PUBLISHED_DEVIATION)
+    prior = prior_of(encode(start), P.published)
     for _ in range(MOST_PASSES):
         fitter = ServoFitter(log, noise, prior=prior)
         choices = Selector(fitter, weight[0]).run(_unlimited(start))
@@ -93,7 +86,7 @@ def identify_joints(log: JointLog, published: JointParameters,
             np.array([free_mask(choice.kept) for choice in choices]), weight)
         points = _best(fitter, problems)
         before, noise = noise, noise_around(log, decode(points), weight[0])
-        if (noise.sigma > NEARLY * before.sigma).all():
+        if (noise.sigma > P.nearly * before.sigma).all():
             break       # else the terms found let see more than the first model did
     sets = decode(_alike(log, noise, problems, points))
     return _models(log, noise, choices, sets, weight, start)
@@ -102,7 +95,7 @@ def identify_joints(log: JointLog, published: JointParameters,
 def _best(fitter, problems):
     """Fit each joint from several starts, for chi2 may have more than one valley."""
     count, starts = len(problems.joints), [problems]
-    for frequency, delay in RESTARTS:
+    for frequency, delay in P.restarts:
         sets = decode(problems.points)
         sets[:, INDEX['natural_frequency']] = frequency
         sets[:, INDEX['delay']] = np.where(problems.free[:, INDEX['delay']], delay, 0.0)
@@ -118,14 +111,14 @@ def _alike(log, noise, problems, points):
 
     A joint whose log decides stays where it is; one whose log does not, follows.
     """
-    if len(points) < LEAST_COMMON:
+    if len(points) < P.least_common:
         return points
     for _ in range(MOST_ROUNDS):
         common = np.median(points, axis=0)
-        points = ServoFitter(log, noise, prior=prior_of(common, COMMON_DEVIATION)).solve(
+        points = ServoFitter(log, noise, prior=prior_of(common, P.common)).solve(
             replace(problems, points=points), 8).points
         change = np.median(points, axis=0) - common
-        if np.abs(change[[INDEX[name] for name in COMMON_DEVIATION]]).max() < RESTING:
+        if np.abs(change[[INDEX[name] for name in P.common]]).max() < RESTING:
             break
     return points
 
@@ -140,11 +133,11 @@ def _first_noise(log, start, weight):
     sets = np.tile(_unlimited(start), (len(joints), 1))
     sets[:, INDEX['delay']], sets[:, INDEX['coulomb_friction']] = 0.01, 0.01
     free = np.tile(free_mask((*CERTAIN, 'offset')), (len(joints), 1))
-    beyond = log.asked_speed() > BEYOND * log.speed()
+    beyond = log.asked_speed() > P.beyond * log.speed()
     limit = INDEX['velocity_limit']
     sets[beyond, limit], free[beyond, limit] = log.speed()[beyond], True
     fitter = ServoFitter(log, first_noise(log),
-                         prior=prior_of(encode(start), PUBLISHED_DEVIATION))
+                         prior=prior_of(encode(start), P.published))
     fits = fitter.solve(Problems.apart(joints, sets, free, weight))
     return noise_around(log, decode(fits.points), weight[0])
 
@@ -210,4 +203,4 @@ def error_rms(log: JointLog, joint: int, values: np.ndarray, held: bool = True,
     return float(np.sqrt(np.mean(error[part]**2)))
 
 
-__all__ = ['error_rms', 'FITTED_PART', 'identify_joints', 'JointModel', 'LINEAR']
+__all__ = ['error_rms', 'identify_joints', 'JointModel', 'LINEAR']

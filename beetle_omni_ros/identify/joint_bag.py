@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros.identify.csv_table import LogError
+from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.runs.bag import BagError, read_bag
 
-LONGEST = 30.0          # [s] more costs minutes and says little more
-LAST_COMMAND = 0.1      # [s] for which the actuators follow a command that no other follows
+LIMITS = shipped().log
 
 
 def is_bag(path: Path) -> bool:
@@ -42,7 +42,7 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     fresh = np.r_[True, np.diff(log.joint_t) > 0]
     t, position = log.joint_t[fresh], log.joint_position[fresh]
     last = np.searchsorted(received, t, side='right') - 1
-    driven = (last >= 0) & (t - received[np.maximum(last, 0)] <= LAST_COMMAND)
+    driven = (last >= 0) & (t - received[np.maximum(last, 0)] <= LIMITS.last_command)
     edges = np.flatnonzero(np.diff(np.r_[False, driven, False].astype(int)))
     stretches = edges.reshape(-1, 2)
     if not len(stretches):
@@ -55,8 +55,8 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _liveliest(t, command, first, end):
-    """Narrow a stretch to the part of :data:`LONGEST` in which all commands travel most."""
-    ends = np.minimum(np.searchsorted(t, t[first:end] + LONGEST, side='right'), end)
+    """Narrow a stretch to the longest part that is taken, in which all commands travel most."""
+    ends = np.minimum(np.searchsorted(t, t[first:end] + LIMITS.longest_bag, side='right'), end)
     travel = np.cumsum(np.r_[0.0, np.abs(np.diff(command[:end], axis=0)).sum(axis=1)])
     gain = travel[ends - 1] - travel[first:end]
     begin = first + int(np.argmax(gain))

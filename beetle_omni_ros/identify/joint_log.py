@@ -9,16 +9,11 @@ import numpy as np
 
 from beetle_omni_ros.identify.csv_table import LogError, missing, read_table
 from beetle_omni_ros.identify.joint_bag import is_bag, read_bag_response
+from beetle_omni_ros.identify.parameters import shipped
 
 HEADER = 't_s,q1_rad,q2_rad,q3_rad,q4_rad,command_rad (or command1_rad to command4_rad)'
 JOINTS = (1, 2, 3, 4)
-LONGEST_PERIOD, SHORTEST_PERIOD = 0.1, 2e-4   # [s] between samples; slower cannot show a servo
-LONGEST_GAP = 0.25       # [s] within a log
-LEAST_DURATION = 2.0     # [s]
-LEAST_SAMPLES = 100
-LEAST_TRAVEL = 0.02      # [rad] of the command and of each joint
-LARGEST_ANGLE = 13.0     # [rad] two turns: a larger one is not an angle in radians
-HISTORY = 0.3            # [s] for which the command goes on backwards before the log
+LIMITS = shipped().log
 
 
 @dataclass(frozen=True)
@@ -54,7 +49,7 @@ class JointLog:
         count = max(4, int(round(0.04 / period)) + 1)
         first = np.polyfit(self.t[:count] - self.t[0], self.measured[:, :count].T, 2)
         slope = np.polyfit(self.t[:count] - self.t[0], self.command[:, :count].T, 1)[0]
-        back = -period * np.arange(int(HISTORY / period) + 1, 0, -1)
+        back = -period * np.arange(int(LIMITS.history / period) + 1, 0, -1)
         before = self.command[:, :1] + slope[:, None] * back
         command_t = np.concatenate([self.t[0] + back, self.t])
         command = np.concatenate([before, self.command], axis=1)
@@ -171,34 +166,37 @@ def _wanted(header):
 
 
 def _check_times(path, t, rows):
-    if len(t) < LEAST_SAMPLES:
-        raise LogError(f'{path}: {len(t)} rows are too few; expected at least {LEAST_SAMPLES}')
+    if len(t) < LIMITS.least_samples:
+        raise LogError(f'{path}: {len(t)} rows are too few; expected at least '
+                       f'{LIMITS.least_samples}')
     steps = np.diff(t)
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0)) + 1
         raise LogError(f'{path}: row {rows[k]}, column t_s: {t[k]:g} s does not come after '
                        f'{t[k - 1]:g} s; expected increasing times')
     period = float(np.median(steps))
-    if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
+    if not LIMITS.periods[0] <= period <= LIMITS.periods[1]:
         raise LogError(f'{path}: column t_s: samples are {period:g} s apart; expected '
-                       f'{SHORTEST_PERIOD:g} to {LONGEST_PERIOD:g} s (is the time in seconds?)')
-    if t[-1] - t[0] < LEAST_DURATION:
+                       f'{LIMITS.periods[0]:g} to {LIMITS.periods[1]:g} s (is the time in '
+                       'seconds?)')
+    if t[-1] - t[0] < LIMITS.least_duration:
         raise LogError(f'{path}: {t[-1] - t[0]:.2f} s are too short; expected at least '
-                       f'{LEAST_DURATION:g} s')
-    if steps.max() > LONGEST_GAP:
+                       f'{LIMITS.least_duration:g} s')
+    if steps.max() > LIMITS.longest_gap:
         k = int(np.argmax(steps)) + 1
         raise LogError(f'{path}: row {rows[k]}: {steps.max():.2f} s without a sample; '
-                       f'expected gaps below {LONGEST_GAP:g} s (split the log there)')
+                       f'expected gaps below {LIMITS.longest_gap:g} s (split the log there)')
 
 
 def _check_angles(path, joint, position, command):
     for name, values in (('the command', command), (f'q{joint}_rad', position)):
-        if np.abs(values).max() > LARGEST_ANGLE:
+        if np.abs(values).max() > LIMITS.largest_angle:
             raise LogError(f'{path}: {name} reaches {np.abs(values).max():g}; expected radians '
-                           f'within +-{LARGEST_ANGLE:g} (degrees or encoder counts?)')
-        if np.ptp(values) < LEAST_TRAVEL:
+                           f'within +-{LIMITS.largest_angle:g} (degrees or encoder counts?)')
+        if np.ptp(values) < LIMITS.least_travel:
             raise LogError(f'{path}: {name} moves by {np.ptp(values):.4f} rad only; expected at '
-                           f'least {LEAST_TRAVEL:g} rad (a constant says nothing about a servo)')
+                           f'least {LIMITS.least_travel:g} rad (a constant says nothing about a '
+                           'servo)')
     ratio = np.ptp(position) / np.ptp(command)
     if not 0.1 < ratio < 10:
         raise LogError(f'{path}: q{joint}_rad travels {ratio:.3g} times as far as its command; '

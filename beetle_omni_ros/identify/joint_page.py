@@ -9,7 +9,7 @@ import numpy as np
 from beetle_omni_ros.identify.joint import JointModel
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.joint_servos import FileServos
-from beetle_omni_ros.identify.servo_fit import FITTED_PART
+from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, INK, legend, line, panels, STYLE, svg
 from beetle_omni_ros.pages.page import page, section
@@ -66,7 +66,7 @@ def joint_page(log: JointLog, validations: list[JointLog], models: list[JointMod
     with matplotlib.rc_context(STYLE):
         sections = []
         for k, other in enumerate([log, *validations]):
-            end = FITTED_PART if k == 0 else None
+            end = shipped().servo.fitted if k == 0 else None
             title = other.name + (': fitted to the shaded part' if k == 0 else ': not fitted')
             sections.append(section(title, 'Command, measured position, published and identified '
                                     'model, which run freely from the first sample on.',

@@ -10,9 +10,9 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.joint import error_rms, JointModel
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.joint_servos import FileServos
+from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.robot_file import rounded, write_robot_file
 from beetle_omni_ros.identify.selection import CANDIDATES, LINEAR
-from beetle_omni_ros.identify.servo_fit import FITTED_PART
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, published_set, TERMS
 from beetle_omni_ros.robot.parameters import JointParameters
 
@@ -41,7 +41,7 @@ def joint_results(log: JointLog, validations: list[JointLog], models: list[Joint
     joints = [_joint(log, k, validations, model, published, believed)
               for k, model in enumerate(models)]
     return {'meta': {'log': log.name, 'validate': [other.name for other in validations],
-                     'fitted_part': FITTED_PART, 'version': __version__},
+                     'fitted_part': shipped().servo.fitted, 'version': __version__},
             'joints': joints, 'text': _merged(joints)}
 
 
@@ -56,7 +56,7 @@ def _merged(joints):
 
 
 def _joint(log, index, validations, model, published, believed):
-    end = log.end_of(FITTED_PART)
+    end = log.end_of(shipped().servo.fitted)
     first, last = slice(0, end), slice(end, None)
     start, held, inertia = believed.sets[index], believed.held, published.inertia
     wn, zeta = (model.values[INDEX[name]] for name in LINEAR)

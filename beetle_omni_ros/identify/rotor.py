@@ -19,11 +19,11 @@ from beetle_omni_ros.identify.inference.least_squares import (
     Steps,
 )
 from beetle_omni_ros.identify.inference.prior import UNKNOWN
+from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor_log import Plateau, RotorLog
 
 UNIT_THRUST = 10.0      # [N] of g
-STOP = 50.5             # [%] of duty up to which the rotor stands: not fitted
-LEAST_SLOPE = 1.0       # [% of duty for each g] of a map that can be inverted safely
+P = shipped().rotor
 NORMAL_95 = 1.96
 GRID = 400
 
@@ -83,7 +83,7 @@ def inverse(coefficients: np.ndarray, duty: np.ndarray, thrust_max: float) -> np
     inside = (g > 0) & (g < grid[-1])
     for _ in range(2):
         step = (np.polyval(coefficients[::-1], g) - duty) / np.maximum(
-            np.polyval(slope, g), LEAST_SLOPE / 10)
+            np.polyval(slope, g), P.least_slope / 10)
         g = np.where(inside, np.clip(g - step, 0, grid[-1]), g)
     return UNIT_THRUST * g
 
@@ -96,7 +96,7 @@ def fit_row(name: str, plateau: Plateau) -> MapRow:
         LogError: the sweep is too small, or thrust does not rise with duty.
 
     """
-    used = plateau.duty > STOP
+    used = plateau.duty > P.stop_duty
     duty, g = plateau.duty[used], plateau.force[used] / UNIT_THRUST
     if used.sum() < 12 or np.unique(np.round(duty, 1)).size < 5:
         raise LogError(f'{name}: at {plateau.voltage:.2f} V only {used.sum()} rows of '
@@ -126,7 +126,7 @@ def fit_row(name: str, plateau: Plateau) -> MapRow:
                  np.stack([coefficients - size, coefficients + size], axis=1),
                  float(UNIT_THRUST * np.sqrt(np.mean(residual**2))),
                  float(NORMAL_95 * UNIT_THRUST * band.max()), 0.0, int(used.sum()),
-                 bool(slopes.min() < 1.5 * LEAST_SLOPE))
+                 bool(slopes.min() < 1.5 * P.least_slope))
     back = row.thrust(row.duty(thrust))
     return MapRow(**{**row.__dict__, 'inverse_error': float(np.abs(back / thrust - 1).max())})
 
@@ -135,7 +135,7 @@ def _start(g, duty):
     """Coefficients of a rising polynomial near the data."""
     run = g > 0.02
     start = np.polyfit(g[run], duty[run], 3)[::-1]
-    if np.polyval(np.polyder(start[::-1]), np.linspace(0, g.max(), 60)).min() < LEAST_SLOPE:
+    if np.polyval(np.polyder(start[::-1]), np.linspace(0, g.max(), 60)).min() < P.least_slope:
         start = np.array([*np.polyfit(g[run], duty[run], 1)[::-1], 0.0, 0.0])
     return start
 
@@ -154,7 +154,7 @@ def _error(coefficients, g, duty, weight):
     """Weighted error of thrust / 10 N, then what is missing of a rising slope."""
     slope = np.polyval(np.polyder(coefficients[::-1]), np.linspace(0, 1.05 * g.max(), 60))
     fitted = inverse(coefficients, duty, UNIT_THRUST * 1.3 * g.max()) / UNIT_THRUST
-    return np.concatenate([weight * (fitted - g), 0.3 * np.minimum(slope - LEAST_SLOPE, 0)])
+    return np.concatenate([weight * (fitted - g), 0.3 * np.minimum(slope - P.least_slope, 0)])
 
 
 def _weights(g, residual):
@@ -167,7 +167,7 @@ def _weights(g, residual):
 
 def _slopes(coefficients, g):
     """(N, 4) change of g with each coefficient at a given duty."""
-    slope = np.maximum(np.polyval(np.polyder(coefficients[::-1]), g), LEAST_SLOPE / 10)
+    slope = np.maximum(np.polyval(np.polyder(coefficients[::-1]), g), P.least_slope / 10)
     return -np.stack([g**k for k in range(4)], axis=1) / slope[:, None]
 
 

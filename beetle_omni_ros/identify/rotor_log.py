@@ -8,18 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros.identify.csv_table import LogError, missing, read_table
+from beetle_omni_ros.identify.parameters import shipped
 
 HEADER = 'pwm_us (or duty_percent),force_N,torque_N_m,voltage_V'
 ALTERNATIVES = {'force_N': ('force_N', 'thrust_N'), 'torque_N_m': ('torque_N_m', 'torque_Nm'),
                 'voltage_V': ('voltage_V',), 'pwm': ('duty_percent', 'pwm_us')}
 FULL_PULSE = 2000.0     # [us] of 100 % duty, the unit of the map in params/robot.yaml
-DUTY_RANGE = (40.0, 101.0)          # [%]
-LARGEST_FORCE, LARGEST_TORQUE = 200.0, 20.0     # [N], [N m]
-VOLTAGE_RANGE = (5.0, 60.0)         # [V]
-LEAST_ROWS = 20         # of a plateau
-SETTLING = 0.5          # [s] after a change of PWM that is left out, where times are given
-PLATEAU_WIDTH = 0.08    # [V] standard deviation by which voltages are smoothed
-VALLEY = 0.3            # a dip below this part of its lower neighbour parts two plateaus
+P = shipped().rotor
 
 
 @dataclass(frozen=True)
@@ -71,17 +66,17 @@ def read_rotor_log(path: str | Path) -> RotorLog:
     column = {wanted: next(table.columns[name] for name in names if name in table.columns)
               for wanted, names in ALTERNATIVES.items()}
     duty = column['pwm'] if 'duty_percent' in table.columns else 100 * column['pwm'] / FULL_PULSE
-    if len(table) < LEAST_ROWS:
-        raise LogError(f'{path}: {len(table)} rows are too few; expected at least {LEAST_ROWS}')
+    if len(table) < P.least_rows:
+        raise LogError(f'{path}: {len(table)} rows are too few; expected at least {P.least_rows}')
     pwm_name = 'duty_percent' if 'duty_percent' in table.columns else 'pwm_us'
     unit = ('percent of 2000 us, 50 at stop' if pwm_name == 'duty_percent'
             else 'microseconds, 1000 at stop')
-    _check(table, pwm_name, duty, *DUTY_RANGE, unit)
-    _check(table, 'force_N', column['force_N'], -5.0, LARGEST_FORCE,
+    _check(table, pwm_name, duty, *P.duty, unit)
+    _check(table, 'force_N', column['force_N'], -5.0, P.largest_force,
            'newtons, thrust positive (grams?)')
-    _check(table, 'torque_N_m', np.abs(column['torque_N_m']), 0.0, LARGEST_TORQUE,
+    _check(table, 'torque_N_m', np.abs(column['torque_N_m']), 0.0, P.largest_torque,
            'newton metres')
-    _check(table, 'voltage_V', column['voltage_V'], *VOLTAGE_RANGE, 'volts (millivolts?)')
+    _check(table, 'voltage_V', column['voltage_V'], *P.voltage, 'volts (millivolts?)')
     if np.ptp(duty) < 5:
         raise LogError(f'{path}: {pwm_name} spans {np.ptp(duty):.2g} % of duty only; expected a '
                        'sweep from stop to full')
@@ -141,7 +136,7 @@ def _settled(table, duty, warnings):
     last = np.searchsorted(changes, t, side='right') - 1
     since = np.where(last >= 0, t - changes[np.maximum(last, 0)] if changes.size else np.inf,
                      np.inf)
-    settled = since >= SETTLING
+    settled = since >= P.settling
     if settled.mean() < 0.2:
         warnings.append('PWM changes all the time: every row is used, though the rotor lags')
         return np.ones(len(duty), dtype=bool)
@@ -150,8 +145,8 @@ def _settled(table, duty, warnings):
 
 def _plateaus(path, voltage, duty, force, torque, warnings):
     """Part the rows where the density of voltages has valleys."""
-    grid = np.arange(voltage.min() - 0.5, voltage.max() + 0.5, PLATEAU_WIDTH / 4)
-    counts, _ = np.histogram(voltage, np.append(grid, grid[-1] + PLATEAU_WIDTH / 4))
+    grid = np.arange(voltage.min() - 0.5, voltage.max() + 0.5, P.plateau_width / 4)
+    counts, _ = np.histogram(voltage, np.append(grid, grid[-1] + P.plateau_width / 4))
     kernel = np.exp(-0.5 * (np.arange(-16, 17) / 4.0)**2)
     density = np.convolve(counts, kernel, mode='same')
     peaks = [k for k in range(1, len(grid) - 1) if density[k - 1] < density[k] >= density[k + 1]]
@@ -160,7 +155,7 @@ def _plateaus(path, voltage, duty, force, torque, warnings):
     for peak in sorted(peaks):
         if last is not None:
             valley = last + int(np.argmin(density[last:peak + 1]))
-            if density[valley] > VALLEY * min(density[last], density[peak]):
+            if density[valley] > P.valley * min(density[last], density[peak]):
                 last = max(last, peak, key=lambda k: density[k])
                 continue
             edges.append(grid[valley])
@@ -170,12 +165,12 @@ def _plateaus(path, voltage, duty, force, torque, warnings):
     for k in np.unique(group):
         rows = group == k
         middle = float(np.median(voltage[rows]))
-        if rows.sum() < LEAST_ROWS or np.ptp(force[rows]) < 0.3 * np.ptp(force):
+        if rows.sum() < P.least_rows or np.ptp(force[rows]) < 0.3 * np.ptp(force):
             warnings.append(f'{rows.sum()} rows at {middle:.2f} V are too few, or too short a '
                             'sweep, for a row of the map: left out')
             continue
         found.append(Plateau(middle, duty[rows], force[rows], torque[rows]))
     if not found:
-        raise LogError(f'{path}: no voltage plateau with {LEAST_ROWS} rows and a sweep of thrust; '
-                       f'voltages span {voltage.min():.2f} to {voltage.max():.2f} V')
+        raise LogError(f'{path}: no voltage plateau with {P.least_rows} rows and a sweep of '
+                       f'thrust; voltages span {voltage.min():.2f} to {voltage.max():.2f} V')
     return sorted(found, key=lambda plateau: -plateau.voltage)

@@ -15,13 +15,12 @@ import numpy as np
 
 from beetle_omni_ros.identify.inference.blocks import block_masks, HeldOut
 from beetle_omni_ros.identify.joint_log import JointLog
-from beetle_omni_ros.identify.servo_fit import BEYOND, decode, Problems, ServoFitter
+from beetle_omni_ros.identify.parameters import shipped
+from beetle_omni_ros.identify.servo_fit import decode, Problems, ServoFitter
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, TERMS
 
 LINEAR = ('natural_frequency', 'damping_ratio')   # always there
-BLOCKS = 5
-LEAST_GAIN = 10.0       # of chi2 on unseen data for each number, all blocks together
-LEAST_DELAY = 0.001     # [s]
+P = shipped().servo
 MOST_PASSES = 3
 QUICK, THOROUGH = 6, 15  # iterations
 
@@ -119,7 +118,7 @@ class Selector:
     def __init__(self, fitter: ServoFitter, weight: np.ndarray,
                  allowed: tuple[str, ...] = tuple(CANDIDATES)):
         self.fitter, self.log, self.allowed = fitter, fitter.log, allowed
-        self.blocks = block_masks(weight, BLOCKS)
+        self.blocks = block_masks(weight, P.blocks)
         self.all = self.blocks.sum(axis=0)
 
     def run(self, start: np.ndarray) -> list[Choice]:
@@ -182,7 +181,7 @@ class Selector:
     def _open(self, tier, joint):
         """Candidates of a tier that the joint can have and has not."""
         kept = self.kept[joint]
-        slow = self.log.asked_speed()[joint] < BEYOND * 0.95 * self.log.speed()[joint]
+        slow = self.log.asked_speed()[joint] < P.beyond * 0.95 * self.log.speed()[joint]
         return [name for name in self.allowed if name in tier and name not in kept
                 and CANDIDATES[name].needs in (None, *kept)
                 and not (name == 'velocity_limit' and slow)]
@@ -202,7 +201,7 @@ class Selector:
                 continue
             found, costs = answers[j, label]
             gain = float((answers[j, None][1] - costs).sum())
-            if gain > LEAST_GAIN and self._matters(j, rival, found):
+            if gain > P.least_gain and self._matters(j, rival, found):
                 self.kept[j], self.values[j], swapped = asked[j, label][0], found, True
                 self.tried[j][rival] = found
         return swapped
@@ -284,13 +283,13 @@ class Selector:
         """A term below the encoder's step, or a limit that is never met, is no finding."""
         sizes = {member: abs(values[INDEX[member]]) for member in CANDIDATES[name].members}
         if name == 'delay':
-            return sizes['delay'] >= LEAST_DELAY
+            return sizes['delay'] >= P.least_delay
         if name == 'velocity_limit':
-            return BEYOND * sizes[name] <= self.log.asked_speed()[joint]
+            return P.beyond * sizes[name] <= self.log.asked_speed()[joint]
         if name == 'torque_limit':
             sent = self.log.t - values[INDEX['delay']] - self.log.period / 2
             errors = np.abs(self.log.command_at(joint, sent) - self.log.measured[joint])
-            return BEYOND * sizes[name] <= np.quantile(errors[self.all > 0], 0.99)
+            return P.beyond * sizes[name] <= np.quantile(errors[self.all > 0], 0.99)
         return max(size for member, size in sizes.items()
                    if member != 'stribeck_velocity') >= self.log.quantum
 
@@ -303,4 +302,4 @@ def _weight(name, kept):
 def _verdict(gains, weight):
     """Gain over all blocks, and whether it is real: above its scatter, in most blocks."""
     held = HeldOut(gains)
-    return held.total, held.total > max(LEAST_GAIN * weight, held.error) and held.positive > 0.5
+    return held.total, held.total > max(P.least_gain * weight, held.error) and held.positive > 0.5

@@ -25,17 +25,13 @@ from beetle_omni_ros.identify.inference.least_squares import (
 from beetle_omni_ros.identify.inference.noise import Noise
 from beetle_omni_ros.identify.inference.prior import Prior, UNKNOWN
 from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
 
-FITTED_PART = 0.6       # of a log; the rest judges
-SETTLING = 0.25         # [s] of a log that are not fitted: its first velocity is only a guess
-FIRST_NOISE = 0.002     # [rad] white, until the residuals tell
-NEARLY = 0.8            # of the noise: below, what was found lets see more than before
-MEMORY = 0.12           # [s] of the whitening filter
+P = shipped().servo
 ORDERS = 6, 40          # its range in samples
 DIFFERENCE = 0.05       # of a parameter's scale, for derivatives
 DIFFERENT = 10          # blocks over which the gradient's scatter is taken
-BEYOND = 1.15           # a limit counts only if the command asks for so much more than it
 
 
 class Apart:
@@ -99,18 +95,18 @@ class Problems:
 
 def fitted_samples(log: JointLog) -> np.ndarray:
     """(N,) weight of each sample: 0 where the log still settles."""
-    return (log.t >= log.t[0] + SETTLING).astype(float)
+    return (log.t >= log.t[0] + P.settling).astype(float)
 
 
 def first_noise(log: JointLog) -> Noise:
     """White, before anything is fitted."""
-    return Noise.white(len(log.joints), FIRST_NOISE)
+    return Noise.white(len(log.joints), P.first_noise)
 
 
 def noise_around(log: JointLog, sets: np.ndarray, weight: np.ndarray) -> Noise:
     """Noise of each joint around its parameter set (J, n), of samples with a weight (N,)."""
     error = simulate(log, np.arange(len(sets)), sets) - log.measured
-    order = int(np.clip(round(MEMORY / log.period), *ORDERS))
+    order = int(np.clip(round(P.memory / log.period), *ORDERS))
     return Noise.of(error[:, weight > 0], order, max(log.quantum, 1e-4) / np.sqrt(12))
 
 

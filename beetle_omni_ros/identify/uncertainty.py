@@ -16,14 +16,14 @@ import numpy as np
 from beetle_omni_ros.identify.inference.least_squares import covariance
 from beetle_omni_ros.identify.inference.noise import Noise
 from beetle_omni_ros.identify.joint_log import JointLog
+from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo_fit import APART, decode, encode, Problems, ServoFitter
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
 
 RISE = 3.84             # of chi2 with one degree of freedom, 95 %
 PROFILED = ('natural_frequency', 'damping_ratio', 'delay')
 LADDER = np.array([0.5, 1.2, 2.2, 3.6, 5.5, 8.0, 12.0, 18.0])  # in scales of a term
-TRADED = 0.6            # part of its interval through which another's interval drags a number
-LOOSE = 1.5             # half width of an interval, in scales, below which nothing is traded
+P = shipped().servo
 LOW, HIGH = APART.coordinates.low, APART.coordinates.high
 
 
@@ -156,15 +156,13 @@ def _crossing(rise):
 
 def traded(result: Uncertainty, names: list[str]) -> list[list[str]]:
     """Pairs of these numbers that the log cannot separate, the closest first."""
-    loose = [name for name in names if result.half_width(name) > LOOSE]
+    loose = [name for name in names if result.half_width(name) > P.loose]
     pairs = [(abs(result.correlation[INDEX[a], INDEX[b]]), a, b)
              for k, a in enumerate(loose) for b in loose[:k]]
-    return [sorted([a, b]) for r, a, b in sorted(pairs, reverse=True) if r >= TRADED]
+    return [sorted([a, b]) for r, a, b in sorted(pairs, reverse=True) if r >= P.traded]
 
 
-FREQUENCIES = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0)    # [Hz] of excitations that are weighed
-EXCITATION_TIME, EXCITATION_PERIOD = 10.0, 0.01           # [s] length, between samples
-LARGEST_AMPLITUDE, LARGEST_SPEED = 0.5, 6.0               # [rad], [rad/s] below the servo's limit
+SINE_PERIOD = 0.01      # [s] between its samples
 
 
 @dataclass(frozen=True)
@@ -218,10 +216,10 @@ def separating_experiments(sets: np.ndarray, free: np.ndarray, noise: Noise, sca
 
 def _plans(sets, free, noise, scatter):
     """For each frequency, what its sine would tell about each joint; all in one simulation."""
-    count, many = len(sets), len(FREQUENCIES)
-    t = np.arange(0.0, EXCITATION_TIME, EXCITATION_PERIOD)
-    omega = 2 * np.pi * np.repeat(FREQUENCIES, count)
-    amplitude = np.minimum(LARGEST_AMPLITUDE, LARGEST_SPEED / omega)
+    count, many = len(sets), len(P.sines)
+    t = np.arange(0.0, P.sine_time, SINE_PERIOD)
+    omega = 2 * np.pi * np.repeat(P.sines, count)
+    amplitude = np.minimum(P.sine_amplitude, P.sine_speed / omega)
     command = amplitude[:, None] * np.sin(omega[:, None] * t)
     sets, free = np.tile(sets, (many, 1)), np.tile(free, (many, 1))
     noise = Noise(np.tile(noise.taps, (many, 1)), np.tile(noise.sigma, many))
@@ -238,7 +236,7 @@ def _plans(sets, free, noise, scatter):
     for row, factor in zip(rows, np.tile(scatter, many), strict=True):
         width = np.sqrt(RISE * factor * np.diag(covariance(information[row], free[row]))) * scale
         plans.append(Experiment(float(omega[row] / 2 / np.pi), float(amplitude[row]),
-                                EXCITATION_TIME, float(width[d]),
+                                P.sine_time, float(width[d]),
                                 float(width[f] * sets[row, f])))
     return [plans[k:k + count] for k in range(0, len(plans), count)]
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from servo_logs import log_of, sweep
 
-from beetle_omni_ros.identify.joint import error_rms, FITTED_PART, identify_joints
+from beetle_omni_ros.identify.joint import error_rms, identify_joints
 from beetle_omni_ros.identify.joint_log import read_joint_log
 from beetle_omni_ros.identify.joint_results import joint_results
+from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo_model import INDEX, published_set
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -112,7 +113,7 @@ def test_samples_of_the_judging_part_are_never_looked_at():
 def replace_end(log):
     """The log with nonsense in its last part."""
     measured = log.measured.copy()
-    measured[:, log.end_of(FITTED_PART):] = 0.3
+    measured[:, log.end_of(shipped().servo.fitted):] = 0.3
     return replace(log, measured=measured)
 
 

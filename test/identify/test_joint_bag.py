@@ -1,5 +1,7 @@
 """A recorded run as a response log: the same rows as a CSV file of it would have."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from servo_logs import sweep
@@ -35,7 +37,7 @@ def test_each_feedback_stands_beside_the_command_that_came_last_before_it(tmp_pa
 
 def test_the_longest_stretch_with_commands_counts_and_of_it_the_liveliest_part(
         tmp_path, monkeypatch):
-    monkeypatch.setattr(joint_bag, 'LONGEST', 2.5)
+    monkeypatch.setattr(joint_bag, 'LIMITS', replace(joint_bag.LIMITS, longest_bag=2.5))
     t, command = sweep(duration=9.0)
     command = np.where((t > 5.0) & (t < 7.5), command, 0.05 * command)
     sent = (t < 1.0) | (t > 2.0)

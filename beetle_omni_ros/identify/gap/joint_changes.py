@@ -13,9 +13,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import norm
 
-from beetle_omni_ros.identify.joint import COMMON_DEVIATION
+from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.joint_servos import GROUPS, Servos
+from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo_fit import (
     decode,
     first_noise,
@@ -38,14 +39,11 @@ ROWS = tuple(
     for spec in [CATALOGUE[name].parameters[parameter]]
     if spec.log and (spec.log.each or not CATALOGUE[name].starts)
     for row in ((name, parameter, spec.unit), *((name, *more) for more in spec.log.better)))
-WRONG = 0.05            # probability that any row of two logs is called significant by chance
-# One standard deviation of frequency and damping about the median joint: a factor, which keeps a
-# fit in place and says nothing beside a log.
-FACTOR = 1.6
 MILLI = {'rad': ('mrad', 1e3), 's': ('ms', 1e3), 'N m': ('mN m', 1e3)}
 
 
-def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[dict]:
+def changes(before: JointLog, after: JointLog, robot: RobotParameters,
+            p: GapParameters | None = None) -> list[dict]:
     """
     Compare the servos of two logs.
 
@@ -53,6 +51,7 @@ def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[d
         before: the first log.
         after: the second.
         robot: the servos as believed, from which both fits start.
+        p: parameters; default the shipped ones.
 
     Returns:
         for each joint of both logs and each of ``ROWS`` the second ``log``, ``joint``, ``name``
@@ -61,9 +60,10 @@ def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[d
         chance makes so large a difference anywhere between two logs in 5 % of the cases at most.
 
     """
-    fits = [estimate(log, robot) for log in (before, after)]
+    p = p or GapParameters.load()
+    fits = [estimate(log, robot, p) for log in (before, after)]
     joints = [j for j in before.joints if j in after.joints]
-    rows, count = [], len(joints) * len(ROWS)
+    rows, least = [], norm.isf(p.log_changes_chance / 2 / max(len(joints) * len(ROWS), 1))
     for number in joints:
         pair = [(values[log.joints.index(number)], errors[log.joints.index(number)])
                 for log, (values, errors) in zip((before, after), fits, strict=True)]
@@ -75,12 +75,12 @@ def changes(before: JointLog, after: JointLog, robot: RobotParameters) -> list[d
                          'parameter': parameter, 'unit': unit,
                          'before': float(old), 'after': float(new), 'difference': difference,
                          'interval': [difference - reach, difference + reach],
-                         'significant': bool(abs(difference) > norm.isf(WRONG / 2 / count)
-                                             * error)})
+                         'significant': bool(abs(difference) > least * error)})
     return rows
 
 
-def estimate(log: JointLog, robot: RobotParameters) -> tuple[np.ndarray, np.ndarray]:
+def estimate(log: JointLog, robot: RobotParameters,
+             p: GapParameters) -> tuple[np.ndarray, np.ndarray]:
     """
     Zero, gains, friction and delay of each joint of a log.
 
@@ -99,7 +99,7 @@ def estimate(log: JointLog, robot: RobotParameters) -> tuple[np.ndarray, np.ndar
     for _ in range(2):
         # Frequency and damping within a factor of the median joint's keep a fit in place.
         prior = prior_of(np.median(problems.points, axis=0), dict.fromkeys(
-            ('natural_frequency', 'damping_ratio'), float(np.log(FACTOR))))
+            ('natural_frequency', 'damping_ratio'), float(np.log(p.log_changes_factor))))
         fits = ServoFitter(log, noise, prior=prior).solve(problems, 15)
         problems = replace(problems, points=fits.points)
         noise = noise_around(log, decode(problems.points), weight[0])
@@ -117,7 +117,8 @@ def _pooled(fitter, problems, free):
     own = problems.points[:, free].ravel()
     apart = np.eye(count) - 1 / count
     names = [name for name, chosen in zip(NAMES, free, strict=True) if chosen]
-    common = np.diag([(TERMS[n].scale / COMMON_DEVIATION[n])**2 if n in COMMON_DEVIATION else 0.0
+    deviation = shipped().servo.common
+    common = np.diag([(TERMS[n].scale / deviation[n])**2 if n in deviation else 0.0
                       for n in names])
     covariance = np.linalg.inv(precision + np.kron(apart, common))
     return (covariance @ precision @ own).reshape(count, size), covariance

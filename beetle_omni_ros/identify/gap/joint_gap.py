@@ -25,7 +25,7 @@ from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
 from beetle_omni_ros.identify.joint_page import joint_page
 from beetle_omni_ros.identify.joint_results import joint_results
 from beetle_omni_ros.identify.joint_servos import file_servos
-from beetle_omni_ros.identify.servo_fit import FITTED_PART
+from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.pages.figures import legend, line, panels, STYLE, svg
 from beetle_omni_ros.robot.effects import CATALOGUE, separating
@@ -61,7 +61,7 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
     for k, joint in enumerate(joints):
         joint['file_heldout_rms_rad'] = float(found.errors['believed'][k])
         joint['corrected_heldout_rms_rad'] = float(found.errors['corrected'][k])
-    made['changes'] = [row for other in others for row in changes(log, other, robot)]
+    made['changes'] = [row for other in others for row in changes(log, other, robot, p)]
     made['findings'] = [text for other in others for text in sentences(
         [row for row in made['changes'] if row['log'] == other.name], other.name)]
     identified['text'] = [*identified['text'], *made['findings']]
@@ -90,7 +90,7 @@ def _picture(found, log):
             for k, axis in enumerate(axes[:, 0]):
                 line(axis, t, 1e3 * error[k], color=colour, lw=0.9, label=text)
                 axis.set_ylabel(f'joint {log.joints[k]} [mrad]')
-        held_out = t[log.end_of(FITTED_PART)]
+        held_out = t[log.end_of(shipped().servo.fitted)]
         for axis in axes[:, 0]:
             axis.axvspan(t[0], held_out, color='#eef3f8', lw=0)
         axes[-1, 0].set_xlabel('time [s]; shaded: fitted, the rest is held out')

@@ -17,14 +17,13 @@ from scipy.stats import chi2 as chi_square
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.inference.blocks import block_masks, HeldOut
+from beetle_omni_ros.identify.inference.selection import grow, prune
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.joint_servos import GROUPS, Servos
+from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo_fit import (
-    BEYOND,
     first_noise,
-    FITTED_PART,
     fitted_samples,
-    NEARLY,
     noise_around,
     Problems,
     ServoFitter,
@@ -33,7 +32,7 @@ from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-BLOCKS = 5
+FIT = shipped().servo
 QUICK = 5               # iterations that show what an entry gains; the accepted are fitted again
 MOST_PASSES = 3
 # Delay and stiffness of a pair are told apart where both are known better than the smallest
@@ -141,10 +140,10 @@ class Search:
 
     def __init__(self, log: JointLog, robot: RobotParameters, p: GapParameters | None = None):
         self.p = p or GapParameters.load()
-        self.whole, self.log = log, log.first(FITTED_PART)
+        self.whole, self.log = log, log.first(FIT.fitted)
         self.servos = Servos(robot, log.joints)
         self.weight = fitted_samples(self.log)
-        self.blocks = block_masks(self.weight, BLOCKS)
+        self.blocks = block_masks(self.weight, FIT.blocks)
         self.samples = int(self.weight.sum()) * len(log.joints)
         self.entries = self._entries()
         self._estimate_noise()
@@ -154,7 +153,7 @@ class Search:
                 for j in range(len(self.log.joints))]
         made += [Entry(name) for name in GROUPS if name != 'joint_offset']
         # A speed limit that the command never asks for cannot show.
-        slow = (self.log.asked_speed() < BEYOND * 0.95 * self.log.speed()).all()
+        slow = (self.log.asked_speed() < FIT.beyond * 0.95 * self.log.speed()).all()
         return [e for e in made if not (e.name == 'joint_velocity_limit' and slow)]
 
     def _estimate_noise(self):
@@ -231,28 +230,26 @@ class Search:
         kept: list[Entry] = []
         point = self.servos.believed.copy()
         for _ in range(MOST_PASSES):
-            accepted, point, trials = self._grown(kept, point)
-            kept, point = self._pruned(accepted, point)
+            accepted, point = grow(kept, point, self._best, self._joined, self.p.log_effects)
+            kept, point = prune(accepted, point, self._worst, self._refitted)
             noise = self._noise(point)
-            if (noise.sigma > NEARLY * self.noise.sigma).all():
+            if (noise.sigma > FIT.nearly * self.noise.sigma).all():
                 break
             self.noise, self.full = noise, point
             self.fitter = self._fitter(noise)
-        return self._found(kept, point, trials if kept == accepted else self._beside(kept, point))
+        return self._found(kept, point, self._others if kept == accepted
+                           else self._beside(kept, point))
 
-    def _grown(self, accepted, point):
-        """Add entries while any is worth it: accepted, their model, and the trials of the rest."""
-        trials = self._beside(accepted, point)
-        while len(accepted) < self.p.log_effects:
-            fit = [t for t in trials if t.unlikely and self._matters(t)]
-            if not fit:
-                break
-            # The most for its numbers: one zero outdoes a friction of four.
-            best = max(fit, key=lambda t: t.gain - t.needed)
-            inside = [e for e in accepted if not self._within(e, best.entry)]
-            accepted, point = [*inside, best.entry], best.point
-            trials = self._beside(accepted, point)
-        return accepted, point, trials
+    def _best(self, accepted, point):
+        self._others = self._beside(accepted, point)
+        # The most for its numbers: one zero outdoes a friction of four.
+        return max((t for t in self._others if t.unlikely and self._matters(t)),
+                   key=lambda t: t.gain - t.needed, default=None)
+
+    def _joined(self, accepted, best):
+        free = self._free([best.entry])
+        outside = [e for e in accepted if (self._free([e]) & ~free).any()]
+        return [*outside, best.entry], best.point
 
     def _beside(self, accepted, point):
         """A trial of each other entry beside the accepted ones."""
@@ -266,12 +263,8 @@ class Search:
         for (entry, _), p, chi2 in zip(asked, solved.points[1:], solved.chi2[1:], strict=True):
             gain = (solved.chi2[0] - chi2) / self.scatter
             if entry not in best or gain > best[entry].gain:
-                best[entry] = self._trial(entry, gain, HeldOut(np.zeros(BLOCKS)), p)
+                best[entry] = self._trial(entry, gain, HeldOut(np.zeros(FIT.blocks)), p)
         return list(best.values())
-
-    def _within(self, entry, other):
-        """Whether the other entry frees all numbers of this one."""
-        return not (self._free([entry]) & ~self._free([other])).any()
 
     def _count(self, entry):
         return int(self._free([entry]).sum())
@@ -292,7 +285,7 @@ class Search:
         if entry.name == 'joint_torque_limit':
             errors = np.abs(self.log.command - self.log.measured)
             limit = new[self.servos.index('effort_limit')] / new[self.servos.index('kp')]
-            if BEYOND * limit > np.quantile(errors[:, self.weight > 0], 0.99):
+            if FIT.beyond * limit > np.quantile(errors[:, self.weight > 0], 0.99):
                 return False
         mask = self.servos.mask(entry.name, entry.joint)
         for k in np.flatnonzero(mask):
@@ -304,19 +297,13 @@ class Search:
                 return True
         return False
 
-    def _pruned(self, accepted, point):
-        """Drop, the weakest first, what others explain or what unseen blocks do not confirm."""
-        while accepted:
-            trials = self._dropped(accepted, point)
-            weak = [t for t in trials if not (t.unlikely and t.agreed and self._matters(t))]
-            if not weak:
-                break
-            worst = min(weak, key=lambda t: t.gain).entry
-            accepted = [e for e in accepted if e != worst]
-            point = self._refitted(accepted, point)
-        return accepted, point
+    def _worst(self, accepted, point):
+        """The weakest entry that others explain or that unseen blocks do not confirm."""
+        weak = [t for t in self._dropped(accepted, point)
+                if not (t.unlikely and t.agreed and self._matters(t))]
+        return min(weak, key=lambda t: t.gain).entry if weak else None
 
-    def _refitted(self, accepted, point):
+    def _refitted(self, accepted, point, _=None):
         """The model with these entries alone, all else as the file has it."""
         start = self._kept(accepted, point)
         return self._solve([start], [accepted]).points[0] if accepted else start
@@ -346,13 +333,13 @@ class Search:
                 for e, chi2, cost in zip(each, solved.chi2[1:], unseen[1:], strict=True)]
 
     def _unseen(self, points, models):
-        """(M, BLOCKS) chi2 of each block, predicted by models fitted without it."""
+        """(M, FIT.blocks) chi2 of each block, predicted by models fitted without it."""
         every = self.blocks.sum(axis=0)
-        rows = np.repeat(np.arange(len(models)), BLOCKS)
+        rows = np.repeat(np.arange(len(models)), FIT.blocks)
         left = np.tile(self.blocks, (len(models), 1))
         fitted = self._solve(points[rows], [models[r] for r in rows], 4, every - left).points
         cost = self.fitter.cost(self._problems(fitted, [models[r] for r in rows], left))
-        return cost.reshape(len(models), BLOCKS)
+        return cost.reshape(len(models), FIT.blocks)
 
     def _found(self, accepted, point, others):
         trials = self._dropped(accepted, point) if accepted else []
@@ -475,12 +462,12 @@ class Search:
         joints = np.arange(len(self.log.joints))
         a, b = (simulate(self.whole, joints, self.servos.sets(p[None])[0])
                 for p in (point, self.servos.believed))
-        return np.sqrt(np.mean((a - b)[:, self.whole.end_of(FITTED_PART):]**2, axis=1))
+        return np.sqrt(np.mean((a - b)[:, self.whole.end_of(FIT.fitted):]**2, axis=1))
 
 
 def held_out_rms(log: JointLog, servos: Servos, point: np.ndarray) -> np.ndarray:
     """(J,) RMS [rad] of free runs minus the log, over its part that is not fitted."""
     sets = servos.sets(point[None])[0]
     error = simulate(log, np.arange(len(sets)), sets) - log.measured
-    return np.sqrt(np.mean(error[:, log.end_of(FITTED_PART):]**2, axis=1))
+    return np.sqrt(np.mean(error[:, log.end_of(FIT.fitted):]**2, axis=1))
 

@@ -187,6 +187,8 @@ class GapParameters:
         doc='Least change of its dead band.', unit='rad', low=0, high=1)
     log_as_well: float = _factor(
         'Error over that of the freest fit up to which a joint log shows no gap.')
+    log_changes_chance: float = _share('Chance that a row of two logs is called significant.')
+    log_changes_factor: float = _factor('Deviation of frequency and damping about the median.')
 
     least_left: float = _chi2('What known effects could still explain, to say unknown.')
     least_remainder: float = _chi2('Gain of a generic regression, to say unknown.')
@@ -200,6 +202,9 @@ class GapParameters:
         doc='Least RMS of what repeats in a joint angle.', unit='rad', low=0, high=1)
     remainder_share: float = _share('Gain of that regression over that of the named effects.')
     least_pattern: float = _chi2('Gain of one question beyond the catalogue.')
+    pattern_agrees: np.ndarray = parameter(
+        doc='Standard errors of the gain and part of the blocks that gain, of either of which one '
+        'pair is enough.', shape=(2, 2), low=0, high=100)
     pattern_share: float = _share('The same, over the gain of the named effects.')
     pattern_force: float = parameter(
         doc='Likely size of a force of a question.', unit='N', low=1e-3, high=100)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.signal import bilinear, lfilter
 
 from beetle_omni_ros.identify.gap.fit import Problem, State
+from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
 from beetle_omni_ros.identify.gap.series import matrices
 from beetle_omni_ros.identify.inference.blocks import ridge_held_out
@@ -46,16 +47,10 @@ class Pattern:
     positive: float
     size: tuple[float, float]
 
-    @property
-    def sure(self) -> bool:
-        """
-        Whether blocks that were left out agree.
-
-        What changes with time gains most where it is largest: where nearly every block gains,
-        they need not gain alike.
-        """
-        return self.gain > 3 * self.error and self.positive >= 0.7 \
-            or self.gain > 2 * self.error and self.positive >= 0.85
+    def agrees(self, p: GapParameters) -> bool:
+        """Whether blocks that were left out gain: enough of them alike, or nearly all."""
+        return any(self.gain > errors * self.error and self.positive >= part
+                   for errors, part in p.pattern_agrees)
 
 
 def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from beetle_omni_ros.identify.gap.gates import (
     neither_holds,
 )
 from beetle_omni_ros.identify.gap.proposals import Proposals
+from beetle_omni_ros.identify.inference.selection import grow, prune
 
 
 class Search:
@@ -57,26 +59,11 @@ class Search:
         self.progress('noise')
         problem.guide({})
         problem.state({}, self.names)
-        state, cost = self._settle({}, [])
-        found.base = dict(state.theta)
+        begun = self._settle({}, [])
+        found.base = dict(begun[0].theta)
         found.still = liveliness(problem) < self.p.least_liveliness
-        while True:
-            self.progress(f'step {len(found.accepted) + 1}')
-            floor = self._floor(state)
-            trials = self._step(state, cost, [t.candidate for t in found.accepted])
-            for trial in trials:
-                found.trials[trial.candidate.label] = trial
-            best = self._judge(trials, cost, floor, [t.candidate for t in found.accepted])
-            while best is None and (more := self._proposals.fit_more()):
-                best = self._judge(more, cost, floor, [t.candidate for t in found.accepted])
-                found.trials |= {trial.candidate.label: trial for trial in more}
-            if best is None or len(found.accepted) >= self.p.most_effects:
-                break
-            found.accepted.append(best)
-            if found.still and best.candidate.pushes(problem.keys):
-                # One explanation of a flight that cannot decide is enough.
-                self.candidates = [c for c in self.candidates if not c.pushes(problem.keys)]
-            state, cost = self._settle(best.theta, [t.candidate for t in found.accepted])
+        found.accepted, (state, cost) = grow([], begun, partial(self._best, found),
+                                             partial(self._joined, found), self.p.most_effects)
         state, cost = self._prune(found, state, cost)
         found.theta, found.state = dict(state.theta), state
         base_state, before = self._refit(State(found.base, problem.residual(found.base),
@@ -89,6 +76,27 @@ class Search:
         self.candidates = everyone
         self._find_rivals(found, state, cost)
         return found
+
+    def _best(self, found, accepted, model):
+        """The trial to accept beside the accepted ones, or None."""
+        self.progress(f'step {len(accepted) + 1}')
+        state, cost = model
+        floor, named = self._floor(state), [t.candidate for t in accepted]
+        trials = self._step(state, cost, named)
+        for trial in trials:
+            found.trials[trial.candidate.label] = trial
+        best = self._judge(trials, cost, floor, named)
+        while best is None and (more := self._proposals.fit_more()):
+            best = self._judge(more, cost, floor, named)
+            found.trials |= {trial.candidate.label: trial for trial in more}
+        return best
+
+    def _joined(self, found, accepted, best):
+        if found.still and best.candidate.pushes(self.problem.keys):
+            # One explanation of a flight that cannot decide is enough.
+            self.candidates = [c for c in self.candidates if not c.pushes(self.problem.keys)]
+        accepted = [*accepted, best]
+        return accepted, self._settle(best.theta, [t.candidate for t in accepted])
 
     def _free(self, accepted):
         return frozenset(name for c in accepted for name in c.keys)
@@ -219,31 +227,31 @@ class Search:
 
     def _prune(self, found, state, cost):
         """Drop what later steps, or the noise learnt after the last one, made superfluous."""
-        while found.accepted:
-            dropped = self._beyond(found, state) or self._superfluous(found, state, cost)
-            if dropped is None:
-                break
-            found.accepted.remove(dropped)
-            kept = [t.candidate for t in found.accepted]
-            theta = {n: v for n, v in state.theta.items()
-                     if n not in dropped.candidate.keys or n in self.problem.beliefs}
-            state, cost = self._settle(theta, kept)
-        return state, cost
+        found.accepted, model = prune(found.accepted, (state, cost), self._worst, self._dropped)
+        return model
 
-    def _beyond(self, found, state):
+    def _worst(self, accepted, model):
+        return self._beyond(accepted, model[0]) or self._superfluous(accepted, *model)
+
+    def _dropped(self, accepted, model, dropped):
+        theta = {n: v for n, v in model[0].theta.items()
+                 if n not in dropped.candidate.keys or n in self.problem.beliefs}
+        return self._settle(theta, [t.candidate for t in accepted])
+
+    def _beyond(self, accepted, state):
         """Return an accepted entry that the fit of all together made physically impossible."""
-        for trial in found.accepted:
+        for trial in accepted:
             if self._impossible(replace(trial, theta=state.theta)):
                 trial.reason = IMPOSSIBLE
                 return trial
         return None
 
-    def _superfluous(self, found, state, cost):
+    def _superfluous(self, accepted, state, cost):
         """Return the accepted entry whose loss chance explains, or that is too small by now."""
         losses, of_beliefs = [], []
-        everything = [t.candidate for t in found.accepted]
-        for trial in found.accepted:
-            rest = [t.candidate for t in found.accepted if t is not trial]
+        everything = [t.candidate for t in accepted]
+        for trial in accepted:
+            rest = [t.candidate for t in accepted if t is not trial]
             zero = {n: 0.0 for n in trial.candidate.keys if n not in self.problem.beliefs}
             theta = {**state.theta, **zero}
             start = State(theta, self.problem.residual(theta), state.slopes, state.names)
@@ -252,7 +260,7 @@ class Search:
             of_beliefs.append(self.problem.prior(there.theta, self._free(rest))
                               - self.problem.prior(state.theta, self._free(everything)))
         weakest = int(np.argmin(losses))
-        trial = found.accepted[weakest]
+        trial = accepted[weakest]
         small = not trial.candidate.large_enough(self.problem.keys, state.theta)
         if enough(self.p, losses[weakest], of_beliefs[weakest]) and not small:
             return None

@@ -146,7 +146,7 @@ def _strange(a, explained, p):
         swings = pattern.text == SWINGING and force > p.swinging_force
         large = swings or force > p.least_force or torque > p.least_torque
         share = 0.0 if swings else p.pattern_share
-        if pattern.sure and large and pattern.gain > max(p.least_pattern, share * explained):
+        if pattern.agrees(p) and large and pattern.gain > max(p.least_pattern, share * explained):
             return (f'a force that goes with {pattern.text} ({force:.2f} m/s^2, {torque:.2f} '
                     f'rad/s^2); it gains {pattern.gain:.0f} of chi2 on data left out')
     return ''
