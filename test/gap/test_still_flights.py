@@ -123,6 +123,7 @@ def test_a_still_flight_without_a_finding_is_not_decidable():
 def test_one_explanation_of_a_still_flight_is_enough(monkeypatch, lively, expected):
     first, second = thrust(), trial('wind', 'wind.force[2]')
     search = Search(problem(MOTION.flight()), [first.candidate, second.candidate])
+    search._proposals = SimpleNamespace(fit_more=list)
     state = SimpleNamespace(theta={}, r=np.zeros(1), slopes=np.zeros((1, 0)), names=[])
     module = 'beetle_omni_ros.identify.gap.search.'
     monkeypatch.setattr(module + 'liveliness', lambda problem: lively)
