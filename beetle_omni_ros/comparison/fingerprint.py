@@ -15,7 +15,7 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.robot.resources import PACKAGE, share_path
 
 ROOMS = ('control', 'estimation', 'evaluation', 'robot', 'runs', 'safety', 'sim')
-LIBRARIES = ('casadi', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
+LIBRARIES = ('casadi', 'filterpy', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
 # What no other shipped controller reads: folders and files of the package, parameters.
 OF_POLICIES = ('control/guidance', 'control/observation.py', 'control/policy.py',
                'control/policy_file.py', 'control/policy_network.py', 'params/rl.yaml')

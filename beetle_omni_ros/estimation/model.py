@@ -1,13 +1,14 @@
 """
-The error-state Kalman filter: prediction and correction of one node.
+The error-state model: what filterpy's Kalman filter is fed with at each step.
 
-The algebra of covariance and gain is the usual one, the correction in Joseph's form. What is
-particular to a rigid body is propagation and residual on SO(3), and the injection of the
-estimated error into the state.
+filterpy keeps the error state and does its covariance and gain algebra; around it stands
+only what is particular to a rigid body: propagation and residual on SO(3), and the
+injection of the estimated error into the state.
 """
 
 from dataclasses import replace
 
+from filterpy.kalman import KalmanFilter
 import numpy as np
 from scipy.special import gammaincinv
 
@@ -53,7 +54,8 @@ class ErrorStateModel:
         imu, mocap = parameters.imu, parameters.mocap
         self.gravity = gravity
         self.parameters = parameters
-        self._identity = np.eye(STATES)
+        self.filter = KalmanFilter(dim_x=STATES, dim_z=MEASURED)
+        self._no_error = np.zeros(STATES)
         self._transition = identity()
         self._process = _process_noise(parameters)
         self._period = 1 / imu.rate
@@ -73,10 +75,8 @@ class ErrorStateModel:
         self._lever = mocap.position - imu.position
         self._has_lever = bool(np.any(self._lever))
         self.marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
-        self._jacobian = np.zeros((MEASURED, STATES))     # of the residual
-        self._jacobian[0:3, POSITION] = np.eye(3)
-        self._jacobian[3:6, ATTITUDE] = np.eye(3)
-        self._residual = np.zeros(MEASURED)
+        self.filter.H[0:3, POSITION] = np.eye(3)
+        self.filter.H[3:6, ATTITUDE] = np.eye(3)
         self._claimed_noise = (mocap.position_noise ** 2, mocap.orientation_noise ** 2)
         self.scale_noise(1.0, 1.0)
         # quantile of the chi-square distribution
@@ -84,8 +84,8 @@ class ErrorStateModel:
 
     def scale_noise(self, position: float, orientation: float) -> None:
         """Take the MoCap's variances as these multiples of the parameters' ones."""
-        self._noise = np.diag([position * self._claimed_noise[0]] * 3
-                              + [orientation * self._claimed_noise[1]] * 3)
+        self.filter.R = np.diag([position * self._claimed_noise[0]] * 3
+                                + [orientation * self._claimed_noise[1]] * 3)
 
     def start(self, stamp, force, rate, position, quaternion, biases: Node | None) -> Node:
         """
@@ -104,7 +104,7 @@ class ErrorStateModel:
         attitude = rotations.normalized(rotations.multiply(quaternion, self.marker_to_base))
         rotation = rotations.matrix(attitude)
         arm = rotation @ rotations.skew(self._lever)
-        noise = self._noise
+        noise = self.filter.R
         covariance = np.zeros((STATES, STATES))
         covariance[POSITION, POSITION] = noise[:3, :3] + arm @ noise[3:, 3:] @ arm.T
         covariance[POSITION, ATTITUDE] = arm @ noise[3:, 3:]
@@ -164,11 +164,14 @@ class ErrorStateModel:
         dt = stamp - node.stamp
         # What happened during missing samples is interpolated: its error grows with each.
         missing = max(1.0, dt / self._period)
-        change = transition(node, after, self._transition)
-        after.covariance = change @ node.covariance @ change.T \
-            + self._process * (dt * missing ** 3)
-        jump = force - node.force
-        jolt = float(jump @ jump)
+        kalman = self.filter
+        kalman.x = self._no_error
+        kalman.P = node.covariance
+        kalman.predict(F=transition(node, after, self._transition),
+                       Q=self._process * (dt * missing ** 3))
+        after.covariance = kalman.P
+        change = force - node.force
+        jolt = float(change @ change)
         if shaken or jolt > self._impact:
             self._doubt_impulse(after, dt, jolt, shaken)
         return after
@@ -193,29 +196,28 @@ class ErrorStateModel:
             The corrected node, or None when the pose fails the chi-square gate.
 
         """
-        residual, jacobian = np.empty(MEASURED), self._jacobian
+        kalman = self.filter
+        residual = np.empty(MEASURED)
         residual[:3] = position - prior.position
         residual[3:] = rotations.log(rotations.multiply(
             rotations.conjugate(prior.quaternion),
             rotations.multiply(quaternion, self.marker_to_base)))
         if self._has_lever:
             residual[:3] -= prior.rotation @ self._lever
-            jacobian[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
+            kalman.H[0:3, ATTITUDE] = -prior.rotation @ rotations.skew(self._lever)
         self._linearise_time(prior)
-        self._residual = residual
-        shared = prior.covariance @ jacobian.T
-        information = np.linalg.inv(jacobian @ shared + self._noise)
-        if not float(residual @ information @ residual) <= self.gate:     # also where it is NaN
+        kalman.x = self._no_error
+        kalman.P = prior.covariance
+        kalman.update(residual, H=kalman.H)
+        # The innovation is filterpy's y with inverse covariance SI; not <= also catches NaN.
+        if not float(kalman.y @ kalman.SI @ kalman.y) <= self.gate:
             return None
-        gain = shared @ information
-        kept = self._identity - gain @ jacobian
-        return self._inject(prior, gain @ residual, kept @ prior.covariance @ kept.T
-                            + gain @ self._noise @ gain.T)
+        return self._inject(prior, kalman.x, kalman.P)
 
     @property
     def whitened_residual(self) -> np.ndarray:
         """(6,) residual of the last :meth:`correct` in standard deviations of the MoCap."""
-        return self._residual / np.sqrt(np.diag(self._noise))
+        return np.ravel(self.filter.y) / np.sqrt(np.diag(self.filter.R))
 
     def _linearise_time(self, prior) -> None:
         """
@@ -224,7 +226,7 @@ class ErrorStateModel:
         At rest they are zero: there, the estimated velocity and rate are mostly noise, which is
         correlated with the residual and would pass for an offset.
         """
-        least, jacobian = self.parameters.time_offset, self._jacobian
+        least, jacobian = self.parameters.time_offset, self.filter.H
         rate = prior.rate - prior.gyroscope_bias
         velocity = prior.velocity
         if self._has_lever:
