@@ -184,9 +184,9 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
             if text:
                 console.print(text, markup=False, emoji=False, highlight=False)
 
-        if not driver.wait(lambda: driver.answers and driver.odom is not None,
+        if not driver.wait(lambda: driver.answers and driver.state and driver.odom is not None,
                            SUPERVISOR_TIMEOUT):
-            missing = 'odom' if driver.answers else 'supervisor_node'
+            missing = 'odom' if driver.answers and driver.state else 'supervisor_node'
             print(f'beetle_omni drive: error: {missing}: not seen in ROS domain {domain}; '
                   'expected a running graph (bringup.launch.py, or beetle_omni fly)',
                   file=sys.stderr)
@@ -197,14 +197,16 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
         say(asks.help)
         say(driver.where())
         before = driver.time()
-        while not asks.done:
-            driver.spin(PERIOD)
-            now = driver.time()
-            for action in asks.actions(now - before):
-                say(driver.obey(action))
-            say(driver.follow(now - before))
-            before = now
-        say('left; the robot holds its last target')
+        try:
+            while not asks.done:
+                driver.spin(PERIOD)
+                now = driver.time()
+                for action in asks.actions(now - before):
+                    say(driver.obey(action))
+                say(driver.follow(now - before))
+                before = now
+        finally:    # also at Ctrl-C
+            say('left; the robot holds its last target')
     return OK
 
 
