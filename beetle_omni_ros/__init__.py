@@ -16,13 +16,14 @@ Examples of one screen each stand in examples/.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, TYPE_CHECKING
-
 from beetle_omni_ros import robot
 
+TYPE_CHECKING = False       # typing and pathlib would delay the start of every program
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+    from typing import Any
+
     from beetle_omni_ros.robot.parameters import RobotParameters
     from beetle_omni_ros.runs.log import FlightLog
 
@@ -55,6 +56,8 @@ def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
         ParameterError, TaskError, BagError, FlightError: in one line.
 
     """
+    from pathlib import Path
+
     from beetle_omni_ros.evaluation.command import fly
     believed, flown = _robot(robot), _task(task, seed)
     return fly(_reference(controller), flown, robot=believed,
@@ -86,6 +89,8 @@ def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any =
         What `evaluate --json` writes: ``meta``, and a key for each controller's name.
 
     """
+    from pathlib import Path
+
     from rich.console import Console
 
     from beetle_omni_ros.evaluation.command import run_evaluate
@@ -134,6 +139,8 @@ def find_gap(runs: Sequence[str | Path], holdout: Sequence[str | Path] = (), *,
         What `gap --json` writes: ``verdict``, ``effects``, ``closure`` and the rest.
 
     """
+    from pathlib import Path
+
     from rich.console import Console
 
     from beetle_omni_ros.identify.gap.command import gap_results
@@ -169,6 +176,8 @@ def _robot(given):
 
 
 def _task(given, seed):
+    from pathlib import Path
+
     from beetle_omni_ros.runs.tasks import make_task, poses_task, Task
     if isinstance(given, Task):
         return given

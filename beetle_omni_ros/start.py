@@ -2,7 +2,8 @@
 Entry points of all executables, and ``python -m beetle_omni_ros.start NAME``.
 
 A node takes up to a second to load its modules. An interrupt in this time ends the process by the
-signal, without a traceback; afterwards each program answers it in its own way.
+signal, without a traceback; afterwards each program answers it in its own way. What comes before
+this module stays short: Python itself answers an interrupt there, with a traceback.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ def begin(module: str) -> int | None:
     if listens:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     main = import_module(module).main
-    if listens:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
+        if listens:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         return main()
     except KeyboardInterrupt:
         return INTERRUPTED

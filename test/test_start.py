@@ -1,13 +1,17 @@
 """Executables end quietly when they are interrupted while their modules load."""
 
+from pathlib import Path
+import random
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
 from beetle_omni_ros import start
 
+ROOT = Path(__file__).resolve().parents[1]
 SLOW = 'import time\nprint("loading", flush=True)\ntime.sleep(30)\n'
 INTERRUPTED = 'def main():\n    raise KeyboardInterrupt\n'
 
@@ -28,6 +32,34 @@ def test_an_interrupt_while_modules_load_ends_without_a_traceback(tmp_path):
     process.send_signal(signal.SIGINT)
     assert process.communicate(timeout=10) == ('', '')
     assert process.returncode == -signal.SIGINT
+
+
+def test_an_interrupt_at_a_random_moment_shows_no_traceback():
+    moments = random.Random(3)
+    statuses = set()
+    for _ in range(8):
+        process = subprocess.Popen(
+            [sys.executable, '-c', 'import sys; from beetle_omni_ros.start import beetle_omni\n'
+             'sys.stdout.write("begun\\n"); sys.stdout.flush()\n'
+             'sys.argv = ["beetle_omni", "report", "/does/not/exist"]; sys.exit(beetle_omni())'],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+        assert process.stdout.readline() == 'begun\n'
+        time.sleep(moments.uniform(0.02, 0.6))
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=60)
+        assert 'Traceback' not in error
+        statuses.add(process.returncode)
+    assert statuses <= {-signal.SIGINT, 130, 2} and -signal.SIGINT in statuses
+
+
+def test_little_is_loaded_before_an_interrupt_is_answered():
+    loaded = subprocess.run(
+        [sys.executable, '-S', '-c', 'import sys; before = set(sys.modules)\n'
+         'import beetle_omni_ros.start; print(*sorted(set(sys.modules) - before))'],
+        capture_output=True, text=True, timeout=60, check=True, cwd=ROOT).stdout.split()
+    assert {'numpy', 'typing', 'pathlib', 'logging'}.isdisjoint(loaded)
+    assert len(loaded) < 30, loaded
 
 
 def test_an_interrupt_that_a_program_lets_through_is_status_130(tmp_path):
