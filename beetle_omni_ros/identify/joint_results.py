@@ -16,12 +16,6 @@ from beetle_omni_ros.identify.selection import CANDIDATES, LINEAR
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, published_set, TERMS
 from beetle_omni_ros.robot.parameters import JointParameters
 
-WORDS = {'natural_frequency': 'bandwidth', 'damping_ratio': 'damping', 'delay': 'delay',
-         'coulomb_friction': 'friction', 'velocity_limit': 'speed limit',
-         'torque_limit': 'torque limit (an error of position)',
-         'stribeck_velocity': 'Stribeck velocity', 'load_sine': 'load (sine)',
-         'load_cosine': 'load (cosine)'}
-
 
 def joint_results(log: JointLog, validations: list[JointLog], models: list[JointModel],
                   published: JointParameters, believed: FileServos | None = None) -> dict:
@@ -99,7 +93,7 @@ def sentences(model: JointModel) -> list[str]:
     text = []
     intervals = model.uncertainty.intervals
     for pair in model.traded:
-        parts = [f'{WORDS.get(name, name)} {_range(name, intervals[INDEX[name]])}'
+        parts = [f'{TERMS[name].words or name} {_range(name, intervals[INDEX[name]])}'
                  for name in pair]
         text.append(f'This log trades {" against ".join(parts)}: more of one with less of the '
                     'other predicts it equally well.')
@@ -114,7 +108,7 @@ def sentences(model: JointModel) -> list[str]:
     if unmet:
         used = ' and '.join(f'{model.values[INDEX[name]]:.3g} {TERMS[name].unit}'
                             for name in unmet)
-        text.append(f'Not met in this log: {" and ".join(WORDS[name] for name in unmet)}; '
+        text.append(f'Not met in this log: {" and ".join(TERMS[name].words for name in unmet)}; '
                     f'predictions use {used} as published. A sine of 1.5 rad, fast enough for '
                     f'{1.2 * model.values[INDEX["velocity_limit"]]:.0f} rad/s, would show them.')
     return text

@@ -34,12 +34,16 @@ class Candidate:
         members: names of its numbers in a parameter set.
         starts: (log, joint index) -> values of the members to start from, several.
         needs: a candidate that must be there before.
+        rival: the candidate that looks much alike.
+        tier: when it is offered.
 
     """
 
     members: tuple[str, ...]
     starts: Callable[[JointLog, int], list[tuple[float, ...]]]
     needs: str | None = None
+    rival: str | None = None
+    tier: int = 0
 
 
 def _speeds(log, joint):
@@ -51,28 +55,27 @@ def _errors(log, joint):
     return [(0.9 * largest,), (0.6 * largest,)]
 
 
+# Offered tier by tier. A delay and friction or play are certain to be there in some size, a limit
+# that was met spoils all else, and what comes later imitates them on slow logs: stiction, above
+# all, can stand in for a delay. A dead band is a rival of play, a limit of speed of one of torque.
 CANDIDATES = {
     'delay': Candidate(('delay',), lambda log, joint: [(0.006,), (0.02,)]),
-    'coulomb_friction': Candidate(('coulomb_friction',), lambda log, joint: [(0.01,), (0.04,)]),
-    'backlash': Candidate(('backlash',), lambda log, joint: [(0.01,), (0.03,)]),
+    'coulomb_friction': Candidate(('coulomb_friction',), lambda log, joint: [(0.01,), (0.04,)],
+                                  rival='backlash'),
+    'backlash': Candidate(('backlash',), lambda log, joint: [(0.01,), (0.03,)],
+                          rival='coulomb_friction'),
     'offset': Candidate(('offset',), lambda log, joint: [(
         float(np.mean(log.measured[joint] - log.command[joint])),)]),
     'stiction': Candidate(('stiction', 'stribeck_velocity'),
-                          lambda log, joint: [(0.005, 0.1), (0.005, 1.0)], 'coulomb_friction'),
-    'velocity_limit': Candidate(('velocity_limit',), _speeds),
-    'torque_limit': Candidate(('torque_limit',), _errors),
+                          lambda log, joint: [(0.005, 0.1), (0.005, 1.0)], 'coulomb_friction',
+                          tier=1),
+    'velocity_limit': Candidate(('velocity_limit',), _speeds, rival='torque_limit'),
+    'torque_limit': Candidate(('torque_limit',), _errors, rival='velocity_limit'),
     'load': Candidate(('load_sine', 'load_cosine'),
-                      lambda log, joint: [(0.005, 0.005), (-0.005, -0.005)]),
+                      lambda log, joint: [(0.005, 0.005), (-0.005, -0.005)], tier=2),
 }
-
-# Offered in this order. A delay and friction or play are certain to be there in some size, a limit
-# that was met spoils all else, and what comes later imitates them on slow logs: stiction, above
-# all, can stand in for a delay.
-TIERS = (('delay', 'coulomb_friction', 'backlash', 'offset', 'velocity_limit', 'torque_limit'),
-         ('stiction',), ('load',))
-# What looks much alike: a dead band or play, a limit of speed or of torque.
-RIVALS = {'coulomb_friction': 'backlash', 'backlash': 'coulomb_friction',
-          'velocity_limit': 'torque_limit', 'torque_limit': 'velocity_limit'}
+TIERS = tuple(tuple(name for name, each in CANDIDATES.items() if each.tier == tier)
+              for tier in range(3))
 
 
 def free_mask(kept: tuple[str, ...]) -> np.ndarray:
@@ -191,7 +194,7 @@ class Selector:
         asked: Asked = {(j, None): (names, None) for j, names in enumerate(self.kept)}
         for j, names in enumerate(self.kept):
             for name in names:
-                rival = RIVALS.get(name)
+                rival = CANDIDATES[name].rival
                 if rival in self.allowed and rival not in names:
                     asked[j, name] = (tuple(rival if n == name else n for n in names
                                             if CANDIDATES[n].needs != name), rival)
@@ -296,7 +299,7 @@ class Selector:
 
 def _weight(name, kept):
     """By how much a candidate must beat the least gain; twice where its rival is there too."""
-    return len(CANDIDATES[name].members) * (2 if RIVALS.get(name) in kept else 1)
+    return len(CANDIDATES[name].members) * (2 if CANDIDATES[name].rival in kept else 1)
 
 
 def _verdict(gains, weight):

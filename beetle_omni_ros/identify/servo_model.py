@@ -41,6 +41,8 @@ class Term:
         high: largest.
         scale: a change that matters; of the logarithm where ``logarithmic``.
         logarithmic: whether it is fitted as its logarithm.
+        words: in a sentence; by default its name.
+        moving: whether it acts in a step, neither before (delay, offset) nor after it (play).
 
     """
 
@@ -50,27 +52,32 @@ class Term:
     high: float
     scale: float
     logarithmic: bool = False
+    words: str = ''
+    moving: bool = True
 
 
 TERMS = {
-    'natural_frequency': Term('rad/s', 60.0, 8.0, 400.0, 0.05, True),     # sqrt(Kp / J)
-    'damping_ratio': Term('1', 0.9, 0.05, 20.0, 0.05, True),              # Kd / (2 sqrt(Kp J))
-    'delay': Term('s', 0.0, 0.0, 0.12, 0.002),
-    'offset': Term('rad', 0.0, -0.5, 0.5, 0.002),             # measured minus commanded, at rest
-    'coulomb_friction': Term('rad', 0.0, 0.0, 0.4, 0.002),    # dead band to each side
-    'stiction': Term('rad', 0.0, 0.0, 0.4, 0.002),            # breakaway above that
-    'stribeck_velocity': Term('rad/s', 0.1, 0.02, 3.0, 0.2, True),    # at which stiction fades
-    'backlash': Term('rad', 0.0, 0.0, 0.3, 0.002),    # play to each side, before the encoder
-    'velocity_limit': Term('rad/s', NEVER, 0.2, NEVER, 0.05, True),
-    'torque_limit': Term('rad', NEVER, 0.005, NEVER, 0.05, True),
-    'load_sine': Term('rad', 0.0, -0.3, 0.3, 0.002),          # sag ~ sin(q): a weight on the joint
-    'load_cosine': Term('rad', 0.0, -0.3, 0.3, 0.002),
+    'natural_frequency': Term('rad/s', 60.0, 8.0, 400.0, 0.05, True, 'bandwidth'),  # sqrt(Kp / J)
+    'damping_ratio': Term('1', 0.9, 0.05, 20.0, 0.05, True, 'damping'),   # Kd / (2 sqrt(Kp J))
+    'delay': Term('s', 0.0, 0.0, 0.12, 0.002, moving=False),
+    'offset': Term('rad', 0.0, -0.5, 0.5, 0.002, moving=False),   # measured minus commanded
+    'coulomb_friction': Term('rad', 0.0, 0.0, 0.4, 0.002, words='friction'),  # half a dead band
+    'stiction': Term('rad', 0.0, 0.0, 0.4, 0.002),                # breakaway above that
+    # at which stiction fades
+    'stribeck_velocity': Term('rad/s', 0.1, 0.02, 3.0, 0.2, True, 'Stribeck velocity'),
+    # play to each side, before the encoder
+    'backlash': Term('rad', 0.0, 0.0, 0.3, 0.002, moving=False),
+    'velocity_limit': Term('rad/s', NEVER, 0.2, NEVER, 0.05, True, 'speed limit'),
+    'torque_limit': Term('rad', NEVER, 0.005, NEVER, 0.05, True,
+                         'torque limit (an error of position)'),
+    # sag ~ sin(q): a weight on the joint
+    'load_sine': Term('rad', 0.0, -0.3, 0.3, 0.002, words='load (sine)'),
+    'load_cosine': Term('rad', 0.0, -0.3, 0.3, 0.002, words='load (cosine)'),
 }
 NAMES = tuple(TERMS)
 INDEX = {name: k for k, name in enumerate(NAMES)}
 OFF = np.array([term.off for term in TERMS.values()])
-# Those that act in a step; delay and offset act before, play after it.
-MOVING = tuple(name for name in NAMES if name not in ('delay', 'offset', 'backlash'))
+MOVING = tuple(name for name, term in TERMS.items() if term.moving)
 # Arrays of (steps, sets), of states one row more; numbers: (NUMBERS, sets).
 LOOP = """
 void servo_run(long steps, long sets, double step, const double *command, const double *early,
