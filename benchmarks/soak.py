@@ -27,11 +27,11 @@ from rich.console import Console
 from rich.table import Table
 import yaml
 
-from beetle_omni_ros.nodes import domain
-from beetle_omni_ros.nodes.actuators import bridged, BRIDGES
+from beetle_omni_ros.nodes import discovery
 from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
+from beetle_omni_ros.nodes.plan import bridged, BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.runs.pose_file import COLUMNS
 from beetle_omni_ros.runs.tasks import POSE_DURATION, WAYPOINTS
@@ -164,7 +164,7 @@ def soak(given, console: Console) -> dict:
     operator, graph, ended = None, None, 'no take-off'
     samples: dict[str, list[Sample]] = {}
     try:
-        with domain.reserved() as number:
+        with discovery.reserved() as number:
             try:
                 graph = make_graph(folder, number, given)
                 graph.start()

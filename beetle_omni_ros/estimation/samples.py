@@ -52,7 +52,11 @@ class Estimate:
 
 
 def pose_covariance(estimate: Estimate) -> np.ndarray:
-    """Covariance (6, 6) of position [m] and rotation about world axes [rad]."""
+    """
+    Covariance (6, 6) of position [m] and rotation about world axes [rad].
+
+    The filter's rotation error is about body axes, that of nav_msgs/Odometry about world's.
+    """
     jacobian = np.zeros((6, ERROR_STATES))
     jacobian[:3, POSITION] = np.eye(3)
     jacobian[3:, ATTITUDE] = rotations.matrix(estimate.quaternion)

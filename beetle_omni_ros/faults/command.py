@@ -18,8 +18,13 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of
 from beetle_omni_ros.faults import campaign, page
 from beetle_omni_ros.faults.flight import ALL_STARTS, STARTS
-from beetle_omni_ros.faults.healthy import CONDITIONS, fly_healthy, HealthyTrial
-from beetle_omni_ros.faults.landings import fly_landing, LandingTrial
+from beetle_omni_ros.faults.landings import (
+    CONDITIONS,
+    fly_healthy,
+    fly_landing,
+    HealthyTrial,
+    LandingTrial,
+)
 from beetle_omni_ros.faults.trial import fly_trial, Trial
 from beetle_omni_ros.faults.watch import as_expected
 from beetle_omni_ros.robot.parameters import RobotParameters

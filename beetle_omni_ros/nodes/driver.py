@@ -24,8 +24,8 @@ from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.discovery import confine
-from beetle_omni_ros.nodes.interrupts import terminable
 from beetle_omni_ros.nodes.operator import Operator
+from beetle_omni_ros.nodes.runner import terminable
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError

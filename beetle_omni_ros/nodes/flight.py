@@ -7,9 +7,9 @@ import time
 
 from rich.progress import Progress
 
-from beetle_omni_ros.nodes.actuators import BridgeCounts, BRIDGES
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
+from beetle_omni_ros.nodes.plan import BridgeCounts, BRIDGES
 from beetle_omni_ros.runs.tasks import Task
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller

@@ -18,14 +18,13 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.nodes import domain, runner
-from beetle_omni_ros.nodes.actuators import ACTUATORS
-from beetle_omni_ros.nodes.discovery import confine
+from beetle_omni_ros.nodes import runner
+from beetle_omni_ros.nodes.discovery import confine, reserved
 from beetle_omni_ros.nodes.flight import Flight, FlightError, TooSlowError
 from beetle_omni_ros.nodes.graph import child_environment, Graph
-from beetle_omni_ros.nodes.interrupts import terminable, undisturbed
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.plan import plan, Wanted
+from beetle_omni_ros.nodes.plan import ACTUATORS, plan, Wanted
+from beetle_omni_ros.nodes.runner import terminable, undisturbed
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table
@@ -111,7 +110,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             for name, reason in plan(wanted).left_out.items():
                 _tell(console, f'{name} does not stand by: {reason}')
             controller = registry.find(controller).name
-            number = stack.enter_context(domain.reserved()) if domain_id is None else domain_id
+            number = stack.enter_context(reserved()) if domain_id is None else domain_id
             if view:
                 stack.enter_context(viewed(number, robot, allow_targets, console))
             meta = {'task': task, 'conditions': conditions, 'seed': seed,

@@ -13,9 +13,8 @@ import yaml
 
 import beetle_omni_ros
 from beetle_omni_ros.nodes import plan
-from beetle_omni_ros.nodes.actuators import BRIDGES
 from beetle_omni_ros.nodes.discovery import confine
-from beetle_omni_ros.nodes.plan import BRIDGES_COMPOSED, COMPOSED
+from beetle_omni_ros.nodes.plan import BRIDGES, BRIDGES_COMPOSED, COMPOSED
 
 PORT_TIMEOUT = 30.0     # s for the simulator to make its serial ports
 STOP_TIMEOUT = 8.0      # s for a process to stop by itself before it is killed

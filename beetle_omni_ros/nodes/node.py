@@ -10,12 +10,55 @@ from rclpy.node import Node
 
 from beetle_omni_ros.messages.topics import Qos, topic_of
 from beetle_omni_ros.messages.values import MessageError
-from beetle_omni_ros.nodes import instance, parameters, wire
+from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.health import Health
+from beetle_omni_ros.nodes.private import HeldError, Lock
 
 # A stamp this far ahead of the clock comes from another clock.
 FUTURE = 0.05
 TWIN_CHECKS = 3
+
+
+class StartError(RuntimeError):
+    """A node cannot start or go on; the text is one line for the operator."""
+
+
+def claim(node: Node):
+    """
+    Take the node's lock until it is closed, or the process ends.
+
+    Two supervisors, or two estimators, on one set of topics would take turns with the robot. A
+    lock file names the holder at once on the same computer and goes with its process, however
+    that ends; a node on another computer is seen in the ROS graph.
+
+    Raises:
+        StartError: another process of this computer holds it.
+
+    """
+    domain = node.context.get_domain_id()
+    name = node.get_fully_qualified_name()
+    try:
+        return Lock(f"{domain}{name.replace('/', '.')}.lock")
+    except HeldError as error:
+        raise StartError(f'{name} runs already (process {str(error) or "unknown"}, ROS domain '
+                         f'{domain}); stop it first') from None
+    except OSError as error:    # the graph check still stands
+        node.get_logger().warning(f'a second {name} on this computer may go unnoticed: {error}')
+        return None
+
+
+def refuse_twin(node: Node) -> None:
+    """
+    Look for a node of the same name elsewhere in the ROS graph.
+
+    Raises:
+        StartError: there is one.
+
+    """
+    own = (node.get_name(), node.get_namespace())
+    if node.get_node_names_and_namespaces().count(own) > 1:
+        raise StartError(f'{node.get_fully_qualified_name()} runs already on another computer '
+                         f'(ROS domain {node.context.get_domain_id()}); stop it first')
 
 
 class FlightNode(Node):
@@ -52,7 +95,7 @@ class FlightNode(Node):
 
         """
         super().__init__(name)
-        self._claim = instance.claim(self)
+        self._claim = claim(self)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         # Simulated time may stand still; what times a flight then goes by it, and by nothing else.
         self.simulated = bool(self.get_parameter(parameters.CLOCK).value)
@@ -137,7 +180,7 @@ class FlightNode(Node):
 
     def _look_for_twin(self):
         # Discovery takes its time: look a few times after the start, then never again.
-        instance.refuse_twin(self)
+        refuse_twin(self)
         self._twin_checks += 1
         if self._twin_checks >= TWIN_CHECKS:
             self._twin_timer.cancel()

@@ -17,8 +17,8 @@ from beetle_omni_ros.messages.conversions import seconds
 from beetle_omni_ros.messages.topics import request, SENSOR
 from beetle_omni_ros.messages.values import Diagnostic
 from beetle_omni_ros.nodes import health, runner, wire
-from beetle_omni_ros.nodes.actuators import READY, STATES
 from beetle_omni_ros.nodes.discovery import confine
+from beetle_omni_ros.nodes.plan import READY, STATES
 
 # Where time is simulated and slow, or stands still because its source died, waiting ends with this
 # much steady time for each second of it.

@@ -7,16 +7,22 @@ No ROS is needed to read it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.nodes.actuators import bridged, BRIDGES
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
+BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
+STATES = {'joint_bridge_node': 'joint_bridge/state', 'rotor_bridge_node': 'rotor_bridge/state'}
+ACTUATORS = ('emulated', 'direct')
+READY = 'ready'
+# status of the diagnostics, key there -> key of what a flight measured
+MEASURED = {
+    'joint_bridge_node': ('bus', 'servos'), 'rotor_bridge_node': ('board', 'motor_board')}
 # Executables; each is a module of this folder with a class of the same name. `controller_node`
 # runs any registered controller, under the name `<controller>_node`.
 NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'controller_node', 'supervisor_node',
@@ -25,6 +31,63 @@ NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'controller_node', 'sup
 GENERIC = 'controller_node'
 COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes of several nodes
 Parameters = dict[str, dict]        # node name -> parameters that differ from the shipped ones
+
+
+def bridged(folder: Path, believed: dict) -> dict[str, dict]:
+    """
+    Node name -> parameters of simulator and bridges that meet in ``folder``.
+
+    Args:
+        folder: for the names of the two pseudo-terminals.
+        believed: parameters of every node that believes in a robot file.
+
+    """
+    servos, board = str(Path(folder) / 'servo_bus'), str(Path(folder) / 'motor_board')
+    return {'sim_node': {'actuators': 'emulated', 'servo_port': servos, 'board_port': board},
+            'joint_bridge_node': {**believed, 'port': servos, 'autostart': 'activate'},
+            'rotor_bridge_node': {**believed, 'port': board}}
+
+
+class BridgeCounts:
+    """
+    What the bridges did in a stretch of a flight, from their diagnostics.
+
+    Args:
+        values: status name -> its values, as they were told last.
+
+    """
+
+    def __init__(self, values: Callable[[str], dict[str, str]]):
+        self._values = values
+        self._first = self._cycles()
+
+    def measured(self) -> dict[str, float]:
+        """
+        Count of cycles and of missed ones since the beginning; latencies [ms].
+
+        Keys: ``servos_cycles``, ``servos_missed_cycles``, ``servos_latency_median_ms``,
+        ``..._p99_ms`` and ``..._max_ms``, and the same of ``motor_board``. The latency is from
+        the publication of `command` to its last byte written.
+        """
+        found = {}
+        last = self._cycles()
+        for node, (_, name) in MEASURED.items():
+            for key in ('cycles', 'missed_cycles'):
+                if f'{name}_{key}' in last:
+                    found[f'{name}_{key}'] = \
+                        last[f'{name}_{key}'] - self._first.get(f'{name}_{key}', 0)
+            latency = self._values(f'{node}: latency')
+            found.update({f'{name}_latency_{key}': float(latency[key])
+                          for key in ('median_ms', 'p99_ms', 'max_ms') if key in latency})
+        return found
+
+    def _cycles(self):
+        counts = {}
+        for node, (status, name) in MEASURED.items():
+            values = self._values(f'{node}: {status}')
+            counts.update({f'{name}_{key}': int(values[key])
+                           for key in ('cycles', 'missed_cycles') if key in values})
+        return counts
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,12 +15,11 @@ from rclpy.parameter_client import AsyncParameterClient
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.conversions import read_command, read_odom
 from beetle_omni_ros.messages.topics import EVENT, SENSOR
-from beetle_omni_ros.nodes import domain, wire
-from beetle_omni_ros.nodes.actuators import BRIDGES
-from beetle_omni_ros.nodes.discovery import confine
+from beetle_omni_ros.nodes import wire
+from beetle_omni_ros.nodes.discovery import confine, reserved
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.plan import plan, Wanted
+from beetle_omni_ros.nodes.plan import BRIDGES, plan, Wanted
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.sim.faults.listed import FaultList, OutcomeLimits
@@ -205,7 +204,7 @@ def fly_through_ros(name: str, listed: FaultList) -> dict:
               'named': '', 'states': [], 'impact_m_s': None, 'stopped_s': None, 'takeoffs': 0,
               'bag_lost': False, 'error': ''}
     confine()
-    with tempfile.TemporaryDirectory(prefix='beetle_omni_') as folder, domain.reserved() as number:
+    with tempfile.TemporaryDirectory(prefix='beetle_omni_') as folder, reserved() as number:
         graph, observer = _graph(Path(folder), number, fault.bridges), None
         try:
             graph.start()

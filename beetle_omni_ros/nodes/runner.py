@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import contextmanager
 import ctypes
 import gc
 import os
@@ -19,7 +20,7 @@ from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
 from beetle_omni_ros.nodes import discovery
-from beetle_omni_ros.nodes.instance import StartError
+from beetle_omni_ros.nodes.node import StartError
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
 OK, FAILED, UNUSABLE = 0, 1, 2
@@ -30,6 +31,7 @@ FOREVER = 1e8
 THREAD_SWITCH = 0.0005  # s
 REAL_TIME_PRIORITY = 1  # lowest of the real-time ones: above every ordinary process
 PR_SET_PDEATHSIG = 1    # of linux/prctl.h
+ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def main(node_class: type, args: Sequence[str] | None = None) -> None:
@@ -190,3 +192,51 @@ def _fail(name, error, status):
     text = ' '.join(str(error).split())
     print(f'{name}: error: {text}', file=sys.stderr, flush=True)
     return status
+
+
+@contextmanager
+def terminable():
+    """
+    Let SIGTERM end what is inside as Ctrl-C does, so that nothing is left behind.
+
+    The first signal counts; those that follow do not cut the cleaning up short.
+
+    Raises:
+        KeyboardInterrupt: one of the signals came, whatever a library made of it.
+
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came = []
+
+    def interrupt(number, _):
+        came.append(number)
+        for each in ENDING:
+            signal.signal(each, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in ENDING}
+    try:
+        yield
+    except Exception:
+        if came:
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def undisturbed():
+    """Let signals wait: who cleans up has been told already, and a launch system tells twice."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in ENDING}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -147,7 +147,10 @@ def _value(at, spec, value):
 
 def stand(consumer: str, name: str) -> Stand:
     """
-    Stand of a consumer on an effect.
+    Stand of a consumer on an effect: whether it acts on it, leaves it to another or refuses it.
+
+    It follows from how the effect acts (:attr:`Effect.kind`), so that a new entry of the
+    catalogue has a stand everywhere. One test over all of them holds that the stand is true.
 
     Args:
         consumer: one of ``CONSUMERS``.

@@ -13,8 +13,13 @@ from beetle_omni_ros import cli
 from beetle_omni_ros.faults import page
 from beetle_omni_ros.faults.campaign import healthy_summary, landing_summary, summary
 from beetle_omni_ros.faults.command import run_faults
-from beetle_omni_ros.faults.healthy import fly_healthy, HealthyTrial
-from beetle_omni_ros.faults.landings import attitude, fly_landing, LandingTrial
+from beetle_omni_ros.faults.landings import (
+    attitude,
+    fly_healthy,
+    fly_landing,
+    HealthyTrial,
+    LandingTrial,
+)
 from beetle_omni_ros.faults.trial import fly_trial, go_to_the_fault, Trial
 
 ROOT = Path(__file__).parents[2]

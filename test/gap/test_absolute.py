@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap import analysis
-from beetle_omni_ros.identify.gap.absolute import ceilings, too_loud
 from beetle_omni_ros.identify.gap.analysis import Analysis
+from beetle_omni_ros.identify.gap.noise import ceilings, too_loud
 from beetle_omni_ros.identify.gap.rollouts import HORIZONS, Runs
 from beetle_omni_ros.identify.gap.verdict import disagreement
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.bags import Recording
-from beetle_omni_ros.identify.gap.filters import LEAST_SAMPLES, shortest_flight
 from beetle_omni_ros.identify.gap.ingest import load_flight, prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.series import LEAST_SAMPLES, shortest_flight
 from beetle_omni_ros.runs.bag_files import BagError
 
 

@@ -5,8 +5,7 @@ from types import SimpleNamespace
 from flights import KEYS, ROBOT
 import pytest
 
-from beetle_omni_ros.identify.gap.results import grids, headline, parameters
-from beetle_omni_ros.identify.gap.sentence import summary
+from beetle_omni_ros.identify.gap.results import grids, headline, parameters, summary
 from beetle_omni_ros.robot.effects import CATALOGUE
 
 

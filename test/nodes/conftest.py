@@ -9,12 +9,12 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from beetle_omni_ros.nodes import domain
+from beetle_omni_ros.nodes import discovery
 
 
 @pytest.fixture
 def ros_domain(monkeypatch):
     """Hold a free ROS domain for one test, so that tests can run at the same time."""
-    with domain.reserved() as number:
+    with discovery.reserved() as number:
         monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
         yield number

@@ -11,7 +11,7 @@ from sensor_msgs.msg import BatteryState, JointState
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.messages.topics import SENSOR
-from beetle_omni_ros.nodes import domain, wire
+from beetle_omni_ros.nodes import discovery, wire
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameters
@@ -140,7 +140,7 @@ class Bench:
 @contextmanager
 def bench(folder, **parameters):
     """Start a bridge; without a parameter ``port``, on an emulated board."""
-    with domain.reserved() as number, EmulatedMotorBoard(parameters=QUICK) as board:
+    with discovery.reserved() as number, EmulatedMotorBoard(parameters=QUICK) as board:
         patient = {'port': board.port, 'reconnect_period': 0.1, 'silence': 1.0}
         graph = Graph({NODE: {**patient, **parameters}}, folder, number, composed=False)
         commander = None

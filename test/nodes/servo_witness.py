@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.messages.topics import SENSOR
-from beetle_omni_ros.nodes import domain, wire
+from beetle_omni_ros.nodes import discovery, wire
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
@@ -133,7 +133,7 @@ class ServoWitness(Operator):
 @contextmanager
 def joint_bridge(folder, others=(), **parameters):
     """Run the node in a process of its own, or composed with others; yield graph and witness."""
-    with domain.reserved() as number:
+    with discovery.reserved() as number:
         graph = Graph({NODE: {**PATIENT, **parameters}, **{name: {} for name in others}}, folder,
                       number, composed=bool(others))
         witness = None

@@ -12,8 +12,8 @@ from rclpy.parameter_client import AsyncParameterClient
 from std_srvs.srv import Trigger
 from witness import PATIENT, READY, Witness
 
-from beetle_omni_ros.nodes.actuators import bridged, BRIDGES
 from beetle_omni_ros.nodes.graph import BRIDGES_COMPOSED, Graph
+from beetle_omni_ros.nodes.plan import bridged, BRIDGES
 
 pytestmark = pytest.mark.alone
 

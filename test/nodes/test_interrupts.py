@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from beetle_omni_ros.nodes.interrupts import terminable, undisturbed
+from beetle_omni_ros.nodes.runner import terminable, undisturbed
 from beetle_omni_ros.runs.bag import read_bag
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from beetle_omni_ros.messages.topics import TOPICS
 from beetle_omni_ros.nodes import discovery, plan, private
-from beetle_omni_ros.nodes.actuators import BRIDGES
+from beetle_omni_ros.nodes.plan import BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 

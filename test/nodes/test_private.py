@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from beetle_omni_ros.nodes import domain, private
+from beetle_omni_ros.nodes import discovery, private
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_the_runtime_folder_comes_first_where_it_is_safe(temporary, monkeypatch)
 def test_a_link_in_place_of_the_folder_is_refused(temporary, name):
     (temporary / 'victim').mkdir(mode=0o700)
     (temporary / name).symlink_to(temporary / 'victim')
-    with pytest.raises(OSError, match='found a link or file'), domain.reserved():
+    with pytest.raises(OSError, match='found a link or file'), discovery.reserved():
         pass
     assert not list((temporary / 'victim').iterdir())
 
@@ -49,7 +49,7 @@ def test_a_link_in_place_of_the_folder_is_refused(temporary, name):
 def test_a_folder_that_others_may_enter_is_refused(temporary, name):
     (temporary / name).mkdir()
     (temporary / name).chmod(0o777)
-    with pytest.raises(OSError, match='open to other users .mode 777.'), domain.reserved():
+    with pytest.raises(OSError, match='open to other users .mode 777.'), discovery.reserved():
         pass
 
 
@@ -57,7 +57,7 @@ def test_a_folder_that_others_may_enter_is_refused(temporary, name):
 def test_a_folder_of_another_user_is_refused(temporary, name):
     (temporary / name).mkdir(mode=0o700)
     os.chown(temporary / name, 12345, -1)
-    with pytest.raises(OSError, match='belongs to user 12345'), domain.reserved():
+    with pytest.raises(OSError, match='belongs to user 12345'), discovery.reserved():
         pass
 
 
@@ -65,9 +65,9 @@ def test_a_folder_of_another_user_is_refused(temporary, name):
 def test_a_file_of_the_victim_is_not_emptied(temporary, link):
     victim = temporary / 'victim'
     victim.write_text('precious')
-    for number in domain.DOMAINS:
+    for number in discovery.DOMAINS:
         link(victim, private.folder() / f'domain{number}.lock')
-    with pytest.raises(OSError, match='lock'), domain.reserved():
+    with pytest.raises(OSError, match='lock'), discovery.reserved():
         pass
     assert victim.read_text() == 'precious'
 
@@ -112,7 +112,7 @@ def test_a_lock_that_its_holder_removes_meanwhile_is_taken_anew(temporary, monke
 
 
 def test_a_domain_leaves_nothing_behind_but_the_locks_of_who_lives(temporary):
-    with domain.reserved() as number:
+    with discovery.reserved() as number:
         alive = private.Lock(f'{number}.ekf_node.lock')
         (private.folder() / f'{number}.sim_node.lock').write_text('999999999')   # was killed
     assert [path.name for path in private.folder().iterdir()] == [f'{number}.ekf_node.lock']
@@ -121,7 +121,7 @@ def test_a_domain_leaves_nothing_behind_but_the_locks_of_who_lives(temporary):
 
 
 def test_a_node_leaves_the_file_behind_a_link_alone(temporary):
-    from beetle_omni_ros.nodes.instance import claim
+    from beetle_omni_ros.nodes.node import claim
     victim = temporary / 'victim'
     victim.write_text('precious')
     told = []

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.absolute import ceilings, Loud, too_loud
 from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import candidates, Found, Trial
@@ -20,6 +19,7 @@ from beetle_omni_ros.identify.gap.certainty import (
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, Key, tolerances
+from beetle_omni_ros.identify.gap.noise import ceilings, Loud, too_loud
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, Rhythm, rhythm
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel

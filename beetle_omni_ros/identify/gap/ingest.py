@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, read_recording, Recording
-from beetle_omni_ros.identify.gap.filters import shortest_flight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.gap.series import shortest_flight
 from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.robot.parameters import RobotParameters

@@ -18,8 +18,7 @@ from beetle_omni_ros.identify.gap.joint_search import (
 from beetle_omni_ros.identify.gap.keys import friction
 from beetle_omni_ros.identify.gap.page import AFTER, BEFORE, head
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.results import grids
-from beetle_omni_ros.identify.gap.sentence import summary
+from beetle_omni_ros.identify.gap.results import grids, summary
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
 from beetle_omni_ros.identify.joint_page import joint_page

@@ -14,11 +14,10 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.gap.body import BodyModel
-from beetle_omni_ros.identify.gap.filters import channel_filters, THIN
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import delays_of, Key
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.series import matrices
+from beetle_omni_ros.identify.gap.series import channel_filters, matrices, THIN
 from beetle_omni_ros.identify.gap.servo import (
     module_load,
     simulate,

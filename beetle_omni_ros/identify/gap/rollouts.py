@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from beetle_omni_ros.identify.gap.filters import low_pass
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
+from beetle_omni_ros.identify.gap.series import low_pass
 from beetle_omni_ros.identify.gap.servo import (
     module_load,
     simulate,

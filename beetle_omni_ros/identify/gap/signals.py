@@ -8,15 +8,16 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from beetle_omni_ros.identify.gap.filters import EDGE, low_pass
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import names_of, THRUST_BUS, TILT_BUS
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import (
     derivatives,
+    EDGE,
     filled,
     held_at,
     integral,
+    low_pass,
     matrices,
     spread,
     turn,

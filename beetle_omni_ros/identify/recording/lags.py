@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import Recording
-from beetle_omni_ros.identify.gap.filters import low_pass
-from beetle_omni_ros.identify.gap.series import matrices
+from beetle_omni_ros.identify.gap.series import low_pass, matrices
 from beetle_omni_ros.identify.recording.clocks import begin_of, change_point
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.identify.recording.limits import RecordingLimits

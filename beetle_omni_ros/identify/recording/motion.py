@@ -8,8 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
-from beetle_omni_ros.identify.gap.filters import low_pass
-from beetle_omni_ros.identify.gap.series import matrices
+from beetle_omni_ros.identify.gap.series import low_pass, matrices
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.robot.parameters import RobotParameters
 
