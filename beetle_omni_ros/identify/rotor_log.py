@@ -71,12 +71,12 @@ def read_rotor_log(path: str | Path) -> RotorLog:
     pwm_name = 'duty_percent' if 'duty_percent' in table.columns else 'pwm_us'
     unit = ('percent of 2000 us, 50 at stop' if pwm_name == 'duty_percent'
             else 'microseconds, 1000 at stop')
-    _check(table, pwm_name, duty, *P.duty, unit)
-    _check(table, 'force_N', column['force_N'], -5.0, P.largest_force,
+    _check(table, pwm_name, duty, P.duty, unit)
+    _check(table, 'force_N', column['force_N'], (-5.0, P.largest_force),
            'newtons, thrust positive (grams?)')
-    _check(table, 'torque_N_m', np.abs(column['torque_N_m']), 0.0, P.largest_torque,
+    _check(table, 'torque_N_m', np.abs(column['torque_N_m']), (0.0, P.largest_torque),
            'newton metres')
-    _check(table, 'voltage_V', column['voltage_V'], *P.voltage, 'volts (millivolts?)')
+    _check(table, 'voltage_V', column['voltage_V'], P.voltage, 'volts (millivolts?)')
     if np.ptp(duty) < 5:
         raise LogError(f'{path}: {pwm_name} spans {np.ptp(duty):.2g} % of duty only; expected a '
                        'sweep from stop to full')
@@ -104,7 +104,8 @@ def _wanted(header):
     return names + (['t_s'] if 't_s' in header else [])
 
 
-def _check(table, name, values, low, high, expected):
+def _check(table, name, values, bounds, expected):
+    low, high = bounds
     bad = np.flatnonzero((values < low) | (values > high))
     if bad.size:
         header = next((n for n in ALTERNATIVES.get(name, (name,)) if n in table.columns), name)
