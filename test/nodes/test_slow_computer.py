@@ -75,6 +75,18 @@ def test_a_fast_one_tries_and_a_failed_flight_says_what_the_simulator_lost():
 
 
 @pytest.mark.real_time
+@pytest.mark.parametrize('may_be_slow', [True, False])
+def test_a_flight_that_fails_after_a_pause_says_so(may_be_slow):
+    class Paused(Nodes):
+        states = ['fallback:supervisor_paused', 'emergency_stop:crash']
+
+    with pytest.raises(FlightError, match='refuses to arm: not level; the simulator fell 0.0 s '
+                       'behind in .* s, and supervisor_node was not scheduled') as raised:
+        flown(Paused(), may_be_slow=may_be_slow)
+    assert (raised.type is TooSlowError) != may_be_slow
+
+
+@pytest.mark.real_time
 def test_a_fault_that_keeps_it_on_the_ground_ends_the_attempt_at_once():
     class Jammed(Nodes):
         states, waited = [], 0

@@ -245,3 +245,23 @@ def test_a_fault_stays_named_and_the_health_follows():
     assert watch.news() and not watch.news()
     watch.reset()
     assert watch.faults == {} and watch.health.healthy
+
+
+@pytest.mark.parametrize('pause', [0.03, 0.3, 1.0])
+@pytest.mark.parametrize('spacing', [TICK, 1e-4, 1e-7, 0.0])
+def test_a_burst_of_samples_after_a_pause_is_neither_crash_nor_fault(pause, spacing):
+    """A process that was held up finds its samples at once, however they are stamped."""
+    body, watch = Body(ATTITUDES[1]), wrench_watch()
+    contact = ContactWatch(P.contact, ROBOT.gravity)
+    assert body.feed(watch, 1.0) is None
+    noise = np.random.default_rng(1)
+    t = body.time + pause
+    for _ in range(60):
+        force, _ = ALLOCATOR.wrench(body.hover.tilt, body.thrust)
+        watch.on_imu(t, force / ALLOCATOR.mass + 0.05 * noise.normal(size=3),
+                     body.rate + 0.005 * noise.normal(size=3), body.hover.tilt,
+                     body.hover.thrust, ALL_WELL)
+        contact.update(min(spacing, 0.05), 0.2, watch)
+        t += spacing
+    assert not watch.impact and not contact.reason
+    assert watch.lost is None and watch.slipped is None

@@ -1,0 +1,44 @@
+"""Processes that the computer does not schedule for a while: what is true is told, no more."""
+
+import signal
+import time
+
+import pytest
+from witness import READY, Witness
+
+from beetle_omni_ros.nodes.graph import Graph
+from beetle_omni_ros.nodes.plan import COMPOSED, plan, Wanted
+
+pytestmark = pytest.mark.real_time
+PAUSE = 0.5     # [s]
+SOFT = 0.6      # [m/s] of a touchdown; a fall by 0.1 m is faster
+
+
+def test_a_pause_of_the_computer_in_flight_ends_without_a_crash_that_was_none(ros_domain,
+                                                                              tmp_path):
+    wanted = Wanted(controller='nmpc', task='hover', actuators='direct', ports=str(tmp_path),
+                    bag=str(tmp_path / 'bag'), standby=False)
+    graph = Graph(plan(wanted).nodes, tmp_path, ros_domain)
+    witness = None
+    try:
+        graph.start()
+        witness = Witness(ros_domain)
+        assert witness.wait(lambda: witness.ready, READY), graph.dead()
+        witness.can_judge(graph)
+        witness.take_off(lambda: witness.state.startswith('flying'))
+        witness.spin(2.0)
+        witness.states.clear()
+        process = graph.processes[COMPOSED]
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(PAUSE)
+        process.send_signal(signal.SIGCONT)
+        witness.spin(6.0)
+        robot = witness.values('sim_node: robot')
+        impact = float(robot.get('impact_m_s', 0.0))
+        assert not any('crash' in state for state in witness.states), (witness.states, robot)
+        assert robot['broken'] == '0' and impact < SOFT
+        assert witness.state.startswith('flying') or witness.state == 'disarmed'
+    finally:
+        graph.stop()
+        if witness:
+            witness.close()
