@@ -6,13 +6,17 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 from rosbags.interfaces import Nodetype
+from synthetic_flights import fly
 import yaml
 
-from beetle_omni_ros.messages.bag_types import TYPESTORE
+from beetle_omni_ros.messages.bag_types import from_bytes, TYPESTORE
 from beetle_omni_ros.messages.topics import ALL
 from beetle_omni_ros.nodes import plan
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.robot.resources import share_path
+from beetle_omni_ros.robot.urdf import description, SHIPPED
+from beetle_omni_ros.runs.bag import BagWriter, read_messages
+from beetle_omni_ros.runs.tasks import make_task
 
 VIEWERS = share_path('viewers')
 # What viewer_node adds to the topics of a flight.
@@ -116,3 +120,118 @@ def test_the_aggregator_has_a_group_for_each_node(node):
     found = [group for group in groups
              if any(node.startswith(prefix) for prefix in group['startswith'])]
     assert len(found) == 1, node
+
+
+# What the programs' own sources declare: display class -> properties, and so on.
+DISPLAY = {'Class', 'Name', 'Enabled', 'Value'}
+RVIZ = {
+    'rviz_default_plugins/Grid': {
+        'Alpha', 'Cell Size', 'Color', 'Line Style', 'Normal Cell Count', 'Offset', 'Plane',
+        'Plane Cell Count', 'Reference Frame'},
+    'rviz_default_plugins/RobotModel': {
+        'Alpha', 'Collision Enabled', 'Description File', 'Description Source',
+        'Description Topic', 'Links', 'Mass Properties', 'TF Prefix', 'Update Interval',
+        'Visual Enabled'},
+    'rviz_default_plugins/MarkerArray': {'Namespaces', 'Topic'},
+    'rviz_default_plugins/Pose': {
+        'Alpha', 'Axes Length', 'Axes Radius', 'Color', 'Head Length', 'Head Radius',
+        'Shaft Length', 'Shaft Radius', 'Shape', 'Topic'},
+    'rviz_default_plugins/Odometry': {
+        'Angle Tolerance', 'Covariance', 'Keep', 'Position Tolerance', 'Shape', 'Topic'},
+    'rviz_default_plugins/TF': {
+        'Filter (blacklist)', 'Filter (whitelist)', 'Frame Timeout', 'Frames', 'Marker Scale',
+        'Show Arrows', 'Show Axes', 'Show Names', 'Tree', 'Update Interval'}}
+RVIZ_TOPIC = {'Value', 'Depth', 'Durability Policy', 'Filter size', 'History Policy',
+              'Reliability Policy'}
+RVIZ_TOOLS = {f'rviz_default_plugins/{name}' for name in (
+    'FocusCamera', 'Interact', 'Measure', 'MoveCamera', 'PublishPoint', 'Select',
+    'SetGoal', 'SetInitialPose')}
+RVIZ_ORBIT = {'Class', 'Name', 'Target Frame', 'Distance', 'Enable Stereo Rendering',
+              'Focal Point', 'Focal Shape Fixed Size', 'Focal Shape Size', 'Near Clip Distance',
+              'Invert Z Axis', 'Pitch', 'Yaw', 'Value'}
+FOXGLOVE = {'3D', 'DiagnosticSummary', 'Plot', 'StateTransitions', 'Tab'}
+FOLLOW = {'follow-pose', 'follow-position', 'follow-none'}
+
+
+def test_rviz_knows_every_class_and_property():
+    content = yaml.safe_load((VIEWERS / 'beetle_omni.rviz').read_text())
+    assert {panel['Class'] for panel in content['Panels']} <= {
+        f'rviz_common/{name}' for name in ('Displays', 'Selection', 'Time', 'Tool Properties',
+                                           'Views')}
+    manager = content['Visualization Manager']
+    assert manager['Global Options'].keys() <= {'Background Color', 'Fixed Frame', 'Frame Rate'}
+    for display in manager['Displays']:
+        assert display.keys() <= RVIZ[display['Class']] | DISPLAY, display['Name']
+        for given in (display.get('Topic'), display.get('Description Topic')):
+            assert given is None or given.keys() <= RVIZ_TOPIC
+    assert {tool['Class'] for tool in manager['Tools']} <= RVIZ_TOOLS
+    view = manager['Views']['Current']
+    assert view['Class'] == 'rviz_default_plugins/Orbit' and view.keys() <= RVIZ_ORBIT
+
+
+def test_foxglove_knows_every_panel_and_how_it_follows():
+    layout = json.loads((VIEWERS / 'foxglove.json').read_text())
+    assert layout.keys() == {'configById', 'globalVariables', 'userNodes', 'playbackConfig',
+                             'layout'}
+    assert {name.partition('!')[0] for name in layout['configById']} <= FOXGLOVE
+    scene = layout['configById']['3D!robot']
+    assert scene['followMode'] in FOLLOW
+    assert {layer['layerId'] for layer in scene['layers'].values()} <= {
+        'foxglove.Grid', 'foxglove.Urdf', 'foxglove.TiledMap'}
+    for panel in layout['configById'].values():
+        for path in panel.get('paths', ()):
+            assert path['timestampMethod'] in ('headerStamp', 'receiveTime')
+            stamped = 'header' in dict(TYPESTORE.fielddefs[TYPES[split(path['value'])[0]]][1])
+            assert stamped or path['timestampMethod'] == 'receiveTime', path['value']
+
+
+def test_plotjuggler_finds_the_elements_of_its_layouts():
+    root = ElementTree.parse(VIEWERS / 'plotjuggler.xml').getroot()
+    window, = root.findall('tabbed_widget')
+    assert window.get('parent') == 'main_window'
+    for tab in window.findall('Tab'):
+        assert int(tab.get('containers')) == len(tab.findall('Container'))
+    for splitter in root.iter('DockSplitter'):
+        sizes = splitter.get('sizes').split(';')
+        areas = splitter.findall('DockArea')
+        assert int(splitter.get('count')) == len(sizes) == len(areas)
+        assert splitter.get('orientation') in '-|'
+        assert sum(map(float, sizes)) == pytest.approx(1.0, abs=1e-3)
+    for plot in root.iter('plot'):
+        assert plot.get('mode') == 'TimeSeries' and plot.findall('curve')
+        assert all(re.fullmatch('#[0-9a-f]{6}', curve.get('color'))
+                   for curve in plot.findall('curve'))
+
+
+def test_a_bag_holds_the_frames_and_topics_of_all_layouts(tmp_path):
+    urdf = description(share_path(SHIPPED))
+    with BagWriter(tmp_path / 'bag', description=urdf) as writer:
+        fly(writer, make_task('waypoints'), duration=2.0)
+    held, parents = {}, {}
+    for message in read_messages(tmp_path / 'bag'):
+        held[message.topic] = message.type
+        if message.topic in ('/tf', '/tf_static'):
+            for transform in from_bytes(message.data, message.type).transforms:
+                parents[transform.child_frame_id] = transform.header.frame_id
+    rviz = yaml.safe_load((VIEWERS / 'beetle_omni.rviz').read_text())['Visualization Manager']
+    layout = json.loads((VIEWERS / 'foxglove.json').read_text())['configById']
+    frames = {*parents, *parents.values()}
+    assert {rviz['Global Options']['Fixed Frame'], rviz['Views']['Current']['Target Frame'],
+            layout['3D!robot']['followTf'],
+            *(layer['frameId'] for layer in layout['3D!robot']['layers'].values()
+              if 'frameId' in layer)} <= frames
+    links = {link.get('name') for link in ElementTree.fromstring(urdf).findall('link')}
+    assert links <= frames
+    for link in links:      # each leads to the world
+        while link != 'world':
+            link = parents[link]
+    told = {split(curve.get('name'))[0] for curve in
+            ElementTree.parse(VIEWERS / 'plotjuggler.xml').getroot().iter('curve')}
+    told |= {split(path['value'])[0] for panel in layout.values()
+             for path in panel.get('paths', ())}
+    told |= {'robot_description'}
+    missing = {name for name in told if f'/{name}' not in held}
+    # Nodes tell these to each other; a flight in one process has none of them.
+    assert missing <= {name for name in told if name.endswith('/state')}, missing
+    for name in told - missing:
+        assert held[f'/{name}'] == TYPES[name]
