@@ -29,23 +29,24 @@ HANDOVER = SupervisorParameters.load().handover
 HEADER = 'x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n'
 
 
-@pytest.fixture(scope='module', params=['written', 'shipped'])
+@pytest.fixture(scope='module', params=[('written', 0), ('shipped', 1)], ids=lambda p: p[0])
 def policy(request, tmp_path_factory):
-    """Path of a policy that flies: one made by hand, and the one in policies/."""
-    if request.param == 'shipped':
+    """Path of a policy that flies, made by hand or the one in policies/, and a seed."""
+    name, seed = request.param
+    if name == 'shipped':
         try:
-            return share_path('policies/rl.onnx')
+            return share_path('policies/rl.onnx'), seed
         except FileNotFoundError:
             pytest.skip('no policies/rl.onnx in this version')
     pytest.importorskip('onnx')
     from hover_policy import write_hover_policy
-    return write_hover_policy(tmp_path_factory.mktemp('policy') / 'hover.onnx', memory=True)
+    return write_hover_policy(tmp_path_factory.mktemp('policy') / 'hover.onnx', memory=True), seed
 
 
 @pytest.fixture(scope='module')
-def flights(policy):
-    """One flight with switches for each of two seeds."""
-    return [fly_switching(policy, seed) for seed in (0, 1)]
+def flight(policy):
+    """One flight with switches."""
+    return fly_switching(*policy)
 
 
 class Switching(LogRecorder):
@@ -80,8 +81,8 @@ def fly_switching(policy, seed):
     return loop.fly(task), recorder, task
 
 
-def test_twenty_switches_at_random_moments_of_random_poses(flights):
-    stayed, recorder, task = flights[0]
+def test_twenty_switches_at_random_moments_of_random_poses(flight):
+    stayed, recorder, task = flight
     log = recorder.log()
     assert stayed and len(recorder.switched) == SWITCHES
     # every switch takes effect at its moment, and nothing else changes the state
@@ -103,9 +104,8 @@ def test_twenty_switches_at_random_moments_of_random_poses(flights):
         assert np.allclose(asked.tilt[k], log.command_tilt[inside], atol=1e-9)
 
 
-@pytest.mark.parametrize('flown', [0, 1])
-def test_no_switch_makes_the_command_jump(flights, flown):
-    stayed, recorder, _ = flights[flown]
+def test_no_switch_makes_the_command_jump(flight):
+    stayed, recorder, _ = flight
     log = recorder.log()
     assert stayed and len(recorder.switched) == SWITCHES
     step = np.diff(log.command_t)
@@ -123,8 +123,8 @@ def test_no_switch_makes_the_command_jump(flights, flown):
                 break       # it has caught up, and has its way
 
 
-def test_switched_flights_are_the_same_every_time(policy, flights):
-    first, again = (flown[1].log() for flown in (flights[1], fly_switching(policy, seed=1)))
+def test_switched_flights_are_the_same_every_time(policy, flight):
+    first, again = (flown[1].log() for flown in (flight, fly_switching(*policy)))
     assert np.array_equal(first.truth_position, again.truth_position)
     assert np.array_equal(first.command_tilt, again.command_tilt)
 

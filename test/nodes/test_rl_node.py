@@ -174,15 +174,17 @@ class Pilot(Witness):
         return accepted, reason
 
 
-@pytest.fixture(params=['written', 'shipped'])
-def flight(request, ros_domain, tmp_path):
-    """The composed graph with both controllers in the air, on its way through random poses."""
-    if request.param == 'written':
+@pytest.fixture
+def flight(ros_domain, tmp_path):
+    """
+    The composed graph with both controllers in the air, on its way through random poses.
+
+    The policy is the shipped one, or made by hand where that does not fit; in one process
+    test_switching.py flies both.
+    """
+    policy = ''
+    if unfit(DEFAULT):
         policy = str(write_hover_policy(tmp_path / 'hover.onnx', memory=True))
-    elif reason := unfit(DEFAULT):
-        pytest.skip(reason)
-    else:
-        policy = ''
     controllers, reason = controller_nodes('nmpc', policy=policy)
     assert not reason
     graph = Graph({'sim_node': {}, 'ekf_node': {}, **controllers, 'supervisor_node': {},
