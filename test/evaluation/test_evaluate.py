@@ -19,7 +19,7 @@ from beetle_omni_ros.runs.tasks import make_task, TaskError
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 
 ROBOT = RobotParameters.load()
-CAPACITY = 0.18     # [A h] of a pack that is empty before the third pose
+CAPACITY = 0.0975   # [A h] of a pack that does not last for two poses
 
 
 def evaluate(task, controllers=('nmpc',), **options):
@@ -135,7 +135,7 @@ def test_an_empty_pack_is_swapped_at_the_next_target(charge, tmp_path, monkeypat
     small = SimulatorParameters.load()
     small = replace(small, battery=replace(small.battery, capacity=CAPACITY))
     monkeypatch.setattr(command.SimulatorParameters, 'load', lambda: small)
-    task = make_task('random3')
+    task = make_task('random2')
     log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)
     assert not log.meta['crashed']
     assert metrics(log, task)['success_rate'] == 1.0
