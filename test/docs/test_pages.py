@@ -106,3 +106,9 @@ def test_a_long_sentence_and_a_broken_link_are_found(tmp_path):
     assert [line for line, _ in pages.too_long(page.read_text())] == [3]
     assert pages.too_wide(page.read_text())
     assert [broken.split(': ')[1] for broken in pages.broken_links(page)] == ['none.md', '#none']
+
+
+def test_bars_in_code_of_tables_are_plain_on_the_site():
+    text = '| `--a x\\|y` | a \\| b `c` |\n\n    `x\\|y`\n'
+    assert module('hooks').on_page_markdown(text, page=None) == \
+        '| `--a x|y` | a \\| b `c` |\n\n    `x\\|y`\n'
