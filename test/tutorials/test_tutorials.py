@@ -3,7 +3,8 @@ Each tutorial runs from its own text: its files are written, its commands run in
 
 A comment before a block says how the test differs from what a reader does:
 ``<!-- test: skip -->``, ``OLD -> NEW`` in the commands, ``prints TEXT``, ``fails STATUS``,
-``background NAME`` until the page ends, and ``waits FILE`` for what that makes.
+``background NAME`` until a block that ``ends NAME`` or the page's end, and ``waits FILE`` for what
+that makes.
 """
 
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ import os
 from pathlib import Path
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -91,30 +93,37 @@ def run(block, folder, environment):
     assert block.one('prints') in done.stdout, said
 
 
+def stop(process):
+    """End a program as Ctrl-C does."""
+    process.send_signal(signal.SIGINT)
+    process.wait(20)
+
+
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
 def test_a_tutorial_does_what_it_says(page, tmp_path, shell):
     found = blocks(page)
     if any('fly ' in block.text or block.one('background') for block in found):
         pytest.importorskip('rclpy')
-    folder, background = tmp_path / 'reader', []
+    folder, background = tmp_path / 'reader', {}
     folder.mkdir()
     try:
         for block in found:
             if 'skip' in block.told:
                 continue
+            if block.one('ends'):
+                stop(background.pop(block.one('ends')))
             if block.file:
                 (folder / block.file).write_text(block.commands)
             elif block.one('background'):
-                background.append(subprocess.Popen(
+                background[block.one('background')] = subprocess.Popen(
                     ['bash', '-c', f'exec {block.commands}'], cwd=folder, env=shell,
-                    stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+                    stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             else:
                 run(block, folder, shell)
     finally:
-        for process in background:
-            process.terminate()
-            process.wait(20)
+        for process in background.values():
+            stop(process)
     shutil.rmtree(folder)
 
 
