@@ -1,6 +1,7 @@
 """The installer of the onboard computer, the images and the container say what they should."""
 
 import json
+import os
 from pathlib import Path
 import re
 import shutil
@@ -139,6 +140,53 @@ def test_the_image_with_ros_is_built_by_the_lines_of_the_page():
             assert command in run, command
     wanted = re.search(r'sudo apt install (.*)', block)[1].split()
     assert set(wanted) <= set(run.split())
+
+
+@pytest.mark.parametrize('image', ['Dockerfile', 'Dockerfile.python'])
+def test_the_images_can_draw_without_a_screen(image):
+    text = (DEPLOY / image).read_text()
+    assert 'ENV MUJOCO_GL=egl' in text      # then MuJoCo is not even imported without these
+    assert {'libegl1', 'libgl1-mesa-dri', 'libopengl0'} <= set(commands(DEPLOY / image).split())
+
+
+@pytest.mark.parametrize('image', ['Dockerfile', 'Dockerfile.python'])
+def test_the_linter_of_images_finds_nothing(image):
+    linter = shutil.which('hadolint', path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    if linter is None:
+        pytest.skip('no hadolint here')
+    # DL3008: the newest packages of the distribution are wanted.
+    done = subprocess.run([linter, '--ignore', 'DL3008', str(DEPLOY / image)],
+                          capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_entry_point_finds_what_colcon_installed(tmp_path):
+    place = tmp_path / 'ws/install/beetle_omni_ros/lib/beetle_omni_ros'
+    for setup in ('opt/ros/jazzy/setup.bash', 'ws/.venv/bin/activate', 'ws/install/setup.bash'):
+        (tmp_path / setup).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / setup).write_text(f'export SEEN="$SEEN {setup}"\n')
+    place.mkdir(parents=True)
+    (place / 'beetle_omni').write_text('#!/bin/sh\necho "$SEEN: $1"\n')
+    (place / 'beetle_omni').chmod(0o755)
+    entry = tmp_path / 'entrypoint'
+    entry.write_text(re.sub(r'/(opt/ros|ws)/', rf'{tmp_path}/\1/',
+                            (DEPLOY / 'entrypoint').read_text()))
+    assert os.access(DEPLOY / 'entrypoint', os.X_OK)
+    done = subprocess.run(['bash', str(entry), 'beetle_omni', 'fly'], capture_output=True,
+                          text=True, timeout=60)
+    assert done.stdout.strip().endswith('ws/install/setup.bash: fly'), done.stderr
+    assert 'COPY . src/beetle_omni_ros' in (DEPLOY / 'Dockerfile').read_text()
+
+
+def test_the_rules_are_read_by_udev(tmp_path):
+    udevadm = shutil.which('udevadm')
+    if udevadm is None or subprocess.run([udevadm, 'verify', '--help'], capture_output=True,
+                                         timeout=60).returncode:
+        pytest.skip('no udevadm verify here (systemd 254)')
+    assert install(tmp_path, '--servo-serial', 'FT2N08').returncode == 0
+    done = subprocess.run([udevadm, 'verify', str(tmp_path / RULES)], capture_output=True,
+                          text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_the_image_without_ros_uses_the_set_up_of_the_makefile():

@@ -39,7 +39,7 @@ def choose_backend() -> str:
     raise ParameterError(
         (f'MUJOCO_GL={given} draws nothing here; unset it, or ' if given else
          'no off-screen OpenGL here: ')
-        + 'install libegl1 and libgl1-mesa-dri (apt), or libosmesa6')
+        + 'install libegl1, libgl1-mesa-dri and libopengl0 (apt), or libosmesa6')
 
 
 def _works(backend):
