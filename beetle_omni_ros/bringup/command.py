@@ -35,17 +35,8 @@ def run_check(*, listen: Callable[[float], Heard], servo_port: str | None = None
     """
     Look at everything and print a table; nothing moves, nothing is set.
 
-    Args:
-        listen: called with seconds, returns what ROS said; raises ModuleNotFoundError without ROS.
-        servo_port: instead of the one of the parameters.
-        board_port: likewise.
-        servo_bus: parameter file; default the shipped one.
-        motor_board: likewise.
-        robot: likewise.
-        seconds: to listen to the board, and to ROS.
-        skip: parts not to look at: 'servos', 'board', 'ros'.
-        json_path: file for the findings.
-        console: where to print.
+    Arguments are the options of `beetle_omni check`. ``listen`` is called with seconds, returns
+    what ROS said and raises ModuleNotFoundError without ROS.
 
     Returns:
         exit status: 0 nothing failed, 1 something did.

@@ -49,21 +49,7 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
     """
     Fly what is missing, then write page, pictures and numbers.
 
-    Args:
-        output: folder for ``comparison.html``, ``comparison.json``, ``README.md`` and pictures.
-        controllers: names, or where their classes are; None takes the shipped ones that are
-            there, and says which are not.
-        tasks: names or pose files; None is all.
-        conditions: 'nominal', 'published'; None is both.
-        seeds: None is 0 and 1, and 0 alone for long tasks.
-        jobs: flights at a time; None is one on each core.
-        backend: 'processes' or 'ray'.
-        address: of a Ray cluster; None starts Ray on this computer.
-        cache: folder of finished flights; None is in the output.
-        fresh: fly again what is kept.
-        policy: another policy for the controller that `--policy` is for.
-        json_path: a second place for the numbers.
-        console: where to print.
+    Arguments are the options of `beetle_omni compare`; None is their default.
 
     Returns:
         What ``comparison.json`` holds.

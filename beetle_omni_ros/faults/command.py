@@ -44,23 +44,8 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     """
     Fly the list of faults; or landings, or healthy flights, where those are asked for.
 
-    Args:
-        faults: file of the list; by default params/faults.yaml.
-        only: names of the list to fly; by default all.
-        starts: of ALL_STARTS; by default STARTS.
-        seeds: flights of each fault from each start.
-        conditions: 'nominal' or 'published'; healthy flights are flown in all.
-        controller: the active one.
-        jobs: flights at a time; by default one a core.
-        output: folder for the page, Markdown, JSON and bags.
-        json_path: file for the results, too.
-        docs: Markdown file whose fault table is written between its markers.
-        bags: whether each flight is recorded and its bag read back.
-        landings: number of landings, in place of the list.
-        without_mocap: whether those lose motion capture.
-        healthy: hours of healthy flight under each of its conditions, in place of the list.
-        through_ros: flies what only the ROS graph shows, in place of the list.
-        console: where to print.
+    Arguments are the options of `beetle_omni faults`; ``starts`` of ALL_STARTS, ``healthy`` in
+    hours, and ``through_ros`` flies what only the ROS graph shows, in place of the list.
 
     Returns:
         ``meta``; ``flights`` and ``summary``, or ``landings``, ``healthy`` or ``ros``.

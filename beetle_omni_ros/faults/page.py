@@ -19,11 +19,6 @@ def fault_rows(results: dict) -> list[list[str]]:
             for name, row in results['summary']['faults'].items()]
 
 
-def listed_rows(listed) -> list[list[str]]:
-    """Rows under COLUMNS of a list of which nothing has been flown."""
-    return [[name, case.what, case.expected, *[''] * 6] for name, case in listed.cases.items()]
-
-
 def other_tables(results: dict) -> list[tuple[str, tuple[str, ...], list[list[str]]]]:
     """Title, header and rows of landings, healthy flights and ROS, where they were flown."""
     tables = []

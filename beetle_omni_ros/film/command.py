@@ -28,16 +28,7 @@ def run_film(paths: list[Path], outputs: list[Path], *, models: list[Path] = (),
     """
     Draw flights side by side.
 
-    Args:
-        paths: bags; with ``models`` one.
-        outputs: .gif or .mp4 files.
-        models: robot files whose free runs are drawn over the flight, a panel for each.
-        robot: file with the robot's dimensions; default the shipped one.
-        start: since the first target [s].
-        duration: of the flights; by default to their ends [s].
-        speed: of the film, 1 is real time.
-        size: width of a panel [pixels].
-        console: where to print.
+    Arguments are those of `beetle_omni film`; with ``models`` there is one path.
 
     Raises:
         BagError: a run cannot be read.

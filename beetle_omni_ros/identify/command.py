@@ -27,14 +27,7 @@ def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path
     """
     Identify the tilt servos from a response log.
 
-    Args:
-        path: log, see docs/how-to/identification.md.
-        validate: further logs, which only judge.
-        robot: file with the published servo and its inertia; default the shipped one.
-        json_path: file for the results.
-        report: HTML page to write.
-        params: robot file to write.
-        console: where to print.
+    Arguments are those of `beetle_omni identify joint`.
 
     Returns:
         the results as in INTERFACES: ``joints``, and ``meta``.
@@ -72,13 +65,7 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
     """
     Identify a rotor's map and torque ratio from a bench log.
 
-    Args:
-        path: log, see docs/how-to/identification.md.
-        robot: file whose map is drawn beside and extended; default the shipped one.
-        json_path: file for the results.
-        report: HTML page to write.
-        params: robot file to write.
-        console: where to print.
+    Arguments are those of `beetle_omni identify rotor`.
 
     Returns:
         ``plateaus``, ``torque_to_thrust_ratio``, ``warnings`` and ``meta``.

@@ -148,14 +148,7 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
     """
     Drive until the user quits.
 
-    Args:
-        source: of SOURCES.
-        parameters: file in place of params/drive.yaml.
-        poses: file of more named poses.
-        robot: file of the robot, for the floor under it; default the shipped one.
-        domain_id: ROS domain; default ROS_DOMAIN_ID, or 0.
-        discovery: who can find the nodes, see :mod:`discovery`.
-        console: where to print.
+    Arguments are those of `beetle_omni drive`; ``source`` is one of SOURCES.
 
     Returns:
         Exit status: 0 left by the user, 1 no flight stack there.

@@ -52,31 +52,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
     """
     Fly a task through the ROS graph and print what the bag says.
 
-    Args:
-        controller: the active one: a name, or where its class is.
-        task: name or pose file.
-        bag: folder to create; None: the bag is thrown away.
-        compression: of the bag, 'none' or 'zstd'.
-        seed: of the task and the simulation.
-        conditions: 'nominal' or 'published'.
-        actuators: 'emulated': through drivers, serial ports and emulated devices; 'direct':
-            straight into the plant; default emulated, direct in simulated time.
-        clock: 'system': real time; 'simulated': time that waits for nodes that are late; 'auto':
-            simulated if the computer turns out to be too slow for real time, unless ``actuators``
-            are asked to be emulated.
-        robot: file that estimator and controller believe; default the shipped one.
-        plant: file that is true in the simulation; default ``robot``.
-        policy: file for the controller that `--policy` is for; default the shipped one.
-        allow_other_robot: fly a policy that was trained for other robot parameters.
-        standby: run those that stand by too, so that they can be selected in flight.
-        composed: all nodes in one process, or one process for each.
-        faults: file of what fails, when since the task's start and how long.
-        json_path: file for the results.
-        domain_id: ROS domain; default a free one.
-        discovery: who can find the nodes, see :mod:`discovery`; default this computer alone.
-        view: show the flight in the browser, from a process of its own.
-        allow_targets: poses dragged there become targets.
-        console: where to print.
+    Arguments are the options of `beetle_omni fly`; without ``bag`` it is thrown away.
 
     Returns:
         Exit status: 0 flown to the end, 1 not, 2 unusable input, 130 interrupted.

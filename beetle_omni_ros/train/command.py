@@ -76,18 +76,8 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     """
     Train, assess, export.
 
-    Args:
-        output: folder for parameters, checkpoints, TensorBoard log and policy.onnx; default
-            that of ``resume``.
-        config: parameter file; default the shipped one, with ``resume`` that of the run.
-        robot: robot file.
-        changes: dotted parameter name -> value, over the file.
-        device: 'auto', 'cpu', 'cuda' or 'cuda:N'.
-        resume: a run's folder, or a checkpoint.
-        smoke: tiny sizes, to see that everything fits together.
-        stop_after: seconds of training after which it stops early.
-        json_path: file for the results.
-        console: where to print.
+    Arguments are the options of `beetle_omni train`; ``changes`` holds a value for each dotted
+    parameter name, over the file.
 
     Returns:
         ``policy`` (path), ``iterations``, ``seconds``, ``metrics`` by conditions.

@@ -41,17 +41,7 @@ def run_gap(runs: list[Path], holdout: Sequence[Path] = (), robot: Path | None =
     """
     Find where model and measurement disagree.
 
-    Args:
-        runs: rosbag2 folders that are fitted, or one joint log (CSV).
-        holdout: folders that judge; by default the last run, where there are three or more.
-        robot: file that is believed; default the shipped one.
-        apply: robot file to write, with the named effects.
-        json_path: file for the results.
-        page: HTML page to write.
-        console: where to print.
-        parameters: file with changes to params/gap.yaml.
-        fix: whether damage whose correction is certain is corrected in what was read.
-        tolerances: whether ``apply`` also gets the numbers that were fitted within tolerance.
+    Arguments are those of `beetle_omni gap`.
 
     Returns:
         3 for the verdict `bad_data`; 0 for any other, which is no error.

@@ -10,7 +10,7 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, read_recording, Recording
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.series import shortest_flight
+from beetle_omni_ros.identify.gap.series import aligned, shortest_flight
 from beetle_omni_ros.identify.recording.check import damages, repaired
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -206,10 +206,7 @@ def _without_gaps(name, series, begin, end, p, findings):
 def _continuous(quaternion):
     """Quaternions without changes of sign, normalised."""
     norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    unit = quaternion / np.where(norm > 1e-6, norm, 1.0)
-    turn = np.sign((unit[1:] * unit[:-1]).sum(axis=1))
-    turn[turn == 0] = 1
-    return unit * np.concatenate([[1.0], np.cumprod(turn)])[:, None]
+    return aligned(quaternion / np.where(norm > 1e-6, norm, 1.0))
 
 
 def _check_robot(flight, robot, p):

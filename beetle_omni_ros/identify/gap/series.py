@@ -9,6 +9,7 @@ import numpy as np
 from scipy.signal import firwin, upfirdn
 
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.robot import rotations
 
 SHARPNESS = 5.0     # taps for each sampling rate over edge
 THIN = 2            # grid points to each at which the body's equations are evaluated
@@ -169,6 +170,11 @@ def turned(quaternion, vector):
     angle = np.linalg.norm(vector)
     x2, y2, z2 = vector / angle * np.sin(angle / 2)
     w2 = np.cos(angle / 2)
-    x, y, z, w = quaternion.T
-    return np.stack([w * x2 + x * w2 + y * z2 - z * y2, w * y2 - x * z2 + y * w2 + z * x2,
-                     w * z2 + x * y2 - y * x2 + z * w2, w * w2 - x * x2 - y * y2 - z * z2], axis=1)
+    return np.stack(rotations.product(*quaternion.T, x2, y2, z2, w2), axis=1)
+
+
+def aligned(quaternion):
+    """Quaternions (N, 4) without changes of sign from one to the next."""
+    sign = np.sign((quaternion[1:] * quaternion[:-1]).sum(axis=1))
+    sign[sign == 0] = 1
+    return quaternion * np.concatenate([[1.0], np.cumprod(sign)])[:, None]

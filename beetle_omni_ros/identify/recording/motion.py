@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
-from beetle_omni_ros.identify.gap.series import low_pass, matrices
+from beetle_omni_ros.identify.gap.series import aligned, low_pass, matrices
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -145,10 +145,7 @@ def silent(recording: Recording, t: np.ndarray, reach: float) -> np.ndarray:
 def _orientation(stamps, quaternion, grid):
     """Unit quaternions (N, 4) xyzw on a grid."""
     norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    unit = quaternion / np.where(norm > 1e-9, norm, 1.0)
-    sign = np.sign((unit[1:] * unit[:-1]).sum(axis=1))
-    sign[sign == 0] = 1
-    unit = unit * np.concatenate([[1.0], np.cumprod(sign)])[:, None]
+    unit = aligned(quaternion / np.where(norm > 1e-9, norm, 1.0))
     q = np.stack([np.interp(grid, stamps, column) for column in unit.T], axis=1)
     return q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-9)
 

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from beetle_omni_ros.identify.gap.bags import Recording
+from beetle_omni_ros.identify.gap.series import aligned
 from beetle_omni_ros.identify.recording.clocks import begin_of, NORMAL
 from beetle_omni_ros.identify.recording.damage import changed, Damage
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
@@ -70,7 +71,7 @@ def noise_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]
         series = _Series(recording, topic)
         values = series.values.copy()
         if topic == 'mocap/pose':
-            values[:, 3:] = 2 * _aligned(values[:, 3:])     # [rad] of small turns
+            values[:, 3:] = 2 * aligned(values[:, 3:])     # [rad] of small turns
         if len(values) < 20:
             continue
         scatter = NORMAL * np.median(np.abs(np.diff(values, 3, axis=0)), axis=0) / DIFFERENCED
@@ -165,7 +166,7 @@ def _outliers(series, limits):
     values = series.values
     if series.topic == 'mocap/pose':
         values = values.copy()
-        values[:, 3:] = _aligned(values[:, 3:])
+        values[:, 3:] = aligned(values[:, 3:])
         floor = [limits.outlier_position] * 3 + [limits.outlier_angle / 2] * 4
     elif series.topic == 'imu/data_raw':
         floor = [limits.outlier_force] * 3 + [limits.outlier_rate] * 3
@@ -207,13 +208,6 @@ def _alternating(series, limits):
     return series.damage(f'{back.mean():.0%} of the positions jump to and fro by '
                          f'{np.median(size[1:][back]):.2f} m: two sources or two recordings are '
                          'interleaved', series.t[int(np.argmax(back))])
-
-
-def _aligned(quaternion):
-    """Quaternions (N, 4) whose signs follow a running reference."""
-    sign = np.sign((quaternion[1:] * quaternion[:-1]).sum(axis=1))
-    sign[sign == 0] = 1
-    return quaternion * np.concatenate([[1.0], np.cumprod(sign)])[:, None]
 
 
 def _stale(series, limits):
