@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from beetle_omni_ros.identify.gap.bags import NEEDED, Recording
+from beetle_omni_ros.identify.recording.actuator_conventions import (
+    joint_damages,
+    thrust_damages,
+)
 from beetle_omni_ros.identify.recording.clocks import clock_damages
-from beetle_omni_ros.identify.recording.conventions import convention_damages
+from beetle_omni_ros.identify.recording.conventions import body_damages
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.identify.recording.lags import lag_damages
 from beetle_omni_ros.identify.recording.limits import RecordingLimits, shipped
+from beetle_omni_ros.identify.recording.motion import motion_of
 from beetle_omni_ros.identify.recording.readings import noise_damages, reading_damages
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -35,7 +42,18 @@ def damages(recording: Recording, robot: RobotParameters,
     found = clock_damages(recording, limits)
     found += reading_damages(recording, limits, {damage.topic for damage in found})
     return found or lag_damages(recording, limits) \
-        or convention_damages(recording, robot, limits) or noise_damages(recording, limits)
+        or _convention_damages(recording, robot, limits) or noise_damages(recording, limits)
+
+
+def _convention_damages(recording, robot, limits):
+    """Everything that sensors and commands show against each other."""
+    m = motion_of(recording, robot, limits)
+    if m is None:
+        return []
+    with np.errstate(all='ignore'):
+        return body_damages(recording, m, robot, limits) \
+            or joint_damages(recording, m, robot, limits) \
+            or thrust_damages(recording, m, robot, limits)
 
 
 def repaired(recording: Recording, robot: RobotParameters,

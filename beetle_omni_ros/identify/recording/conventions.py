@@ -1,10 +1,10 @@
 """
-Units, axes, signs and orders, from motion that two sensors measure.
+Units and axes of IMU and MoCap, from the motion that both measure.
 
 Gyroscope and MoCap measure the same rate of turn. The accelerometer measures MoCap's second
-derivative less gravity. Encoders follow tilt commands, and thrust commands push the body. For
-each pair, the conventions that people mix up are hypotheses, weighted by their likelihood with
-Gaussian errors of unknown size and by a prior against every deviation from the convention.
+derivative less gravity. The conventions that people mix up are hypotheses, weighted by their
+likelihood with Gaussian errors of unknown size and by a prior against every deviation from the
+convention.
 """
 
 from __future__ import annotations
@@ -16,12 +16,18 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.recording.clocks import begin_of
-from beetle_omni_ros.identify.recording.damage import CERTAIN, changed, Damage, MOST_CERTAIN
+from beetle_omni_ros.identify.recording.damage import (
+    CERTAIN,
+    columns_changed,
+    Damage,
+    FLOOR,
+    MOST_CERTAIN,
+    PRIOR,
+)
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
-from beetle_omni_ros.identify.recording.motion import MEANINGS, Motion, motion_of
+from beetle_omni_ros.identify.recording.motion import MEANINGS, Motion
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-PRIOR = 6.0             # logarithm of the odds against each deviation from the convention
 RATE_UNITS = {1.0: '', 180 / np.pi: 'in degrees per second, not rad/s',
               np.pi / 180: 'turned into radians twice'}
 FORCE_UNITS = {1.0: '', 1 / 9.80665: 'in units of g', 1e3 / 9.80665: 'in milli-g',
@@ -29,18 +35,11 @@ FORCE_UNITS = {1.0: '', 1 / 9.80665: 'in units of g', 1e3 / 9.80665: 'in milli-g
 LENGTH_UNITS = {1.0: '', 1e3: 'in millimetres, not metres', 100.0: 'in centimetres, not metres',
                 1e-3: 'in kilometres, not metres', 1 / 0.3048: 'in feet, not metres',
                 1 / 0.0254: 'in inches, not metres'}
-ANGLE_UNITS = {1.0: '', 180 / np.pi: 'in degrees, not radians',
-               4096 / (2 * np.pi): 'in encoder counts, not radians',
-               np.pi / 180: 'turned into radians twice', 1 / (2 * np.pi): 'in turns, not radians'}
-THRUST_UNITS = {1e3: 'in millinewtons, not N', 1e3 / 9.80665: 'in grams, not N',
-                1 / 9.80665: 'in kilograms, not N', 5.0: 'in percent of the largest thrust, not N',
-                0.05: 'in parts of the largest thrust, not N'}
 AXES = 'xyz'
 ALL_AXES = [np.array([[sign * (place == column) for column in range(3)]
                       for sign, place in zip(signs, order, strict=True)], dtype=float)
             for order in permutations(range(3)) for signs in product((1, -1), repeat=3)]
 UPS = [np.eye(3)[k] * sign for k in (2, 1, 0) for sign in (1, -1)]      # (0, 0, 1) first
-FLOOR = 1e-4            # part of a variance that no agreement of two sensors is below
 ONE = np.eye(3)
 
 
@@ -103,24 +102,9 @@ def _along(m, meaning, source, target):
     return size[:, None] * up[:, target]
 
 
-def convention_damages(recording: Recording, robot: RobotParameters,
-                       limits: RecordingLimits) -> list[Damage]:
-    """Everything that sensors show against each other."""
-    m = motion_of(recording, robot, limits)
-    if m is None:
-        return []
-    with np.errstate(all='ignore'):
-        found = _body(recording, m, robot, limits)
-        if not found:
-            found = _joints(recording, m, robot, limits)
-        if not found:
-            found = _thrusts(recording, m, robot, limits)
-    return found
-
-
-# ---- IMU against MoCap
-
-def _body(recording, m, robot, limits):
+def body_damages(recording: Recording, m: Motion, robot: RobotParameters,
+                 limits: RecordingLimits) -> list[Damage]:
+    """What IMU and MoCap show against each other."""
     usual_rate, usual_force = _errors(m, USUAL, robot)
     lively = np.sqrt((m.rate**2).sum(axis=1).mean()) > limits.least_motion[0]
     fine = 1 - limits.least_agreement
@@ -294,12 +278,13 @@ def _said(recording, m, meaning, sure, at, robot, limits, repair=True):
             meaning.quaternion if meaning.quaternion.startswith('(')
             else f'the {meaning.quaternion}, world seen from the body') +
             '; expected (x, y, z, w), the body seen from the world',
-            'reorder the quaternion', _with(3, 7, lambda v: v[:, order] * [sign] * 1.0
-                                            if sign > 0 else v[:, order] * [-1, -1, -1, 1]))
+            'reorder the quaternion', columns_changed(3, 7, lambda v: v[:, order] * [sign] * 1.0
+                                                  if sign > 0 else v[:, order] * [-1, -1, -1, 1]))
     if meaning.length_unit != 1.0:
         unit = meaning.length_unit
         say('mocap/pose', f'positions accelerate {unit:.4g} times as much as the IMU measures: '
-            f'{LENGTH_UNITS[unit]}?', 'scale the positions', _with(0, 3, lambda v: v / unit))
+            f'{LENGTH_UNITS[unit]}?', 'scale the positions',
+            columns_changed(0, 3, lambda v: v / unit))
     if meaning.up is not UPS[0]:
         k = int(np.argmax(np.abs(meaning.up)))
         axis = f'{"-" if meaning.up[k] < 0 else ""}{AXES[k]}'
@@ -309,24 +294,15 @@ def _said(recording, m, meaning, sure, at, robot, limits, repair=True):
         unit = meaning.rate_unit
         say('imu/data_raw', f"angular velocity is {unit:.3g} times the MoCap's: "
             f'{RATE_UNITS[unit]}?', 'scale the angular velocity',
-            _with(3, 6, lambda v: v / unit, 'imu/data_raw'))
+            columns_changed(3, 6, lambda v: v / unit, 'imu/data_raw'))
     if meaning.force_unit != 1.0:
         unit = meaning.force_unit
         say('imu/data_raw', f'linear acceleration is {unit:.3g} times what MoCap and gravity '
             f'make: {FORCE_UNITS[unit]}?', 'scale the linear acceleration',
-            _with(0, 3, lambda v: v / unit, 'imu/data_raw'))
+            columns_changed(0, 3, lambda v: v / unit, 'imu/data_raw'))
     _say_axes(say, m, meaning, slice(None) if at is None else m.t >= at)
     return made or [Damage(recording.name, 'imu/data_raw', 'angular velocity and linear '
                            'acceleration contradict mocap/pose', moment, sure)]
-
-
-def _with(first, last, change, topic='mocap/pose'):
-    """A repair of some columns."""
-    def repair(recording):
-        values = recording.values[topic].copy()
-        values[:, first:last] = change(values[:, first:last])
-        return changed(recording, topic, values=values)
-    return repair
 
 
 def _say_axes(say, m, meaning, part):
@@ -342,7 +318,7 @@ def _say_axes(say, m, meaning, part):
             f'the frame is left-handed: {_axes_text(force)}'
         whose = "the IMU's axes in those of the MoCap's body"
         fix = topic == 'imu/data_raw'
-        say(topic, f'{how} ({whose})', 'turn the axes back' if fix else None, _with(
+        say(topic, f'{how} ({whose})', 'turn the axes back' if fix else None, columns_changed(
             0, 6, lambda v: np.concatenate([v[:, :3] @ force, v[:, 3:] @ rate], axis=1),
             'imu/data_raw'))
         return
@@ -359,7 +335,7 @@ def _say_axes(say, m, meaning, part):
                 + _axes_text(axes)
         else:
             how = f'has axes that are turned: {_axes_text(axes)}'
-        say('imu/data_raw', f'{what} {how}', 'exchange the axes', _with(
+        say('imu/data_raw', f'{what} {how}', 'exchange the axes', columns_changed(
             *columns, lambda v, axes=axes: v @ axes, 'imu/data_raw'))
 
 
@@ -406,111 +382,4 @@ def _position_axes(recording, m, robot, limits):
     return [Damage(recording.name, 'mocap/pose', f'the axes of positions are {kind} against those '
                    f'of the orientation and of the accelerometer: {_axes_text(axes)}', None, sure,
                    'exchange the axes of positions' if sure >= CERTAIN else None,
-                   _with(0, 3, lambda v: v @ axes.T) if sure >= CERTAIN else None)]
-
-
-# ---- encoders against tilt commands
-
-def _joints(recording, m, robot, limits):
-    asked, read = (x - x.mean(axis=0) for x in (m.tilt_command, m.tilt))
-    count, limit = 0.5 * len(m.t), robot.joints.position_limit
-    moving = np.sqrt((np.gradient(asked, m.t, axis=0)**2).mean(axis=0)) > limits.least_motion[2]
-    moving |= np.ptp(read, axis=0) > 2 * limit
-    units, swaps, signs, unlike = [], [], [], []
-    for i in np.flatnonzero(moving):
-        total = (read[:, i]**2).sum()
-        usual = ((read[:, i] - asked[:, i])**2).sum()
-        if usual < (1 - limits.least_agreement) * max(total, (asked[:, i]**2).sum()):
-            continue
-        tried = []
-        for j, (unit, sign) in product(range(4), product(
-                {*ANGLE_UNITS, *(1 / u for u in ANGLE_UNITS)}, (1, -1))):
-            left = ((read[:, i] - sign * unit * asked[:, j])**2).sum() / max(total, 1e-12)
-            price = PRIOR * ((j != i) + (unit != 1.0) + (sign < 0))
-            tried.append((-0.5 * count * np.log(max(left, FLOOR)) - price, j, unit, sign, left))
-        tried.sort(key=lambda one: -one[0])
-        weight = np.exp(np.array([one[0] for one in tried]) - tried[0][0])
-        sure = float(min(1 / weight.sum(), MOST_CERTAIN))
-        _, j, unit, sign, left = tried[0]
-        if left > 1 - limits.least_agreement:
-            unlike.append((i, sure))
-        elif unit != 1.0:
-            units.append((i, unit, sure))
-        elif j != i:
-            swaps.append((i, j, sure))
-        elif sign < 0:
-            signs.append((i, sure))
-    return _joints_said(recording, m, robot, units, swaps, signs, unlike)
-
-
-def _joints_said(recording, m, robot, units, swaps, signs, unlike):
-    def damage(topic, cause, sure, fix=None, repair=None):
-        can = fix and sure >= CERTAIN
-        return [Damage(recording.name, topic, cause, None, sure, fix if can else None,
-                       repair if can else None)]
-
-    if units:
-        i, unit, sure = units[0]
-        limit = 2 * robot.joints.position_limit
-        odd = 'command' if np.ptp(m.tilt_command[:, i]) > limit else 'joint_states'
-        topic = odd if unit != 1.0 else 'joint_states'
-        ratio = unit if topic == 'joint_states' else 1 / unit
-        words = ANGLE_UNITS.get(min(ANGLE_UNITS, key=lambda u: abs(np.log(u / ratio))), '')
-        what = 'encoders turn' if topic == 'joint_states' else 'tilt commands turn'
-        other = 'tilt commands' if topic == 'joint_states' else 'encoders'
-        return damage(topic, f'{what} {ratio:.4g} times as far as the {other}: {words}?', sure,
-                      'scale the angles', _with(0, 4, lambda v: v / ratio, topic))
-    if swaps:
-        sure = min(s for *_, s in swaps)
-        text = ', '.join(f'gimbal{i + 1} moves as gimbal{j + 1} is commanded'
-                         for i, j, _ in swaps)
-        order = np.arange(4)
-        for i, j, _ in swaps:
-            order[j] = i
-        whole = sorted(order) == [0, 1, 2, 3]
-        return damage('joint_states', f'joints are swapped: {text}', sure,
-                      'exchange the joints' if whole else None,
-                      _with(0, 4, lambda v: v[:, order], 'joint_states'))
-    if signs:
-        sure = min(s for _, s in signs)
-        names = ', '.join(f'gimbal{i + 1}' for i, _ in signs)
-        flip = np.ones(4)
-        flip[[i for i, _ in signs]] = -1
-        return damage('joint_states', f'{names} turns against its command: the sign of the '
-                      'encoder or of the command is reversed', sure, 'reverse the sign',
-                      _with(0, 4, lambda v: v * flip, 'joint_states'))
-    if unlike:
-        names = ', '.join(f'gimbal{i + 1}' for i, _ in unlike)
-        return damage('joint_states', f'{names} does not follow its command: encoder, servo, or '
-                      'the commands of another flight', 0.9)
-    return []
-
-
-# ---- thrust commands against the accelerometer
-
-def _thrusts(recording, m, robot, limits):
-    pushed, felt = (np.linalg.norm(x, axis=1) for x in (m.thrust_force, m.force))
-    scale = float((pushed * felt).sum() / max((felt**2).sum(), 1e-12))
-    unit = min(THRUST_UNITS, key=lambda u: abs(np.log(max(scale, 1e-9) / u)))
-    # Thrusts and accelerometer agree within some per cent; any other factor is another robot's.
-    if not 1 / 3 < scale < 3 and 0.85 < scale / unit < 1.18:
-        return [Damage(recording.name, 'command', f'commanded thrusts are {scale:.3g} times what '
-                       f'the accelerometer feels: {THRUST_UNITS[unit]}?', None, 0.95)]
-    measured = np.concatenate([m.force, 0.1 * m.turning], axis=1)
-    wrench = m.rotor_wrench * np.array([1, 1, 1, 0.1, 0.1, 0.1])[:, None]
-    count, tried = 0.5 * len(m.t), []
-    for order in permutations(range(4)):
-        expected = np.einsum('nci,ni->nc', wrench, m.thrust[:, order])
-        left = ((measured - expected)**2).sum()
-        tried.append((left, order))
-    usual = tried[0][0]
-    tried.sort()
-    left, order = tried[0]
-    if order == (0, 1, 2, 3) or left > limits.permuted * usual \
-            or left > (1 - limits.least_agreement) * (measured**2).sum():
-        return []
-    sure = float(min(1 - np.exp(-count * np.log(usual / max(left, 1e-12))), MOST_CERTAIN))
-    text = ', '.join(f'rotor{i + 1} gives what rotor{j + 1} is commanded'
-                     for i, j in enumerate(order) if i != j)
-    return [Damage(recording.name, 'command', f'the order of the thrusts is another one: {text}',
-                   None, sure)]
+                   columns_changed(0, 3, lambda v: v @ axes.T) if sure >= CERTAIN else None)]

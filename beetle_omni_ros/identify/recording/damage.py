@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from beetle_omni_ros.identify.gap.bags import Recording
 
 MOST_CERTAIN = 0.999    # no probability from a finite model is stated above this
 # A repair changes a recording in place of the user; only a cause this certain offers one.
 CERTAIN = 0.99
+PRIOR = 6.0             # logarithm of the odds against each deviation from a convention
+FLOOR = 1e-4            # part of a variance that no agreement of two sensors is below
 Repair = Callable[[Recording], Recording]
 
 
@@ -68,3 +72,13 @@ def changed(recording: Recording, topic: str, times=None, values=None,
             if topic in part:
                 part[topic] = part[topic][keep]
     return made
+
+
+def columns_changed(first: int, last: int, change: Callable[[np.ndarray], np.ndarray],
+                    topic: str = 'mocap/pose') -> Repair:
+    """A repair of some columns of a topic."""
+    def repair(recording):
+        values = recording.values[topic].copy()
+        values[:, first:last] = change(values[:, first:last])
+        return changed(recording, topic, values=values)
+    return repair
