@@ -170,7 +170,8 @@ def turned(quaternion, vector):
     angle = np.linalg.norm(vector)
     x2, y2, z2 = vector / angle * np.sin(angle / 2)
     w2 = np.cos(angle / 2)
-    return np.stack(rotations.product(*quaternion.T, x2, y2, z2, w2), axis=1)
+    x, y, z, w = quaternion.T
+    return np.stack(rotations.product(x, y, z, w, x2, y2, z2, w2), axis=1)
 
 
 def aligned(quaternion):

@@ -74,7 +74,7 @@ def changed(recording: Recording, topic: str, times=None, values=None,
     return made
 
 
-def columns_changed(first: int, last: int, change: Callable[[np.ndarray], np.ndarray],
+def columns_changed(first: int, last: int, change: Callable[..., np.ndarray],
                     topic: str = 'mocap/pose') -> Repair:
     """A repair of some columns of a topic."""
     def repair(recording):
