@@ -1,5 +1,8 @@
 """A vehicle on strings for tests of the state machine: it goes where the test puts it."""
 
+from copy import deepcopy
+from functools import cache
+
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, State
@@ -92,3 +95,13 @@ class Puppet:
         for name in ('nmpc', 'rl'):
             if name in alive:
                 supervisor.on_command(name, hover_command(self.now, self.quaternion), self.now)
+
+
+def flown():
+    """A puppet of its own in state 'flying'; the take-off is simulated once."""
+    return deepcopy(_flown())
+
+
+@cache
+def _flown():
+    return Puppet().fly()

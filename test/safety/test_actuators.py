@@ -1,6 +1,6 @@
 """What the bridges to servos and motor board say, and what the supervisor makes of it."""
 
-from puppet import Puppet, TICK
+from puppet import flown, Puppet, TICK
 import pytest
 
 from beetle_omni_ros.safety.actuators import Actuators
@@ -13,7 +13,7 @@ def told(puppet, name, text):
 
 
 def test_bridges_that_were_never_heard_have_no_influence():
-    puppet = Puppet().fly()
+    puppet = flown()
     assert puppet.supervisor.actuators.why_not_arm == ''
     assert puppet.supervisor.actuators.diagnostics() == {}
 
@@ -41,7 +41,7 @@ def test_both_reasons_are_given_on_one_line():
 
 @pytest.mark.parametrize('text', ['lost: gimbal3 silent', 'waiting: deactivated'])
 def test_lost_servos_in_flight_lead_to_a_landing_that_names_them(text):
-    puppet = Puppet().fly()
+    puppet = flown()
     told(puppet, 'joint', 'ready')
     assert puppet.supervisor.state == 'flying'
     told(puppet, 'joint', text)
@@ -54,7 +54,7 @@ def test_lost_servos_in_flight_lead_to_a_landing_that_names_them(text):
 
 @pytest.mark.parametrize('landing', [False, True])
 def test_a_lost_motor_board_in_flight_stops_everything_until_disarmed(landing):
-    puppet = Puppet().fly()
+    puppet = flown()
     told(puppet, 'rotor', 'ready')
     if landing:
         assert puppet.supervisor.land(puppet.now)
@@ -69,7 +69,7 @@ def test_a_lost_motor_board_in_flight_stops_everything_until_disarmed(landing):
 
 
 def test_a_motor_board_that_is_not_heard_carries_the_robot_to_the_ground():
-    puppet = Puppet().fly()
+    puppet = flown()
     told(puppet, 'rotor', 'silent: nothing heard of the board')
     assert puppet.supervisor.state == 'landing' and puppet.command.thrust.any()
     assert any('silent: nothing heard of the board: landing' in said
@@ -100,7 +100,7 @@ def test_the_rest_of_a_flight_is_not_bothered_by_a_bridge_that_is_lost_while_dis
 
 
 def test_an_unknown_bridge_is_refused_and_told():
-    puppet = Puppet().fly()
+    puppet = flown()
     assert not puppet.supervisor.on_actuators('wheel', 'lost: it', puppet.now)
     puppet.run(0.1)
     assert puppet.supervisor.state == 'flying'

@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
-from puppet import LEVEL, PARAMETERS, Puppet, ROBOT
+from puppet import flown, LEVEL, PARAMETERS, Puppet, ROBOT
 
 from beetle_omni_ros.control.base import Command, State
 
@@ -81,9 +81,7 @@ def watch(puppet, command):
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(airborne=st.booleans(), sequence=actions)
 def test_nothing_unsafe_ever_goes_out(airborne, sequence):
-    puppet = Puppet()
-    if airborne:
-        puppet.fly()
+    puppet = flown() if airborne else Puppet()
     inner = puppet.supervisor.update
 
     def watched(now):

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from puppet import PARAMETERS, Puppet, TICK
+from puppet import flown, PARAMETERS, TICK
 import pytest
 
 from beetle_omni_ros.control.base import Command
@@ -90,7 +90,7 @@ def switching(puppet, far):
 
 
 def test_the_supervisor_hands_over_at_the_limited_rate():
-    puppet = Puppet().fly()
+    puppet = flown()
     sent = switching(puppet, command(0.0, 0.4, 3.0))
     assert puppet.supervisor.source == 'rl' and puppet.supervisor.state == 'flying'
     tilt = np.array([c.tilt for c in sent])
@@ -101,7 +101,7 @@ def test_the_supervisor_hands_over_at_the_limited_rate():
 
 
 def test_a_clock_that_goes_back_does_not_hold_an_old_command():
-    puppet = Puppet().fly()
+    puppet = flown()
     switching(puppet, command(0.0, 0.4, 3.0))
     assert puppet.supervisor.select('nmpc')
     puppet.now -= 5.0

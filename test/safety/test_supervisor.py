@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from puppet import hover_command, PARAMETERS, Puppet, ROBOT, TICK
+from puppet import flown, hover_command, PARAMETERS, Puppet, ROBOT, TICK
 import pytest
 
 from beetle_omni_ros.control.base import Command
@@ -51,7 +51,7 @@ def test_arming_is_refused_with_the_reason(spoil, text):
 
 
 def test_silent_controller_falls_back_to_hover_without_a_jump_and_gets_control_back():
-    puppet = Puppet().fly()
+    puppet = flown()
     before = puppet.command
     puppet.alive.discard('nmpc')
     puppet.run(TIMEOUT - TICK)
@@ -70,7 +70,7 @@ def test_silent_controller_falls_back_to_hover_without_a_jump_and_gets_control_b
 
 
 def test_fallback_holds_the_pose_at_which_it_began():
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.quaternion = rotations.from_rpy(1.2, 0.4, -2.0)
     puppet.run(0.2)
     puppet.alive.discard('nmpc')
@@ -81,7 +81,7 @@ def test_fallback_holds_the_pose_at_which_it_began():
 
 
 def test_controller_that_sends_only_rubbish_counts_as_silent_and_the_reason_is_named():
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.alive.discard('nmpc')
     for _ in range(20):
         puppet.supervisor.on_command('nmpc', Command(puppet.now, np.full(4, np.nan), np.ones(4)),
@@ -93,7 +93,7 @@ def test_controller_that_sends_only_rubbish_counts_as_silent_and_the_reason_is_n
 
 
 def test_controller_that_shakes_at_the_limits_of_a_manoeuvre_goes_on_flying():
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.alive.discard('nmpc')
     top = ROBOT.rotors.thrust_max
     for k in range(30):
@@ -144,7 +144,7 @@ def test_selecting_on_the_ground_is_free():
 
 
 def test_emergency_stop_is_latched_until_disarmed():
-    puppet = Puppet().fly()
+    puppet = flown()
     assert puppet.supervisor.emergency_stop(puppet.now)
     sent = puppet.run(1.0)
     stop_ticks = round(PARAMETERS.stop_time / TICK)
@@ -164,7 +164,7 @@ def test_disarming_is_refused_in_the_air_and_granted_on_the_ground():
     puppet.supervisor.arm(puppet.now)
     puppet.run(0.2)
     assert puppet.supervisor.disarm(puppet.now)
-    flying = Puppet().fly()
+    flying = flown()
     answer = flying.supervisor.disarm(flying.now)
     assert not answer and 'land or emergency_stop' in answer.text
     assert flying.supervisor.state == 'flying'
@@ -201,7 +201,7 @@ def test_joint_that_does_not_follow_stops_the_takeoff_before_the_rotors_start():
     ('estimate', 'ekf_node', PARAMETERS.state.timeout),
     ('joints', 'joint_bridge_node', PARAMETERS.state.joint_timeout)])
 def test_silent_estimator_or_joints_lead_to_a_landing_that_names_the_node(source, name, delay):
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.alive.discard(source)
     puppet.run(delay + 2 * TICK)
     assert puppet.supervisor.state == 'landing' and puppet.supervisor.source == 'hover'
@@ -210,7 +210,7 @@ def test_silent_estimator_or_joints_lead_to_a_landing_that_names_the_node(source
 
 
 def test_estimator_that_reports_lost_counts_as_silent():
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.status = 'dead_reckoning'
     puppet.run(0.5)
     assert puppet.supervisor.state == 'flying'
@@ -221,7 +221,7 @@ def test_estimator_that_reports_lost_counts_as_silent():
 
 
 def test_nothing_left_to_measure_with_stops_the_motors():
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.alive -= {'estimate', 'imu', 'mocap'}
     puppet.run(1.0)
     assert puppet.supervisor.state == 'emergency_stop'
@@ -262,7 +262,7 @@ def test_low_battery_warns_then_lands():
 
 
 def test_a_pack_that_sags_under_the_same_load_leads_to_a_landing_within_half_a_second():
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.run(1.0)
     assert puppet.supervisor.health.healthy
     puppet.voltage -= 6.0
@@ -301,7 +301,7 @@ def test_lost_control_reaction_is_a_parameter(motion, reaction, state):
 
 
 def test_any_attitude_is_legal():
-    puppet = Puppet().fly()
+    puppet = flown()
     rng = np.random.default_rng(0)
     for _ in range(20):
         puppet.quaternion = rotations.normalized(rng.normal(size=4))
@@ -310,7 +310,7 @@ def test_any_attitude_is_legal():
 
 
 def test_supervisor_that_was_held_up_declares_nobody_dead_and_sends_nothing_old():
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.now += 3.0
     assert puppet.supervisor.update(puppet.now) is None
     puppet.run(0.1)
@@ -318,7 +318,7 @@ def test_supervisor_that_was_held_up_declares_nobody_dead_and_sends_nothing_old(
 
 
 def test_clock_set_back_in_flight_is_survived():
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.now -= 30.0
     puppet.run(1.0)
     assert puppet.supervisor.state == 'flying'
@@ -349,7 +349,7 @@ def test_bad_estimates_are_refused_and_counted(change, reason):
 
 
 def test_command_of_an_unknown_controller_is_counted_and_not_executed():
-    puppet = Puppet().fly()
+    puppet = flown()
     assert not puppet.supervisor.on_command('pid', hover_command(puppet.now), puppet.now)
     assert puppet.supervisor.diagnostics()['refused.unknown controller'] == 1
 
@@ -369,7 +369,7 @@ def test_parameters_of_the_wrong_kind_are_named():
 
 
 def test_an_impact_near_the_floor_stops_the_motors_for_good():
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.position = np.array([0.3, -0.2, 0.25])
     puppet.run(0.05)
     puppet.supervisor.on_imu(puppet.now + 0.001, np.array([0, 0, 120.0]), np.zeros(3))
@@ -385,7 +385,7 @@ def test_an_impact_near_the_floor_stops_the_motors_for_good():
 
 
 def test_an_impact_high_above_the_floor_is_no_crash():
-    puppet = Puppet().fly()
+    puppet = flown()
     for after in (0.001, 0.006):
         puppet.supervisor.on_imu(puppet.now + after, np.array([0, 120.0, 0]), np.zeros(3))
     puppet.run(0.2)
@@ -393,12 +393,12 @@ def test_an_impact_high_above_the_floor_is_no_crash():
 
 
 def test_a_pause_in_the_air_ends_in_fallback_and_on_the_floor_with_motors_off():
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.now += 0.4
     puppet.run(0.02)
     assert 'supervisor_paused' in puppet.supervisor.faults
     assert puppet.supervisor.state in ('fallback', 'flying')
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.now += 1.0
     puppet.position = np.array([0.3, -0.2, 0.2])
     sent = puppet.run(0.5)
@@ -410,7 +410,7 @@ def test_a_pause_in_the_air_ends_in_fallback_and_on_the_floor_with_motors_off():
     lambda p: setattr(p, 'position', np.array([0.0, 0.0, 25.0])),
     lambda p: setattr(p, 'rate', np.array([20.0, 0.0, 0.0]))])
 def test_limits_hold_while_landing(spoil):
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.supervisor.land(puppet.now)
     puppet.velocity = np.array([0.0, 0.0, -0.3])
     spoil(puppet)
@@ -421,7 +421,7 @@ def test_limits_hold_while_landing(spoil):
 
 
 def test_landing_and_fallback_end_in_time():
-    puppet = Puppet().fly()
+    puppet = flown()
     puppet.alive -= {'nmpc', 'rl'}
     puppet.run(PARAMETERS.envelope.fallback_time + 0.2)
     assert puppet.supervisor.state == 'landing'
@@ -431,7 +431,7 @@ def test_landing_and_fallback_end_in_time():
 
 
 def test_a_flip_of_the_markers_leads_to_a_landing_without_mocap():
-    puppet = Puppet().fly()
+    puppet = flown()
     attitude, puppet.quaternion = puppet.quaternion, rotations.from_rpy(0, 0, np.pi / 2)
     on_state = puppet.supervisor.on_state
     puppet.supervisor.on_state = lambda state, status: on_state(
