@@ -236,18 +236,3 @@ def leaned(quaternion: np.ndarray, direction: np.ndarray) -> np.ndarray:
         axis, length = np.cross(present, np.eye(3)[np.argmin(np.abs(present))]), 1.0
     axis = axis / np.linalg.norm(axis)
     return rotations.normalized(rotations.multiply(quaternion, rotations.exp(angle * axis)))
-
-
-def best_attitude(robot: RobotParameters, health: ActuatorHealth,
-                  near_quaternion: np.ndarray) -> np.ndarray:
-    """
-    Attitude (4,) to fly in with what is left: the nearest with the margin for flying.
-
-    Args:
-        robot: the robot.
-        health: what is left of it.
-        near_quaternion: (4,) wished or present attitude.
-
-    """
-    holding = Holding(robot, health)
-    return holding.nearest(near_quaternion, holding.parameters.flying_margin)

@@ -11,7 +11,7 @@ from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
-from beetle_omni_ros.robot.holding import best_attitude, Holding
+from beetle_omni_ros.robot.holding import Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
@@ -20,6 +20,12 @@ LOST = ActuatorHealth(rotors=(True, False, True, True))
 STUCK = ActuatorHealth(stuck=(None, None, 0.8, None))
 WEAK = ActuatorHealth(thrust_limit=8.8)
 PLACE = np.array([0.0, 0.0, 2.0])
+
+
+def held(health):
+    """Attitude nearest to level with the margin for flying."""
+    holding = Holding(ROBOT, health)
+    return holding.nearest(LEVEL, holding.parameters.flying_margin)
 
 
 class Body:
@@ -65,7 +71,7 @@ def test_recovers_from_hover_and_holds_the_attitude_to_fly_in(controller, health
     body.broken = health
     body.fly(controller, PoseTarget(PLACE, LEVEL), 0.1)
     controller.set_health(health)
-    target = PoseTarget(PLACE, best_attitude(ROBOT, health, LEVEL))
+    target = PoseTarget(PLACE, held(health))
     body.fly(controller, target, 7.0)
     assert body.lowest > 1.4
     assert np.linalg.norm(body.x[:3] - PLACE) < 0.03
@@ -110,7 +116,7 @@ def test_the_plan_knows_the_bounds(nmpc):
     nmpc.reset()
     body = Body().fly(nmpc, PoseTarget(PLACE, LEVEL), 0.3)
     nmpc.set_health(LOST)
-    body.fly(nmpc, PoseTarget(PLACE, best_attitude(ROBOT, LOST, LEVEL)), 0.1)
+    body.fly(nmpc, PoseTarget(PLACE, held(LOST)), 0.1)
     assert np.abs(nmpc.predicted_states[:, 18]).max() < 0.01
     assert nmpc.diagnostics()['unsolved'] == 0
 

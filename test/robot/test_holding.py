@@ -6,7 +6,7 @@ import pytest
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.degraded_allocation import allocator
-from beetle_omni_ros.robot.holding import best_attitude, Holding, leaned, sphere, up
+from beetle_omni_ros.robot.holding import Holding, leaned, sphere, up
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROBOT = RobotParameters.load()
@@ -90,9 +90,10 @@ def test_the_quickest_attitude_needs_no_turn_where_all_is_firm(holdings):
     assert rotations.log(turning)[0] > rotations.log(got)[0] + 0.05
 
 
-def test_best_attitude_has_the_margin_to_fly_near_the_wished_one():
-    got = best_attitude(ROBOT, LOST, LEVEL)
-    assert Holding(ROBOT, LOST).margin(got) >= 2.0
+def test_the_nearest_attitude_has_the_margin_to_fly_near_the_wished_one():
+    holding = Holding(ROBOT, LOST)
+    got = holding.nearest(LEVEL, holding.parameters.flying_margin)
+    assert holding.margin(got) >= 2.0
     assert rotations.geodesic_angle(got, LEVEL) < np.radians(20)
 
 

@@ -154,11 +154,6 @@ class Receiver:
         self.skipped += len(self._buffer)
         self._buffer.clear()
 
-    @property
-    def unfinished(self) -> bool:
-        """Whether part of a packet has arrived."""
-        return bool(self._buffer)
-
     def feed(self, data: bytes) -> Iterator[Packet]:
         """Take bytes as they arrive; yield each packet that they complete."""
         self._buffer += data
