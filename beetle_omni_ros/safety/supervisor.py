@@ -221,6 +221,10 @@ class Supervisor(Inputs):
         self._health = health = self.watch.health
         if health.healthy:
             return      # a zero has moved, which commands and readings take into account
+        near = self._parameters.detection.contact.near_ground
+        if health.rotors.count(False) > 1 and self._height is not None and self._height < near:
+            # Two rotors hold nothing, and rotors that stop one after another hit the floor.
+            return self._crash(now, 'a second rotor is lost at the floor')
         self._hover.set_health(health)
         if self.state != LANDING:
             self._land(now, ERROR, f"{', '.join(self.faults)}: landing with what is left")

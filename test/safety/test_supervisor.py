@@ -8,6 +8,7 @@ import pytest
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 
 TIMEOUT = PARAMETERS.commands.timeout
@@ -382,6 +383,20 @@ def test_an_impact_near_the_floor_stops_the_motors_for_good():
     assert puppet.supervisor.told == 'emergency_stop:crash'
     assert not sent[0].thrust.any()
     assert not puppet.supervisor.arm(puppet.now)
+
+
+@pytest.mark.parametrize('height, stops', [(0.2, True), (0.8, False)])
+def test_a_second_rotor_lost_at_the_floor_stops_the_motors_at_once(height, stops):
+    puppet = Puppet().fly()
+    puppet.supervisor.watch.health = ActuatorHealth(rotors=(True, False, True, True))
+    puppet.run(TICK)
+    assert puppet.supervisor.state == 'landing'
+    puppet.position = np.array([0.3, -0.2, 0.16 + height])
+    puppet.run(0.05)
+    assert puppet.supervisor.state == 'landing'
+    puppet.supervisor.watch.health = ActuatorHealth(rotors=(True, False, False, True))
+    puppet.run(TICK)
+    assert (puppet.supervisor.state in ('disarmed', 'emergency_stop')) == stops
 
 
 def test_an_impact_high_above_the_floor_is_no_crash():
