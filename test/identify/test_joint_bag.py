@@ -7,7 +7,7 @@ import pytest
 from servo_logs import sweep
 from synthetic_flights import write_command, write_joints
 
-from beetle_omni_ros.identify import joint_bag
+from beetle_omni_ros.identify import joint_log
 from beetle_omni_ros.identify.csv_table import LogError
 from beetle_omni_ros.identify.joint_log import read_joint_log
 from beetle_omni_ros.runs.bag import BagWriter
@@ -37,7 +37,7 @@ def test_each_feedback_stands_beside_the_command_that_came_last_before_it(tmp_pa
 
 def test_the_longest_stretch_with_commands_counts_and_of_it_the_liveliest_part(
         tmp_path, monkeypatch):
-    monkeypatch.setattr(joint_bag, 'LIMITS', replace(joint_bag.LIMITS, longest_bag=2.5))
+    monkeypatch.setattr(joint_log, 'LIMITS', replace(joint_log.LIMITS, longest_bag=2.5))
     t, command = sweep(duration=9.0)
     command = np.where((t > 5.0) & (t < 7.5), command, 0.05 * command)
     sent = (t < 1.0) | (t > 2.0)
