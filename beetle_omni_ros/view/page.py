@@ -30,7 +30,7 @@ SHOWN_PLOTS = ('position error [m]', 'thrust command [N]')      # to begin with
 ESTIMATE = ((70, 140, 250), 0.35)
 GHOST_OPACITY = 0.35
 TARGET_AXES = 0.28      # [m]
-TRAIL_POINTS = 300
+TRAIL_POINTS = 800
 SHADOW_RADIUS, SHADOW_OPACITY = 0.24, 0.15     # of the spot below the robot [m]
 VIEW_FROM, SMALLEST_VIEW = np.array([-0.5, -0.8, 0.36]), 2.0     # [m]
 NARROW, PHONE_DISTANCE, PANEL_SHARE = 0.8, 1.6, 0.35
@@ -171,9 +171,12 @@ class Page:
 
     def draw_trail(self, k: int, positions: np.ndarray) -> None:
         """Draw the path of a run: (N, 3) in world [m]."""
-        points = positions[::max(1, len(positions) // TRAIL_POINTS)]
-        if len(points) < 2:
+        if len(positions) < 2:
             return
+        # By the way flown: most of the time is spent at the poses.
+        steps = np.diff(positions, axis=0, prepend=positions[:1])
+        flown = np.cumsum(np.linalg.norm(steps, axis=1))
+        points = positions[np.searchsorted(flown, np.linspace(0, flown[-1], TRAIL_POINTS))]
         lines = np.stack([points[:-1], points[1:]], axis=1)
         self._trails[k] = self.server.scene.add_line_segments(
             f'/trail{k}', lines, plots.RUN_COLOURS[k % 4] if len(self._names) > 1

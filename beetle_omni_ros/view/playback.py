@@ -46,9 +46,9 @@ class Player:
 
     @property
     def length(self) -> float:
-        """Length of what is known of the first run [s]."""
+        """Length of what is known of the first run [s], to the slider's hundredth."""
         times = self._runs[0].rows.times
-        return float(times[-1] - times[0])
+        return round(float(times[-1] - times[0]), 2)
 
     def _on_slider(self, event):
         if event.client is not None:    # not the player itself

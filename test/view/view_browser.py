@@ -15,6 +15,7 @@ NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable'
 FLAGS = ('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
          '--disable-background-networking', '--disable-component-update', '--disable-sync',
          '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader')
+PANEL = 350             # [px]
 PATIENCE = 120.0        # [s] on a busy computer
 
 
@@ -49,7 +50,7 @@ def opened(url, width=900, height=560):
 def picture(page):
     """(H, W, 3) of the page, without the panel on its right."""
     image = Image.open(io.BytesIO(page.screenshot())).convert('RGB')
-    return np.asarray(image, dtype=float)[:, :550]
+    return np.asarray(image, dtype=float)[:, :-PANEL]
 
 
 def rendered(page):
