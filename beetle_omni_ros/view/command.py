@@ -62,8 +62,8 @@ def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None =
         player = Player(page, recordings, start, play)
         player.look()
         player.draw()
-        announce(page.url, console)
         with suppress(KeyboardInterrupt):       # how a viewer is ended
+            announce(page.url, console)
             player.run()
 
 
