@@ -11,7 +11,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from beetle_omni_ros.identify.gap.bags import read_recording
 from beetle_omni_ros.identify.gap.ingest import prepare, UnusableFlight
 from beetle_omni_ros.identify.gap.parameters import GapParameters
+from beetle_omni_ros.identify.recording.actuator_conventions import thrust_damages
 from beetle_omni_ros.identify.recording.check import damages, repaired
+from beetle_omni_ros.identify.recording.limits import RecordingLimits
+from beetle_omni_ros.identify.recording.motion import Motion
 from beetle_omni_ros.messages import columns as message_columns
 from beetle_omni_ros.runs.bag import BagWriter
 
@@ -227,6 +230,8 @@ KINDS = {
     'encoders noisy': (lambda m: noisy(m, JOINTS, 4, 0.1), JOINTS, ['scatters'], None),
     'tilts commanded in degrees': (lambda m: columns(m, COMMAND, 0, 4, np.rad2deg), COMMAND,
                                    ['degrees'], None),
+    'rotors in reverse order': (lambda m: columns(m, COMMAND, 4, 8, lambda v: v[:, ::-1]), COMMAND,
+                                ['order of the thrusts'], None),
     'thrusts in millinewtons': (lambda m: columns(m, COMMAND, 4, 8, lambda v: 1e3 * v), COMMAND,
                                 ['millinewtons'], None),
 }
@@ -266,6 +271,30 @@ def test_damage_is_refused_with_topic_cause_and_moment(kind, conditions):
 def test_a_sound_recording_has_no_damage(conditions):
     assert damages(recording(conditions), ROBOT) == []
     assert damages(silent_clock(recording(conditions)), ROBOT) == []
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('swapped', [False, True])
+def test_rotors_of_unlike_strength_in_hover_are_not_in_another_order(swapped, seed):
+    # Two weak neighbours: they are commanded more, which looks like a torque that is not there.
+    # In another order it would look like less.
+    rng, count = np.random.default_rng(seed), 600
+    share = np.array([0.94, 0.94, 1.06, 1.06])
+    wanted = ROBOT.hover_thrust * (1 + 0.03 * rng.normal(size=(count, 4)))
+    lever = np.cross(ROBOT.rotors.positions, [0.0, 0.0, 1.0]) + np.outer(
+        ROBOT.rotors.spin * ROBOT.rotors.torque_to_thrust_ratio, [0.0, 0.0, 1.0])
+    wrench = np.zeros((count, 6, 4))
+    wrench[:, 2], wrench[:, 3:] = 1 / ROBOT.mass, (lever / ROBOT.inertia).T
+    felt = np.einsum('nci,ni->nc', wrench, wanted)
+    felt += rng.normal(0, 0.05, felt.shape)
+    commanded = wanted / share
+    still, joints = np.zeros((count, 3)), np.zeros((count, 4))
+    motion = Motion(0.1 * np.arange(count), still, felt[:, :3], {}, {}, {}, joints, joints,
+                    np.einsum('nci,ni->nc', wrench[:, :3], commanded), wrench,
+                    commanded[:, [3, 2, 1, 0] if swapped else slice(None)], felt[:, 3:])
+    found = thrust_damages(recording(), motion, ROBOT, RecordingLimits.load())
+    assert [d.cause for d in found if 'order of the thrusts' in d.cause] == [
+        d.cause for d in found] and bool(found) == swapped
 
 
 @pytest.mark.parametrize('kind', ['quaternion w first', 'millimetres', 'degrees per second',

@@ -119,12 +119,15 @@ def thrust_damages(recording: Recording, m: Motion, robot: RobotParameters,
     if not 1 / 3 < scale < 3 and 0.85 < scale / unit < 1.18:
         return [Damage(recording.name, 'command', f'commanded thrusts are {scale:.3g} times what '
                        f'the accelerometer feels: {THRUST_UNITS[unit]}?', None, 0.95)]
+    # Changes alone tell one rotor from another: a constant force or torque is a mass, a centre of
+    # mass or a rotor that differs from the file, and in hover another order can imitate it.
     measured = np.concatenate([m.force, 0.1 * m.turning], axis=1)
+    measured -= measured.mean(axis=0)
     wrench = m.rotor_wrench * np.array([1, 1, 1, 0.1, 0.1, 0.1])[:, None]
     count, tried = 0.5 * len(m.t), []
     for order in permutations(range(4)):
         expected = np.einsum('nci,ni->nc', wrench, m.thrust[:, order])
-        left = ((measured - expected)**2).sum()
+        left = ((measured - expected + expected.mean(axis=0))**2).sum()
         tried.append((left, order))
     usual = tried[0][0]
     tried.sort()
