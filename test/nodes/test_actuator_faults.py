@@ -2,8 +2,12 @@
 Faults of servos and motor board in flight: what the robot does, who says why, what is left on.
 
 The whole graph flies through both bridges. Faults are switched on in the emulated devices by
-sim_node's parameters; what the rotors and servos really do is read from the simulator.
+sim_node's parameters; what the rotors and servos really do is read from the simulator. A test that
+leaves the robot sound and in the air passes it on to the next one.
 """
+
+from contextlib import contextmanager, ExitStack
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +16,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from std_srvs.srv import Trigger
 from witness import PATIENT, READY, Witness
 
+from beetle_omni_ros.nodes import discovery
 from beetle_omni_ros.nodes.graph import BRIDGES_COMPOSED, Graph
 from beetle_omni_ros.nodes.plan import bridged, BRIDGES
 
@@ -22,10 +27,12 @@ DEVICES = 'sim_node: devices'
 
 
 class Mechanic(Witness):
-    """A witness who breaks and mends the simulated devices."""
+    """A witness who breaks and mends the simulated devices; ``sound`` where all are mended."""
 
-    def __init__(self, domain):
-        super().__init__(domain)
+    sound = False
+
+    def __init__(self, number):
+        super().__init__(number)
         self._client = AsyncParameterClient(self._node, 'sim_node')
 
     def set(self, name, value):
@@ -60,25 +67,47 @@ class Mechanic(Witness):
         return future.result().success
 
 
-@pytest.fixture
-def robot(ros_domain, tmp_path):
-    """Graph and mechanic of a robot in the air."""
+@contextmanager
+def airborne(folder):
+    """Graph and mechanic of a robot in the air, in a ROS domain of its own."""
     parameters = {'sim_node': {}, 'ekf_node': {}, 'nmpc_node': {}, 'supervisor_node': PATIENT}
-    for node, values in bridged(tmp_path, {}).items():
+    for node, values in bridged(folder, {}).items():
         parameters[node] = {**parameters.get(node, {}), **values}
-    graph, mechanic = Graph(parameters, tmp_path, ros_domain), None
-    try:
-        graph.start()
-        mechanic = Mechanic(ros_domain)
-        assert mechanic.wait(lambda: mechanic.ready, READY), graph.dead()
-        mechanic.can_judge(graph)
-        mechanic.start()
-        yield graph, mechanic
-    finally:
-        stubborn = graph.stop()
-        if mechanic:
-            mechanic.close()
-    assert not stubborn
+    with discovery.reserved() as number, pytest.MonkeyPatch.context() as patch:
+        patch.setenv('ROS_DOMAIN_ID', str(number))
+        graph, mechanic = Graph(parameters, folder, number), None
+        try:
+            graph.start()
+            mechanic = Mechanic(number)
+            assert mechanic.wait(lambda: mechanic.ready, READY), graph.dead()
+            mechanic.can_judge(graph)
+            mechanic.start()
+            yield graph, mechanic
+        finally:
+            stubborn = graph.stop()
+            if mechanic:
+                mechanic.close()
+        assert not stubborn
+
+
+@pytest.fixture(scope='module')
+def hangar():
+    """Keeps a robot from one test to the next."""
+    with ExitStack() as stack:
+        yield SimpleNamespace(stack=stack, robot=None)
+
+
+@pytest.fixture
+def robot(hangar, tmp_path):
+    """Graph and mechanic of a robot in the air: the last test's, if that left it sound there."""
+    if hangar.robot is None:
+        hangar.robot = hangar.stack.enter_context(airborne(tmp_path))
+    graph, mechanic = hangar.robot
+    mechanic.sound = False
+    yield graph, mechanic
+    if not mechanic.sound or mechanic.state != FLYING:
+        hangar.robot = None
+        hangar.stack.close()
 
 
 # parameters of sim_node, switched on and off again; bridge, status and counter that tell of it
@@ -117,6 +146,7 @@ def test_faults_that_drivers_bear_do_not_end_a_flight(robot):
         assert mechanic.state == FLYING, (switched, mechanic.states)
     assert mechanic.wait(lambda: np.linalg.norm(mechanic.truth.velocity) < 0.1, 10)
     assert not graph.dead()
+    mechanic.sound = True
 
 
 # fault, mended; what joint_bridge_node or rotor_bridge_node says; whether it needs a reboot
@@ -147,6 +177,7 @@ def test_what_does_not_obey_or_is_not_heard_ends_the_flight_with_a_landing(robot
             assert mechanic.ask('reboot')
         mechanic.start()
     assert not graph.dead()
+    mechanic.sound = True
 
 
 def rests(mechanic):
@@ -157,11 +188,12 @@ def rests(mechanic):
 @pytest.mark.parametrize('fault', ['reboot', 'hang', 'unplugged'])
 def test_a_board_that_stopped_is_not_armed_again_in_the_fall_or_after_it(robot, fault):
     graph, mechanic = robot
+    before = len(graph.log('composed').read_text())
     mechanic.set(f'board_faults.{fault}', True)
     assert mechanic.wait(lambda: mechanic.state == 'emergency_stop', 5), mechanic.states
     if fault == 'unplugged':
         mechanic.set('board_faults.unplugged', False)
-    assert 'rotor_bridge_node lost' in graph.log('composed').read_text()
+    assert 'rotor_bridge_node lost' in graph.log('composed').read_text()[before:]
     assert mechanic.wait(lambda: rests(mechanic), 10)
     mechanic.spin(1.5)
     assert rests(mechanic)
