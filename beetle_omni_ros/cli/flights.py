@@ -205,6 +205,9 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
                                                   'three.')] = None,
            seeds: Annotated[int, typer.Option(
                '--seeds', metavar='N', min=1, help='Flights of each fault from each start.')] = 1,
+           seed: Annotated[int, typer.Option(
+               '--seed', metavar='N', min=0, max=2**31 - 1,
+               help='Seed of the first flight; the next have the next.')] = 0,
            conditions: ConditionsOption = 'nominal',
            controller: ControllerOption = DEFAULT,
            landings: Annotated[int, typer.Option(
@@ -254,7 +257,7 @@ def faults(faults: Annotated[Optional[Path], typer.Option(
 
     from beetle_omni_ros.faults.command import run_faults
     run_faults(faults=faults, only=chosen, starts=names('--from', starts),
-               seeds=seeds, conditions=conditions, controller=controller, jobs=jobs,
+               seeds=seeds, seed=seed, conditions=conditions, controller=controller, jobs=jobs,
                output=output, json_path=json_path, docs=docs, bags=bags, landings=landings,
                without_mocap=without_mocap, healthy=healthy, through_ros=through_ros)
 

@@ -34,9 +34,9 @@ from beetle_omni_ros.sim.faults.listed import FaultList
 
 
 def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
-               starts: list[str] | None = None, seeds: int = 1, conditions: str = 'nominal',
-               controller: str = registry.DEFAULT, jobs: int | None = None,
-               output: Path | None = None,
+               starts: list[str] | None = None, seeds: int = 1, seed: int = 0,
+               conditions: str = 'nominal', controller: str = registry.DEFAULT,
+               jobs: int | None = None, output: Path | None = None,
                json_path: Path | None = None, docs: Path | None = None, bags: bool = False,
                landings: int = 0, without_mocap: bool = False, healthy: float = 0.0,
                through_ros: Callable[[FaultList], Iterator[dict]] | None = None,
@@ -61,21 +61,21 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     controller = entry.reference
     _check(starts, output, json_path, docs, bags)
     guidance = guidance_of(entry.make(RobotParameters.load()))      # or what is wrong with it
-    meta = {'command': _described(faults, only, starts, seeds, conditions, controller, landings,
-                                  without_mocap, healthy, bool(through_ros)),
+    meta = {'command': _described(faults, only, starts, seeds, seed, conditions, controller,
+                                  landings, without_mocap, healthy, bool(through_ros)),
             'version': __version__, 'guidance': guidance}
     fly = _Flyer(console, jobs, output)
     results: dict = {'meta': meta}
     if landings:
         flown = fly('landings', fly_landing, [
-            LandingTrial(seed, conditions, controller, without_mocap)
-            for seed in range(landings)], listed)
+            LandingTrial(k, conditions, controller, without_mocap)
+            for k in range(seed, seed + landings)], listed)
         results['landings'] = {'flights': flown, 'summary': campaign.landing_summary(flown)}
     if healthy:
         number = ceil(3600 * healthy / listed.healthy.flight_time)
         flown = fly('healthy flights', fly_healthy, [
-            HealthyTrial(seed, name, controller) for name in CONDITIONS
-            for seed in range(number)], listed)
+            HealthyTrial(k, name, controller) for name in CONDITIONS
+            for k in range(seed, seed + number)], listed)
         results['healthy'] = {'flights': flown, 'summary': campaign.healthy_summary(flown)}
     if through_ros:
         results['ros'] = []
@@ -87,8 +87,8 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
                           markup=False, highlight=False)
     if not landings and not healthy and not through_ros:
         flown = fly('faults', fly_trial, [
-            Trial(case.name, start, seed, conditions, controller) for case in cases
-            for start in starts or STARTS for seed in range(seeds)], listed,
+            Trial(case.name, start, k, conditions, controller) for case in cases
+            for start in starts or STARTS for k in range(seed, seed + seeds)], listed,
             output / 'bags' if bags else None)
         flown.sort(key=lambda one: (list(listed.cases).index(one['case']), one['start'],
                                     one['seed']))
@@ -123,8 +123,8 @@ def _text(path):
         raise ParameterError(f'{path}: cannot be read ({type(error).__name__})') from None
 
 
-def _described(faults, only, starts, seeds, conditions, controller, landings, without_mocap,
-               healthy, through_ros):
+def _described(faults, only, starts, seeds, seed, conditions, controller, landings,
+               without_mocap, healthy, through_ros):
     parts = ['beetle_omni faults'] + ['--ros'] * through_ros
     parts += [f'--faults {faults}'] if faults else []
     parts += [f"--only {','.join(only)}"] if only else []
@@ -133,6 +133,7 @@ def _described(faults, only, starts, seeds, conditions, controller, landings, wi
     parts += ['--without-mocap'] if without_mocap else []
     parts += [f'--healthy {healthy:g}'] if healthy else [f'--conditions {conditions}']
     parts += [] if landings or healthy else [f'--seeds {seeds}']
+    parts += [f'--seed {seed}'] if seed else []
     return ' '.join([*parts, f'--controller {controller}'])
 
 

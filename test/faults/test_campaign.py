@@ -115,9 +115,11 @@ def test_the_command_writes_page_markdown_and_json(listed, tmp_path, monkeypatch
                                    outcome='<b>') for trial in trials))
     docs = tmp_path / 'safety.md'
     docs.write_text(f'before\n{page.BEGIN}\nold\n{page.END}\nafter\n')
-    told = run_faults(only=['gust', 'impact'], starts=['hover'], seeds=2, docs=docs,
+    told = run_faults(only=['gust', 'impact'], starts=['hover'], seeds=2, seed=7, docs=docs,
                       output=tmp_path / 'out', console=Console(file=io.StringIO()))
-    assert len(told['flights']) == 4
+    assert [(one['case'], one['seed']) for one in told['flights']] == [
+        ('gust', 7), ('gust', 8), ('impact', 7), ('impact', 8)]
+    assert '--seeds 2 --seed 7 ' in told['meta']['command']
     html = (tmp_path / 'out' / 'faults.html').read_text()
     assert '&lt;b&gt;' in html and 'http' not in html
     assert json.loads((tmp_path / 'out' / 'faults.json').read_text())['summary']['total']['good']
