@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 import re
+import signal
 import sys
 import time
 
@@ -10,6 +11,10 @@ import pytest
 
 # Jazzy writes a scalar field of a wrong type as garbage unless this is set before the import.
 os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
+# A shell starts its background jobs with interrupts ignored, and programs that tests start inherit
+# that: none could then be interrupted.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 WORKER = 'PYTEST_XDIST_WORKER' in os.environ
 if WORKER:     # each has one core
     os.environ.setdefault('OMP_NUM_THREADS', '1')

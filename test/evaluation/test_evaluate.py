@@ -115,7 +115,7 @@ def test_a_flight_that_the_supervisor_ends_says_when_and_why(poses, monkeypatch)
     text = io.StringIO()
     results = command.run_evaluate(controllers=['nmpc'], task=str(poses),
                                    console=Console(file=text, width=200))
-    assert 'battery empty' in results['nmpc']['ended']
+    assert 'battery' in results['nmpc']['ended']     # empty, or too weak before that
     assert results['nmpc']['ended'].startswith('landing at ')
     assert f"nmpc: the flight ended early, {results['nmpc']['ended']}" in text.getvalue()
 
