@@ -20,7 +20,7 @@ direction helps.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, inf
+from math import exp, expm1, inf, sqrt
 from pathlib import Path
 
 import numpy as np
@@ -162,12 +162,14 @@ class HoverController:
             return
         force, torque = self._allocator.wrench(state.tilt, self._thrust)
         rate, inertia = state.angular_velocity, self._robot.inertia
-        model = np.concatenate([
-            (rotations.matrix(state.quaternion) @ force - self._allocator.weight)
-            / self._allocator.mass, (torque - rotations.cross(rate, inertia * rate)) / inertia])
-        measured = np.concatenate([state.velocity - before.velocity,
-                                   rate - before.angular_velocity]) / dt
-        self._disturbance += -np.expm1(-dt / self.parameters.disturbance_time) \
+        model, measured = np.empty(6), np.empty(6)
+        model[:3] = (rotations.matrix(state.quaternion) @ force - self._allocator.weight) \
+            / self._allocator.mass
+        model[3:] = (torque - rotations.cross(rate, inertia * rate)) / inertia
+        measured[:3] = state.velocity - before.velocity
+        measured[3:] = rate - before.angular_velocity
+        measured /= dt
+        self._disturbance += -expm1(-dt / self.parameters.disturbance_time) \
             * (measured - model - self._disturbance)
         p = self.parameters
         self._disturbance[:3] = _shortened(self._disturbance[:3], p.position.disturbance_limit)
@@ -272,5 +274,5 @@ def _pd(gains, error, rate_error):
 
 
 def _shortened(vector, limit):
-    length = float(np.sqrt(vector @ vector))
+    length = sqrt(float(vector @ vector))
     return vector if length <= limit else vector * (limit / length)

@@ -24,6 +24,12 @@ def matrix(quaternion: Vector) -> np.ndarray:
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
 
 
+def up(quaternion: Vector) -> np.ndarray:
+    """The world's z axis (3,) in body axes: the last row of :func:`matrix`."""
+    x, y, z, w = _floats(quaternion)
+    return np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
+
+
 def multiply(a: Vector, b: Vector) -> np.ndarray:
     """Quaternion product: first ``b``, then ``a`` (R(a) R(b))."""
     return np.array(product(*_floats(a), *_floats(b)))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from math import sqrt
 
 import numpy as np
 
@@ -270,10 +271,14 @@ def _vector(value, size):
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):
         return None
-    small = array.shape == (size,) and all(abs(number) < ABSURD for number in array.tolist())
-    return array if small else None
+    if array.shape != (size,):
+        return None
+    for number in array.tolist():
+        if not abs(number) < ABSURD:    # nan, too
+            return None
+    return array
 
 
 def _shortened(vector, limit):
-    length = float(np.sqrt(vector @ vector))
+    length = sqrt(float(vector @ vector))
     return vector if length <= limit else vector * (limit / length)

@@ -88,7 +88,7 @@ class Inputs:
 
     def _watch_joints(self, stamp, reading):
         """Let the detectors look at a reading (4,); a zero that it moves counts for it, too."""
-        if not (isfinite(stamp) and np.isfinite(reading).all()):
+        if not (isfinite(stamp) and all(map(isfinite, reading.tolist()))):
             return
         zeros = self.watch.health.zeros
         self.watch.on_joints(stamp, reading, self.airborne)
@@ -117,9 +117,9 @@ class Inputs:
                            for vector in (specific_force, angular_velocity))
         except (TypeError, ValueError):
             return False
-        if not np.isfinite(force).all() or not np.isfinite(rate).all():
-            return False
         values = (*force.tolist(), *rate.tolist())
+        if not all(map(isfinite, values)):
+            return False
         self._same_samples = self._same_samples + 1 if values == self._sample else 0
         self._sample = values
         limits = self._parameters.detection.imu

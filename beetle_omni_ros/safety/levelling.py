@@ -106,7 +106,7 @@ def plan(quaternion: np.ndarray, tilt: np.ndarray, allocator: Allocator,
         the way, from the present attitude to a level one.
 
     """
-    start = rotations.matrix(quaternion)[2]     # world's up in base_link
+    start = rotations.up(quaternion)
     paths = [_path(corners) for corners in _corners(start, allocator)]
     longest = max(map(len, paths))
     # One array: a path that ends earlier stays level.

@@ -37,7 +37,7 @@ class SupportGauge:
         self._thrusts += share * ((0.0 if command is None else command.thrust) - self._thrusts)
         if command is not None:
             force, _ = self._allocator.wrench(command.tilt, command.thrust)
-            now = float(rotations.matrix(quaternion)[2] @ force) \
+            now = float(rotations.up(quaternion) @ force) \
                 / (self._allocator.mass * self._gravity)
         self.thrust += share * (now - self.thrust)
         if learn and specific_force_up is not None and self.thrust > LEAST_THRUST:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from itertools import chain
-from math import isfinite, nan
+from math import isfinite, nan, sqrt
 
 import numpy as np
 
@@ -103,10 +103,11 @@ class Vehicle:
 
         Only a complete one ends the joints' silence.
         """
+        if not (isfinite(stamp) and stamp > self.tilt_stamp):
+            return False
         angles, rates = _numbers(position, 4) or [], _numbers(velocity, 4) or [nan] * 4
         known = [isfinite(angle) for angle in angles]
-        if not (isfinite(stamp) and stamp > self.tilt_stamp and any(known)
-                and all(abs(angle) < ABSURD for angle in angles if isfinite(angle))):
+        if not any(known) or any(abs(angle) >= ABSURD for angle in angles if isfinite(angle)):
             return False
         self.tilt = np.array([new if there else old for new, there, old in zip(
             angles, known, self.tilt.tolist())])
@@ -146,7 +147,7 @@ class Vehicle:
         force = self.backup.last_specific_force
         if self.imu.silent or force is None or self.state is None:
             return None
-        return float(rotations.matrix(self.state.quaternion)[2] @ force)
+        return float(rotations.up(self.state.quaternion) @ force)
 
     @property
     def mocap_lost(self) -> bool:
@@ -204,16 +205,16 @@ class Vehicle:
 
     def _outside(self, margin):
         fence = self._parameters.envelope
-        x, y, z = np.abs(self._best.position)
-        return bool(max(x, y) > fence.half_width + margin or z > fence.height + margin)
+        x, y, z = map(abs, self._best.position.tolist())
+        return max(x, y) > fence.half_width + margin or z > fence.height + margin
 
     def _below(self, threshold):
         return self.voltage is not None and self.voltage < threshold * self._cells
 
     def _tumbling(self):
         fence, state = self._parameters.envelope, self._best
-        return np.linalg.norm(state.angular_velocity) > fence.rate \
-            or state.velocity[2] < -fence.fall_speed
+        rate = state.angular_velocity
+        return sqrt(float(rate @ rate)) > fence.rate or state.velocity[2] < -fence.fall_speed
 
     def _check_state(self, state, status, now):
         limits = self._parameters.state

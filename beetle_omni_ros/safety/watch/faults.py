@@ -154,8 +154,9 @@ class FaultWatch:
 
         """
         watch = self._joints
-        watch.on_joints(stamp, tilt)
-        if not trusted:
+        if not watch.on_joints(stamp, tilt) or not trusted:
+            return
+        if watch.well and self.health.stuck == ALL_WELL.stuck:
             return
         for joint in np.flatnonzero(watch.jump):
             self._name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
@@ -223,9 +224,8 @@ class FaultWatch:
                                f'{self._speeds.thrust[deaf]:.1f} N'):
             self._hold(deaf, self._speeds.thrust[deaf])
         for rotor, held in enumerate(self.health.held):
-            given = self._speeds.thrust[rotor]
-            if held is not None and abs(given - held) > NOTICEABLE:
-                self._hold(rotor, given)
+            if held is not None and abs(self._speeds.thrust[rotor] - held) > NOTICEABLE:
+                self._hold(rotor, self._speeds.thrust[rotor])
 
     def name(self, name: str, now: float, text: str) -> bool:
         """Enter a fault that others found; False where it is known."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from math import expm1
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from beetle_omni_ros.safety.watch.parameters import ServoLimits
 
 KEPT = 64               # commands, 0.3 s at 200 Hz
 LONGEST = 0.1           # [s] between two readings; after a longer gap the model starts anew
+NO_JUMP = np.zeros(ROTORS)
 AT_REST = 0.05          # [rad] by which a jammed joint may move while it is judged
 
 
@@ -47,32 +49,42 @@ class JointWatch:
         self._low = self._high = np.zeros(ROTORS)
         self.jammed = np.zeros(ROTORS, dtype=bool)
         self.astray = np.zeros(ROTORS, dtype=bool)
-        self.jump = np.zeros(ROTORS)
+        self.jump = NO_JUMP
+        self._suspects = False      # whether a joint was off its model at the last reading
+
+    @property
+    def well(self) -> bool:
+        """Whether no joint jumped, and none is off its model, at the last reading."""
+        return self.jump is NO_JUMP and not self._suspects
 
     def on_command(self, stamp: float, tilt: np.ndarray) -> None:
         """Take what the joints were asked at ``stamp`` [s], (4,) [rad]."""
         self._commands.append((stamp, tilt))
 
-    def on_joints(self, stamp: float, tilt: np.ndarray) -> None:
-        """Take a complete reading (4,) [rad] of the time ``stamp`` [s]."""
+    def on_joints(self, stamp: float, tilt: np.ndarray) -> bool:
+        """Take a complete reading (4,) [rad] of the time ``stamp`` [s]; False where it is old."""
         dt = stamp - self._stamp
         if dt <= 0:
-            self.jump = np.zeros(ROTORS)
-            return
+            self.jump = NO_JUMP
+            return False
         before, self._stamp = getattr(self, '_tilt', tilt), stamp
         self._tilt = tilt
         asked = self._asked(stamp - self._p.delay)
         if dt > LONGEST or asked is None or self.model is None:
             self.model, self._for = tilt.copy(), np.zeros(ROTORS)
-            self._change, self.jump = np.zeros(ROTORS), np.zeros(ROTORS)
-            return
+            self._change, self.jump = np.zeros(ROTORS), NO_JUMP
+            return True
         change = tilt - before
-        jumped = np.abs(change) > self._rate_limit * dt + self._p.jump
-        self.jump = np.where(jumped, change - self._change, 0.0)
-        self._change = np.where(jumped, self._change, change)
         step = self._step(asked, dt)
-        self.model = np.where(jumped, tilt, self.model + step)
+        jumped = np.abs(change) > self._rate_limit * dt + self._p.jump
+        if jumped.any():
+            self.jump = np.where(jumped, change - self._change, 0.0)
+            self._change = np.where(jumped, self._change, change)
+            self.model = np.where(jumped, tilt, self.model + step)
+        else:
+            self.jump, self._change, self.model = NO_JUMP, change, self.model + step
         self._judge(tilt, dt, np.abs(step) / dt)
+        return True
 
     def advance(self, stamp: float) -> None:
         """Go on with the model alone to ``stamp`` [s], for want of readings."""
@@ -85,15 +97,19 @@ class JointWatch:
     def _step(self, asked, dt):
         """Motion (4,) [rad] of servos of first order with a limited rate in ``dt`` [s]."""
         reach = self._rate_limit * dt
-        return np.clip((asked - self.model) * -np.expm1(-dt / self._lag), -reach, reach)
+        step = (asked - self.model) * -expm1(-dt / self._lag)
+        return np.minimum(np.maximum(step, -reach), reach)
 
     def _judge(self, tilt, dt, rate):
         p = self._p
         off = np.abs(tilt - self.model) > p.error + p.spread * rate
+        if not self._suspects and not off.any():
+            return
         began = off & (self._for == 0)
         self._low = np.where(began, tilt, np.minimum(self._low, tilt))
         self._high = np.where(began, tilt, np.maximum(self._high, tilt))
         self._for = np.where(off, self._for + dt, 0.0)
+        self._suspects = bool(off.any())
         named = self._for >= p.time
         still = self._high - self._low < AT_REST
         self.jammed, self.astray = named & still, named & ~still

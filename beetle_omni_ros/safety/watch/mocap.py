@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import sqrt
+
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
@@ -69,7 +71,7 @@ class MocapWatch:
         dt, before = stamp - self._stamp, self._quaternion
         now = rotations.normalized(quaternion)
         self._stamp, self._quaternion = stamp, now
-        turning = 0.0 if rate is None else float(np.linalg.norm(rate))
+        turning = 0.0 if rate is None else _length(rate)
         if before is not None and 0 < dt < LONGEST and rotations.geodesic_angle(
                 before, now) > self._p.attitude + turning * dt:
             self.jumped = True
@@ -87,9 +89,14 @@ class MocapWatch:
         """Whether the position is not the estimate's, and whether it jumped there."""
         before, self._position = self._position, position
         if before is not None and 0 < dt < LONGEST \
-                and np.linalg.norm(position - before) > self._p.distance + FASTEST * dt:
+                and _length(position - before) > self._p.distance + FASTEST * dt:
             self._moved = True
-        far = place is not None and float(np.linalg.norm(position - place)) > \
-            self._p.distance + float(np.linalg.norm(velocity)) * AGE
+        far = place is not None \
+            and _length(position - place) > self._p.distance + _length(velocity) * AGE
         self._moved &= far
         return far
+
+
+def _length(vector):
+    """As np.linalg.norm, for a fraction of its time."""
+    return sqrt(float(vector @ vector))

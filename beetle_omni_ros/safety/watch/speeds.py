@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from math import exp
+from math import exp, expm1
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from beetle_omni_ros.safety.watch.parameters import RotorLimits
 LEARNT = 1.0            # [s] over which each rotor's speed at a thrust is learnt
 DELAY = 0.01            # [s] from a command's stamp until it acts
 KEPT = 64               # commands, 0.3 s at 200 Hz
+ONES = np.ones(ROTORS)
 LONGEST = 0.2           # [s] between two reports that still count as one stretch
 
 
@@ -75,7 +76,7 @@ class SpeedWatch:
             until = commands[k + 1][0] if k + 1 < len(commands) else end
             span = min(until, end) - max(stamp, start)
             if span > 0:
-                self._thrust = self._thrust - np.expm1(-span / self._lag) * (thrust - self._thrust)
+                self._thrust = self._thrust - expm1(-span / self._lag) * (thrust - self._thrust)
 
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """
@@ -115,7 +116,7 @@ class SpeedWatch:
         """Whose measured thrust does not follow the modelled one."""
         x, y = np.where(known, [self._thrust, self.thrust], 0.0)
         self._sums *= np.where(known, exp(-dt / self._p.slope_window), 0.0)
-        self._sums += np.where(known, dt * np.array([np.ones(ROTORS), x, y, x * x, x * y]), 0.0)
+        self._sums += np.where(known, dt * np.array([ONES, x, y, x * x, x * y]), 0.0)
         weight, sum_x, sum_y, sum_xx, sum_xy = self._sums
         full = weight > 0.5 * self._p.slope_window
         count = np.where(full, weight, 1.0)

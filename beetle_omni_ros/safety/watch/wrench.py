@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from math import exp
+from math import exp, expm1, sqrt
 
 import numpy as np
 
@@ -62,17 +62,17 @@ class WrenchWatch:
         self._thrust = np.zeros(ROTORS)
         self._stamp: float | None = None
         self.supported = np.zeros(ROTORS, dtype=bool)
-        self._lost_for, self._slipped_for = np.zeros(ROTORS), np.zeros(ROTORS)
         self._filtered, self._vectors = np.zeros(6), np.zeros((ROTORS, 2))
-        self.lost: int | None = None
-        self.slipped: tuple[int, float] | None = None
+        self.forget()
         self.impact = 0.0
         self.unexplained = np.zeros(3)
 
     def forget(self) -> None:
         """Suspect no rotor."""
         self._lost_for, self._slipped_for = np.zeros(ROTORS), np.zeros(ROTORS)
-        self.lost = self.slipped = None
+        self._suspects = False
+        self.lost: int | None = None
+        self.slipped: tuple[int, float] | None = None
 
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                thrust: np.ndarray, health: ActuatorHealth) -> None:
@@ -92,22 +92,25 @@ class WrenchWatch:
         if dt <= 0:
             return
         self._stamp = stamp
-        size = float(np.sqrt(force @ force))
+        size = sqrt(float(force @ force))
         self.impact = size if size > self._contact.impact * self._reach else 0.0
-        commanded = np.where(health.rotors, thrust, 0.0)
+        commanded = thrust if all(health.rotors) else np.where(health.rotors, thrust, 0.0)
         if dt > LONGEST or tilt is None:
             impact = self.impact
             self.reset()
             self._thrust, self._stamp, self._rate = commanded.copy(), stamp, rate
             self.impact = impact
             return
-        self._thrust += -np.expm1(-dt / self._robot.rotors.time_constant) \
+        self._thrust += -expm1(-dt / self._robot.rotors.time_constant) \
             * (commanded - self._thrust)
         inertia = self._robot.inertia
-        measured = np.concatenate([force, (rate - self._rate) / dt
-                                   + rotations.cross(rate, inertia * rate) / inertia])
+        measured = np.empty(6)
+        measured[:3] = force
+        measured[3:] = (rate - self._rate) / dt + rotations.cross(rate, inertia * rate) / inertia
         self._rate = rate
-        vectors = np.stack([np.cos(tilt), np.sin(tilt)], axis=1) * self._thrust[:, None]
+        vectors = np.empty((ROTORS, 2))
+        vectors[:, 0] = np.cos(tilt) * self._thrust
+        vectors[:, 1] = np.sin(tilt) * self._thrust
         modelled = self._allocator.matrix @ vectors.ravel() / self._units
         gain = 1 - exp(-dt / self._contact.filter)
         self._filtered += gain * (measured - modelled - self._filtered)
@@ -120,6 +123,8 @@ class WrenchWatch:
         residual = self._filtered * self._weights
         size = float(residual @ residual)
         self.unexplained = self._filtered[:3]
+        if size <= p.least_evidence**2 and not self._suspects:
+            return
         lost, slipped = np.zeros(ROTORS, dtype=bool), np.zeros(ROTORS, dtype=bool)
         angle = 0.0
         if size > p.least_evidence**2:
@@ -138,6 +143,7 @@ class WrenchWatch:
                 self.unexplained = left[i][:3] / self._weights[:3]
         self._lost_for = self._counted(self._lost_for, lost, dt)
         self._slipped_for = self._counted(self._slipped_for, slipped, dt)
+        self._suspects = bool(self._lost_for.any() or self._slipped_for.any())
         self.lost = self._first(self._lost_for >= np.where(self.supported, p.time, p.time_alone))
         joint = self._first(self._slipped_for >= p.slip_time)
         self.slipped = None if joint is None or not slipped[joint] else (joint, angle)
@@ -186,7 +192,7 @@ class ContactWatch:
             wrench: of the same sample.
 
         """
-        push = float(np.linalg.norm(wrench.unexplained)) / self._gravity
+        push = sqrt(float(wrench.unexplained @ wrench.unexplained)) / self._gravity
         near = height is None or height <= self._limits.near_ground
         self._since_hit = 0.0 if wrench.impact else self._since_hit + dt
         hit = self._since_hit < AFTER_HIT
