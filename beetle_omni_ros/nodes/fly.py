@@ -95,19 +95,8 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
                     'controller': controller, 'composed': composed}
             if struck:
                 meta['faults'] = [str(fault) for fault in struck]
-            for kind in clocks:
-                meta |= {'clock': kind, 'actuators': actuators or (
-                    'direct' if kind == 'simulated' else 'emulated')}
-                graph = _make_graph(wanted, meta, folder, number)
-                try:
-                    status = _fly(graph, controller, flown, meta, console, listed.text(struck),
-                                  may_be_slow=kind == clocks[-1])
-                    break
-                except TooSlowError as error:
-                    _clear(bag, folder, error, console)
-                except KeyboardInterrupt:
-                    _keep(bag, meta)
-                    raise
+            status = _attempt(clocks, actuators, wanted, meta, folder, number, flown,
+                              listed.text(struck), console)
             if not bag.exists():
                 return status or runner.FAILED
             return max(status, _report(bag, controller, flown, meta, json_path, console))
@@ -117,6 +106,24 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
     except KeyboardInterrupt:
         print('beetle_omni fly: interrupted; everything is stopped', file=sys.stderr)
         return INTERRUPTED
+
+
+def _attempt(clocks, actuators, wanted, meta, folder, number, task, faults, console) -> int:
+    """Fly by the first clock that this computer keeps; ``meta`` gets that and what was measured."""
+    bag = Path(wanted.bag)
+    for kind in clocks:
+        meta |= {'clock': kind, 'actuators': actuators or (
+            'direct' if kind == 'simulated' else 'emulated')}
+        graph = _make_graph(wanted, meta, folder, number)
+        try:
+            return _fly(graph, meta['controller'], task, meta, console, faults,
+                        may_be_slow=kind == clocks[-1])
+        except TooSlowError as error:
+            _clear(bag, folder, error, console)
+        except KeyboardInterrupt:
+            _keep(bag, meta)
+            raise
+    return runner.FAILED
 
 
 def _actuators_for(faults, actuators):
