@@ -109,7 +109,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
 
 
 def _attempt(clocks, actuators, wanted, meta, folder, number, task, faults, console) -> int:
-    """Fly by the first clock that this computer keeps; ``meta`` gets that and what was measured."""
+    """Fly by the first clock that the computer keeps; ``meta`` gets it and what was measured."""
     bag = Path(wanted.bag)
     for kind in clocks:
         meta |= {'clock': kind, 'actuators': actuators or (

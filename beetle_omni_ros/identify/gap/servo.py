@@ -72,29 +72,13 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
     def each(name):
         return np.concatenate([column(f'{name}[{k}]', np.exp) for k in range(4)], axis=2)
 
-    own = {'joint_friction': dict(zip(('coulomb', 'stiction'), friction(robot), strict=True))}
-    numbers: dict[str, np.ndarray] = {}
-    acting = []
-    for name, effect in CATALOGUE.items():
-        numbers |= {key.partition('.')[2]: column(f'{name}.{parameter}', np.exp)
-                    for parameter, key in effect.settings.items() if key.startswith('joints.')}
-        if effect.servo is not None:
-            base = {**robot.effects, **own}.get(name, {})
-            values = {p: np.asarray(base.get(p, spec.neutral)) + column(f'{name}.{p}')
-                      for p, spec in effect.parameters.items()}
-            if effect.apply is None:    # the body's equations bear what a servo does not
-                values = {p: np.maximum(x, effect.parameters[p].low) for p, x in values.items()}
-            if any(values[p].any() for p in effect.numbers):
-                acting.append((effect.servo, values))
+    numbers, acting = _of_effects(robot, column)
     joint, hanging = robot.joints, robot.effects.get(MODULES, {})
     kp = joint.kp * numbers['kp'] * each('servo.kp')
     kd = joint.kd * numbers['kd'] * each('servo.kd')
     speed = joint.velocity_limit * numbers['velocity_limit']
     effort = joint.effort_limit * numbers['effort_limit']
-    loads = [(windows.load, modules + column('modules.share'))]
-    loads += [(torque, hanging.get(name, 0.0) + column(f'{MODULES}.{name}')) for torque, name in
-              zip(windows.undescribed, ('mass_moment', 'module_inertia'), strict=False)]
-    loads = [(torque, size) for torque, size in loads if size.any()]
+    loads = _loads(windows, hanging, modules, column)
 
     def terms_at(k):
         made = ServoTerms(targets[:, k], windows.thrust[k], windows.spin[k])
@@ -122,6 +106,41 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
         terms = terms_at(k)
         q, v = step(terms.target, q, v, None if np.isscalar(terms.load) else terms.load)
     return shown.transpose(1, 0, 2, 3)
+
+
+def _of_effects(robot, column):
+    """
+    What the catalogue changes about servos.
+
+    Returns:
+        (name of a number of the joints -> its factors), and (servo equation, its parameters) of
+        each effect that acts.
+
+    """
+    own = {'joint_friction': dict(zip(('coulomb', 'stiction'), friction(robot), strict=True))}
+    numbers: dict[str, np.ndarray] = {}
+    acting = []
+    for name, effect in CATALOGUE.items():
+        numbers |= {key.partition('.')[2]: column(f'{name}.{parameter}', np.exp)
+                    for parameter, key in effect.settings.items() if key.startswith('joints.')}
+        if effect.servo is None:
+            continue
+        base = {**robot.effects, **own}.get(name, {})
+        values = {p: np.asarray(base.get(p, spec.neutral)) + column(f'{name}.{p}')
+                  for p, spec in effect.parameters.items()}
+        if effect.apply is None:    # the body's equations bear what a servo does not
+            values = {p: np.maximum(x, effect.parameters[p].low) for p, x in values.items()}
+        if any(values[p].any() for p in effect.numbers):
+            acting.append((effect.servo, values))
+    return numbers, acting
+
+
+def _loads(windows, hanging, modules, column):
+    """Torques of unit size on the joints with their sizes, of modules in the file or not."""
+    loads = [(windows.load, modules + column('modules.share'))]
+    loads += [(torque, hanging.get(name, 0.0) + column(f'{MODULES}.{name}')) for torque, name in
+              zip(windows.undescribed, ('mass_moment', 'module_inertia'), strict=False)]
+    return [(torque, size) for torque, size in loads if size.any()]
 
 
 def module_load(signals: Signals, theta: dict[str, float]) -> np.ndarray:
