@@ -33,20 +33,22 @@ sys.path.append(str(Path(__file__).parent))
 # the length of the stall: it could not be judged. On a computer that keeps time, nothing is.
 RERUNS = 1
 STALL = 0.05        # s; the limits of silence in these tests are 50 to 80 ms
-MARKS = re.compile(r'\breal_time\b|\balone\b|\bros_domain\b')
+MARKS = {'alone': re.compile(r'\bmark\.alone\b'),      # part of the suite -> in a file of it
+         'real_time': re.compile(r'\bmark\.(real_time|alone)\b|\bros_domain\b')}
 BEAT, BEGIN = pytest.StashKey(), pytest.StashKey[float]()
 
 
 def pytest_ignore_collect(collection_path, config):
-    """Leave files alone that have no test in real time, where only those are asked for."""
-    if config.getoption('markexpr').startswith(('alone', 'real_time')) \
-            and collection_path.match('test_*.py') and not _says_so(collection_path):
+    """Do not load files without a test of the part that is asked for: that takes seconds."""
+    part = config.getoption('markexpr').partition(' ')[0]
+    if part in MARKS and collection_path.match('test_*.py') \
+            and not _says_so(collection_path, part):
         return True
     return None
 
 
-def _says_so(path):
-    return MARKS.search(Path(path).read_text(encoding='utf-8')) is not None
+def _says_so(path, part):
+    return MARKS[part].search(Path(path).read_text(encoding='utf-8')) is not None
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -56,8 +58,9 @@ def pytest_collection_modifyitems(config, items):
     real_time = [item for item in items if item.get_closest_marker('alone')
                  or item.get_closest_marker('real_time')
                  or ('ros_domain' in item.fixturenames and item not in waiting)]
-    for path in {item.path for item in real_time}:
-        if not _says_so(path):      # it would be in neither part
+    for path, part in {(item.path, 'alone' if item.get_closest_marker('alone') else 'real_time')
+                       for item in real_time}:
+        if not _says_so(path, part):      # it would be in neither part
             raise pytest.UsageError(f'{path}: has tests in real time: name the mark in the file')
     for item in real_time:
         item.add_marker(pytest.mark.real_time)
