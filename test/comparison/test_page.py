@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 from beetle_omni_ros.comparison import command, summary
+from beetle_omni_ros.comparison import page as comparison_page
 from beetle_omni_ros.comparison.plan import Flight
 from beetle_omni_ros.runs import published
 
@@ -31,9 +32,11 @@ def written(folder, flown, tasks=TASKS, controllers=CONTROLLERS, skipped=()):
 
 @pytest.fixture(scope='module')
 def whole(tmp_path_factory):
-    """Folder, page, JSON and Markdown of a whole comparison."""
+    """Folder, page, JSON and Markdown of a whole comparison; coarse pictures are soon drawn."""
     folder = tmp_path_factory.mktemp('comparison')
-    return folder, *written(folder, made_sweep())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(comparison_page, 'DOTS', 50)
+        return folder, *written(folder, made_sweep())
 
 
 class Page(HTMLParser):

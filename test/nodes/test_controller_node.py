@@ -1,6 +1,5 @@
 """Any registered controller as a node: by name, by its class, in a whole graph."""
 
-import json
 import math
 import os
 from pathlib import Path
@@ -11,7 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
-from witness import HEADER, READY
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
@@ -23,7 +21,6 @@ from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import ParameterError
-from beetle_omni_ros.runs.bag import read_bag
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 OWN = f"{Path(__file__).resolve().parents[2] / 'examples' / 'own_controller.py'}:PoseController"
@@ -137,23 +134,3 @@ def test_topics_of_any_controller_are_told_from_those_of_a_robot():
     assert split_topic('/robot1/own/command', ('/robot1',)) == ('/robot1', 'own/command')
     assert split_topic('/robot1/command', ('/robot1',)) == ('/robot1', 'command')
     assert topic_of('own/command') == topic_of('nmpc/command') == topics_with(['x'])['x/command']
-
-
-@pytest.mark.simulated_time
-def test_a_class_of_a_file_flies_the_whole_graph_and_is_read_back(tmp_path):
-    task, bag, result = tmp_path / 'poses.csv', tmp_path / 'bag', tmp_path / 'result.json'
-    task.write_text(HEADER + '0.3,0,1,20,0,30\n')
-    environment = dict(os.environ)
-    environment.pop('ROS_DOMAIN_ID', None)
-    done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--controller', OWN, '--task', task,
-         '--clock', 'simulated', '--bag', bag, '--json', result],
-        capture_output=True, text=True, timeout=READY, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
-    results = json.loads(result.read_text())
-    assert results['pose_controller']['success_rate'] == 1.0
-    assert results['pose_controller']['guidance'] == 'none'
-    assert results['pose_controller']['compute_ms']['median'] > 0
-    log = read_bag(bag)
-    assert 'flying:pose_controller' in log.states and not log.warnings
-    assert set(log.requests) == {'pose_controller', *registry.standing_by()}

@@ -60,7 +60,8 @@ def test_sigterm_ends_a_flight_cleanly_and_the_bag_is_complete(tmp_path, moment)
     temporary.mkdir()
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros.cli', 'fly', '--bag', str(bag), '--task', 'hover',
-         '--clock', 'simulated'], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+         '--clock', 'simulated', '--alone'],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         env={**os.environ, 'TMPDIR': str(temporary)})
     deadline = time.monotonic() + 120
     try:
