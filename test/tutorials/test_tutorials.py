@@ -18,10 +18,12 @@ import sys
 import time
 
 import pytest
+import ready_program
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / 'docs' / 'tutorials').glob('*.md'))
 NAMES = ('beetle_omni', 'sim_node')
+STARTED = 'first_flight'    # the page whose commands load their modules, as a reader's do
 TIMEOUT = 1000       # s of one block
 BLOCK = re.compile(r'(?P<before>[^\n]*)\n(?:\n<!-- test: (?P<told>[^\n]*) -->\n)?\n'
                    r'```(?P<language>\w+)\n(?P<text>.*?)^```$', re.DOTALL | re.MULTILINE)
@@ -64,17 +66,42 @@ def blocks(page):
     return found
 
 
+def variables():
+    """Environment in which the modules of this checkout are found, with one thread."""
+    return {**os.environ, 'COLUMNS': '120', 'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1'}
+
+
+@pytest.fixture(scope='module')
+def client(tmp_path_factory):
+    """Text of a `beetle_omni` that need not load its modules."""
+    address = tmp_path_factory.mktemp('ready') / 'socket'
+    process = subprocess.Popen([sys.executable, ready_program.__file__, str(address)],
+                               env=variables(), start_new_session=True)
+    try:
+        end = time.monotonic() + 60
+        while not address.exists():
+            assert process.poll() is None and time.monotonic() < end
+            time.sleep(0.05)
+        yield ready_program.CLIENT.format(python=sys.executable, address=str(address))
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)      # with calls that a test gave up
+        process.wait()
+
+
 @pytest.fixture
-def shell(tmp_path):
+def shell(tmp_path, page, client):
     """Environment in which the commands of this checkout are found."""
     programs = tmp_path / 'programs'
     programs.mkdir()
-    for name, arguments in {'python': '', **{
-            name: f'-m beetle_omni_ros.start {name}' for name in NAMES}}.items():
-        (programs / name).write_text(f'#!/bin/sh\nexec {sys.executable} {arguments} "$@"\n')
+    texts = {name: f'#!/bin/sh\nexec {sys.executable} -m beetle_omni_ros.start {name} "$@"\n'
+             for name in NAMES}
+    texts['python'] = f'#!/bin/sh\nexec {sys.executable} "$@"\n'
+    if page.stem != STARTED:
+        texts['beetle_omni'] = client
+    for name, text in texts.items():
+        (programs / name).write_text(text)
         (programs / name).chmod(0o755)
-    environment = {**os.environ, 'PATH': f"{programs}:{os.environ['PATH']}", 'COLUMNS': '120',
-                   'PYTHONPATH': str(ROOT), 'OMP_NUM_THREADS': '1'}
+    environment = {**variables(), 'PATH': f"{programs}:{os.environ['PATH']}"}
     environment.pop('ROS_DOMAIN_ID', None)
     return environment
 
