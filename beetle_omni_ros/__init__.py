@@ -1,7 +1,7 @@
 """
 Flight stack and controller comparison for an overactuated tiltable quadrotor.
 
-What a notebook needs is here, and imports nothing before it is called::
+The functions for notebooks. Imports are delayed until a function is called::
 
     import beetle_omni_ros as bo
 
@@ -9,9 +9,9 @@ What a notebook needs is here, and imports nothing before it is called::
     log = bo.simulate('nmpc', [[0, 0, 1, 90, 0, 0]])      # a flight as numpy arrays
     table = bo.evaluate([MyController, 'rl'], 'waypoints')      # metrics, and a table in print
     log = bo.read_run('runs_out/flight')                  # a recorded bag as numpy arrays
-    found = bo.find_gap(['flight1', 'flight2'])           # where model and measurement disagree
+    found = bo.find_gap(['flight1', 'flight2'])           # effects that the model lacks
 
-Examples of one screen each stand in examples/.
+The folder examples/ contains short examples.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ def simulate(controller: str | Callable = 'nmpc', task: Any = 'waypoints', *,
     Args:
         controller: a registered name, 'package.module:Class', or a class
             (docs/how-to/own_controller.md).
-        task: a name as on the command line, a pose file, poses (N, 6) of x, y, z [m], roll,
-            pitch, yaw [deg], or what :func:`trajectory` returns.
-        robot: what estimator and controller believe: parameters or a file; None: the shipped one.
-        plant: what is true in the simulation; None: as ``robot``.
+        task: a name as on the command line, a pose file, poses (N, 6) of x, y, z [m], roll, pitch,
+            yaw [deg], or a result of :func:`trajectory`.
+        robot: model of estimator and controller: parameters or a file; None: the shipped file.
+        plant: model of the simulated plant; None: as ``robot``.
         conditions: 'nominal' or 'published'.
         seed: of everything random.
         bag: new folder to record a bag in.
 
     Returns:
-        The flight; ``log.meta['crashed']`` says whether the robot touched the ground.
+        The flight; ``log.meta['crashed']`` is true if the robot touched the ground.
 
     Raises:
-        ParameterError, TaskError, BagError, FlightError: in one line.
+        ParameterError, TaskError, BagError, FlightError: with a message of one line.
 
     """
     from pathlib import Path
@@ -73,20 +73,20 @@ def evaluate(controllers: str | Callable | Sequence[str | Callable], task: Any =
              conditions: str = 'nominal', seed: int = 0, bag: str | Path | None = None,
              quiet: bool = False) -> dict:
     """
-    Fly a task with each controller and judge the flights, as `beetle_omni evaluate` does.
+    Fly a task with each controller and compute metrics, as `beetle_omni evaluate` does.
 
     Args:
         controllers: one or several, each as in :func:`simulate`.
         task: as in :func:`simulate`.
-        robot: file of what estimator and controllers believe; None: the shipped one.
-        plant: file of what is true in the simulation; None: as ``robot``.
+        robot: robot file of estimator and controllers; None: the shipped file.
+        plant: robot file of the simulated plant; None: as ``robot``.
         conditions: 'nominal' or 'published'.
         seed: of everything random.
-        bag: new folder; with several controllers it holds a bag for each.
+        bag: new folder; with several controllers it contains one bag for each.
         quiet: print no table.
 
     Returns:
-        What `evaluate --json` writes: ``meta``, and a key for each controller's name.
+        The content of `evaluate --json`: ``meta``, and a key for each controller's name.
 
     """
     from pathlib import Path
@@ -111,10 +111,10 @@ def read_run(path: str | Path) -> FlightLog:
         path: rosbag2 folder, or one of its files.
 
     Returns:
-        The flight; what was missing or wrong stands in its ``warnings``.
+        The flight; its ``warnings`` list missing topics and damage.
 
     Raises:
-        BagError: it cannot be read; one line.
+        BagError: the bag cannot be read; the message has one line.
 
     """
     from beetle_omni_ros.runs.bag_reader import read_bag
@@ -125,18 +125,18 @@ def find_gap(runs: Sequence[str | Path], holdout: Sequence[str | Path] = (), *,
              robot: str | Path | None = None, apply: str | Path | None = None,
              report: str | Path | None = None, quiet: bool = False) -> dict:
     """
-    Find where model and measurement disagree, as `beetle_omni gap` does.
+    Identify effects that the robot model lacks, as `beetle_omni gap` does.
 
     Args:
-        runs: bags that are fitted.
-        holdout: bags that judge; by default the last run, where there are three or more.
-        robot: file that is believed.
+        runs: bags for the fit.
+        holdout: bags for validation; by default the last of three or more runs.
+        robot: robot file with which the flights are compared.
         apply: robot file to write, with the named effects.
         report: HTML page to write.
         quiet: print nothing.
 
     Returns:
-        What `gap --json` writes: ``verdict``, ``effects``, ``closure`` and the rest.
+        The content of `gap --json`: ``verdict``, ``effects``, ``closure`` and further keys.
 
     """
     from pathlib import Path
@@ -152,7 +152,7 @@ def find_gap(runs: Sequence[str | Path], holdout: Sequence[str | Path] = (), *,
 
 def trajectory(times, positions, quaternions, name: str = 'own trajectory'):
     """
-    Make a task of a trajectory: 8 s at its first pose, then the whole of it.
+    Make a task from a trajectory: 8 s at its first pose, then the complete trajectory.
 
     Args:
         times: (N,) increasing, from 0 [s].

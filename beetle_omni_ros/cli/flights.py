@@ -43,23 +43,24 @@ def fly(bag: Annotated[Path, typer.Option(
         seed: SeedOption = 0,
         actuators: Annotated[Optional[str], typer.Option(
             '--actuators', metavar='emulated|direct',
-            help='Through joint_bridge_node, rotor_bridge_node, serial ports and emulated '
-                 'devices, the default; or straight into the simulated plant.')] = None,
+            help='emulated (default): commands go through joint_bridge_node, rotor_bridge_node, '
+                 'serial ports and emulated devices; direct: they go straight to the simulated '
+                 'plant.')] = None,
         clock: Annotated[str, typer.Option(
             '--clock', metavar='auto|system|simulated',
-            help='Real time on the system clock; or simulated time on /clock, which waits for '
-                 'nodes that are late, with direct actuators; auto: simulated where the computer '
-                 'is too slow for real time.')] = 'auto',
+            help='system: real time; simulated: simulated time on /clock, which waits for late '
+                 'nodes, with direct actuators; auto: simulated if the computer is too slow for '
+                 'real time.')] = 'auto',
         robot: RobotOption = None,
         plant: PlantOption = None,
         policy: PolicyOption = None,
         allow_other_robot: OtherRobotOption = False,
         standby: Annotated[bool, typer.Option(
-            '--standby/--alone', help='The other controller runs too, to be selected in flight; '
-                                      'or only the active one.')] = True,
+            '--standby/--alone', help='Run the other controllers on standby, to be selected in '
+                                      'flight, or only the active controller.')] = True,
         composed: Annotated[bool, typer.Option(
-            '--composed/--separate', help='One process, and one for the bridges; or one for '
-                                          'each node.')] = True,
+            '--composed/--separate', help='One process for all nodes and one for the bridges, or '
+                                          'one process for each node.')] = True,
         faults: FaultsOption = None,
         domain_id: Annotated[Optional[int], typer.Option(
             '--domain-id', min=0, max=101, help='ROS domain. Default: a free one.')] = None,
@@ -110,12 +111,12 @@ def evaluate(controllers: Annotated[str, typer.Option(
              allow_other_robot: OtherRobotOption = False,
              bag: Annotated[Optional[Path], typer.Option(
                  '--bag', metavar='DIR', help='New folder for the bag; with several controllers '
-                                              'it holds one bag for each.')] = None,
+                                              'it contains one bag for each.')] = None,
              compression: CompressionOption = 'none',
              faults: FaultsOption = None,
              json_path: JsonOption = None):
     """
-    Fly a task in one process: deterministic and faster than real time.
+    Fly a task in one process, deterministic and without a real-time clock.
 
     Plant, sensors, estimator, controllers and actuators are those of the ROS graph.
     Example: beetle_omni evaluate --controllers nmpc --task random100 --json result.json
@@ -146,7 +147,7 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
                 help=f'Of {KNOWN}. Default: the policies and NMPCs that are shipped, as far as '
                      'there.')] = None,
             tasks: Annotated[Optional[str], typer.Option(
-                '--tasks', metavar='TASK,...', help='Names or pose files; default: all.')] = None,
+                '--tasks', metavar='TASK,...', help='Names or pose files. Default: all.')] = None,
             conditions: Annotated[str, typer.Option(
                 '--conditions', metavar='NAME,...')] = ','.join(CONDITIONS),
             seeds: Annotated[Optional[str], typer.Option(
@@ -154,27 +155,29 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
                 help='Default: 0,1, and 0 for tasks of more than 50 s.')] = None,
             policy: PolicyOption = None,
             jobs: Annotated[Optional[int], typer.Option(
-                '--jobs', '-j', min=1, help='Flights at a time. Default: one a core.')] = None,
+                '--jobs', '-j', min=1, help='Parallel flights. Default: one on each core.')]
+            = None,
             backend: Annotated[str, typer.Option(
-                '--backend', metavar='processes|ray', help='This computer, or Ray.')]
+                '--backend', metavar='processes|ray', help='Run the flights on this computer, or '
+                                                           'on Ray.')]
             = 'processes',
             address: Annotated[Optional[str], typer.Option(
                 '--ray-address', metavar='ADDRESS', envvar='RAY_ADDRESS',
-                help='Of a running cluster. Default: Ray on this computer.')] = None,
+                help='Address of a running cluster. Default: Ray on this computer.')] = None,
             output: Annotated[Path, typer.Option(
                 '--output', '-o', metavar='DIR', help='Folder for page, pictures and JSON.')]
             = Path('comparison'),
             cache: Annotated[Optional[Path], typer.Option(
-                '--cache', metavar='DIR', help='Where finished flights are kept. '
-                                               'Default: .flights in the output.')] = None,
+                '--cache', metavar='DIR', help='Cache of finished flights. Default: .flights in '
+                                               'the output.')] = None,
             fresh: Annotated[bool, typer.Option(
-                '--fresh', help='Fly again what is kept.')] = False,
+                '--fresh', help='Ignore the cache.')] = False,
             json_path: JsonOption = None):
     """
     Fly every experiment with several controllers and write one page about it.
 
-    An interrupted or repeated comparison flies only what is missing.
-    Example: beetle_omni compare --controllers rl,nmpc --tasks waypoints --seeds 0,1,2
+    An interrupted or repeated comparison flies only the missing flights. Example: beetle_omni
+    compare --controllers rl,nmpc --tasks waypoints --seeds 0,1,2
     """
     from beetle_omni_ros.runs.json_file import check_writable
     arguments = {'controllers': names('--controllers', controllers),
@@ -195,48 +198,52 @@ def compare(controllers: Annotated[Optional[str], typer.Option(
 
 
 def faults(faults: Annotated[Optional[Path], typer.Option(
-               '--faults', metavar='FILE', help='The list. Default: the shipped '
+               '--faults', metavar='FILE', help='List of faults. Default: the shipped '
                                                 'params/faults.yaml.')] = None,
            only: Annotated[Optional[str], typer.Option(
-               '--only', metavar='NAME,...', help='Of the list. Default: all.')] = None,
+               '--only', metavar='NAME,...', help='Faults of the list. Default: all.')] = None,
            starts: Annotated[Optional[str], typer.Option(
-               '--from', metavar='NAME,...', help='hover, moving, upside_down, or random: a '
-                                                  'random moment of random100. Default: the first '
-                                                  'three.')] = None,
+               '--from', metavar='NAME,...', help='Start of the fault: hover, moving, '
+                                                  'upside_down, or random (a random time of '
+                                                  'random100). Default: the first three.')] = None,
            seeds: Annotated[int, typer.Option(
                '--seeds', metavar='N', min=1, help='Flights of each fault from each start.')] = 1,
            seed: Annotated[int, typer.Option(
                '--seed', metavar='N', min=0, max=2**31 - 1,
-               help='Seed of the first flight; the next have the next.')] = 0,
+               help='Seed of the first flight; it grows by one with each further flight.')] = 0,
            conditions: ConditionsOption = 'nominal',
            controller: ControllerOption = DEFAULT,
            landings: Annotated[int, typer.Option(
-               '--landings', metavar='N', min=0, help='Fly N landings from random attitudes in '
-                                                      'place of the list.')] = 0,
+               '--landings', metavar='N', min=0, help='Fly N landings from random attitudes '
+                                                      'instead of the list.')] = 0,
            without_mocap: Annotated[bool, typer.Option(
-               '--without-mocap', help='They lose motion capture as they begin.')] = False,
+               '--without-mocap', help='With --landings: motion capture is lost at the '
+                                       'beginning.')] = False,
            healthy: Annotated[float, typer.Option(
                '--healthy', metavar='HOURS', min=0.0, max=1000.0,
-               help='Fly so long without a fault under each of nominal, published and effects, '
-                    'and count alarms, in place of the list.')] = 0.0,
+               help='Fly for this time without a fault under each of nominal, published and '
+                    'effects, and count false alarms, instead of the list.')] = 0.0,
            ros: Annotated[bool, typer.Option(
-               '--ros', help='Fly what only the ROS graph shows, in real time and in hover: '
-                             'processes killed or stopped, strangers on its topics.')] = False,
+               '--ros', help='Inject the faults that need the ROS graph, in real time and in '
+                             'hover: killed or stopped processes, and other programs that publish '
+                             'on its topics.')] = False,
            jobs: Annotated[Optional[int], typer.Option(
-               '--jobs', '-j', min=1, help='Flights at a time. Default: one a core.')] = None,
+               '--jobs', '-j', min=1, help='Parallel flights. Default: one on each core.')]
+            = None,
            bags: Annotated[bool, typer.Option(
                '--bags', help='Record each flight below --output, and read it back.')] = False,
            output: Annotated[Optional[Path], typer.Option(
                '--output', '-o', metavar='DIR', help='Folder for page, Markdown and JSON.')]
            = None,
            docs: Annotated[Optional[Path], typer.Option(
-               '--docs', metavar='FILE', help='Markdown file whose fault table is renewed.')]
+               '--docs', metavar='FILE', help='Markdown file in which the fault table is '
+                                              'replaced.')]
            = None,
            json_path: JsonOption = None):
     """
-    Fly a list of faults in process, on all cores: what happens, and is it what should.
+    Inject a list of faults into flights, on all cores, and compare outcomes with expectations.
 
-    Each fault strikes in hover, on the move and upside down; each flight ends with a landing.
+    Each fault occurs in hover, on the move and upside down; each flight ends with a landing.
     Example: beetle_omni faults --only rotor_1_stops,mocap_lost --seeds 3 --output runs_out/faults
     """
     if conditions not in CONDITIONS:
@@ -269,7 +276,7 @@ def report(runs: Annotated[list[Path], typer.Argument(
            = Path('report.html'),
            json_path: JsonOption = None):
     """
-    Make one self-contained HTML page of metrics and plots, several runs side by side.
+    Write one self-contained HTML page with metrics and plots of one or several runs.
 
     Example: beetle_omni report flight_a flight_b --output report.html
     """
@@ -288,24 +295,27 @@ def film(runs: Annotated[list[Path], typer.Argument(
              '--output', '-o', metavar='FILE', help='The film, .gif or .mp4; may be repeated.')],
          model: Annotated[Optional[list[Path]], typer.Option(
              '--model', metavar='FILE',
-             help='Robot file: over one RUN, what its model expects from the commands, put right '
-                  'each second; a panel for each --model.')] = None,
+             help='Robot file whose prediction is drawn over one RUN; it starts again from the '
+                  'recorded state each second; one panel for each --model.')] = None,
          robot: Annotated[Optional[Path], typer.Option(
-             '--robot', metavar='FILE', help='Dimensions of the robot that is drawn. '
+             '--robot', metavar='FILE', help='Robot file with the dimensions for drawing. '
                                              'Default: the shipped params/robot.yaml.')] = None,
          start: Annotated[float, typer.Option(
-             '--start', metavar='SECONDS', help='Since the first target.')] = 0.0,
+             '--start', metavar='SECONDS', help='Start of the film, after the first '
+                                                'target.')] = 0.0,
          duration: Annotated[Optional[float], typer.Option(
-             '--duration', metavar='SECONDS', help='Of the flight. Default: to its end.')] = None,
+             '--duration', metavar='SECONDS', help='Duration of the film. Default: to the end of '
+                                                   'the flight.')] = None,
          speed: Annotated[float, typer.Option(
-             '--speed', metavar='FACTOR', min=0.05, max=50.0, help='1 is real time.')] = 1.0,
+             '--speed', metavar='FACTOR', min=0.05, max=50.0, help='Speed of the film; 1 is real '
+                                                                   'time.')] = 1.0,
          size: Annotated[int, typer.Option(
              '--size', metavar='PIXELS', min=160, max=1600, help='Width of a panel, even.')]
          = 440):
     """
-    Draw recorded flights as a film: the robot, its target, its path, errors, thrusts.
+    Render recorded flights as a film: robot, target, path, errors and thrusts.
 
-    Needs an OpenGL that draws without a window; says what to install where there is none.
+    Needs an OpenGL for off-screen rendering; without it, a message names the packages to install.
     Example: beetle_omni film my_run/rl my_run/nmpc --output flight.gif
     """
     from beetle_omni_ros.runs.json_file import check_writable

@@ -1,4 +1,4 @@
-"""Subcommands that meet a running robot or graph: check, drive, view."""
+"""Subcommands for a running robot or graph: check, drive, view."""
 
 from __future__ import annotations
 
@@ -12,30 +12,33 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 
 def check(servo_port: Annotated[Optional[str], typer.Option(
-              '--servo-port', metavar='PORT', help='Default: that of --servo-bus.')] = None,
+              '--servo-port', metavar='PORT', help='Serial port of the servos. Default: the port '
+                                                   'in --servo-bus.')] = None,
           board_port: Annotated[Optional[str], typer.Option(
-              '--board-port', metavar='PORT', help='Default: that of --motor-board.')] = None,
+              '--board-port', metavar='PORT', help='Serial port of the motor board. Default: the '
+                                                   'port in --motor-board.')] = None,
           servo_bus: Annotated[Optional[Path], typer.Option(
-              '--servo-bus', metavar='FILE', help='Default: the shipped '
-                                                  'params/servo_bus.yaml.')] = None,
+              '--servo-bus', metavar='FILE', help='Settings of the servo bus. Default: the '
+                                                  'shipped params/servo_bus.yaml.')] = None,
           motor_board: Annotated[Optional[Path], typer.Option(
-              '--motor-board', metavar='FILE', help='Default: the shipped '
-                                                    'params/motor_board.yaml.')] = None,
+              '--motor-board', metavar='FILE', help='Settings of the motor board. Default: the '
+                                                    'shipped params/motor_board.yaml.')] = None,
           robot: PublishedOption = None,
           seconds: Annotated[float, typer.Option(
-              '--seconds', min=1, max=600, help='To listen to the motor board, and to ROS.')]
+              '--seconds', min=1, max=600, help='Time to receive from the motor board, and from '
+                                                'ROS.')]
           = 3.0,
           skip: Annotated[Optional[list[str]], typer.Option(
               '--skip', metavar='servos|board|ros', help='Leave a part out; may be '
                                                          'repeated.')] = None,
           namespace: Annotated[str, typer.Option(
-              '--namespace', metavar='NAME', help="Of the robot's topics.")] = '',
+              '--namespace', metavar='NAME', help="Namespace of the robot's topics.")] = '',
           discovery: DiscoveryOption = None,
           json_path: JsonOption = None):
     """
-    Look at the real robot before a flight: ports, servos, motor board, MoCap, IMU, clocks.
+    Check the real robot before a flight: ports, servos, motor board, MoCap, IMU, clocks.
 
-    Nothing moves and nothing is set. Exit status 0: nothing failed; 1: something did.
+    It moves nothing and changes no setting. Exit status 0: nothing failed; 1: something failed.
     Example: beetle_omni check --servo-port /dev/ttyUSB0 --skip board
     """
     def listen(duration):
@@ -50,8 +53,8 @@ def check(servo_port: Annotated[Optional[str], typer.Option(
 
 
 def drive(source: Annotated[str, typer.Argument(
-              metavar='keyboard|joystick|terminal', help='Keys of this terminal; the topic joy; '
-                                                         'or lines of words.')] = 'keyboard',
+              metavar='keyboard|joystick|terminal', help='Input: keys of this terminal, the topic '
+                                                         'joy, or typed commands.')] = 'keyboard',
           parameters: Annotated[Optional[Path], typer.Option(
               '--params', metavar='FILE', help='Limits, axes, buttons and named poses. Default: '
                                                'the shipped params/drive.yaml.')] = None,
@@ -63,7 +66,7 @@ def drive(source: Annotated[str, typer.Argument(
                                                   '0.')] = None,
           discovery: DiscoveryOption = None):
     """
-    Drive a running graph by hand: targets at limited speed, through the supervisor as any other.
+    Drive a running graph by hand: the target moves at limited speed, within all supervisor checks.
 
     Example: beetle_omni drive keyboard
     """
@@ -73,38 +76,40 @@ def drive(source: Annotated[str, typer.Argument(
 
 
 def view(runs: Annotated[Optional[list[Path]], typer.Argument(
-             metavar='RUN...', help='Recorded bags to play over each other; none: a running '
+             metavar='RUN...', help='Recorded bags, shown together; without RUN: a running '
                                     'graph.')] = None,
          at: Annotated[float, typer.Option(
-             '--at', metavar='SECONDS', min=0.0, help='Of a RUN: where to begin.')] = 0.0,
+             '--at', metavar='SECONDS', min=0.0, help='With RUN: start of the playback.')] = 0.0,
          paused: Annotated[bool, typer.Option(
-             '--paused', help='Of a RUN: do not play at once.')] = False,
+             '--paused', help='With RUN: do not start the playback.')] = False,
          allow_targets: Annotated[bool, typer.Option(
-             '--allow-targets', help='Of a running graph: poses dragged in the page become '
+             '--allow-targets', help='For a running graph: poses dragged in the page become '
                                      'targets, and controllers can be selected there.')] = False,
          namespace: Annotated[str, typer.Option(
-             '--namespace', metavar='NAME', help='Of the topics of a running graph.')] = '',
+             '--namespace', metavar='NAME', help='Namespace of the topics of a running '
+                                                 'graph.')] = '',
          domain_id: Annotated[Optional[int], typer.Option(
              '--domain-id', min=0, max=101,
              help='ROS domain of a running graph. Default: ROS_DOMAIN_ID.')] = None,
          discovery: DiscoveryOption = None,
          robot: Annotated[Optional[Path], typer.Option(
-             '--robot', metavar='FILE', help='Where rotors sit and forces act. '
-                                             'Default: the shipped params/robot.yaml.')] = None,
+             '--robot', metavar='FILE', help='Robot file with the positions of rotors. Default: '
+                                             'the shipped params/robot.yaml.')] = None,
          urdf: Annotated[Optional[Path], typer.Option(
-             '--urdf', metavar='FILE', help='What the robot looks like. '
-                                            'Default: the shipped description.')] = None,
+             '--urdf', metavar='FILE', help="URDF of the robot's shape. Default: the shipped "
+                                            'description.')] = None,
          host: Annotated[str, typer.Option(
-             '--host', metavar='ADDRESS', help='Where the page is served; 0.0.0.0: to the whole '
-                                               'network.')] = '127.0.0.1',
+             '--host', metavar='ADDRESS', help='Address at which the page is served; 0.0.0.0: to '
+                                               'the whole network.')] = '127.0.0.1',
          port: Annotated[int, typer.Option(
-             '--port', min=1, max=65535, help='Of the page; the next free one is taken.')] = 8080,
+             '--port', min=1, max=65535, help='Port of the page; the next free port is '
+                                              'used.')] = 8080,
          dark: Annotated[bool, typer.Option('--dark', help='Begin with dark colours.')] = False):
     """
     Show a running graph, or play recorded runs, in 3D in the browser.
 
-    Prints the address of the page, which needs no network, and serves it until Ctrl-C.
-    Example: beetle_omni view my_run/rl my_run/nmpc
+    Prints the address of the page, which needs no network, and runs until Ctrl-C. Example:
+    beetle_omni view my_run/rl my_run/nmpc
     """
     shared = {'robot': robot, 'urdf': urdf, 'host': host, 'port': port, 'dark': dark}
     if runs:

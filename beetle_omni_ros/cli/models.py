@@ -1,4 +1,4 @@
-"""Subcommands that learn from data: gap, identify joint, identify rotor, train."""
+"""Subcommands that use data: gap, identify joint, identify rotor, train."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ HOLDOUT = '--holdout'
 def gap(runs: Annotated[list[Path], typer.Argument(
             metavar='RUN...', help='Recorded flights (bags), or one joint log (CSV).')],
         holdout: Annotated[Optional[list[Path]], typer.Option(
-            HOLDOUT, metavar='RUN...', help='Flights that only judge. Default: the last run, '
-                                            'where there are three or more.')] = None,
+            HOLDOUT, metavar='RUN...', help='Flights for validation only. Default: the last run '
+                                            'of three or more.')] = None,
         robot: Annotated[Optional[Path], typer.Option(
-            '--robot', metavar='FILE', help='What the flights are compared with. '
+            '--robot', metavar='FILE', help='Robot file with which the flights are compared. '
                                             'Default: the shipped params/robot.yaml.')] = None,
         apply: Annotated[Optional[Path], typer.Option(
-            '--apply', metavar='FILE', help='Write the robot file with what was named.')] = None,
+            '--apply', metavar='FILE', help='Write a robot file with the named effects.')] = None,
         page: Annotated[Optional[Path], typer.Option(
             '--report', metavar='FILE', help='Write an HTML page with the plots.')] = None,
         parameters: Annotated[Optional[Path], typer.Option(
             '--gap', metavar='FILE', help='Changes to params/gap.yaml.')] = None,
         fix: Annotated[bool, typer.Option(
-            '--fix', help='Correct damaged recordings where the correction is certain; the bags '
-                          'stay as they are.')] = False,
+            '--fix', help='Correct damaged recordings if the correction is certain; the bags stay '
+                          'unchanged.')] = False,
         tolerances: Annotated[bool, typer.Option(
             '--tolerances', help="With --apply: also write this robot's own mass, inertia, gains, "
                                  'lags and rotor positions, as fitted within tolerance.')] = False,
         json_path: JsonOption = None):
     """
-    Find where model and measurement disagree, name the effect, add it, show the gap shrink.
+    Compare flights with the robot model, identify the missing effect and add it to the model.
 
     Example: beetle_omni gap flight1 flight2 --holdout flight3 --apply robot_new.yaml
     """
@@ -50,9 +50,9 @@ def gap(runs: Annotated[list[Path], typer.Argument(
 
 def spread(arguments: list[str]) -> list[str]:
     """
-    Let `gap RUN... --holdout RUN RUN` mean two flights that judge, not a third that is fitted.
+    Interpret `gap RUN... --holdout RUN RUN` as two held-out flights.
 
-    Without a run before it, `--holdout` takes one, and the runs follow.
+    If no run precedes `--holdout`, only the first run after it is held out.
     """
     spread, runs, holding = [], 0, False
     for k, argument in enumerate(arguments):
@@ -74,11 +74,11 @@ def joint(logs: Annotated[list[Path], typer.Argument(
               metavar='LOG', help='Response log (CSV) or recorded run (bag), see '
                                   'docs/how-to/identification.md.')],
           validate: Annotated[Optional[list[Path]], typer.Option(
-              '--validate', metavar='LOG.csv...', help='Further logs, which only judge.')] = None,
+              '--validate', metavar='LOG.csv...', help='Further logs for validation.')] = None,
           robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,
           json_path: JsonOption = None):
     """
-    Identify the tilt servos from the first 60 % of a response log; the rest judges.
+    Fit servo models to the first 60 % of a response log; the rest is for validation.
 
     Example: beetle_omni identify joint slow.csv --validate fast.csv --report servos.html
     """
@@ -92,11 +92,12 @@ def joint(logs: Annotated[list[Path], typer.Argument(
 
 
 def rotor(log: Annotated[Path, typer.Argument(
-              metavar='LOG.csv', help='Bench log, see docs/how-to/identification.md.')],
+              metavar='LOG.csv', help='Log of a force-torque stand, see '
+                                      'docs/how-to/identification.md.')],
           robot: PublishedOption = None, report: PageOption = None, params: ParamsOption = None,
           json_path: JsonOption = None):
     """
-    Identify thrust map and torque ratio of a rotor from a force-torque log.
+    Fit thrust map and torque ratio of a rotor to a force-torque log.
 
     Example: beetle_omni identify rotor bench.csv --params my_robot.yaml --report rotor.html
     """
@@ -113,23 +114,24 @@ def train(output: Annotated[Path, typer.Option(
               '--set', metavar='KEY=VALUE', help='Replace a parameter, e.g. iterations=5000 or '
                                                  'ppo.robots=8192; may be repeated.')] = None,
           seed: Annotated[Optional[int], typer.Option(
-              '--seed', min=0, max=2**31 - 1, help='Of everything random.')] = None,
+              '--seed', min=0, max=2**31 - 1, help='Seed of all random numbers.')] = None,
           memory: Annotated[Optional[bool], typer.Option(
-              '--memory', help='The policy also sees the estimated disturbance.')] = None,
+              '--memory', help='Add the estimated disturbance to the inputs of the '
+                               'policy.')] = None,
           device: Annotated[str, typer.Option('--device', help='auto, cpu, cuda[:N].')] = 'auto',
           resume: Annotated[Optional[Path], typer.Option(
-              '--resume', metavar='DIR', help="Go on from a run's last checkpoint, or from a "
-                                              'model_N.pt.')] = None,
+              '--resume', metavar='DIR', help='Continue from the last checkpoint of a run, or '
+                                              'from a model_N.pt.')] = None,
           smoke: Annotated[bool, typer.Option(
-              '--smoke', help='Tiny sizes: does everything fit together?')] = False,
+              '--smoke', help='A test of all parts with tiny sizes.')] = False,
           stop_after: Annotated[Optional[float], typer.Option(
               '--stop-after', min=0, metavar='SECONDS', help='Stop training early.')] = None,
           robot: Annotated[Optional[Path], typer.Option(
-              '--robot', metavar='FILE', help='The robot that is trained, with its effects. '
+              '--robot', metavar='FILE', help='Robot file for the training, with its effects. '
                                               'Default: the shipped params/robot.yaml.')] = None,
           json_path: JsonOption = None):
     """
-    Train a policy and export it to ONNX; needs the extra 'train', and a GPU to be useful.
+    Train a policy and export it to ONNX; needs the extra 'train' and a GPU.
 
     Several GPUs: torchrun --nproc-per-node N -m beetle_omni_ros.cli train --output DIR
     """

@@ -1,4 +1,4 @@
-"""What several subcommands share: options, exit statuses, checks of their input."""
+"""Options, exit statuses and input checks that several subcommands share."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ TaskOption = Annotated[str, typer.Option(
                    'force, torque or payload.', metavar='TASK')]
 ConditionsOption = Annotated[str, typer.Option(
     '--conditions', metavar='nominal|published',
-    help="The simulator as measured, or with the publication's randomisation drawn from --seed.")]
+    help="nominal: the simulator with the measured parameters; published: with the publication's "
+         'randomisation, drawn from --seed.')]
 SeedOption = Annotated[int, typer.Option(
-    '--seed', min=0, max=2**31 - 1, help='Of random poses and of everything random in the '
-                                         'simulation.')]
+    '--seed', min=0, max=2**31 - 1, help='Seed of random poses and of the simulation.')]
 RobotOption = Annotated[Optional[Path], typer.Option(
-    '--robot', metavar='FILE', help='What estimator and controller believe. '
-                                    'Default: the shipped params/robot.yaml.')]
+    '--robot', metavar='FILE', help='Robot file of estimator and controller. Default: the shipped '
+                                    'params/robot.yaml.')]
 PublishedOption = Annotated[Optional[Path], typer.Option(
-    '--robot', metavar='FILE', help='The robot as believed so far. '
-                                    'Default: the shipped params/robot.yaml.')]
+    '--robot', metavar='FILE', help='The present robot file. Default: the shipped '
+                                    'params/robot.yaml.')]
 PlantOption = Annotated[Optional[Path], typer.Option(
-    '--plant', metavar='FILE', help='What is true in the simulation. Default: as --robot.')]
+    '--plant', metavar='FILE', help='Robot file of the simulated plant. Default: as --robot.')]
 PolicyOption = Annotated[Optional[Path], typer.Option(
     '--policy', metavar='FILE',
     help=f"Another policy (ONNX) for the controller '{registry.owner('--policy')}'.")]
@@ -44,14 +44,14 @@ OtherRobotOption = Annotated[bool, typer.Option(
                                 'parameters.')]
 DiscoveryOption = Annotated[Optional[str], typer.Option(
     '--discovery', metavar='LOCALHOST|SUBNET|OFF|SYSTEM_DEFAULT',
-    help='Who can find the nodes. Default: programs of this computer alone.')]
+    help='Range in which nodes are visible. Default: programs on this computer only.')]
 CompressionOption = Annotated[str, typer.Option(
-    '--compression', metavar='none|zstd', help='Of the chunks in the bag.')]
+    '--compression', metavar='none|zstd', help='Compression of the chunks in the bag.')]
 FaultsOption = Annotated[Optional[Path], typer.Option(
-    '--faults', metavar='FILE', help='What fails, when and for how long (YAML, see '
+    '--faults', metavar='FILE', help='Faults with times and durations (YAML, see '
                                      'docs/faults.md).')]
 JsonOption = Annotated[Optional[Path], typer.Option(
-    '--json', metavar='FILE', help='Write the results there as JSON.')]
+    '--json', metavar='FILE', help='Write the results as JSON.')]
 
 
 def fail(error: Exception | str, status: int) -> int:
@@ -64,7 +64,7 @@ MAY_BE_EMPTY = ('--namespace',)
 
 
 def refuse_empty(args: list[str]) -> None:
-    """Refuse '' as a value: as a path it would be the working folder, as a name nothing."""
+    """Refuse '' as a value: as a path it would mean the working folder."""
     for option, value in zip(['', *args], args):
         if value == '' and option not in MAY_BE_EMPTY:
             where = option if option.startswith('-') else 'argument'
@@ -73,11 +73,11 @@ def refuse_empty(args: list[str]) -> None:
 
 def usage_text(error: Exception, args: list[str]) -> str:
     """
-    One line about a usage error of typer's parser: what was given where, what was expected.
+    Text of a usage error of typer's parser: the given value, its option, the expected value.
 
     Args:
         error: with ``format_message()``; a wrong value has ``param`` and ``ctx``.
-        args: of the command line, in which the value is looked for.
+        args: of the command line, in which the value is searched.
 
     """
     text, context = error.format_message(), getattr(error, 'ctx', None)
@@ -95,7 +95,7 @@ def usage_text(error: Exception, args: list[str]) -> str:
 
 
 def check_flight(*, task, seed, conditions, bag, compression, json_path, files):
-    """Refuse unusable input before anything long starts."""
+    """Refuse unusable input before the flight starts."""
     from beetle_omni_ros.runs.json_file import check_writable
     from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS
     from beetle_omni_ros.runs.tasks import make_task
