@@ -1,4 +1,4 @@
-"""The whole contract between the flight stack and a controller."""
+"""The interface between the flight stack and a controller."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ ROTORS = 4
 @dataclass(frozen=True)
 class Command:
     """
-    What a controller asks of the actuators.
+    Targets of the actuators, computed by a controller.
 
     Attributes:
-        stamp: time of the state estimate that it answers [s].
+        stamp: of the state estimate from which it was computed [s].
         tilt: (4,) tilt joint targets [rad].
         thrust: (4,) rotor thrust targets [N].
 
@@ -34,7 +34,7 @@ class Command:
 @dataclass(frozen=True)
 class State:
     """
-    The estimated state that a controller acts on.
+    The estimated state, input of a controller.
 
     Attributes:
         stamp: time of the estimate [s].
@@ -45,7 +45,7 @@ class State:
         tilt: (4,) latest measured tilt angles [rad].
         tilt_velocity: (4,) their rates [rad/s].
         tilt_stamp: capture time of ``tilt`` [s].
-        command: the command in force (of whichever controller), or None before the first.
+        command: the last executed command, of any controller, or None before the first.
 
     """
 
@@ -106,7 +106,7 @@ class PoseTarget:
         return Reference(self.position, self.quaternion, np.zeros(3), np.zeros(3))
 
     def same_pose(self, other: PoseTarget) -> bool:
-        """Whether another target asks for the same."""
+        """Whether another target is the same pose."""
         return np.array_equal(self.position, other.position) \
             and np.array_equal(self.quaternion, other.quaternion)
 
@@ -114,7 +114,7 @@ class PoseTarget:
 @dataclass(frozen=True)
 class TrajectoryTarget:
     """
-    A time-parameterised reference; before its start and after its end the end poses hold.
+    A time-parameterised reference; its first and last pose are held before and after it.
 
     Attributes:
         times: (N,) increasing absolute times [s].
@@ -133,7 +133,7 @@ class TrajectoryTarget:
     stamp: float = field(default=0.0)
 
     def at(self, time: float) -> Reference:
-        """The reference at ``time``: :meth:`sample` of one, at a fraction of its cost."""
+        """The reference at ``time``: faster than :meth:`sample` of one time."""
         own = self.times
         k = min(max(int(own.searchsorted(time, side='right')) - 1, 0), len(own) - 2)
         s = min(max(float((time - own[k]) / (own[k + 1] - own[k])), 0.0), 1.0)
@@ -172,7 +172,7 @@ Target = PoseTarget | TrajectoryTarget
 
 
 class Followed(Protocol):
-    """Anything that has a reference at each time, as both targets do."""
+    """An object with a reference at each time, like both targets."""
 
     def at(self, time: float) -> Reference:
         """The reference at ``time`` [s]."""
@@ -180,46 +180,46 @@ class Followed(Protocol):
 
 class Controller(Protocol):
     """
-    A function of state and target; whatever differs between controllers is inside.
+    A function of state and target with internal memory.
 
-    ``step`` is called once every ``period`` [s] with a fresh state and must not raise on
-    finite input. A standby controller is stepped as well, so that it can take over
-    without a jump; the command in force stands in ``state.command``.
+    ``step`` is called once every ``period`` [s] with a new state and must not raise on finite
+    input. It is also called for a controller on standby, so that this controller can take over
+    without a jump; ``state.command`` is the executed command.
 
-    A controller may have, and needs none of:
+    Optional members of a controller:
 
     - ``diagnostics() -> dict``: health of the last step and since reset, for operators and logs;
-    - ``set_health(health)``, if it can fly with fewer actuators, see :func:`tell_health`;
-    - ``reach``: farthest target that it flies to [m], see :mod:`control.reach`;
-    - ``guidance``: text, what moves the targets that it is given; result tables show it.
+    - ``set_health(health)``, if it can fly with failed actuators, see :func:`tell_health`;
+    - ``reach``: largest distance to a target [m], see :mod:`control.reach`;
+    - ``guidance``: text for result tables, names the functions that modify its targets.
 
-    :mod:`control.registry` says how one is built from a class, and what it is called.
+    :mod:`control.registry` builds a controller from a class and defines its name.
     """
 
     period: float
 
     def reset(self) -> None:
-        """Forget all memory, as before the first step."""
+        """Reset the memory to the state before the first step."""
 
     def step(self, state: State, target: Target) -> Command:
         """One command for one state."""
 
 
 class Fallback(Controller, Protocol):
-    """A controller that the supervisor itself flies: takeoff, fallback and landing."""
+    """A controller that the supervisor uses for takeoff, fallback and landing."""
 
     def step(self, state: State, target: Followed) -> Command:
         """One command for one state."""
 
     def observe(self, state: State, free: bool = True) -> None:
-        """Learn from a state while another one flies; not where ``free`` is False."""
+        """Update estimates while another controller is active, unless ``free`` is False."""
 
     def set_health(self, health: ActuatorHealth) -> None:
         """Fly with what is left."""
 
 
 def corrected(state: State, health: ActuatorHealth) -> State:
-    """A state with true tilts, of one with readings and with the joint targets in force."""
+    """A state with true tilts, computed from a state with encoder readings."""
     if health.zeros == NO_ZEROS:
         return state
     command = state.command
@@ -229,24 +229,24 @@ def corrected(state: State, health: ActuatorHealth) -> State:
 
 
 def tell_health(controller: Controller, health: ActuatorHealth) -> None:
-    """Tell a controller which actuators are left, where it can make use of that."""
+    """Pass the health of the actuators to a controller with ``set_health``."""
     told = getattr(controller, 'set_health', None)
     if told is not None:
         told(health)
 
 
 def guidance_of(controller: Controller) -> str:
-    """What moves the targets that a controller is given, in words; 'none' for nothing."""
+    """Text that names the functions that modify the targets of a controller; 'none' for none."""
     text = getattr(controller, 'guidance', '')
     return text if text and isinstance(text, str) else 'none'
 
 
 def checked(name: str, command: object) -> Command:
     """
-    Return what a controller's ``step`` gave, if it is a command.
+    Check the return value of a controller's ``step`` and return it.
 
     Raises:
-        ParameterError: what else it is, in one line.
+        ParameterError: it is no command; one line.
 
     """
     if not isinstance(command, Command):
@@ -263,5 +263,5 @@ def checked(name: str, command: object) -> Command:
 
 
 def reach_of(controller: Controller) -> float:
-    """Farthest target that a controller flies to [m]; inf where it does not say."""
+    """Largest distance to a target of a controller [m]; inf if it has none."""
     return float(getattr(controller, 'reach', inf))

@@ -1,4 +1,4 @@
-"""Calling one CasADi function with numpy arrays at little cost, compiled or interpreted."""
+"""Fast calls of one CasADi function with numpy arrays, compiled or interpreted."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class FunctionCall:
 
     Args:
         function: with vector inputs and one vector output.
-        library: holds the function's generated code, or None to interpret it.
+        library: with the function's generated code, or None to interpret it.
 
     """
 

@@ -1,12 +1,11 @@
 """
-Offset-free control: what the model does not explain, estimated and predicted with.
+Disturbance estimates for offset-free control.
 
-Three slow estimates from the model's own prediction error: an external force in world,
-an external torque in body and an offset of each servo's resting angle. A wrong mass or
-thrust coefficient, a shifted centre of mass, wind and servo sag under load all end in
-one of them, and the controller that predicts with them leaves no steady error. Beside
-these it carries what no sensor reports, the rotors' thrust, and the tilts at the present
-moment, of which the encoders tell only the past.
+Three slow estimates integrate the prediction error of the model: an external force in world, an
+external torque in body and an offset of each servo's resting angle. A wrong mass or thrust
+coefficient, a shifted centre of mass, wind and servo sag under load are absorbed by one of them. A
+controller that predicts with them has no steady error. The module also predicts quantities that no
+sensor reports: the rotors' thrust, and the present tilts, because encoder readings are delayed.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
-SHORT = 0.002           # [s] nearer to an end of a span a command changes there
-UNNOTICED = 0.3     # [s] what was learnt since then, before a fault was named, was the fault
-HISTORY = 64        # states and commands kept, far more than any latency needs
+SHORT = 0.002           # [s] a command change nearer to an end of a span is treated as at this end
+UNNOTICED = 0.3     # [s] before a fault is reported: the estimates contain the fault
+HISTORY = 64        # number of stored states and commands, more than any latency needs
 
 
 class DisturbanceEstimator:
     """
-    Follows the robot's full state and the disturbances on it.
+    Estimates the robot's full state and the disturbances.
 
     Args:
         robot: what the controller believes.
@@ -59,7 +58,7 @@ class DisturbanceEstimator:
         self.reset()
 
     def reset(self):
-        """Forget everything."""
+        """Reset all estimates."""
         self.disturbance = np.zeros(model.DISTURBANCE_SIZE)
         self._state: np.ndarray | None = None
         self._stamp = -np.inf
@@ -69,9 +68,9 @@ class DisturbanceEstimator:
 
     def set_health(self, health: ActuatorHealth) -> None:
         """
-        Predict with what is left from now on.
+        Predict with the remaining actuators from now on.
 
-        What was taken for a disturbance while a fault was not yet named is forgotten.
+        Changes of the disturbance estimates shortly before the fault was reported are undone.
         """
         self._health = health
         self._movable = np.array([float(angle is None) for angle in health.stuck])
@@ -84,17 +83,17 @@ class DisturbanceEstimator:
                 self._state[model.TILT], self._state[model.THRUST])
 
     def _acting(self, command):
-        """What the actuators that are left make of a command (8,)."""
+        """Effective command (8,) of the remaining actuators."""
         if self._health.healthy:
             return command
         return np.concatenate(self._health.possible(command[:4], command[4:]))
 
     def update(self, state: State) -> np.ndarray:
         """
-        Take in one state estimate.
+        Update with one state estimate.
 
         Returns:
-            (25,) full state predicted to the moment at which a command answering ``state``
+            (25,) full state predicted to the time at which a command computed from ``state``
             reaches the actuators; slices as in :mod:`robot.dynamics`.
 
         """
@@ -104,7 +103,7 @@ class DisturbanceEstimator:
         return self._flown(present, state.stamp, self._delay)
 
     def observe(self, state: State) -> np.ndarray:
-        """Take in one state estimate; returns the (25,) full state at its stamp."""
+        """Update with one state estimate; returns the (25,) full state at its stamp."""
         if state.command is not None and (
                 not self._commands or state.command.stamp > self._commands[-1].stamp):
             self._commands.append(state.command)
@@ -163,7 +162,7 @@ class DisturbanceEstimator:
         self.disturbance = _clipped(self.disturbance + change, self._limit)
 
     def _correct_tilt(self, state, present, step):
-        """Compare the encoders with what the tilt model said at their capture time."""
+        """Compare the encoders with the tilt model at their capture time."""
         modelled = self._modelled_tilt(state.tilt_stamp)
         if modelled is None:
             return
@@ -186,5 +185,5 @@ class DisturbanceEstimator:
 
 
 def _clipped(values, limit):
-    """As np.clip to +-limit, which costs several times as much on a few numbers."""
+    """Clip to +-limit, faster than np.clip for a few numbers."""
     return np.minimum(np.maximum(values, -limit), limit)

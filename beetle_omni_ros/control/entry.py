@@ -1,4 +1,4 @@
-"""What is known of a controller before it flies, and how it is built from its class."""
+"""Registry entries of controllers, and how a controller is built from its class."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import ParameterError
 
-if TYPE_CHECKING:       # which imports CasADi, and a list of names needs none
+if TYPE_CHECKING:       # imports CasADi, which a list of names does not need
     from beetle_omni_ros.robot.parameters import RobotParameters
 
-PERIOD = 0.01               # [s] of a controller whose class does not say
+PERIOD = 0.01               # [s] of a controller whose class has no period
 LONGEST_PERIOD = 1.0        # [s]
 METHODS = {'step': ('state', 'target'), 'reset': ()}     # and their arguments
 NAME = re.compile(r'[a-z][a-z0-9_]*')
-# `<name>_node` and `<name>/command` are taken, or the word means something in results and states.
+# Names whose `<name>_node` or `<name>/command` exists, and words of results and states.
 RESERVED = ('controller', 'ekf', 'joint_bridge', 'meta', 'none', 'operator', 'recorder',
             'reference', 'rotor_bridge', 'sim', 'supervisor', 'viewer')
 
 
 @dataclass(frozen=True)
 class Line:
-    """How a controller is drawn: colour, dashes, marker; no colour: one is chosen."""
+    """Line style of a controller in figures; without a colour one is chosen."""
 
     colour: str = ''
     dashes: str | tuple = '-'
@@ -43,7 +43,7 @@ class Line:
 @dataclass(frozen=True, kw_only=True)
 class ControllerOptions:
     """
-    What a user gives in place of a controller's own files.
+    Files that replace a controller's own files.
 
     Attributes:
         parameters: file of parameters.
@@ -60,28 +60,28 @@ class ControllerOptions:
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ControllerEntry:
     """
-    One controller; everything that takes a controller's name reads it here.
+    One controller; all programs that accept a controller's name use this entry.
 
     Attributes:
         name: of its results, its topic ``<name>/command`` and its node ``<name>_node``.
         controller: class, or 'package.module:Class', called with the robot and, where its
             signature has them, ``parameters`` and ``options``.
-        spec: by which another process finds it; '' means by its name.
+        spec: reference by which another process finds it; '' means its name.
         label: short, for headings of figures.
         description: one line.
-        period: between its commands, as far as is known before it is built [s].
+        period: between its commands, if known before it is built [s].
         parameters: class of its parameters (:mod:`robot.schema`) or 'package.module:Class'.
         parameters_file: shipped file of them; in the package's share, or any path.
-        fixed: parameters that are its own whatever the shipped file says.
-        policy_file: network that it needs; '' for none. Its parameters then have ``policy`` and
+        fixed: parameters that override the shipped file.
+        policy_file: its network; '' for none. With a network its parameters have ``policy`` and
             ``allow_other_robot``.
-        option: of the command line that replaces the one file of this controller alone.
-        guidance: what moves the targets that it is given, see :mod:`control.guidance`.
-        flies_degraded: whether it can fly with actuators missing (``set_health``).
-        stands_by: whether it is in the ROS graph beside another one that flies.
-        compared: whether `beetle_omni compare` flies it when nobody says what.
-        cost: core seconds for a simulated second; orders flights, decides no result.
-        line: how it is drawn.
+        option: of the command line that replaces the file of this controller only.
+        guidance: names the functions that modify its targets, see :mod:`control.guidance`.
+        flies_degraded: whether it can fly with failed actuators (``set_health``).
+        stands_by: whether it runs in the ROS graph on standby.
+        compared: whether `beetle_omni compare` flies it by default.
+        cost: core seconds for a simulated second, to order flights; without influence on results.
+        line: style in figures.
 
     """
 
@@ -104,7 +104,7 @@ class ControllerEntry:
     line: Line = field(default_factory=Line)
 
     def __post_init__(self):
-        """Refuse a name that cannot be one."""
+        """Refuse an invalid name."""
         if not NAME.fullmatch(self.name) or self.name in RESERVED:
             raise ParameterError(
                 f"controller '{self.name}': not usable as a name; expected small letters, digits "
@@ -112,7 +112,7 @@ class ControllerEntry:
 
     @property
     def reference(self) -> str:
-        """By which another process finds it: the name, or where its class is."""
+        """Reference by which another process finds it: its name, or the path of its class."""
         return self.spec or self.name
 
     @property
@@ -135,15 +135,15 @@ class ControllerEntry:
         return path if path.is_file() else share_path(self.parameters_file)
 
     def completed(self, mapping: dict, from_user: bool) -> dict:
-        """Values of a parameter file with the controller's own; a user's file goes before."""
+        """Values of a parameter file and of ``fixed``; a user's file takes precedence."""
         return {**self.fixed, **mapping} if from_user else {**mapping, **self.fixed}
 
     def load_parameters(self, options: ControllerOptions = ControllerOptions()):
         """
-        Parameters as a file and the options say; None for a controller without.
+        Parameters from a file and the options; None for a controller without parameters.
 
         Raises:
-            ParameterError: a file for a controller that reads none, or an unusable one.
+            ParameterError: an unusable file, or a file for a controller without parameters.
 
         """
         kind = self.parameter_class
@@ -168,9 +168,9 @@ class ControllerEntry:
         Build the controller.
 
         Args:
-            robot: what it believes about the robot.
-            options: in place of its own files.
-            parameters: in place of those that files and options give.
+            robot: its model of the robot.
+            options: files that replace its own.
+            parameters: replace those of files and options.
 
         Raises:
             ParameterError: what is wrong with its class or its files, in one line.
@@ -192,7 +192,7 @@ class ControllerEntry:
         except (ParameterError, FileNotFoundError, ImportError):
             raise
         except Exception as error:
-            if isinstance(self.controller, str):    # ours: a fault of the package
+            if isinstance(self.controller, str):    # a shipped controller: a defect of the package
                 raise
             raise ParameterError(f"controller '{self.reference}': building it raised "
                                  f'{_told(error)}') from error
@@ -202,10 +202,10 @@ class ControllerEntry:
     def reach(self, robot: RobotParameters, options: ControllerOptions = ControllerOptions()
               ) -> float:
         """
-        Farthest target that it flies to [m]; inf where it does not say.
+        Largest distance to a target [m]; inf if it has none.
 
-        What is loaded late tells by its parameters, for building may take seconds; another one
-        is built for the answer.
+        For controllers with a late import the value comes from their parameters, because building
+        them may take seconds. Other controllers are built.
 
         Raises:
             ParameterError: as :meth:`make`.
@@ -236,7 +236,7 @@ class ControllerEntry:
                                      f"({', '.join(expected)}); see control/base.py")
 
     def _check(self, controller):
-        """What is built must be a controller."""
+        """Refuse a result that is no controller."""
         self._check_methods(controller)
         for method, expected in METHODS.items():
             call = getattr(controller, method)
@@ -261,16 +261,16 @@ class ControllerEntry:
 
 def entry_of(found: Any, spec: str, name: str = '') -> ControllerEntry:
     """
-    Make an entry of what a reference leads to.
+    Make an entry from an entry, a class or a function.
 
     Args:
         found: an entry, a class, or a function that builds a controller. A class may have
             ``name``, ``Parameters``, ``parameters_file``, ``policy_file`` and ``guidance``.
-        spec: by which other processes find it.
-        name: under which it is registered; '' takes its own.
+        spec: reference by which other processes find it.
+        name: under which it is registered; '' uses its own name.
 
     Raises:
-        ParameterError: it cannot be one.
+        ParameterError: it cannot be registered.
 
     """
     if isinstance(found, ControllerEntry):
@@ -302,16 +302,16 @@ def entry_of(found: Any, spec: str, name: str = '') -> ControllerEntry:
 
 
 def absolute(spec: str) -> str:
-    """The spec with a file's absolute path, good in any folder."""
+    """The spec with an absolute path, valid in any folder."""
     module, _, name = spec.rpartition(':')
     return f'{Path(module).absolute()}:{name}' if module.endswith('.py') else spec
 
 
 def loaded(reference: str, spec: str) -> Any:
     """
-    Import what ``package.module:Name`` or ``path/to/file.py:Name`` leads to.
+    Import the object of ``package.module:Name`` or ``path/to/file.py:Name``.
 
-    Modules are looked for in the working folder, too.
+    Modules are also searched in the working folder.
 
     Args:
         reference: the above.
@@ -378,7 +378,7 @@ def _told(error):
     return f'{type(error).__name__}: {error}{at}'
 
 
-ANY = frozenset({'parameters', 'options'})      # of what has no signature to ask
+ANY = frozenset({'parameters', 'options'})      # if the object has no signature
 
 
 def _names(builder):
@@ -386,7 +386,7 @@ def _names(builder):
     if inspect.isclass(builder) and not any(
             {'__init__', '__new__'} & set(vars(base)) and not getattr(base, '_is_protocol', False)
             for base in builder.__mro__[:-1]):
-        return []       # Protocol's own signature says otherwise
+        return []       # the signature of Protocol itself differs
     try:
         return list(inspect.signature(builder).parameters)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""What a target becomes for a robot of which some actuators fail."""
+"""Replacement of targets for a robot with failed actuators."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 def feasible_target(target: Target, health: ActuatorHealth, robot: RobotParameters,
                     holding: Holding | None = None) -> Target:
     """
-    A target that can be held, as near as possible to the one asked for.
+    A target that can be held, as near as possible to the requested target.
 
-    A pose keeps its position and takes the nearest attitude with the margin for holding. A
-    trajectory keeps positions and velocities; where one of its attitudes lacks the margin, it
-    flies the whole way in the attitude nearest its first that has the margin for flying.
+    A pose keeps its position and gets the nearest attitude with the margin for holding. A
+    trajectory keeps positions and velocities. If one of its attitudes lacks the margin, its
+    attitude becomes constant: the attitude with the margin for flying that is nearest to the
+    first.
 
     Args:
-        target: as asked for.
-        health: what is left of the robot.
+        target: the requested target.
+        health: of the actuators.
         robot: the robot.
-        holding: its table, where it is kept.
+        holding: its table of margins, if already computed.
 
     """
     if health.healthy:

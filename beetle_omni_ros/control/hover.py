@@ -1,20 +1,19 @@
 """
 Hover: PD on the pose with a disturbance observer, then allocation.
 
-The null controller to compare with, and the fallback that the supervisor flies when nothing
-better answers. It needs the robot's parameters, no compiler and no solver, and it is stable
-from any attitude because translation and rotation do not couple on this robot.
+The simplest controller for comparisons, and the fallback of the supervisor. It needs the robot's
+parameters, no compiler and no solver. It is stable from any attitude, because translation and
+rotation do not couple on this robot.
 
     acceleration = Kp e_p + Kd e_v - d           (world)
     angular acceleration = Kp e_R + Kd e_w - d   (base_link)
 
 with e_R the geodesic attitude error and d the acceleration that the commands do not explain: a
-wrong mass, an offset of the centre of gravity, wind. It is the low-passed difference between the
-measured motion and that of the thrusts in force, so it needs no error to grow, knows nothing of
-the target, and is there when this controller takes over from another. The rotors' slow thrust
-response is sped up by a lead on a thrust model, the tilt targets move at a limited rate from the
-command in force, and a rotor whose joint is still on its way pushes only as far as its present
-direction helps.
+wrong mass, an offset of the centre of gravity, wind. d is the low-passed difference between the
+measured acceleration and that of the present thrusts. It does not depend on errors or targets, and
+it is valid when this controller takes over from another. A lead filter compensates the rotors'
+slow thrust response. The tilt targets move at a limited rate from the executed command. A rotor
+whose joint is still turning gives only the thrust that is useful in its present direction.
 """
 
 from __future__ import annotations
@@ -33,13 +32,13 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import group, parameter
 
-LONGEST_STEP = 0.1   # [s] between two states that tell an acceleration
+LONGEST_STEP = 0.1   # [s] between two states from which an acceleration is computed
 DAMPING = 1e-2   # [(1/kg)^2] keeps the thrusts near the plain projection where directions agree
 
 
 @dataclass(frozen=True, kw_only=True)
 class AxisGains:
-    """Gains of three axes as accelerations, so that they hold for any mass and inertia."""
+    """Gains of three axes as accelerations, so that they are valid for any mass and inertia."""
 
     kp: float = parameter(6.0, doc='acceleration for each unit of error', unit='1/s^2', low=0,
                           high=100)
@@ -55,7 +54,7 @@ class AxisGains:
 
 @dataclass(frozen=True, kw_only=True)
 class HoverParameters:
-    """Tuning of the hover controller; params/hover.yaml says why."""
+    """Tuning of the hover controller; params/hover.yaml gives the reasons."""
 
     period: float = parameter(0.01, doc='time between commands', unit='s', low=0.001, high=0.1)
     position: AxisGains = group(AxisGains, 'position and velocity in world')
@@ -82,10 +81,10 @@ class HoverParameters:
 
 class HoverController:
     """
-    Holds a pose, see the module's text.
+    Holds a pose, see the docstring of the module.
 
     Args:
-        robot: what the controller believes about the robot.
+        robot: the controller's model of the robot.
         parameters: tuning; default the shipped file.
 
     """
@@ -100,7 +99,7 @@ class HoverController:
         self.reset()
 
     def set_health(self, health: ActuatorHealth) -> None:
-        """Fly with what is left, from the next step on; callable in flight."""
+        """Use only working actuators from the next step on; may be called in flight."""
         self._health = health
         self._allocator = allocator(self._robot, health)
         self._thrust_max = health.limited(self._robot.rotors.thrust_max)
@@ -108,7 +107,7 @@ class HoverController:
             [np.full(3, self._allocator.mass), self._robot.inertia])[:, None]
 
     def reset(self) -> None:
-        """Forget disturbances and the thrust model; the next step starts from state.command."""
+        """Reset disturbances and thrust model; the next step starts from state.command."""
         self._before: State | None = None
         self._disturbance = np.zeros(6)     # acceleration in world, angular in base_link
         self._stamp: float | None = None
@@ -127,7 +126,7 @@ class HoverController:
         if self._stamp is not None and state.stamp <= self._stamp and self._command is not None:
             return self._command
         gap = state.stamp - self._stamp if self._stamp is not None else self.period
-        dt = min(gap, 5 * self.period)   # after a pause, not one long blind leap
+        dt = min(gap, 5 * self.period)   # after a pause: no single long step
         in_force = state.command
         self.observe(state)
         force, torque = self._wrench(state, target)
@@ -142,11 +141,11 @@ class HoverController:
 
     def observe(self, state: State, free: bool = True) -> None:
         """
-        Learn the disturbance from one state; :meth:`step` does so itself.
+        Update the disturbance with one state; :meth:`step` does the same.
 
         Args:
-            state: with the command in force, whoever gave it.
-            free: False while something else carries the robot, which is not learnt.
+            state: with the executed command, of any controller.
+            free: False while something else carries the robot; the estimate then does not change.
 
         """
         before = self._before
@@ -183,7 +182,7 @@ class HoverController:
                 'saturated_steps': int(self._saturations)}
 
     def _near(self, degraded: DegradedAllocator, state, target, present, force, torque):
-        """Allocation near the present tilts, on the way to what holds a nearby attitude."""
+        """Allocation near the present tilts, towards tilts that hold a nearby attitude."""
         turn = rotations.log(rotations.multiply(rotations.conjugate(state.quaternion),
                                                 target.at(state.stamp).quaternion))
         ahead = rotations.exp(_shortened(turn, self.parameters.attitude.error_limit))
@@ -192,7 +191,7 @@ class HoverController:
         return degraded.allocate_near(force, torque, present, aim, self.parameters.degraded)
 
     def _wrench(self, state, target):
-        """Force beside the weight's support (world) and torque (base_link)."""
+        """Force without the support of the weight (world) and torque (base_link)."""
         reference = target.at(state.stamp)
         to_body = rotations.conjugate(state.quaternion)
         attitude_error = rotations.log(rotations.multiply(to_body, reference.quaternion))
@@ -210,7 +209,7 @@ class HoverController:
         return self._allocator.mass * acceleration, inertia * angular + gyroscopic
 
     def _follow_thrust(self, in_force, dt):
-        """First-order model of the thrusts that a command has built up, ``dt`` from it on."""
+        """First-order model of the thrusts at ``dt`` after a command."""
         if in_force is None:
             self._thrust = np.zeros(4)
         else:
@@ -238,10 +237,11 @@ class HoverController:
 
     def _thrust_on_the_way(self, wished, tilt):
         """
-        Thrusts that, along the rotors' present directions, come nearest the wished wrench.
+        Thrusts along the present rotor directions that are nearest to the desired wrench.
 
         Least squares in linear and angular acceleration within the thrust range: a rotor that
-        points elsewhere is throttled, and with it those whose torque it no longer balances.
+        points in a wrong direction is throttled, and also the rotors whose torque it should
+        balance.
         """
         rotors, matrix = self._robot.rotors, self._scaled
         now = matrix[:, 0::2] * np.cos(tilt) + matrix[:, 1::2] * np.sin(tilt)
@@ -268,7 +268,7 @@ class HoverController:
 
 
 def _pd(gains, error, rate_error):
-    """Acceleration (3,) of proportional and derivative gain, both on shortened errors."""
+    """Acceleration (3,) of proportional and derivative gain, both with limited errors."""
     return gains.kp * _shortened(error, gains.error_limit) \
         + gains.kd * _shortened(rate_error, gains.rate_limit)
 

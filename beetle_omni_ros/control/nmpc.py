@@ -22,20 +22,20 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 
 log = logging.getLogger(__name__)
 FIRST_ITERATIONS = 5     # from a cold start, before the first command
-NARROW = 1e-3            # [rad or N] between bounds of what cannot move; the QP needs an inside
-FAILURES_TO_RESTART = 5  # unsolved cycles in a row after which the horizon starts anew
+NARROW = 1e-3            # [rad or N] between bounds of a failed actuator; the QP needs an interior
+FAILURES_TO_RESTART = 5  # unsolved cycles in a row after which the horizon is initialised again
 
 
 class NmpcController:
     """
     The model-based controller: a :class:`control.base.Controller`.
 
-    Each step estimates disturbances, predicts the state to the moment the command will
-    act, shifts the stored horizon, and solves one QP. An unsolved QP leaves the shifted
-    previous plan in force; after several in a row the horizon is initialised anew.
+    Each step estimates disturbances, predicts the state at the time at which the command will act,
+    shifts the stored horizon, and solves one QP. If a QP is not solved, the shifted previous plan
+    is used; after several in a row the horizon is initialised again.
 
     Args:
-        robot: what the controller believes about the robot.
+        robot: the controller's model of the robot.
         parameters: weights, limits, horizon.
 
     Attributes:
@@ -73,7 +73,7 @@ class NmpcController:
         self._all_bounds = np.r_[np.full(4, -tilt), np.full(4, robot.rotors.thrust_min),
                              np.full(4, tilt), np.full(4, thrust_max),
                              p.limits.velocity, p.limits.rate,
-                             # how far a held target may lead for the lag to keep the rate
+                             # lead of a held target at which the lag has the rate limit
                              p.limits.tilt_rate * intervals / -np.expm1(
                                  -intervals / p.model.servo_lag)]
         self._health, self._bounds = ALL_WELL, self._all_bounds
@@ -81,10 +81,10 @@ class NmpcController:
 
     def set_health(self, health: ActuatorHealth) -> None:
         """
-        Fly with what is left, from the next step on; callable in flight.
+        Use only working actuators from the next step on; may be called in flight.
 
-        Lost rotors are bounded to no thrust, those that hold a thrust to that, the others to what
-        the pack allows, and stuck joints to their angle, in prediction, reference and plan.
+        Bounds in prediction, reference and plan: lost rotors have zero thrust, rotors that hold a
+        thrust have this thrust, other rotors the limit of the pack, and stuck joints their angle.
         """
         if health == self._health:
             return
@@ -112,7 +112,7 @@ class NmpcController:
         return InterpretedRti(**options)
 
     def reset(self) -> None:
-        """Forget estimates and horizon."""
+        """Reset estimates and horizon."""
         self._estimator.reset()
         self._started, self._failures, self._iterate = False, 0, 0
         self._statuses: dict[int, int] = {}
@@ -177,18 +177,19 @@ class NmpcController:
 
 
 def redated(state: State, robot: RobotParameters) -> State:
-    """State with the capture time of its tilts, which may be older than their stamp says."""
+    """State with the capture time of its tilts, which may be before their stamp."""
     delay = robot.sensors.encoder_delay
     return replace(state, tilt_stamp=state.tilt_stamp - delay) if delay else state
 
 
 def with_delays(robot: RobotParameters, parameters: NmpcParameters) -> NmpcParameters:
     """
-    Take the robot file's command delays and servo gains into the controller's model.
+    Add the robot file's command delays and servo gains to the controller's model.
 
-    The mean of the tilts' and the thrusts' delay is predicted across. On the lemniscate 50 ms on
-    the tilts alone then cost 4 mm, 5 mm with all of it predicted, 27 mm with a longer lag of the
-    servos in the horizon, 8 mm when ignored (80 ms: 6 mm with half, a crash when ignored).
+    The prediction uses the mean of the delays of tilts and thrusts. With a delay of 50 ms of the
+    tilts only, the error on the lemniscate is then 4 mm. It is 5 mm with a prediction by the whole
+    delay, 27 mm with a longer servo lag in the horizon, and 8 mm without prediction. With 80 ms it
+    is 6 mm with the mean; without prediction the robot crashes.
     """
     settings = parameters.model
     servo = robot.joints.kd / robot.joints.kp if 'joint_bandwidth' in robot.effects \

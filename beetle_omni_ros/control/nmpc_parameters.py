@@ -17,7 +17,7 @@ LONGEST_HORIZON = 64  # MAX_STAGES of rti.c
 
 @dataclass(frozen=True, kw_only=True)
 class HorizonParameters:
-    """How far and how finely the controller looks ahead."""
+    """Length and grid of the horizon."""
 
     intervals: np.ndarray = parameter(
         [0.02, 0.03, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.2], unit='s',
@@ -29,7 +29,7 @@ class HorizonParameters:
         low=0, high=1, read_only=True)
 
     def __post_init__(self):
-        """Refuse a grid that the solver has no room for."""
+        """Refuse a grid with too many stages for the solver."""
         if self.intervals.ndim != 1 or not 2 <= len(self.intervals) <= LONGEST_HORIZON:
             raise ParameterError(f'horizon.intervals: expected 2 to {LONGEST_HORIZON} lengths '
                                  f'[s], found {self.intervals.tolist()}')
@@ -37,7 +37,7 @@ class HorizonParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelParameters:
-    """What the prediction model holds."""
+    """Options of the prediction model."""
 
     servo_lag: float = parameter(0.03, doc='time constant of the first-order servo model',
                                  unit='s', low=0.002, high=0.5, read_only=True)
@@ -98,7 +98,7 @@ class NmpcWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class DisturbanceParameters:
-    """Estimation of what the model does not explain; a bandwidth of 0 switches one off."""
+    """Disturbance estimates; a bandwidth of 0 switches one off."""
 
     force_bandwidth: float = parameter(3.0, doc='of the external force', unit='rad/s', low=0,
                                        high=50)

@@ -1,9 +1,8 @@
 """
-What a policy sees: the table of its inputs, and how they follow from state and reference.
+Inputs of a policy: their table, and their computation from state and reference.
 
-Nothing is scaled here: a policy takes plain units, whatever it makes of them is inside its
-file. All vectors are in base_link, so that neither place nor heading matters beyond what the
-attitude columns say.
+Inputs are in SI units without scaling; scaling is part of the policy file. All vectors are in
+base_link, so that they do not depend on position, and on heading only by the attitude columns.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ class Block:
 
     Attributes:
         name: of the quantity.
-        size: numbers that it takes.
+        size: number of values.
         unit: SI unit, '1' for pure numbers.
         frame: in which it is expressed, or what it belongs to.
 
@@ -50,7 +49,7 @@ DISTURBANCES = (
 
 
 def blocks(memory: bool) -> tuple[Block, ...]:
-    """Table of a policy's inputs; ``memory``: with the estimated disturbance."""
+    """Table of the inputs of a policy; ``memory``: with the estimated disturbance."""
     return OBSERVATIONS + DISTURBANCES if memory else OBSERVATIONS
 
 
@@ -66,8 +65,8 @@ def observation(state: State, reference: Reference, previous_action,
 
     Args:
         state: position, velocity, attitude, rates and tilts of the robot.
-        reference: what to follow, already at the time looked ahead to.
-        previous_action: (8,) the command in force as an action.
+        reference: at the time of the state plus the lookahead.
+        previous_action: (8,) the executed command as an action.
         disturbance: (6,) or longer: external force in world [N], torque in base_link [N m].
 
     """

@@ -1,13 +1,13 @@
 """
 The NMPC's optimal control problem as stage functions, generated from the robot's model.
 
-One shooting interval: rigid body by Runge-Kutta 4, while the first-order lags of servos
-and rotors are evaluated in closed form at the start, middle and end of the interval. So
-an interval may be much longer than a servo's time constant, which an explicit rule on
-the whole state would not survive. The cost is least squares in position, velocity, the
-vector part of the attitude error quaternion, body rates, tilts, thrusts and the lead of
-commands over what has been reached (beyond the lead that a moving reference needs). With
-the reference attitude fixed it is linear in the state, so its Gauss-Newton Hessian is exact.
+One shooting interval: rigid body by Runge-Kutta 4, while the first-order lags of servos and rotors
+are evaluated in closed form at the start, middle and end of the interval. An interval may
+therefore be much longer than a servo's time constant, for which an explicit rule on the whole
+state would be unstable. The cost is least squares in position, velocity, the vector part of the
+attitude error quaternion, body rates, tilts, thrusts and the lead of commands over what has been
+reached (beyond the lead that a moving reference needs). With the reference attitude fixed it is
+linear in the state, so its Gauss-Newton Hessian is exact.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ def build(robot: RobotParameters, servo_lag: float, rotor_lag: bool,
         servo_lag: time constant of the servos' first-order reduction [s].
         rotor_lag: whether thrust is a state with the robot's rotor time constant
             (21 states) or follows its command at once (17 states).
-        change_time: the cost of command leads counts for at least this long in each
-            interval [s]; else short first intervals would make violent commands cheap.
+        change_time: smallest duration for the cost of command leads in an interval [s]; otherwise
+            aggressive commands in short first intervals would be cheap.
 
     """
     size = 21 if rotor_lag else 17

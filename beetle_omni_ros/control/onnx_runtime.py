@@ -1,8 +1,8 @@
 """
-The library that runs policies, without its telemetry.
+Import of onnxruntime without its telemetry.
 
-From 1.29 on it leaves a file in the temporary folder, keeps threads of its own and reports to its
-maker, unless a variable says otherwise when it is loaded.
+From version 1.29 on it writes a file into the temporary folder, starts threads and sends reports
+to its vendor, unless an environment variable is set when it is loaded.
 """
 
 import os
@@ -11,7 +11,7 @@ OFF = 'ORT_DISABLE_TELEMETRY'
 
 
 def load():
-    """Import onnxruntime; a value that the user gave the variable stays."""
+    """Import onnxruntime; a value of the variable set by the user is kept."""
     os.environ.setdefault(OFF, '1')
     import onnxruntime
     return onnxruntime

@@ -27,7 +27,7 @@ DEFAULT = 'policies/rl.onnx'
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateParameters:
-    """What the estimate of disturbances must know beside the robot."""
+    """Parameters of the disturbance estimate."""
 
     command_delay: float = parameter(0.01, doc='from the state stamp to the actuators', unit='s',
                                      low=0, high=0.1, read_only=True)
@@ -35,7 +35,7 @@ class EstimateParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyParameters(GuidanceParameters):
-    """Which policy, and what stands around it; params/rl.yaml says why."""
+    """Policy file and guidance; params/rl.yaml gives the reasons."""
 
     policy: str = parameter(DEFAULT, doc="ONNX file, in the package's share or any path",
                             read_only=True)
@@ -63,21 +63,20 @@ class PolicyController:
     """
     The learnt controller: a :class:`control.base.Controller`.
 
-    Its previous action is the command in force, whoever gave it, so that it takes over where
-    another controller leaves off. Targets are cut to the limits of the actuators, as they were
-    in training; an output that is not finite or absurdly large goes out as it is, for the
-    supervisor to refuse. Pose targets are shown as :mod:`control.guidance.guidance`
-    moves them.
+    Its previous action is the executed command, of any controller, so that it can take over from
+    another controller. Targets are clipped to the limits of the actuators, as in training. An
+    output that is not finite or extremely large is returned unchanged, so that the supervisor
+    refuses it. :mod:`control.guidance.guidance` modifies pose targets.
 
     Args:
-        robot: what the controller believes about the robot.
-        parameters: which policy and how.
+        robot: the controller's model of the robot.
+        parameters: policy file and guidance.
 
     Attributes:
-        network: what the policy's file computes.
-        contract: what the policy's file says about itself.
-        reach: farthest target [m].
-        guidance: the parts of it that are on.
+        network: the network of the policy file.
+        contract: the metadata of the policy file.
+        reach: largest distance to a target [m].
+        guidance: text that lists its active parts.
 
     Raises:
         ParameterError: the file is missing, broken, or does not fit; one line.
@@ -102,7 +101,7 @@ class PolicyController:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last command, the estimate and all counts."""
+        """Reset the last command, the estimate and all counts."""
         self._command: Command | None = None
         self._steps = self._rejected = self._faults = self._cut = 0
         self._guidance.reset()
@@ -123,22 +122,22 @@ class PolicyController:
 
     def infer(self, state: State, reference: Reference) -> list[float] | None:
         """
-        Observe, ask the network, cut its answer to the limits of the actuators.
+        Compute observation and action, and clip the targets to the limits of the actuators.
 
         Args:
             state: of the robot.
-            reference: what to follow; of a pose target as the guidance moves it.
+            reference: of the target; a pose target is modified by the guidance.
 
         Returns:
-            Tilt targets (4) [rad] and thrust targets (4) [N], or None where a number that the
-            network would see is not finite.
+            Tilt targets (4) [rad] and thrust targets (4) [N], or None if an input of the network
+            is not finite.
 
         """
         observation = self._observe(state, reference)
         return None if observation is None else self._targets(self.network(observation))
 
     def diagnostics(self) -> dict[str, float | int | str]:
-        """Counts since reset, and what a policy with memory estimates."""
+        """Counts since reset, and the disturbance estimates of a policy with memory."""
         told: dict[str, float | int | str] = {
             'policy': self.contract.name, 'steps': self._steps,
             'rejected_states': self._rejected, 'faulty_actions': self._faults,
@@ -150,13 +149,13 @@ class PolicyController:
         return told
 
     def _reference(self, state, target):
-        """What the policy is to follow from this state on."""
+        """The reference of the policy for this state."""
         if isinstance(target, PoseTarget):
             return self._guidance.target(state, target, self._charge.holds(state)).at(state.stamp)
         return target.at(state.stamp + self._parameters.trajectory_lookahead)
 
     def _observe(self, state, reference):
-        """Numbers for the network, or None when one of them is not finite."""
+        """Inputs of the network, or None when one of them is not finite."""
         observation = observed(state, reference, self._previous_action(state))
         if not isfinite(sum(observation)):
             return None
@@ -170,7 +169,7 @@ class PolicyController:
         return observation
 
     def _previous_action(self, state):
-        """The command in force, before the first the measured tilts and hover thrust."""
+        """The executed command; before the first, the measured tilts and hover thrust."""
         command = state.command
         values = state.tilt.tolist() + self._hover if command is None else \
             command.tilt.tolist() + command.thrust.tolist()
@@ -180,7 +179,7 @@ class PolicyController:
         """Tilt and thrust targets, within limits unless the action is a fault."""
         values = [s * a + o for a, o, s in zip(action, self._offset, self._scale)]
         limit = self._parameters.action_limit
-        # also false for what is no number
+        # also false for NaN
         if not all(-limit <= a <= limit for a in action):
             self._faults += 1
             return values
@@ -190,7 +189,7 @@ class PolicyController:
         return cut
 
     def _repeated(self, state):
-        """The last command under the state's stamp; before the first, hover thrust."""
+        """The last command with the state's stamp; before the first, hover thrust."""
         last = self._command
         if last is not None:
             return Command(state.stamp, last.tilt, last.thrust)

@@ -1,10 +1,10 @@
 """
 The checksum of a policy file: ``python -m beetle_omni_ros.control.policy_checksum FILE`` adds it.
 
-A flipped bit in a weight makes another policy, which still loads and still flies. The checksum is
-over everything in the ONNX file but its metadata: graph, weights, versions of the operators. It
-stands in the metadata. Only the outermost layer of the file is looked at, so that no package but
-this one is needed.
+A flipped bit in a weight changes the policy, but the file still loads. The checksum covers the
+ONNX file without its metadata: graph, weights, versions of the operators. It is stored in the
+metadata. The module parses only the outermost layer of the file, so that no other package is
+needed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def checksum(data: bytes) -> str:
 
 
 def stored(data: bytes) -> str | None:
-    """Checksum that stands in an ONNX file's metadata; None: there is none."""
+    """Checksum in the metadata of an ONNX file; None: there is none."""
     found = None
     for field, _, value in fields(data):
         if field == METADATA:
@@ -70,7 +70,7 @@ def verify(data: bytes) -> bool:
 
 def add(path: str | Path) -> str:
     """
-    Write the checksum into a file that has none; nothing else in it changes.
+    Write the checksum into a file without one; the rest of the file is unchanged.
 
     Returns:
         the checksum.
@@ -155,7 +155,7 @@ def _unreadable():
 
 
 def main(paths: list[str]) -> int:
-    """Add checksums; exit status 0, or 2 with one line about the file that cannot have one."""
+    """Add checksums; exit status 0, or 2 with one line about an unusable file."""
     if not paths or paths[0].startswith('-'):
         print(f'usage: python -m {MODULE} FILE...', file=sys.stderr)
         return 2

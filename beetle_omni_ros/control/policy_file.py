@@ -1,10 +1,9 @@
 """
-The contract that a policy file carries in its metadata, free of torch and onnx.
+The metadata of a policy file, without torch and onnx.
 
-A policy is only right together with the names, order, scales, rate and robot that it was
-trained with. All of that stands in the file itself; the loader compares it with what this
-version builds and executes, and refuses a file that does not fit. See
-docs/reference/policy_file.md.
+A policy is only valid with the names, order, scales, rate and robot of its training. The metadata
+contain all of these. The loader compares them with the inputs and outputs of this version, and
+refuses a file that differs. See docs/reference/policy_file.md.
 """
 
 from __future__ import annotations
@@ -31,14 +30,14 @@ TOLERANCE = 1e-6                       # of scales and offsets, which travel as 
 
 
 def kind(memory: bool) -> str:
-    """Name of a policy that sees the estimated disturbance, or does not."""
+    """Name of a policy with or without the estimated disturbance."""
     return 'rl' + ('_memory' if memory else '')
 
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyContract:
     """
-    Everything that a program must know to fly a policy.
+    Description of a policy: inputs, outputs, rate and robot.
 
     Attributes:
         observations: blocks of the input, in their order.
@@ -50,7 +49,7 @@ class PolicyContract:
         robot_hash: :meth:`RobotParameters.hash` of that robot.
         name: of the policy.
         training: conditions: randomisation, seed, iterations, duration and so on.
-        metrics: what the policy reached.
+        metrics: results of the assessment.
         commit: of the code that trained it.
         version: of the package that wrote the file.
         created: ISO 8601.
@@ -81,7 +80,7 @@ class PolicyContract:
 
     @property
     def memory(self) -> bool:
-        """Whether the policy sees the estimated disturbance."""
+        """Whether the estimated disturbance is an input."""
         return any(block.name == DISTURBANCES[0].name for block in self.observations)
 
     @property
@@ -126,10 +125,10 @@ class PolicyContract:
 
     def check(self, robot: RobotParameters, allow_other_robot: bool = False) -> str:
         """
-        Compare with what this version flies on ``robot``.
+        Compare with the description of this version for ``robot``.
 
         Args:
-            robot: the robot as it is believed to be.
+            robot: the model of the robot.
             allow_other_robot: accept a policy that was trained for another one.
 
         Returns:
@@ -157,7 +156,7 @@ class PolicyContract:
 
     def _other_robot(self, robot):
         """'' when trained for ``robot``, else what differs."""
-        # What the estimator corrects is none of the policy's business.
+        # Effects of sensors are corrected by the estimator and do not concern the policy.
         flown = replace(robot, effects={name: values for name, values in robot.effects.items()
                                         if CATALOGUE[name].kind != 'sensor'})
         if self.robot_hash == flown.hash():

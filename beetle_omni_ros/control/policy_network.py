@@ -1,4 +1,4 @@
-"""A policy file as a function: loaded, compared with its contract, warmed up, called cheaply."""
+"""A policy file as a function: loaded, checked and warmed up."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from beetle_omni_ros.robot.yaml_file import shortened
 
 onnxruntime = onnx_runtime.load()
 log = logging.getLogger(__name__)
-WARM_UP = 20            # calls at start, so that none in flight is the slow first one
+WARM_UP = 20            # calls at start, because the first calls are slow
 LONGEST = 1000          # characters of a refusal: the metadata may hold anything
-FATAL_ONLY = 4          # onnxruntime's log level: what fails is raised, and said once by us
+FATAL_ONLY = 4          # onnxruntime's log level: errors are raised, and reported by this module
 LEVEL = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0)   # x and z axis of a level body
 
 
@@ -31,11 +31,11 @@ class PolicyNetwork:
 
     Args:
         path: ONNX file with the metadata of :class:`PolicyContract`.
-        robot: what it shall fly.
+        robot: the robot that it flies.
         allow_other_robot: accept one that was trained for other robot parameters.
 
     Attributes:
-        contract: what the file says about itself.
+        contract: the metadata of the file.
 
     Raises:
         ParameterError: one line with the file and what is missing, broken or different.
@@ -80,7 +80,7 @@ class PolicyNetwork:
             bind(name, 'cpu', 0, np.float32, array.shape, array.ctypes.data)
 
     def _warm_up(self):
-        """Call as in level flight; a network that answers with anything but numbers is broken."""
+        """Call as in level flight; refuse a network whose output is not finite."""
         rest: list[float] = []
         for block in self.contract.observations:
             rest += LEVEL if 'attitude' in block.name else [0.0] * block.size
@@ -114,7 +114,7 @@ def find(path: str | Path) -> Path:
 
 
 def _content(path):
-    """Bytes of the file: what is checked is what is flown."""
+    """Bytes of the file, read once for checks and use."""
     try:
         with open(path, 'rb') as file:
             data = file.read(policy_checksum.LARGEST + 1)
@@ -134,7 +134,7 @@ def _metadata(session):
 
 
 def _session(data):
-    """Open a file's content with onnxruntime: one thread that sleeps when it has nothing to do."""
+    """Open a file's content with onnxruntime: one thread, without spinning."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
@@ -144,13 +144,13 @@ def _session(data):
     try:
         return onnxruntime.InferenceSession(data, options,
                                             providers=['CPUExecutionProvider'])
-    except Exception as error:      # its exceptions have no common class of their own
+    except Exception as error:      # its exceptions have no common base class
         raise ParameterError(f'not a readable ONNX file, truncated perhaps '
                              f'({_reason(error)})') from None
 
 
 def _reason(error):
-    """The telling end of onnxruntime's messages, which begin with codes."""
+    """The informative end of onnxruntime's messages, which begin with codes."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return shortened(lines[0].split(' : ')[-1])
 

@@ -15,7 +15,7 @@ from beetle_omni_ros.robot.degraded_allocation import allocator
 from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-FIRST_ROUNDS = 3        # of allocation under effects for a new target; afterwards each plan is one
+FIRST_ROUNDS = 3        # iterations of allocation with effects for a new target; later one a plan
 DIFFERENCE_STEP = 1e-3  # [s] for the reference's acceleration
 TILT, THRUST, TILT_LEAD, THRUST_LEAD = (slice(13, 17), slice(17, 21), slice(21, 25),
                                         slice(25, 29))
@@ -25,17 +25,17 @@ class ReferencePlanner:
     """
     Poses, rates, tilts and thrusts over the horizon.
 
-    Tilts and thrusts are what holds the target pose (or follows the trajectory) with the
-    estimated disturbances cancelled, each tilt on the legal turn nearest the present angle,
-    unless the turn within +-pi is not much farther: a joint near its stop has a long way to
-    go at the next pose, during which the robot falls.
-    Where they move, a command held over an interval must lead: to bring a first-order lag
-    from one node's value to the next, it exceeds the first by the change / (1 - exp(-h / lag)).
+    Tilts and thrusts hold the target pose (or follow the trajectory) and cancel the estimated
+    disturbances. Each tilt is the legal angle nearest to the present angle, unless the angle
+    within +-pi is not much farther. A joint near its stop would have to turn far for the next
+    pose, during which the robot falls. For moving tilts, a command that is held over an interval h
+    must lead: a first-order lag reaches the next node's value if the command exceeds the first
+    value by the change / (1 - exp(-h / lag)).
 
     Args:
-        robot: what the controller believes.
+        robot: the controller's model of the robot.
         times: (N + 1,) node times from the horizon's start [s].
-        unwind: extra travel [rad] for which a tilt still goes to its turn within +-pi.
+        unwind: largest extra travel [rad] for which a tilt is chosen within +-pi.
         servo_lag: time constant of the servos [s].
 
     """
@@ -54,7 +54,7 @@ class ReferencePlanner:
         self._thrust_lead = 1 / -np.expm1(-length / robot.rotors.time_constant)
 
     def set_health(self, health: ActuatorHealth) -> None:
-        """Allocate with what is left from now on; a stuck joint takes no other turn."""
+        """Allocate with the working actuators from now on; a stuck joint keeps its angle."""
         self._allocator = allocator(self._robot, health)
         self._movable = np.array([angle is None for angle in health.stuck])
 
@@ -95,7 +95,7 @@ class ReferencePlanner:
         return references
 
     def _unwound(self, tilt, present):
-        """Take the turn within +-pi unless that costs the joint too much more travel."""
+        """Choose the tilts within +-pi unless the joint would have to travel much farther."""
         other = tilt - 2 * np.pi * np.sign(tilt)
         detour = np.abs(other - present) - np.abs(tilt - present)
         better = (np.abs(tilt) > np.pi) & (detour < self._unwind) & self._movable
@@ -124,8 +124,8 @@ class EffectWrench:
     """
     Model less allocation, at the nodes of a reference.
 
-    Without it, tilts and thrusts of the reference would not hold its pose in the model, and the
-    plan would settle between the two.
+    Without this correction, tilts and thrusts of the reference would not hold its pose in the
+    model, and the plan would have a steady error.
 
     Args:
         robot: with the effects.

@@ -1,10 +1,10 @@
 """
-The controllers that can be flown: one table for everything that takes a controller's name.
+The table of controllers, for all programs that accept a controller's name.
 
-A name is looked for among the entry points of the group ``beetle_omni_ros.controllers``, to which
-any installed package may add; ``package.module:Class`` and ``path/to/file.py:Class`` lead to a
-class that is registered nowhere. The entry points of this package are read from
-:mod:`control.shipped`, so that a checkout needs no installation.
+Names are entry points of the group ``beetle_omni_ros.controllers``, which any installed package
+may extend. ``package.module:Class`` and ``path/to/file.py:Class`` refer to a class that is not
+registered. The entry points of this package are read from :mod:`control.shipped`, so that a
+checkout needs no installation.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from beetle_omni_ros.control.entry import (
 )
 from beetle_omni_ros.robot.schema import ParameterError
 
-if TYPE_CHECKING:       # which imports CasADi, and a list of names needs none
+if TYPE_CHECKING:       # imports CasADi, which a list of names does not need
     from beetle_omni_ros.robot.parameters import RobotParameters
 
 GROUP = 'beetle_omni_ros.controllers'
 SHIPPED: Mapping[str, ControllerEntry] = {
     name: entry for name, entry in vars(shipped).items() if isinstance(entry, ControllerEntry)}
-DEFAULT = next(iter(SHIPPED))       # who flies when nobody says who
+DEFAULT = next(iter(SHIPPED))       # the default controller
 
 
 @cache
@@ -53,10 +53,11 @@ def add(found: Any) -> ControllerEntry:
     """
     Register a class, or a function that builds a controller, in this process under its name.
 
-    One of the same name that was added before is replaced, as when a notebook's cell runs again.
+    A controller of the same name that was added before is replaced, for example when a notebook
+    cell runs again.
 
     Raises:
-        ParameterError: it cannot be one, or its name is that of another package's controller.
+        ParameterError: it is no controller, or its name is used by another package.
 
     """
     entry = entry_of(found, '')
@@ -134,13 +135,13 @@ def make(reference: str, robot: RobotParameters,
 
 def pilot(among: Iterable[str] | None = None) -> str:
     """
-    Name of the controller that lands the robot when actuators are lost, whoever flew it.
+    Name of the controller that lands the robot when actuators are lost.
 
     Args:
-        among: names that are there; None: all that are registered.
+        among: available names; None: all registered names.
 
     Returns:
-        The first shipped one that can; '' where none of them is there.
+        The first shipped controller that can; '' if none is available.
 
     """
     there = set(SHIPPED if among is None else among)
@@ -149,12 +150,12 @@ def pilot(among: Iterable[str] | None = None) -> str:
 
 
 def standing_by() -> list[str]:
-    """Names that are in the ROS graph beside another one that flies."""
+    """Names of the controllers that run on standby in the ROS graph."""
     return [name for name, entry in SHIPPED.items() if entry.stands_by]
 
 
 def compared() -> list[str]:
-    """Names that are compared when nobody says what; policies first."""
+    """Names that are compared by default; policies first."""
     return sorted((name for name, entry in SHIPPED.items() if entry.compared),
                   key=lambda name: not SHIPPED[name].policy_file)
 

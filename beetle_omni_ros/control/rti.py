@@ -25,7 +25,7 @@ class CompiledRti:
         soft: linear and quadratic slack weight of the velocity and rate limits, or None.
         tolerance: residual at which the QP counts as solved.
         max_iterations: of the QP.
-        reaches: intervals beyond the first in which tilt targets keep within reach.
+        reaches: number of intervals after the first in which the lead of tilt targets is bounded.
         extra: further CasADi functions to compile into the same library.
 
     Raises:
@@ -71,7 +71,7 @@ class CompiledRti:
 
     def step(self, x0, references, disturbance, weights, bounds) -> tuple[int, int]:
         """
-        One iteration; the result stands in ``states`` and ``inputs``.
+        One iteration; the result is in ``states`` and ``inputs``.
 
         Args:
             x0: (nx,) present state.
@@ -79,7 +79,7 @@ class CompiledRti:
             disturbance: (10,) force in world, torque in body, tilt offsets.
             weights: (11,) in the order of ``ocp.WEIGHTS``.
             bounds: (18 + N,) lower and upper input bounds, limits of |v| and |w|, and for each
-                interval how far a tilt target may lead its tilt.
+                interval the largest lead of a tilt target.
 
         Returns:
             QP status (0 solved) and iterations; above 1 nothing has changed.

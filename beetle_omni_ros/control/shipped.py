@@ -1,13 +1,13 @@
 """
-The controllers of this package, each registered as anybody's is.
+The controllers of this package, registered like those of other packages.
 
-docs/how-to/own_controller.md says how.
+docs/how-to/own_controller.md explains the registration.
 
-setup.py makes an entry point of each. Nothing heavy is imported here: what a controller computes
-with is loaded when it is built.
+setup.py makes an entry point of each. This module imports no large libraries; they are loaded when
+a controller is built.
 
-Lines: blue for RL and red for NMPC as in the publication; the variants are lighter and dashed, so
-that all four differ in brightness and in line, too, for those who cannot tell the colours.
+Line styles: blue for RL and red for NMPC as in the publication. The variants are lighter and
+dashed, so that readers who cannot distinguish the colours can also read the figures.
 """
 
 from beetle_omni_ros.control.entry import ControllerEntry, Line

@@ -1,1 +1,1 @@
-"""What may stand around a controller: pose targets, moved so that the robot gets there."""
+"""Guidance: functions around a controller that modify its pose targets."""

@@ -1,9 +1,9 @@
 """
-Guidance: the pose targets that a controller is shown, one way of moving them after the other.
+Guidance: functions that modify the pose targets of a controller, one after the other.
 
-A controller that acts on the present state alone, as a policy does, needs it for wound joints,
-for dives in large turns and for steady errors. It is no part of any controller: one that wants
-it holds a :class:`Guidance`, or is flown inside a :class:`Guided`; another one leaves it.
+A controller that is a function of the present state, like a policy, needs it for wound joints, for
+dives in large turns and for steady errors. Guidance is optional: a controller may contain a
+:class:`Guidance`, or may be wrapped by a :class:`Guided`.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from beetle_omni_ros.control.guidance.unwinding import Unwinding, UnwindingParam
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.schema import group
 
-LATEST = 10     # steps within which a command comes back as the one in force
-NONE = 'none'   # guidance of a controller that flies without
-ALWAYS = 100.0  # [rad] as a limit of the routing: the shortest turn is always flown
+LATEST = 10     # steps within which a command is reported as the executed command
+NONE = 'none'   # text for a controller without guidance
+ALWAYS = 100.0  # [rad] as the limit of routing: routing is off
 
 
 @dataclass(frozen=True, kw_only=True)
 class GuidanceParameters:
-    """What the guidance does; params/rl.yaml says why."""
+    """Parameters of the guidance; params/rl.yaml gives the reasons."""
 
     unwinding: UnwindingParameters = group(
         UnwindingParameters, 'through a level attitude where joints end at their stops')
@@ -49,7 +49,7 @@ class GuidanceParameters:
 
     @property
     def text(self) -> str:
-        """The parts that are on, for result tables."""
+        """Text that lists the active parts, for result tables."""
         parts = {'unwinding': self.unwinding.attempts > 0,
                  'routing': self.routing.tilt < ALWAYS, 'turning': True,
                  'trimming': self.trimming.rate > 0}
@@ -58,14 +58,14 @@ class GuidanceParameters:
 
 class Guidance:
     """
-    Through level for who is stuck, else round joint stops; without dives; without steady errors.
+    Unwinding if the joints are stuck, otherwise routing; then turning and trimming.
 
     Args:
         parameters: of each.
         axes: (4, 3) unit tilt axes in base_link.
 
     Attributes:
-        text: the parts that are on.
+        text: lists the active parts.
 
     """
 
@@ -77,18 +77,18 @@ class Guidance:
         self._trimming = Trimming(parameters.trimming)
 
     def reset(self) -> None:
-        """Forget the target and all that was found on the way to it."""
+        """Reset the memory of the target and of all parts."""
         for part in (self._unwinding, self._routing, self._turning, self._trimming):
             part.reset()
 
     def target(self, state: State, given: PoseTarget, in_charge: bool = True) -> PoseTarget:
         """
-        The pose target that the controller is to see.
+        The modified pose target for the controller.
 
         Args:
             state: of the robot.
             given: the target.
-            in_charge: whether the robot is flying by this controller.
+            in_charge: whether this controller is active.
 
         """
         aim = self._unwinding.target(state, given)
@@ -97,7 +97,7 @@ class Guidance:
         shown = self._turning.target(state, given, aim)
         if shown is given:
             return self._trimming.target(state, given, in_charge)
-        self._trimming.reset()      # on its way elsewhere; joints may come back wound otherwise
+        self._trimming.reset()      # the joints may be wound differently afterwards
         return shown
 
     def diagnostics(self) -> dict[str, int]:
@@ -106,21 +106,21 @@ class Guidance:
 
 
 class Charge:
-    """Whether the robot flies by the commands of one controller."""
+    """Detects whether the executed commands are those of one controller."""
 
     def __init__(self):
         self.reset()
 
     def reset(self) -> None:
-        """Forget the commands."""
+        """Remove all stored commands."""
         self._latest: deque[list[float]] = deque(maxlen=LATEST)
 
     def gave(self, values: list[float]) -> None:
-        """Keep a command: tilts [rad], then thrusts [N]."""
+        """Store a command: tilts [rad], then thrusts [N]."""
         self._latest.appendleft(values)
 
     def holds(self, state: State) -> bool:
-        """Whether the command in force is one of the latest."""
+        """Whether the executed command is one of the latest commands."""
         command = state.command
         return command is not None and command.tilt.tolist() + command.thrust.tolist() \
             in self._latest
@@ -132,7 +132,7 @@ class Guided:
 
     Args:
         controller: any.
-        guidance: which moves its pose targets; trajectories pass as they are.
+        guidance: which modifies its pose targets; trajectories are not modified.
 
     """
 
@@ -143,7 +143,7 @@ class Guided:
         self.guidance = guidance.text
 
     def reset(self) -> None:
-        """Forget what controller and guidance remember."""
+        """Reset controller and guidance."""
         self._charge.reset()
         self._guidance.reset()
         self._controller.reset()
@@ -157,10 +157,10 @@ class Guided:
         return command
 
     def set_health(self, health: ActuatorHealth) -> None:
-        """Tell the controller, where it can make use of that."""
+        """Pass the health of the actuators to a controller that accepts it."""
         tell_health(self._controller, health)
 
     def diagnostics(self) -> dict[str, float | int | str]:
-        """What the controller tells, and the counts of the guidance."""
+        """Diagnostics of the controller, and the counts of the guidance."""
         told = getattr(self._controller, 'diagnostics', dict)
         return {**told(), **self._guidance.diagnostics()}

@@ -1,11 +1,12 @@
 """
-The way round to another attitude where the shortest turn would drive joints into their stops.
+Intermediate attitudes for turns whose shortest way would drive joints into their stops.
 
-Each turn winds the joints, by what the thrusts have to turn in the body to stay upward. Where the
-shortest turn from how they are wound ends beyond their travel, a policy that knows the present
-state alone begins it all the same, loses the thrust of two rotors half way, dives, and arrives
-with joints at their stops or not at all. Another way, over one attitude in between, ends with
-them wound otherwise. It is looked for when a target is new and shown first.
+In a turn of the body the joints must turn in the body frame so that the thrusts stay upward. If
+the shortest turn needs more than the travel of a joint, a policy, which is a function of the
+present state, begins this turn nevertheless. It loses the thrust of two rotors half way, dives,
+and arrives with joints at their stops or not at all. By way of an intermediate attitude the joints
+end at other angles. This module searches such an attitude for each new target, and uses it as the
+first target.
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ from beetle_omni_ros.control.guidance.turns import tilts_along, turned
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import parameter
 
-ATTITUDES = 150     # in between that are compared; 50 and 400 fly alike
-EXCESS = 5.0        # turn that a way may be longer for winding the joints less [rad/rad]
-SHORTER = 0.2       # by which a way round must be better than the shortest turn [rad]
-ANOTHER = 0.3       # from the last target that a way was looked for to the next [rad]
+ATTITUDES = 150     # compared intermediate attitudes; 50 and 400 give similar flights
+EXCESS = 5.0        # cost of joint angles relative to the length of the turn [rad/rad]
+SHORTER = 0.2       # by which an intermediate attitude must be better than the shortest turn [rad]
+ANOTHER = 0.3       # change of the target that starts a new search [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RoutingParameters:
-    """When a target is reached by a way round, and how long that is followed."""
+    """When an intermediate attitude is used, and for how long."""
 
     tilt: float = parameter(3.4, doc='a shortest turn that winds a joint beyond is not flown if '
                                      'there is a better way; 100: always flown', unit='rad',
@@ -44,7 +45,7 @@ class RoutingParameters:
 
 class Routing:
     """
-    Puts an attitude in between in a pose target's place where that is the better way.
+    Replaces a pose target by an intermediate attitude if this is the better way.
 
     Args:
         parameters: when.
@@ -91,7 +92,7 @@ class Routing:
 
     def _look(self, state, given):
         if not isfinite(sum(state.quaternion.tolist()) + sum(state.tilt.tolist())):
-            self._given = None      # again with the next state
+            self._given = None      # repeat with the next state
             return
         if self._looked is not None \
                 and rotations.geodesic_angle(given.quaternion, self._looked) < ANOTHER:
@@ -104,7 +105,7 @@ class Routing:
 
     def between(self, start: np.ndarray, end: np.ndarray, tilt: np.ndarray) -> np.ndarray | None:
         """
-        Attitude over which the turn winds the joints less.
+        Intermediate attitude with which the joints are wound less.
 
         Args:
             start: (4,) attitude, xyzw.
@@ -112,7 +113,7 @@ class Routing:
             tilt: (4,) tilts at the start [rad].
 
         Returns:
-            (4,) an attitude, xyzw, or None where the shortest turn is as good.
+            (4,) an attitude, xyzw, or None if the shortest turn is as good.
 
         """
         begin, goal = Rotation.from_quat(start), Rotation.from_quat(end)
@@ -133,7 +134,7 @@ class Routing:
         return middle[best].as_quat()
 
     def _wound(self, up, tilt):
-        """(n,) largest tilt on n ways that begin with ``tilt``."""
+        """(n,) largest tilt along n turns that begin with ``tilt``."""
         along = tilts_along(up, self._axes)
         return np.abs(tilt + along - along[:, :1]).max(axis=(1, 2))
 

@@ -1,10 +1,9 @@
 """
-The steady error of a policy at rest, taken off by a target that is moved against it.
+Integral action around a policy: shifts the target against the steady error.
 
-A policy acts on the present state alone: biased encoders, a shifted centre of mass or a payload
-leave it some millimetres and degrees beside the target. As it flies to wherever the target is, the
-integral of what is left, added to the target, ends that error: integral action around the policy,
-as slow as the policy is quick, only near the target, and bounded.
+A policy is a function of the present state. Biased encoders, a shifted centre of mass or a payload
+cause a steady error of some millimetres and degrees. The integral of this error is added to the
+target. The integral is slow compared with the policy, bounded, and only active near the target.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ from beetle_omni_ros.control.base import PoseTarget, State
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import parameter
 
-LONGEST_STEP = 0.1      # [s] between two states; after longer the robot may be anywhere
+LONGEST_STEP = 0.1      # [s] between two states; after a longer gap no update
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrimmingParameters:
-    """How fast a steady error is taken off, and when an error is one."""
+    """Rate of the integral, and the criteria of a steady error."""
 
     rate: float = parameter(1.0, doc='of the integral; 0: off', unit='1/s', low=0, high=5)
     distance: float = parameter(0.06, doc='by which the target may be moved', unit='m', low=0,
@@ -37,14 +36,14 @@ class TrimmingParameters:
 
 class Trimming:
     """
-    Moves pose targets against the steady error.
+    Shifts pose targets against the steady error.
 
     Args:
-        parameters: how.
+        parameters: rate and limits.
 
     Attributes:
-        position: (3,) by which the target is moved, in world [m].
-        rotation: (3,) by which it is turned, rotation vector in the target's frame [rad].
+        position: (3,) shift of the target, in world [m].
+        rotation: (3,) rotation of the target, rotation vector in the target's frame [rad].
 
     """
 
@@ -53,20 +52,20 @@ class Trimming:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was found."""
+        """Reset the integral."""
         self.position, self.rotation = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
         self._given: PoseTarget | None = None
         self._seen = -inf
 
     def target(self, state: State, given: PoseTarget, learn: bool = True) -> PoseTarget:
         """
-        The target as the policy is to see it.
+        The modified target for the policy.
 
         Args:
-            state: of the robot; one that is not finite teaches nothing.
-            given: the target. One that is not near the last starts anew, for the steady error
-                there is another one.
-            learn: whether the robot is flying towards it by this policy.
+            state: of the robot; a state that is not finite does not change the integral.
+            given: the target. If it is not near the last target, the integral is reset, because
+                the steady error is different there.
+            learn: whether this policy is active and flies towards the target.
 
         """
         if given is not self._given:
@@ -91,7 +90,7 @@ class Trimming:
                 self.rotation = _added(self.rotation, p.rate * elapsed, turn, p.angle)
 
     def _near(self, way, turn):
-        # what is no number is not near
+        # NaN is not near
         return hypot(*way) <= self._p.near_distance and hypot(*turn) <= self._p.near_angle
 
 
@@ -99,7 +98,7 @@ class Trimming:
 
 
 def _between(a, b):
-    """Way in world [m] and turn as rotation vector [rad] from one pose to another."""
+    """Translation in world [m] and rotation vector [rad] from one pose to another."""
     x, y, z, w = a.quaternion.tolist()
     x, y, z, w = rotations.product(-x, -y, -z, w, *b.quaternion.tolist())
     sign = 2.0 if w >= 0 else -2.0

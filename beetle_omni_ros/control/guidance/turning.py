@@ -1,10 +1,10 @@
 """
-Large turns without a dive: where a policy is shown its target while it turns.
+Large turns without a dive: modified target positions during a turn.
 
-While joints turn over, thrust is missing: the robot sinks, deepest where it also accelerates
-sideways while upside down. So while there is far to turn, low targets are shown higher, and to
-who is upside down no farther than a carrot; a robot that is about to sink below where it was and
-shall be is shown one above, for as long as it sinks.
+While joints turn over, thrust is missing and the robot sinks. It sinks most if it also accelerates
+sideways while upside down. During a large turn, low targets are therefore raised. If the robot is
+upside down, the distance to the target is limited. If the robot will sink below start and target,
+the target is raised further until the prediction ends.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from beetle_omni_ros.robot.schema import parameter
 
 @dataclass(frozen=True, kw_only=True)
 class TurningParameters:
-    """Where a robot turns that has far to turn."""
+    """Modified target positions in large turns."""
 
     angle: float = parameter(1.0, doc='from the target: while farther off, ...', unit='rad',
                              low=0.1, high=4)
@@ -40,10 +40,10 @@ class TurningParameters:
 
 class Turning:
     """
-    Moves pose targets while a robot has far to turn.
+    Shifts pose targets during a large turn.
 
     Args:
-        parameters: where to.
+        parameters: sizes of the shifts.
 
     """
 
@@ -52,18 +52,19 @@ class Turning:
         self.reset()
 
     def reset(self) -> None:
-        """Forget where the way to the target began."""
+        """Reset the start of the way to the target."""
         self._given: PoseTarget | None = None
         self._lowest = -inf
 
     def target(self, state: State, given: PoseTarget, aim: PoseTarget | None = None) -> PoseTarget:
         """
-        What to fly towards: ``aim``, or its attitude at another place.
+        The modified target: ``aim``, or its attitude at another position.
 
         Args:
-            state: of the robot; one that is not finite sees ``aim``.
+            state: of the robot; if it is not finite, the result is ``aim``.
             given: the target.
-            aim: on the way to it, where that is another; then there is far to turn.
+            aim: the target after unwinding and routing; if it differs from ``given``, the turn is
+                large.
 
         """
         z, p = float(state.position[2]), self._p

@@ -1,8 +1,9 @@
 """
-Turns from one attitude to another, as the joints of a robot with tilting rotors see them.
+Joint angles along turns of a robot with tilting rotors.
 
-In a slow turn every thrust points upward as far as its arm lets it. So the tilts follow from the
-way of world's z through the body, but for whole turns, and these follow from the beginning.
+In a slow turn every thrust points upward as far as its arm permits. The tilts therefore follow
+from the path of world's z in the body frame, except for full turns. The number of full turns
+follows from the initial tilts.
 """
 
 from __future__ import annotations
@@ -11,13 +12,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 STRAIGHT_UP = np.array([0.0, 0.0, 1.0])
-POINTS = 16       # of a turn at which its arms are looked at
-LEAST_USE = 0.2   # part of an arm's thrust that can hold weight, below which it counts as this
+POINTS = 16       # of a turn at which the arms are evaluated
+LEAST_USE = 0.2   # smallest used share of an arm's thrust that can carry weight
 
 
 def turning_cost(start: Rotation, end: Rotation, axes: np.ndarray) -> np.ndarray:
     """
-    Angle of the shortest turn between two attitudes, longer for each arm near upright [rad].
+    Angle of the shortest turn between two attitudes, weighted by arms near upright [rad].
 
     The thrust of a rotor is across its arm, so sqrt(1 - (arm . up)^2) of it can hold weight; the
     angle is weighted with the inverse square of that for the worst arm.
@@ -58,7 +59,7 @@ def tilts_along(up: np.ndarray, axes: np.ndarray) -> np.ndarray:
         axes: (4, 3) unit tilt axes in base_link.
 
     """
-    across = np.cross(axes, STRAIGHT_UP)        # where a thrust points at a tilt of pi / 2
+    across = np.cross(axes, STRAIGHT_UP)        # direction of a thrust at a tilt of pi / 2
     return np.unwrap(np.arctan2(up @ across.T, up[..., 2:]), axis=1)
 
 

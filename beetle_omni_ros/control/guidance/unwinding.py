@@ -1,23 +1,23 @@
 """
-The way off a joint's stop: through a level attitude and back to the target.
+Unwinding: from a joint's stop through a level attitude back to the target.
 
-A joint can hold most thrust directions at two angles, a turn apart. Past half a turn the better
-one may lie a full turn back, and on the way there the thrust points away from where it is needed.
-A policy that acts on the present state alone holds on to what it has: two opposite joints hang
-near half a turn or push against their stops, and the robot stays 10 to 90 degrees off.
+Most thrust directions correspond to two joint angles, a full turn apart. Beyond half a turn the
+better angle may be a full turn back, and on the way there the thrust points in wrong directions. A
+policy, a function of the present state, does not turn back: two opposite joints stay near half a
+turn or at their stops, with an attitude error of 10 to 90 degrees.
 
-In a level hover each tilt is zero, and no other angle within the travel gives the same thrust. So
-a robot that is asked to be level, at the place where it shall be, unwinds all its joints; from
-there the target is reached as from a take-off.
+In level hover each tilt is zero, and no other angle within the travel gives the same thrust. A
+level target at the target position therefore unwinds all joints. From there the target is reached
+as after a take-off.
 
-Which level attitude, its heading, decides about the turns there and back. A turn about an arm
-stands the two arms across upright half way: nothing of their thrust is any use there, their
-joints have to turn over by half a turn at that moment, and which way is left to chance. Half
-way between two arms all four turn along. So the heading is taken whose two turns keep the arms
-from standing upright. And it decides how the joints are wound at the target: a way that ends as
-they were wound when the target was missed is taken only where there is no other. Where the turn
-back is long, its half comes first: near half a turn a policy goes round either way, and the other
-one winds the joints otherwise.
+The heading of the level attitude determines both turns. In a turn about an arm, the two arms
+across point upward half way. Their thrust cannot carry weight there, and their joints must turn
+over by half a turn in an arbitrary direction. In a turn about an axis between two arms all four
+joints turn continuously. The selected heading therefore keeps the arms away from upright in both
+turns. The heading also determines the joint angles at the target: a heading that leads to the same
+angles as at the missed target is used only if there is no other. If the turn back is long, the
+attitude half way is the first target, because a policy may choose either direction for nearly half
+a turn, and the wrong one winds the joints differently.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from beetle_omni_ros.control.guidance.turns import STRAIGHT_UP, tilts_at_end, tu
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.schema import parameter
 
-ARRIVED = 0.35    # [rad] from level: near enough to turn back
-UNWOUND = 1.0     # [rad] all tilts below: a robot that turns back earlier goes the way it came
-LONG_TURN = 2.0   # [rad] from level to the target: beyond, half of it is flown by itself ...
-HALF_WAY = 0.6    # [rad] ... until so near to its end
-STEP = 1.5        # of the limits, that counts as progress, or half of what is left
-HEADINGS = 24     # level attitudes that are compared
+ARRIVED = 0.35    # [rad] distance from level at which the robot turns back
+UNWOUND = 1.0     # [rad] largest tilt at which it turns back; otherwise the joints are wound again
+LONG_TURN = 2.0   # [rad] a longer turn from level to the target has a target half way ...
+HALF_WAY = 0.6    # [rad] ... until this distance from it
+STEP = 1.5        # in limits: an error decrease of this, or of half the error, is progress
+HEADINGS = 24     # number of compared level attitudes
 
 
 @dataclass(frozen=True, kw_only=True)
 class UnwindingParameters:
-    """When a pose counts as out of reach for the way in which the joints are wound."""
+    """Criteria of a pose that is not reached because the joints are wound."""
 
     attempts: int = parameter(2, doc='for one target; 0: never', low=0, high=100)
     tilt: float = parameter(2.4, doc='a joint beyond is wound', unit='rad', low=0.5, high=10)
@@ -63,7 +63,7 @@ class UnwindingParameters:
 
 
 class _Stop(NamedTuple):
-    """On the way: what is shown, and how near, with what tilts, it counts as passed [rad]."""
+    """An intermediate target, and angle and tilt at which it is reached [rad]."""
 
     target: PoseTarget
     angle: float
@@ -72,10 +72,10 @@ class _Stop(NamedTuple):
 
 class Unwinding:
     """
-    Puts a level attitude in a pose target's place while a robot unwinds.
+    Replaces a pose target by a level attitude while the robot unwinds.
 
     Args:
-        parameters: when.
+        parameters: criteria.
         axes: (4, 3) unit tilt axes in base_link.
 
     Attributes:
@@ -89,13 +89,13 @@ class Unwinding:
         self.reset()
 
     def reset(self) -> None:
-        """Forget target and attempts."""
+        """Reset target and attempts."""
         self.attempts = 0
         self._given: PoseTarget | None = None
         self._start()
 
     def _start(self):
-        """A target that is new."""
+        """Begin with a new target."""
         self._left = self._p.attempts
         self._failed: list[np.ndarray] = []
         self._way: list[_Stop] = []
@@ -108,7 +108,7 @@ class Unwinding:
 
     def target(self, state: State, given: PoseTarget) -> PoseTarget:
         """
-        What to fly towards: ``given``, or a level attitude at its position.
+        The modified target: ``given``, or a level attitude at its position.
 
         Args:
             state: finite.
@@ -132,7 +132,7 @@ class Unwinding:
         return given
 
     def _stuck(self, state, given):
-        """Whether joints are wound, and the error has long stood still."""
+        """Whether joints are wound, and the error has not decreased for a long time."""
         p = self._p
         if not max(map(abs, state.tilt.tolist())) >= p.tilt:    # mostly; the rest costs more
             self._watch(state.stamp)
@@ -144,12 +144,12 @@ class Unwinding:
             self._missed += elapsed
         elif error > 1.0:
             self._least, self._missed = error, 0.0
-        else:       # it may swing about its limit: what counts is the side on which it mostly is
+        else:       # the error may oscillate about its limit: the longer side decides
             self._missed = max(0.0, self._missed - elapsed)
         return self._missed >= p.patience
 
     def _progress(self):
-        """Error that is less than the least so far by enough."""
+        """Error below which there is progress."""
         if self._least == inf:
             return inf
         return self._least - max((1 - self._p.progress) * self._least,
@@ -167,7 +167,7 @@ class Unwinding:
         return way
 
     def _go_on(self, state):
-        """Forget what is passed, or all of it where it takes too long."""
+        """Remove a reached intermediate target, or all of them after the time limit."""
         stop = self._way[0]
         if state.stamp >= self._until:
             self._way = []
@@ -180,7 +180,7 @@ class Unwinding:
 
 
 def levelled(quaternion: np.ndarray) -> np.ndarray:
-    """(4,) the level attitude that is the smallest turn away from ``quaternion``, both xyzw."""
+    """(4,) the level attitude nearest to ``quaternion``, both xyzw."""
     up = rotations.matrix(quaternion).T @ STRAIGHT_UP      # world's z in the body
     axis = np.cross(up, STRAIGHT_UP)
     sine = np.linalg.norm(axis)
@@ -195,14 +195,14 @@ def levelled(quaternion: np.ndarray) -> np.ndarray:
 def level_between(start: np.ndarray, end: np.ndarray, axes: np.ndarray,
                   failed: Sequence[np.ndarray] = ()) -> np.ndarray:
     """
-    Choose the level attitude by which a robot with tilting rotors best turns from one to another.
+    Choose the best level attitude between two attitudes.
 
     Args:
         start: (4,) attitude, xyzw.
         end: (4,) the same.
         axes: (4, 3) unit tilt axes in base_link.
-        failed: (4,) tilts [rad] with which the end was not held; ways that wind the joints into
-            none of them are preferred.
+        failed: (4,) tilts [rad] with which the end was not held; headings that lead to other tilts
+            are preferred.
 
     Returns:
         (4,) the level attitude, xyzw, of the least :func:`turning_cost` there and on.
