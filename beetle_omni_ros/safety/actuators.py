@@ -1,4 +1,4 @@
-"""What the actuator bridges say of themselves, as the supervisor understands it."""
+"""The reported states of the actuator bridges, as used by the supervisor."""
 
 from __future__ import annotations
 
@@ -10,40 +10,40 @@ class Actuators:
     """
     The newest state of each bridge: 'ready', 'waiting: WHY', 'silent: WHY' or 'lost: WHY'.
 
-    A bridge that was never heard has no influence: without bridges the simulator takes commands
-    directly.
+    A bridge that never reported a state has no influence: without bridges the simulator gets the
+    commands directly.
     """
 
     def __init__(self):
         self._told: dict[str, str] = {}
 
     def tell(self, name: str, text: str) -> bool:
-        """Take the state of bridge 'joint' or 'rotor'; False for another name."""
+        """Store the state of bridge 'joint' or 'rotor'; False for another name."""
         if name not in NODES:
             return False
         self._told[name] = ' '.join(text.split()) or 'says nothing'
         return True
 
     def fault(self, name: str) -> str:
-        """'' while bridge ``name`` obeys or was never heard, else its node and what it said."""
+        """'' while bridge ``name`` is ready or never reported, else its node and state."""
         told = self._told.get(name, READY)
         return '' if told == READY else f'{NODES[name]} {told}'
 
     @property
     def rotors_may_turn(self) -> bool:
-        """Whether the motor board may still follow, although it is not heard."""
+        """Whether the motor board may still execute commands, although it sends nothing."""
         return self._told.get('rotor', '').startswith(SILENT)
 
     @property
     def joints_lost(self) -> bool:
-        """Whether some joint does not follow."""
+        """Whether some joint does not follow its command."""
         return self._told.get('joint', '').startswith(LOST)
 
     @property
     def why_not_arm(self) -> str:
-        """'' when both obey, else what is missing."""
+        """'' when both are ready, else the missing condition."""
         return '; '.join(filter(None, map(self.fault, NODES)))
 
     def diagnostics(self) -> dict[str, str]:
-        """States as told, by node."""
+        """Reported states, by node."""
         return {NODES[name]: told for name, told in self._told.items()}

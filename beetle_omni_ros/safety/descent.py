@@ -1,12 +1,12 @@
 """
-The estimator of last resort: what is left when the EKF is gone.
+The backup estimator, used when the EKF has failed.
 
-It starts from the last good estimate and is deliberately simpler than the EKF, so that the two do
-not fail for the same reason: gyroscope and accelerometer are integrated, and MoCap poses pull
-position, velocity and attitude by fixed gains, each compared with the own past at its capture
-time. While the EKF lives, the IMU biases are learnt from it. Without MoCap, position and velocity
-are dead reckoning, in which the velocity slowly forgets towards the one that is wished, so that a
-descent stays gentle. Without IMU the model of the rotors takes its place between MoCap poses.
+It starts from the last valid estimate and is deliberately simpler than the EKF, so that both do
+not fail for the same reason. It integrates gyroscope and accelerometer. MoCap poses correct
+position, velocity and attitude with fixed gains; each pose is compared with the stored state at
+its capture time. While the EKF works, the IMU biases are taken from it. Without MoCap, position
+and velocity are dead reckoning, and the velocity slowly decays to the desired velocity, so that a
+descent stays slow. Without IMU the rotor model is used between MoCap poses.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.safety.parameters import BackupParameters
 
 KEPT_SAMPLES = 100     # IMU samples before the failure: 0.5 s at 200 Hz
-KEPT_FIXES = 12        # MoCap poses that tell the velocity
-FIXES_TIME = 0.1       # [s] older ones do not
+KEPT_FIXES = 12        # MoCap poses from which the velocity is computed
+FIXES_TIME = 0.1       # [s] older poses are not used for it
 KEPT_BIASES, BIAS_EVERY = 4, 0.5    # [s] biases of up to 2 s ago, before an estimate went wrong
-KEPT_POSES = 24        # own past for late MoCap frames: 0.12 s at 200 Hz
-LONGEST_STEP = 0.1     # [s] a gap in the samples is not integrated beyond this
-ABSURD = 1e4           # [m, m/s^2, rad/s] no sensor of this robot says that
-LARGEST_BIASES = (1.0, 0.2)   # [m/s^2], [rad/s] what learning may believe of an IMU
+KEPT_POSES = 24        # stored states for late MoCap frames: 0.12 s at 200 Hz
+LONGEST_STEP = 0.1     # [s] longest integrated gap in the samples
+ABSURD = 1e4           # [m, m/s^2, rad/s] beyond any sensor of this robot
+LARGEST_BIASES = (1.0, 0.2)   # [m/s^2], [rad/s] largest learnt biases of an IMU
 
 
 class BackupEstimator:
@@ -59,7 +59,7 @@ class BackupEstimator:
         self.stop()
 
     def stop(self) -> None:
-        """Forget the flight; samples and biases stay."""
+        """Reset the state; samples and biases stay."""
         self.running = False
         self._past: deque = deque(maxlen=KEPT_POSES)
         self.specific_force_up: float | None = None
@@ -71,7 +71,7 @@ class BackupEstimator:
 
     def on_imu(self, stamp: float, specific_force: np.ndarray,
                angular_velocity: np.ndarray) -> bool:
-        """Take one raw sample; False when it is not finite or not newer than the last."""
+        """Store one raw sample; False when it is not finite or not newer than the last."""
         force, rate = _vector(specific_force, 3), _vector(angular_velocity, 3)
         if force is None or rate is None or not np.isfinite(stamp) \
                 or (self._samples and stamp <= self._samples[-1][0]):
@@ -82,13 +82,13 @@ class BackupEstimator:
         return True
 
     def is_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
-        """Whether it is a pose at all, and newer than the last."""
+        """Whether it is a valid pose, and newer than the last."""
         position, quaternion = _vector(position, 3), _vector(quaternion, 4)
         return position is not None and quaternion is not None and bool(np.isfinite(stamp)) \
             and stamp > self._mocap_stamp and abs(quaternion @ quaternion - 1) <= 0.02
 
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
-        """Take one pose, captured at ``stamp``; False when it is not usable."""
+        """Use one pose, captured at ``stamp``; False when it is not usable."""
         if not self.is_pose(stamp, position, quaternion):
             return False
         position, quaternion = _vector(position, 3), _vector(quaternion, 4)
@@ -99,13 +99,13 @@ class BackupEstimator:
         return True
 
     def remember(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> None:
-        """Keep a pose (see :meth:`is_pose`) for a start without an estimate."""
+        """Store a pose (see :meth:`is_pose`) for a start without an estimate."""
         if not self._poses or stamp > self._poses[-1][0]:
             self._poses.append((stamp, _vector(position, 3),
                                 rotations.normalized(_vector(quaternion, 4))))
 
     def learn(self, state: State) -> None:
-        """Compare a good estimate with the IMU sample of its time; learn the biases."""
+        """Update the biases from a valid estimate and the IMU sample of the same time."""
         before, self._learnt = self._learnt, state
         sample = next((s for s in reversed(self._samples) if s[0] <= state.stamp + 1e-6), None)
         if before is None or sample is None:
@@ -124,7 +124,7 @@ class BackupEstimator:
             sample[2] - state.angular_velocity - self._gyroscope_bias), LARGEST_BIASES[1])
 
     def start(self, state: State) -> None:
-        """Continue from the last good estimate, with the samples that came since."""
+        """Continue from the last valid estimate, with the samples since then."""
         self.stop()
         self.running = True
         self._stamp = state.stamp
@@ -143,7 +143,7 @@ class BackupEstimator:
 
     @property
     def velocity_by_poses(self) -> np.ndarray | None:
-        """(3,) in world by the poses of the last 0.1 s alone [m/s], None where there are none."""
+        """(3,) in world from the poses of the last 0.1 s only [m/s], None if there are none."""
         if not self._poses:
             return None
         poses = [pose for pose in self._poses if pose[0] > self._poses[-1][0] - FIXES_TIME]
@@ -153,24 +153,24 @@ class BackupEstimator:
 
     def start_from_poses(self, tilt_source: State) -> None:
         """
-        Continue from MoCap and IMU alone, where the estimate is not to be believed.
+        Continue from MoCap and IMU only, if the estimate is wrong.
 
         Args:
-            tilt_source: the last estimate, used where there are no poses.
+            tilt_source: the last estimate, used if there are no poses.
 
         """
         velocity = self.velocity_by_poses
         if velocity is None:
             return self.start(tilt_source)
         stamp, position, quaternion = self._poses[-1]
-        if self._biases:    # the wrong estimate has taught wrong ones
+        if self._biases:    # those learnt from the wrong estimate are wrong
             self._accelerometer_bias, self._gyroscope_bias = self._biases[0][1:]
         rate = self._samples[-1][2] - self._gyroscope_bias if self._samples else np.zeros(3)
         self.start(State(stamp, position, velocity, quaternion, rate, tilt_source.tilt,
                          tilt_source.tilt_velocity, tilt_source.tilt_stamp))
 
     def clock_went_back(self, by: float) -> None:
-        """Move everything known to the clock that was set back by ``by`` [s]."""
+        """Shift all stamps after the clock was set back by ``by`` [s]."""
         self._samples = deque(((t - by, *rest) for t, *rest in self._samples),
                               maxlen=KEPT_SAMPLES)
         self._past = deque(((t - by, *rest) for t, *rest in self._past), maxlen=KEPT_POSES)
@@ -188,7 +188,7 @@ class BackupEstimator:
 
         Args:
             now: [s].
-            wished_velocity: (3,) in world, given while MoCap is gone [m/s].
+            wished_velocity: (3,) desired velocity in world, given while MoCap is lost [m/s].
             motion: specific force (3,) [m/s^2] and angular acceleration (3,) [rad/s^2] in
                 base_link by the model, used while the IMU is gone.
 
@@ -259,14 +259,14 @@ class BackupEstimator:
             self._rate = self._rate + w * w * dt * turn
         self._quaternion = rotations.normalized(rotations.multiply(
             self._quaternion, rotations.exp(min(1.0, gain * dt) * turn)))
-        # The corrected past is what the next late frame is compared with.
+        # The next late frame is compared with the corrected past.
         self._past = deque(((t, q + min(1.0, 2 * p.position_bandwidth * dt) * error,
                              rotations.multiply(a, rotations.exp(min(1.0, gain * dt) * turn)))
                             for t, q, a in self._past), maxlen=KEPT_POSES)
 
 
 def _vector(value, size):
-    """``value`` as finite, not absurd floats (size,), or None."""
+    """``value`` as finite floats (size,) within plausible limits, or None."""
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""What the supervisor says: events, answers to requests, and the silence of a source."""
+"""Outputs of the supervisor: events, answers to requests, and timeouts of sources."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ KEPT = 1000   # events; a flight has tens
 @dataclass(frozen=True)
 class Event:
     """
-    One thing that an operator must be able to read later.
+    An event for the log of the operator.
 
     Attributes:
         stamp: when [s].
         severity: 'info', 'warning' or 'error'.
-        text: one line that names the node at fault and the outcome.
+        text: one line that names the responsible node and the outcome.
 
     """
 
@@ -27,7 +27,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer to a request: true when granted, with the reason as text."""
+    """The answer to a request: granted or not, with the reason."""
 
     ok: bool
     text: str
@@ -41,7 +41,7 @@ class EventLog(list):
     """A list of events that drops the oldest ones and does not repeat itself."""
 
     def __init__(self, quiet_time: float):
-        """``quiet_time``: a keyed event is said at most once in this time [s]."""
+        """``quiet_time``: a keyed event is added at most once in this time [s]."""
         super().__init__()
         self._quiet_time = quiet_time
         self._said: dict[str, float] = {}
@@ -59,33 +59,33 @@ class EventLog(list):
 
 class Silence:
     """
-    How long a source has said nothing.
+    Time since the last message of a source.
 
-    Time is counted in the supervisor's own ticks, each at most ``tick`` long: when the process
-    itself was held up, or the clock was set, the messages that wait in the queue get their chance
-    before anything is declared dead.
+    Time is counted in ticks of the supervisor, each at most ``tick`` long. After a stall of the
+    process or a change of the clock, messages in the queue are therefore processed before a source
+    is treated as failed.
     """
 
     def __init__(self, limit: float):
         """``limit``: longer silence is a fault [s]."""
         self.limit = limit
-        self.elapsed = float('inf')   # nothing heard yet
+        self.elapsed = float('inf')   # no message yet
         self._just_heard = False
 
     def heard(self) -> None:
-        """The source spoke, some time within the present tick."""
+        """A message arrived within the present tick."""
         self.elapsed = 0.0
         self._just_heard = True
 
     def tick(self, dt: float) -> None:
-        """``dt`` seconds passed; those of the tick in which it spoke do not count."""
+        """``dt`` seconds passed; the tick with the message is not counted."""
         if not self._just_heard:
             self.elapsed += dt
         self._just_heard = False
 
     @property
     def silent(self) -> bool:
-        """Whether the silence is a fault; a rounding error short of the limit counts."""
+        """Whether the silence is a fault, with a tolerance for rounding."""
         return self.elapsed >= self.limit - 1e-9
 
     @property

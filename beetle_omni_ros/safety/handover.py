@@ -1,4 +1,4 @@
-"""From one controller's command to the next one's without a jump."""
+"""Transition between the commands of two controllers without a jump."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from beetle_omni_ros.safety.parameters import HandoverParameters
 
 class Handover:
     """
-    Limits how fast the command changes after somebody else took over.
+    Limits the rate of the command after a change of the controller.
 
-    A controller that follows along has little to jump, but in the middle of a large turn two of
-    them may well disagree. Once the command has caught up with what is asked for, or after
-    ``time``, the controller has its way again.
+    A controller on standby has similar commands, but in a large turn the commands may differ. The
+    limit ends when the new command is reached, or after ``time``.
 
     Args:
         parameters: rates and time.
@@ -26,19 +25,19 @@ class Handover:
         self._left = 0.0
 
     def start(self) -> None:
-        """Somebody else takes over."""
+        """Begin after a change of the controller."""
         self._left = self._parameters.time
 
     def stop(self) -> None:
-        """Stamps cannot be compared any more: let everything through."""
+        """End the limit, because stamps cannot be compared after a change of the clock."""
         self._left = 0.0
 
     def limit(self, asked: Command, in_force: Command | None) -> Command:
-        """Give ``asked``, or as much of it as may be executed after ``in_force``."""
+        """Return ``asked``, limited to the permitted change from ``in_force``."""
         if self._left <= 0 or in_force is None:
             return asked
         step = asked.stamp - in_force.stamp
-        if step <= 0:       # an answer to a state that another controller has answered already
+        if step <= 0:       # a command for this state was already executed
             return in_force
         self._left -= step
         tilt = _towards(asked.tilt, in_force.tilt, step * self._parameters.tilt_rate)

@@ -1,4 +1,4 @@
-"""What comes into the supervisor, and its sense of time."""
+"""Inputs of the supervisor, and its time."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from beetle_omni_ros.safety.selection import Selection
 from beetle_omni_ros.safety.vehicle import Vehicle
 from beetle_omni_ros.safety.watch.faults import FaultWatch
 
-TILT_AGE = 0.05     # [s] older joint angles say nothing of where the thrusts point
-LATEST = 0.1    # [s] between a MoCap pose and the estimate that it is compared with
+TILT_AGE = 0.05     # [s] older joint angles are not used for thrust directions
+LATEST = 0.1    # [s] between a MoCap pose and the estimate for its check
 
 
 class Inputs:
     """
-    The inputs half of the supervisor: every message is checked here and counted.
+    The inputs of the supervisor: checks and counts all messages.
 
     Attributes:
         events: what happened, oldest first.
         vehicle: the latest of estimate, joints, sensors and battery.
-        actuators: what the bridges to servos and motor board say.
-        watch: the detectors, with the faults that they have named.
+        actuators: reported states of the bridges to servos and motor board.
+        watch: the detectors, with the detected faults.
 
     """
 
@@ -47,7 +47,7 @@ class Inputs:
         self._spikes = SpikeFilter(imu.force_change, imu.rate_change)
         self._sample: tuple[float, ...] | None = None
         self._same_samples = 0
-        self._floor = 0.0       # height of base_link where it stood [m]
+        self._floor = 0.0       # height of base_link on the ground before the flight [m]
         self.events = EventLog(parameters.quiet_time)
         self._now: float | None = None
 
@@ -57,7 +57,7 @@ class Inputs:
         return self._selection.active
 
     def on_state(self, state: State, status: str = 'tracking') -> bool:
-        """Take the estimator's state with its status; False when it is refused."""
+        """Receive the estimator's state and status; False when it is refused."""
         before = self.vehicle.status
         true = corrected(state, self.watch.health)
         reason = self.vehicle.on_state(true, status, self._now)
@@ -73,13 +73,14 @@ class Inputs:
         """Check one command of one controller; False when it is refused (and counted)."""
         reason = self._selection.offer(controller, command, now)
         if reason:
-            # A step to a new target jumps once; one that goes on jumping is silent: an error.
+            # A step to a new target causes one jump; repeated jumps end in the controller's
+            # timeout.
             self._say(now, INFO if reason == JUMP else WARNING,
                       f'{controller}_node: command refused: {reason}', f'{controller}: {reason}')
         return not reason
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
-        """Take raw joint feedback (4,), nan where unknown, beside what comes with the state."""
+        """Receive raw joint feedback (4,), nan where unknown."""
         good = not self._ahead(stamp) and self.vehicle.on_joints(
             stamp, self.watch.health.true(position), velocity)
         if good:
@@ -87,7 +88,7 @@ class Inputs:
         return good
 
     def _watch_joints(self, stamp, reading):
-        """Let the detectors look at a reading (4,); a zero that it moves counts for it, too."""
+        """Pass a reading (4,) to the detectors; a changed zero also applies to this reading."""
         if not (isfinite(stamp) and all(map(isfinite, reading.tolist()))):
             return
         zeros = self.watch.health.zeros
@@ -97,7 +98,7 @@ class Inputs:
 
     def on_imu(self, stamp: float, specific_force: np.ndarray,
                angular_velocity: np.ndarray) -> bool:
-        """Take a raw IMU sample (3,), (3,) in base_link, for the descent without estimator."""
+        """Receive a raw IMU sample (3,), (3,) in base_link, for the descent without estimator."""
         good = not self._ahead(stamp) and self._is_real(specific_force, angular_velocity) \
             and self.vehicle.backup.on_imu(stamp, specific_force, angular_velocity)
         if good:
@@ -111,7 +112,7 @@ class Inputs:
         return good
 
     def _is_real(self, specific_force, angular_velocity):
-        """Whether a sample is no lone spike, and not the same as many before."""
+        """Whether a sample is neither a single spike nor one of many equal samples."""
         try:
             force, rate = (np.asarray(vector, dtype=float).reshape(3)
                            for vector in (specific_force, angular_velocity))
@@ -129,7 +130,7 @@ class Inputs:
         return self._spikes.passes(force, rate)
 
     def on_rotors(self, stamp: float, speed: np.ndarray) -> bool:
-        """Take the rotors' speeds (4,) as their ESCs report them [rad/s], nan where unknown."""
+        """Receive the rotor speeds (4,) reported by the ESCs [rad/s], nan where unknown."""
         speed = np.asarray(speed, dtype=float)
         if self._ahead(stamp) or not isfinite(stamp) or speed.shape != (4,):
             return False
@@ -139,12 +140,12 @@ class Inputs:
 
     @property
     def airborne(self) -> bool:
-        """Whether the robot flies, as far as is known."""
+        """Whether the robot flies, as far as known."""
         return False
 
     @property
     def _height(self):
-        """Of base_link above where it stood [m]; None where it is unknown."""
+        """Height of base_link above its height on the ground [m]; None if unknown."""
         vehicle = self.vehicle
         blind = vehicle.mocap.silent if vehicle.backup.running else vehicle.mocap_lost
         if blind or self._now is None:
@@ -153,7 +154,7 @@ class Inputs:
         return None if state is None else float(state.position[2]) - self._floor
 
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> bool:
-        """Take a raw MoCap pose (3,), (4,) of base_link, for the descent without estimator."""
+        """Receive a raw MoCap pose (3,), (4,) of base_link, for the descent without estimator."""
         vehicle = self.vehicle
         if self._ahead(stamp) or not vehicle.backup.is_pose(stamp, position, quaternion):
             return False
@@ -168,7 +169,7 @@ class Inputs:
         return good
 
     def _agrees(self, stamp, position, quaternion):
-        """Whether a MoCap pose fits what is known of the flight."""
+        """Whether a MoCap pose is consistent with estimate and gyroscope."""
         vehicle = self.vehicle
         state = vehicle.backup_state(self._now) \
             if vehicle.backup.running and self._now is not None else vehicle.state
@@ -181,7 +182,7 @@ class Inputs:
         return False
 
     def on_battery(self, voltage: float) -> bool:
-        """Take the pack voltage under load [V]; not finite or negative is refused."""
+        """Receive the pack voltage under load [V]; refused if not finite or negative."""
         if not (isfinite(voltage) and voltage >= 0):
             return False
         self.vehicle.voltage = float(voltage)
@@ -191,7 +192,7 @@ class Inputs:
 
     def on_actuators(self, name: str, text: str, now: float) -> bool:
         """
-        Take what the bridge to an actuator says of itself; the next update acts on it.
+        Receive the reported state of an actuator bridge; the next update acts on it.
 
         Args:
             name: 'joint' or 'rotor'.
@@ -209,7 +210,7 @@ class Inputs:
         return known
 
     def _tick(self, now):
-        """Time since the last update, as far as it counts; follows a clock that was set back."""
+        """Counted time since the last update; also after the clock was set back."""
         if not isfinite(now):
             return 0.0
         before, self._now = self._now, now
@@ -228,7 +229,7 @@ class Inputs:
         return dt
 
     def _clock_went_back(self, now, by):
-        """For the state machine to follow."""
+        """Implemented by the state machine."""
 
     def _ahead(self, stamp):
         return self._now is not None and stamp - self._now > self._parameters.state.timeout

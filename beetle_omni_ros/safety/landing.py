@@ -1,4 +1,4 @@
-"""Landing: level out, sink at a set rate, notice the ground, on whatever estimate is left."""
+"""Landing: level out, sink at a set rate, detect the ground, with any remaining estimate."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from beetle_omni_ros.safety.vehicle import Vehicle
 
 FADING_STEPS = 10       # in which a rotor comes to rest
 AT_ONCE = 1e-3          # [s]
-STILL = 1.0     # [s] without IMU: it should sink and does not
-AHEAD, BETWEEN = 20.0, 0.1      # [s] how far ahead, and how densely, a way is told
+STILL = 1.0     # [s] without IMU: time without sinking until the ground is detected
+AHEAD, BETWEEN = 20.0, 0.1      # [s] length and spacing of the published way
 
 
 class Landing:
@@ -33,17 +33,17 @@ class Landing:
 
     Args:
         parameters: rates and thresholds.
-        robot: as believed.
-        hover: the controller that flies it.
+        robot: the model.
+        hover: the controller.
         allocator: of the robot.
-        gauge: what the rotors carry.
+        gauge: share of the weight that the rotors carry.
         vehicle: estimate, joints and raw sensors.
-        events: where to say what is gone.
-        floor: height of base_link where it stood before the flight [m].
+        events: for messages.
+        floor: height of base_link on the ground before the flight [m].
 
     Attributes:
-        grounded: whether it stands.
-        given_up: '' or why a descent under control is no longer possible.
+        grounded: whether the robot is on the ground.
+        given_up: '' or the reason why a controlled descent is no longer possible.
 
     """
 
@@ -61,7 +61,7 @@ class Landing:
 
     @property
     def way(self) -> TrajectoryTarget:
-        """Where it goes, for a controller that can fly a trajectory."""
+        """The planned way, for a controller that can fly a trajectory."""
         ramp = self._ramp
         times = ramp.stamp + np.arange(0.0, ramp.wait + AHEAD, BETWEEN)
         samples = [ramp.at(time) for time in times]
@@ -71,18 +71,18 @@ class Landing:
                                 np.array([one.angular_velocity for one in samples]), ramp.stamp)
 
     def degrade(self, health: ActuatorHealth, now: float, in_force: Command | None) -> None:
-        """Go on with the actuators that are left."""
+        """Continue with the working actuators."""
         self._health = health
         self.set_out(now, in_force)
 
     def start(self, now: float, in_force: Command | None, distrusted: bool = False) -> None:
         """
-        Begin where the robot is, on the estimator or on the backup.
+        Begin at the present pose, with the estimator or the backup.
 
         Args:
             now: [s].
-            in_force: the command in force.
-            distrusted: whether the estimator is there and wrong.
+            in_force: the executed command.
+            distrusted: whether the estimator runs, but is wrong.
 
         """
         if distrusted:
@@ -93,7 +93,7 @@ class Landing:
         self.set_out(now, in_force)
 
     def step(self, now: float, dt: float, in_force: Command | None) -> Command:
-        """The command of this instant."""
+        """The command for the present time."""
         vehicle, backup = self._vehicle, self._vehicle.backup
         if not backup.running and vehicle.estimate.silent:
             self._events.say(now, ERROR, f'ekf_node {vehicle.estimate.text}: descent goes on with '
@@ -101,7 +101,7 @@ class Landing:
             backup.start(vehicle.known)
             self.set_out(now, in_force)
         if self._without_mocap and not self._blind:
-            self._blind = True      # what is known of the velocity fades: less time in the air
+            self._blind = True      # the velocity error grows with time: land faster
             self.set_out(now, in_force)
         if not backup.running:
             return self._follow(vehicle.seen(in_force), dt, vehicle.specific_force_up
@@ -149,7 +149,7 @@ class Landing:
             self._ramp.duration - wait if fast else 0.0)
 
     def _begin_turnover(self, state, level):
-        """Fly to where a joint turns over with its rotor at rest; whether that exists."""
+        """Fly to an attitude at which a joint turns over with its rotor off; False if none."""
         found = find_turnover(state.quaternion, state.tilt, self._robot, self._allocator, level,
                               self._parameters.turnover)
         if found is None:
@@ -163,14 +163,14 @@ class Landing:
         return True
 
     def _turn_over(self, found: Turnover, state, command) -> Command:
-        """The command with the turning joint's own target; goes on once four rotors push again."""
+        """The command with the target of the turning joint; ends when four rotors work again."""
         elapsed = state.stamp - self._ramp.stamp
         p = self._parameters.turnover
         since = elapsed - self._ramp.way.duration - p.settling_time
         if since < 0:
             self._full = float(command.thrust[found.joint])
         elif self._arrived is None:
-            # The others take over in steps, so that their joints follow.
+            # The other rotors take over the load in steps, so that their joints can follow.
             share = self._rest(found, 1 - since / p.fading_time)
             if share <= 0:
                 command = replace(command, tilt=np.where(
@@ -183,7 +183,7 @@ class Landing:
         return command
 
     def _rest(self, found: Turnover, share) -> float:
-        """Let the rotor give a share of its thrust, in steps; return the step's share."""
+        """Limit the rotor to a share of its thrust, in steps; return the share of the step."""
         share = float(np.clip(np.round(share * FADING_STEPS) / FADING_STEPS, 0.0, 1.0))
         if share != self._share:
             self._share = share
@@ -196,7 +196,7 @@ class Landing:
             self._hover.set_health(self._health)
 
     def _way_with_what_is_left(self, state, rate):
-        """First where control is regained soonest, then to the attitude nearest level with it."""
+        """First to the attitude where control is regained soonest, then towards level."""
         holding = Holding(self._robot, self._health)
         p = holding.parameters
         escape = holding.quickest(state.quaternion, state.angular_velocity, state.tilt,
@@ -216,15 +216,15 @@ class Landing:
         """
         Follow the ramp, whose target waits for the robot.
 
-        ``specific_force_up`` [m/s^2] is given only where motion is not measured: elsewhere an
-        upward wind would be taken for the ground.
+        ``specific_force_up`` [m/s^2] is given only if motion is not measured: otherwise an upward
+        wind would be interpreted as the ground.
         """
         reference = self._ramp.at(state.stamp)
         if isfinite(self._ramp.climb) and self._slow_enough(state.stamp, reference):
             self._flare(state.stamp, reference)
         sink, velocity = 0.0, reference.velocity
         if specific_force_up is not None:
-            # Dead reckoning may believe in a descent that is none: what is overdue sinks faster.
+            # Dead reckoning may estimate a descent that does not happen: then sink faster.
             growth = self._parameters.overdue_acceleration
             late = max(0.0, state.stamp - self._due)
             sink = 0.5 * growth * late ** 2
@@ -236,28 +236,28 @@ class Landing:
         reference = replace(reference, velocity=velocity, position=np.array(
             [*reference.position[:2], height]))
         self._feel_ground(state, dt, specific_force_up, reference)
-        # Rates from MoCap alone are late and noisy: nothing to learn from.
+        # Rates from MoCap only are late and noisy: no update of the disturbance.
         self._hover.observe(state, free=self._vehicle.backup.imu_alive)
         command = self._hover.step(state, _Now(reference))
         return command if self._turnover is None else \
             self._turn_over(self._turnover, state, command)
 
     def _slow_enough(self, stamp, reference):
-        """Whether the fast descent ends: it brakes, down to the speed of the touchdown."""
+        """Whether the fast descent ends, to brake to the touchdown speed."""
         ramp = self._ramp
         half = ramp.stamp + ramp.wait + 0.5 * (ramp.duration - ramp.wait)
         return stamp > half and -reference.velocity[2] <= self._parameters.speed
 
     def _flare(self, stamp, reference):
-        """Go on slowly."""
+        """Continue with the low speed."""
         p = self._parameters
         self._ramp = Ramp(stamp, reference.position, self._ramp.way.ended(), 0.0, -inf, p.speed,
                           p.acceleration, moving=True)
 
     def _feel_ground(self, state, dt, specific_force_up, reference):
-        """The rotors carry clearly less than the weight, yet it does not fall."""
+        """The rotors carry clearly less than the weight, but the robot does not fall."""
         p = self._parameters
-        # Without IMU the model of the rotors, which knows of no floor, leads the velocity.
+        # Without IMU the velocity comes from the rotor model, which does not include the floor.
         blind = self._vehicle.backup.running and not self._vehicle.backup.imu_alive
         by_poses = self._vehicle.backup.velocity_by_poses if blind else None
         sinks = state.velocity[2] if by_poses is None else by_poses[2]

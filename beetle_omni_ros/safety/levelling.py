@@ -1,12 +1,12 @@
 """
-The way back to level that the joints can follow.
+Turns back to level that the joints can follow.
 
-In a slow turn each tilt is the angle of world's up about the rotor's arm, so the tilts follow
-from the path of the up direction through the body alone. The joints have stops, and a joint near
-half a turn can reach level only along paths on its own side. Where an arm stands upright its
-thrust carries nothing and its tilt may have any value: there a joint that is wound the wrong way
-turns over at no cost. The planner compares paths of the up direction: the direct one, those
-through the horizontal plane of the body, and those through upright arms.
+In a slow turn each tilt is the angle of world's up about the rotor's arm. The tilts therefore
+follow from the path of the up direction in the body frame. The joints have stops, and a joint near
+half a turn can reach level only along paths on its own side. If an arm points upward, its thrust
+cannot carry weight and its tilt may have any value: there a joint that is wound in the wrong
+direction can turn over without loss. The planner compares paths of the up direction: the direct
+path, paths through the horizontal plane of the body, and paths through upward arms.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from beetle_omni_ros.robot.schema import parameter
 
 UP = np.array([0.0, 0.0, 1.0])
 STEP = 0.1              # [rad] between points of a path
-VIA = 16                # points of the body's horizontal plane that are tried
-TURNED_OVER = 1.0       # [rad] in one step: the joint points elsewhere meanwhile
+VIA = 16                # tested points of the body's horizontal plane
+TURNED_OVER = 1.0       # [rad] in one step: the thrust points in a wrong direction meanwhile
 
 
 @dataclass(frozen=True, kw_only=True)
 class LevellingParameters:
-    """How fast a robot levels out."""
+    """Rates of levelling."""
 
     rate: float = parameter(0.8, doc='angular rate of the body', unit='rad/s', low=0.05, high=5)
     joint_rate: float = parameter(
@@ -41,12 +41,12 @@ class LevellingParameters:
 
 class Way:
     """
-    An attitude that turns along a path, piece by piece at steady rates.
+    An attitude that turns along a path with piecewise constant rates.
 
     Args:
-        times: (P,) increasing [s]; until the first it stands at its start.
+        times: (P,) increasing [s]; at rest at the start until the first.
         quaternions: (P, 4) base_link to world, xyzw.
-        lost: lift that joints lose that turn over on it, in hover thrusts of one rotor [s].
+        lost: lift lost by joints that turn over, in hover thrusts of one rotor times [s].
 
     """
 
@@ -64,12 +64,12 @@ class Way:
         return cls(np.array([0.0, angle / rate]), np.array([start, goal]))
 
     def ended(self) -> Way:
-        """Its end, held."""
+        """The end of the way, held."""
         return Way(np.zeros(1), self._quaternions[-1:])
 
     @property
     def duration(self) -> float:
-        """Until it stands still [s]."""
+        """Duration until rest [s]."""
         return float(self._times[-1])
 
     @property
@@ -94,7 +94,7 @@ class Way:
 def plan(quaternion: np.ndarray, tilt: np.ndarray, allocator: Allocator,
          p: LevellingParameters) -> Way:
     """
-    Plan the turn to level that the joints follow best.
+    Plan the turn to level that the joints can follow best.
 
     Args:
         quaternion: (4,) present attitude, base_link to world, xyzw.
@@ -109,7 +109,7 @@ def plan(quaternion: np.ndarray, tilt: np.ndarray, allocator: Allocator,
     start = rotations.up(quaternion)
     paths = [_path(corners) for corners in _corners(start, allocator)]
     longest = max(map(len, paths))
-    # One array: a path that ends earlier stays level.
+    # One array: shorter paths stay level at their end.
     up = np.array([np.concatenate([path, np.tile(UP, (longest - len(path), 1))])
                    for path in paths])
     waits, lost = _follow(tilt, up, allocator, p)
@@ -120,7 +120,7 @@ def plan(quaternion: np.ndarray, tilt: np.ndarray, allocator: Allocator,
 
 
 def _corners(start, allocator):
-    """Corner points of the paths of the up direction that are tried."""
+    """Corner points of the compared paths of the up direction."""
     heading = np.linspace(0, 2 * np.pi, VIA, endpoint=False)
     ring = np.stack([np.cos(heading), np.sin(heading), np.zeros(VIA)], axis=1)
     arms = allocator.axes
@@ -153,8 +153,8 @@ def _follow(tilt, up, allocator, p):
     """
     Times (N, P) [s] that the joints need for each step of N paths, and lift lost (N,) [s].
 
-    A joint takes the turn nearest its angle within its stops, as the allocation does. Lift is
-    counted in hover thrusts of one rotor times the time for which its joint points elsewhere.
+    A joint uses the nearest angle within its stops, as in the allocation. Lost lift is the hover
+    thrust of one rotor times the time for which its thrust points in a wrong direction.
     """
     shape = up.shape[:2] + (ROTORS,)
     angles, thrusts = (x.reshape(shape) for x in allocator.upright(up.reshape(-1, 3)))
@@ -174,7 +174,7 @@ def _follow(tilt, up, allocator, p):
 
 
 def _way(quaternion, path, times, lost):
-    """Attitudes along a path: the smallest turns that carry one up direction to the next."""
+    """Attitudes along a path: smallest turns from one up direction to the next."""
     attitudes = [rotations.normalized(quaternion)]
     for a, b in zip(path[:-1], path[1:]):
         axis = np.cross(b, a)

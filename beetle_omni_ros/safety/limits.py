@@ -1,4 +1,4 @@
-"""The checks of every command, and the record of each controller's good and refused ones."""
+"""Checks of commands, and a record of each controller's valid and refused commands."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ SAME = 10       # commands in a row that are equal to the last digit
 
 class CommandStream:
     """
-    One controller's commands: what was accepted last, what was refused and why.
+    Commands of one controller: the last accepted one, and refusals with reasons.
 
     Args:
         limits: thresholds.
         robot: thrust and tilt ranges.
 
     Attributes:
-        accepted: the last good command, or None.
-        cut: the last command that was refused for a range, cut to the limits, or None.
+        accepted: the last valid command, or None.
+        cut: the last command that was refused for a range, clipped to the limits, or None.
         refused: reason -> count.
-        last_refusal: reason of the last refusal, '' after a good command.
-        silence: since the last good command.
-        good_for: how long it has been good without a gap or refusal [s].
+        last_refusal: reason of the last refusal, '' after a valid command.
+        silence: time since the last valid command.
+        good_for: time of valid commands without a gap or refusal [s].
 
     """
 
@@ -60,17 +60,17 @@ class CommandStream:
 
     @property
     def good(self) -> bool:
-        """Whether it may be given control."""
+        """Whether the controller may get control."""
         return not self.silence.silent and self.good_for >= self._limits.return_after - 1e-9
 
     @property
     def in_force(self) -> Command | None:
         """
-        What of it can be executed: its last good command, or a newer one cut to the limits.
+        The executable command: the last valid command, or a newer one clipped to the limits.
 
-        None where it is silent. A controller that asks for somewhat more than there is, in a
-        manoeuvre and for a short while, is better executed at the limits than replaced: wrong
-        units are farther beyond them, and one that has lost its way stays there longer.
+        None if the controller is silent. A command that slightly exceeds the limits for a short
+        time in a manoeuvre is clipped, which is better than a fallback. Wrong units exceed the
+        limits by more, and a failed controller exceeds them for longer.
         """
         cut, good = self.cut, self.accepted
         if cut is not None and (good is None or cut.stamp > good.stamp) \
@@ -81,7 +81,7 @@ class CommandStream:
 
     @property
     def complaint(self) -> str:
-        """Why it is not good, for messages."""
+        """Why the controller may not get control, for messages."""
         if self.silence.silent:
             last = f'; last refused: {self.last_refusal}' if self.last_refusal else ''
             return self.silence.text + last
@@ -89,7 +89,7 @@ class CommandStream:
 
     def offer(self, command: Command, now: float) -> str:
         """
-        Check one command; keep a clean copy when it is good.
+        Check one command; store a copy of a valid command.
 
         Returns:
             '' when accepted, else the reason.
@@ -99,8 +99,8 @@ class CommandStream:
         if reason:
             self.refused[reason] += 1
             self.last_refusal = reason
-            # A step to a new target looks like a jump for one period and is none afterwards;
-            # one that is none of that is soon silent.
+            # A step to a new target looks like a jump for one period only. Repeated jumps end in
+            # the timeout.
             if reason != JUMP:
                 self.good_for = 0.0
             if reason in (THRUST, TILT) and self._slightly(command, clean):
@@ -118,13 +118,13 @@ class CommandStream:
         self.good_for = 0.0 if self.silence.silent else self.good_for + dt
 
     def clock_went_back(self, now: float) -> None:
-        """Stamps from before a clock step must not block the stream."""
+        """Accept new stamps after a step of the clock."""
         if self.accepted is not None and self.accepted.stamp > now:
             self.accepted = self._offered = self.cut = None
             self.silence.elapsed = float('inf')
 
     def _slightly(self, command, clean):
-        """Whether a command oversteps by no more than a share of the ranges."""
+        """Whether a command exceeds the limits by at most a share of the ranges."""
         share, rotors = self._limits.overstep, self._rotors
         return _farthest(np.asarray(command.thrust, dtype=float), clean.thrust) \
             <= share * (rotors.thrust_max - rotors.thrust_min) \
@@ -132,7 +132,7 @@ class CommandStream:
             <= share * self._tilt_limit
 
     def _check(self, command, now):
-        """Reason and, without one, the copy with limits applied exactly."""
+        """Reason of a refusal and, without one, the copy with limits applied exactly."""
         try:
             stamp = float(command.stamp)
             tilt = np.array(command.tilt, dtype=float)
@@ -168,8 +168,8 @@ class CommandStream:
         self._same = self._same + 1 if same else 0
         if self._same >= SAME:
             return FROZEN
-        # Against the previous one offered, not accepted: a lone spike is refused, a real step
-        # costs one period.
+        # Compared with the previous command, accepted or not: a single spike is refused, a real
+        # step is delayed by one period.
         if before is not None and clean.stamp - before.stamp <= self._limits.timeout and (
                 _farthest(clean.tilt, before.tilt) > self._limits.tilt_step
                 or _farthest(clean.thrust, before.thrust) > self._limits.thrust_step):
@@ -180,12 +180,12 @@ class CommandStream:
 def within_limits(command: Command, robot: RobotParameters, stopped: bool = False) -> \
         Command | None:
     """
-    The last look at what goes out: finite and cut to the limits, or None.
+    Final check of the output: finite and clipped to the limits, or None.
 
     Args:
-        command: of whatever source.
+        command: of any source.
         robot: thrust and tilt ranges.
-        stopped: whether zero thrust is meant, below the smallest thrust of flight.
+        stopped: whether zero thrust is intended, below the smallest thrust in flight.
 
     """
     if not all(map(isfinite, (*command.tilt.tolist(), *command.thrust.tolist()))):
@@ -197,7 +197,7 @@ def within_limits(command: Command, robot: RobotParameters, stopped: bool = Fals
 
 
 def _cut(values, low, high):
-    """As np.clip, for a fraction of its time."""
+    """Clip, faster than np.clip."""
     return np.minimum(np.maximum(values, low), high)
 
 

@@ -1,4 +1,4 @@
-"""The supervisor's parameters; params/supervisor.yaml says why each has its value."""
+"""The supervisor's parameters; params/supervisor.yaml gives the reasons of their values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from beetle_omni_ros.safety.watch.parameters import Detection
 
 @dataclass(frozen=True, kw_only=True)
 class CommandLimits:
-    """When a command is refused and when its controller counts as silent."""
+    """When a command is refused and when a controller is silent."""
 
     timeout: float = parameter(0.05, doc='silence of the active controller: fallback', unit='s',
                                low=0.01, high=1)
@@ -43,7 +43,7 @@ class CommandLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class HandoverParameters:
-    """How fast the command may change when somebody else takes over."""
+    """Largest rates of the command after a change of the controller."""
 
     time: float = parameter(0.3, doc='longest; ends when the command has caught up', unit='s',
                             low=0, high=5)
@@ -53,7 +53,7 @@ class HandoverParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class StateLimits:
-    """When the state estimate, the joints and the raw sensors count as gone."""
+    """Timeouts of state estimate, joints and raw sensors."""
 
     timeout: float = parameter(0.05, doc='silence of the estimator: controlled descent', unit='s',
                                low=0.01, high=1)
@@ -72,7 +72,7 @@ class StateLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class ArmingLimits:
-    """What must hold before the motors start."""
+    """Conditions for the start of the motors."""
 
     tilt: float = parameter(0.35, doc='largest inclination', unit='rad', low=0.01, high=3.15)
     speed: float = parameter(0.3, doc='largest speed', unit='m/s', low=0.01, high=10)
@@ -81,7 +81,7 @@ class ArmingLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class TakeoffParameters:
-    """From the ground to the height where the selected controller takes over."""
+    """Climb to the height where the selected controller takes over."""
 
     height: float = parameter(1.0, doc='height of base_link in world', unit='m', low=0.1, high=20)
     clearance: float = parameter(0.3, doc='least climb, from a raised platform', unit='m',
@@ -104,7 +104,7 @@ class TakeoffParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class LandingParameters:
-    """Levelling, descent and how the ground is noticed."""
+    """Levelling, descent and detection of the ground."""
 
     speed: float = parameter(0.3, doc='descent speed', unit='m/s', low=0.05, high=3)
     acceleration: float = parameter(0.5, doc='of the descent', unit='m/s^2', low=0.05, high=10)
@@ -138,7 +138,7 @@ class LandingParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class BackupParameters:
-    """The estimator of last resort."""
+    """The backup estimator."""
 
     position_bandwidth: float = parameter(8.0, doc='of MoCap corrections of position',
                                           unit='rad/s', low=0.5, high=50)
@@ -157,7 +157,7 @@ class BackupParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class BatteryLimits:
-    """Pack voltage for each cell, under load."""
+    """Voltage of a cell, under load."""
 
     arm: float = parameter(3.5, doc='arming needs at least this', unit='V', low=2.5, high=4.4)
     warn: float = parameter(3.4, doc='warning below', unit='V', low=2.5, high=4.4)
@@ -167,7 +167,7 @@ class BatteryLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class Envelope:
-    """Where flight counts as lost; any attitude is legal, so attitude is not in it."""
+    """Flight envelope, without attitude, because any attitude is legal."""
 
     half_width: float = parameter(20.0, doc='|x| and |y| in world', unit='m', low=0.5, high=1000)
     height: float = parameter(20.0, doc='z in world', unit='m', low=0.5, high=1000)
@@ -190,7 +190,7 @@ class Envelope:
 
 @dataclass(frozen=True, kw_only=True)
 class SupervisorParameters:
-    """Everything the supervisor can be told."""
+    """All parameters of the supervisor."""
 
     controller: str = parameter(registry.DEFAULT, doc='the active controller, also in flight')
     commands: CommandLimits = group(CommandLimits)

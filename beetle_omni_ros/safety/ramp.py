@@ -1,4 +1,4 @@
-"""A target that climbs or sinks at a limited speed while the attitude turns level."""
+"""A target that climbs or sinks with a limited speed while the attitude turns to level."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ def inclination(quaternion: np.ndarray) -> float:
 @dataclass(frozen=True)
 class Ramp:
     """
-    Moves vertically from a pose, and turns towards another attitude meanwhile.
+    Moves vertically from a pose, and turns to another attitude meanwhile.
 
-    It has the ``at`` of a target, so a controller follows it like any other.
+    It has the method ``at`` of a target, so a controller can follow it.
 
     Attributes:
         stamp: when it starts [s].
         position: (3,) start in world [m].
         way: of the attitude.
         wait: time before the vertical motion [s].
-        climb: vertical way, negative downwards, may be infinite [m].
+        climb: vertical distance, negative downwards, may be infinite [m].
         speed: of the vertical motion [m/s].
         acceleration: of the vertical motion [m/s^2].
-        moving: whether it already has its speed at the start.
+        moving: whether it starts with its speed.
 
     """
 
@@ -49,7 +49,7 @@ class Ramp:
 
     @property
     def duration(self) -> float:
-        """Until nothing moves any more [s]."""
+        """Duration until rest [s]."""
         return max(self.way.duration, self.wait + self._profile(0.0)[2])
 
     def at(self, time: float) -> Reference:
@@ -61,7 +61,7 @@ class Ramp:
         return Reference(self.position + sign * way * UP, quaternion, sign * speed * UP, rate)
 
     def _profile(self, elapsed):
-        """Way, speed and total time of a trapezoid of speed."""
+        """Distance, speed and total time of a trapezoidal speed profile."""
         if self.moving:
             return max(0.0, elapsed) * self.speed, self.speed, abs(self.climb) / self.speed
         length, a = abs(self.climb), self.acceleration

@@ -1,4 +1,4 @@
-"""Which controller is active, and the streams of all of them."""
+"""The active controller, and the command streams of all controllers."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class Selection:
         return self._streams[self.active]
 
     def good(self, controller: str) -> Command | None:
-        """The latest command of a controller that may be given control, else None."""
+        """The latest command of a controller that may get control, else None."""
         stream = self._streams.get(controller)
         return stream.accepted if stream is not None and stream.good else None
 
     def offer(self, controller: str, command: Command, now: float) -> str:
-        """Check one command; '' when it is good, else the reason (counted)."""
+        """Check one command; '' when it is valid, else the reason (counted)."""
         if controller not in self._streams:
             self._unknown += 1
             return UNKNOWN
@@ -61,12 +61,12 @@ class Selection:
             stream.tick(dt)
 
     def clock_went_back(self, now: float) -> None:
-        """Stamps from before a clock step must not block the streams."""
+        """Accept new stamps after a step of the clock."""
         for stream in self._streams.values():
             stream.clock_went_back(now)
 
     def diagnostics(self) -> dict[str, float | int]:
-        """For each controller: good, silence [ms], refusals by reason."""
+        """For each controller: validity, silence [ms], refusals by reason."""
         told: dict[str, float | int] = {}
         for name, stream in self._streams.items():
             told[f'{name}.good'] = int(stream.good)

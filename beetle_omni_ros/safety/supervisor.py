@@ -1,8 +1,8 @@
 """
-The supervisor: which command the actuators execute, and what happens when something fails.
+The supervisor: selects the command of the actuators and reacts to faults.
 
-A pure state machine: it reads no clock and no topic, every time is passed in, so the node and the
-in-process evaluation run the same code and get the same answer. See docs/safety.md.
+A pure state machine that reads no clock and no topic. All times are arguments, so that the node
+and the in-process evaluation run the same code with the same results. See docs/safety.md.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from beetle_omni_ros.safety.watch.faults import CRASH, DISPLACED
 
 DISARMED, TAKEOFF, FLYING = 'disarmed', 'takeoff', 'flying'
 FALLBACK, LANDING, STOPPED = 'fallback', 'landing', 'emergency_stop'
-RESUMING = 0.1      # [s] after a pause until every source has spoken again
+RESUMING = 0.1      # [s] after a pause until every source has sent a message again
 IN_FLIGHT = (TAKEOFF, FLYING, FALLBACK, LANDING)
 
 
@@ -39,15 +39,15 @@ class Supervisor(Inputs):
 
     Args:
         parameters: thresholds.
-        robot: the robot as it is believed to be.
-        fallback: flies takeoff, fallback and landing; HoverController or alike.
-        controllers: names of the controllers that may be active; None: those that stand by.
-        pilot: who lands with actuators missing, where it is good, else the hover law; None: the
-            registry's choice among ``controllers``.
+        robot: the model of the robot.
+        fallback: for takeoff, fallback and landing; a HoverController or similar.
+        controllers: names of the controllers that may be active; None: those on standby.
+        pilot: the controller that lands with failed actuators, if it sends valid commands, else
+            the fallback; None: the registry's choice among ``controllers``.
 
     Attributes:
         state: 'disarmed', 'takeoff', 'flying', 'fallback', 'landing' or 'emergency_stop'.
-        source: whose command is executed: a controller's name, 'hover' or 'none'.
+        source: of the executed command: a controller's name, 'hover' or 'none'.
         events, vehicle, active: see Inputs.
 
     """
@@ -62,7 +62,7 @@ class Supervisor(Inputs):
         self._gauge = SupportGauge(self._allocator, robot.gravity, robot.rotors.time_constant)
         self._handover = Handover(parameters.handover)
         self.state, self.source = DISARMED, 'none'
-        # What a state needs, made as it is entered.
+        # Objects of the present state, created when it is entered.
         self._takeoff: Takeoff
         self._landing: Landing
         self._target: PoseTarget
@@ -70,13 +70,13 @@ class Supervisor(Inputs):
         self._landing_for = self._fallback_for = 0.0
         self._health = ALL_WELL
         self._landing_way: Target | None = None
-        self._resuming = 0.0    # time in which a pause of this process is looked into [s]
+        self._resuming = 0.0    # remaining time of the check after a pause of this process [s]
         self._before: float | None = None   # time of the update before [s]
 
     # Requests ---------------------------------------------------------------------------------
 
     def arm(self, now: float) -> Answer:
-        """Start the motors and take off, or say why not."""
+        """Start the motors and take off, or return the reason of the refusal."""
         if self.state != DISARMED:
             return self._refuse(now, f'arm refused: {self.state}, not disarmed')
         reason = self.actuators.why_not_arm or self.vehicle.why_not_arm() or self._moved_zero
@@ -94,7 +94,7 @@ class Supervisor(Inputs):
 
     @property
     def _moved_zero(self):
-        """'' or which encoder cannot be trusted on the ground any more."""
+        """'' or the encoder that cannot be trusted on the ground any more."""
         moved = [f'gimbal{k + 1}' for k, zero in enumerate(self._health.zeros) if zero]
         return f"the encoder of {' and '.join(moved)} jumped in the last flight: check it, then " \
                'restart supervisor_node' if moved else ''
@@ -114,7 +114,7 @@ class Supervisor(Inputs):
         return self._motors_off(STOPPED, now, ERROR, f'emergency stop: {reason}')
 
     def land(self, now: float) -> Answer:
-        """Descend where it is, motors off at the ground."""
+        """Descend at the present position, motors off at the ground."""
         if self.state not in IN_FLIGHT:
             return self._refuse(now, f'land refused: {self.state}, not in flight')
         if self.state == LANDING:
@@ -122,7 +122,7 @@ class Supervisor(Inputs):
         return self._land(now, INFO, 'landing on request')
 
     def select(self, controller: str, now: float | None = None) -> Answer:
-        """Make another controller the active one; in flight only one that is good."""
+        """Select another controller; in flight only one with valid commands."""
         now = self._now if now is None else now
         if controller == self.active:
             return Answer(True, f'{controller} is active')
@@ -138,7 +138,7 @@ class Supervisor(Inputs):
 
     def update(self, now: float) -> Command | None:
         """
-        Decide what the actuators execute now; call it at least every 10 ms.
+        Select the command of the actuators; call it at least every 10 ms.
 
         Returns:
             a finite command within limits, or None: nothing is sent.
@@ -166,7 +166,7 @@ class Supervisor(Inputs):
         return asked
 
     def _as_read(self, command):
-        """A command in the joints' own angles, where an encoder's zero has moved."""
+        """A command in encoder angles, if the zero of an encoder has moved."""
         if command is None or self._health.zeros == NO_ZEROS:
             return command
         return within_limits(replace(command, tilt=self._health.read(command.tilt)), self._robot,
@@ -189,16 +189,16 @@ class Supervisor(Inputs):
 
     @property
     def airborne(self) -> bool:
-        """Whether the robot flies, as far as is known."""
+        """Whether the robot flies, as far as known."""
         return self.state in IN_FLIGHT and not self._on_ground
 
     @property
     def faults(self) -> dict[str, float]:
-        """Faults of this flight: name -> when it was named [s]."""
+        """Faults of this flight: name -> time of detection [s]."""
         return self.watch.faults
 
     def _look_for_faults(self, now, dt):
-        """Act on what the detectors say."""
+        """React to the detectors."""
         paused, self._before = now - (now if self._before is None else self._before), now
         for text in self.watch.news():
             self._say(now, ERROR, text)
@@ -216,14 +216,14 @@ class Supervisor(Inputs):
             self._degrade(now)
 
     def _degrade(self, now):
-        """Fly with what is left: land in the attitude nearest level that leaves a margin."""
+        """Fly with the working actuators: land in the attitude nearest level with a margin."""
         moved = self._health.same_actuators(self.watch.health)
         self._health = health = self.watch.health
         if health.healthy:
-            return      # a zero has moved, which commands and readings take into account
+            return      # a zero has moved, which is corrected in commands and readings
         near = self._parameters.detection.contact.near_ground
         if health.rotors.count(False) > 1 and self._height is not None and self._height < near:
-            # Two rotors hold nothing, and rotors that stop one after another hit the floor.
+            # With two rotors no attitude can be held.
             return self._crash(now, 'a second rotor is lost at the floor')
         self._hover.set_health(health)
         if self.state != LANDING:
@@ -242,16 +242,16 @@ class Supervisor(Inputs):
 
     @property
     def health(self) -> ActuatorHealth:
-        """Which actuators work; controllers that can fly without some are told."""
+        """Set the health of the actuators, also of controllers that accept it."""
         return self._health
 
     @property
     def wish(self) -> Target | None:
-        """What controllers shall fly to in place of the operator's target, or None."""
+        """Target of the controllers that replaces the operator's target, or None."""
         return self._landing_way if self.state == LANDING else None
 
     def _resume(self, now, paused):
-        """After a pause of this process, in which the actuators have stopped."""
+        """React to a pause of this process, in which the actuators have stopped."""
         self.watch.name('supervisor_paused', now, '')
         self.watch.restart(now)
         self._say(now, ERROR, f'supervisor_node was not scheduled for {1000 * paused:.0f} ms: '
@@ -261,9 +261,9 @@ class Supervisor(Inputs):
             self._fall_back(now, ERROR, 'fallback to hover after the pause')
 
     def _look_down(self, now, dt):
-        """Whether it lies on the floor; what waited in the queues during a pause is older."""
+        """Whether the robot lies on the floor; messages queued during the pause are older."""
         self._resuming -= dt
-        # The estimate may have lost its way in a fall; MoCap has not.
+        # The estimate may be wrong after a fall, MoCap is not.
         heights = [self._height]
         if not self.vehicle.mocap.silent and self.vehicle.backup.last_position is not None:
             heights.append(float(self.vehicle.backup.last_position[2]) - self._floor)
@@ -273,7 +273,7 @@ class Supervisor(Inputs):
             self._crash(now, 'on the floor after the pause')
 
     def _crash(self, now, why):
-        """Motors off on the ground; a landing that ends upright and softly is none."""
+        """Motors off after a crash; a soft and upright landing is no crash."""
         upright = inclination(self.vehicle.attitude(now)) < self._parameters.arming.tilt
         if self.state == LANDING and upright:
             self._motors_off(DISARMED, now, INFO, f'on the ground, {why}: motors off, disarmed')
@@ -282,7 +282,7 @@ class Supervisor(Inputs):
         self.emergency_stop(now, f'crash: {why}')
 
     def _watch(self, now):
-        """Faults that end or change a flight, whoever flies it."""
+        """Faults that end or change a flight, with any controller."""
         vehicle, envelope = self.vehicle, self._parameters.envelope
         if vehicle.battery_low:
             self._say(now, WARNING, f'battery low: {vehicle.voltage:.1f} V', 'battery')
@@ -322,7 +322,7 @@ class Supervisor(Inputs):
             self._react(envelope.lost_reaction, now, 'tumbling or falling', 'control_lost')
 
     def _beyond_limits(self, now):
-        """Limits that hold while landing and in fallback, too; whether one was passed."""
+        """Limits that also apply in landing and fallback; whether one was exceeded."""
         vehicle, envelope = self.vehicle, self._parameters.envelope
         limits = self._parameters.landing
         if self.state == LANDING and self._landing_for > envelope.recovery_time:
@@ -361,9 +361,9 @@ class Supervisor(Inputs):
 
     def _stand(self, now, dt):
         """
-        Motors off: zero thrust for a short while, then nothing.
+        Motors off: zero thrust for a short time, then no command.
 
-        A rotor that holds its thrust whatever it is asked is turned to press on the floor.
+        A rotor that ignores its thrust command is turned so that it presses on the floor.
         """
         self.source = 'none'
         if self._stop_left <= 0 or self._in_force is None:
@@ -471,10 +471,10 @@ class Supervisor(Inputs):
         if self.state == LANDING:
             self._landing.set_out(now, self._in_force)
 
-    # Small things -----------------------------------------------------------------------------
+    # Helpers ----------------------------------------------------------------------------------
 
     def _guarded(self, command, now):
-        """The last look at whatever goes out: finite, inside limits, not too old."""
+        """Final check of the output: finite, inside limits, not too old."""
         if command is None:
             return None
         if now - command.stamp > self._parameters.commands.age_limit:

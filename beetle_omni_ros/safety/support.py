@@ -1,4 +1,4 @@
-"""How much of the weight the rotors carry, and so whether something else does."""
+"""Share of the weight that the rotors carry, for the detection of the ground."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 
-BASELINE_TIME = 2.0             # [s] over which the thrust that carries the weight is learnt
-BASELINE_RANGE = (0.7, 1.4)     # of the modelled one; more is a disturbance, not the rotors
-LEAST_THRUST = 0.3              # [weights] below it the ratio says nothing
+BASELINE_TIME = 2.0             # [s] time constant of the ratio of specific force and thrust
+BASELINE_RANGE = (0.7, 1.4)     # largest ratio to the model; a larger one is a disturbance
+LEAST_THRUST = 0.3              # [weights] the ratio is not used with less thrust
 
 
 class SupportGauge:
     """
-    How much of the weight the rotors do not carry, from commands and accelerometer.
+    Share of the weight that the rotors do not carry, from commands and accelerometer.
 
-    The rotors' true strength differs from the model's by several percent, so the ratio of
-    specific force to commanded thrust is learnt in free flight and held while landing.
+    The true thrust differs from the model by several percent. The ratio of specific force to
+    commanded thrust is therefore learnt in free flight and kept constant while landing.
     """
 
     def __init__(self, allocator: Allocator, gravity: float, time_constant: float):
         self._allocator, self._gravity, self._lag = allocator, gravity, time_constant
         self._baseline = 1.0
-        self.thrust = 0.0     # along world up, in weights, as it has built up
+        self.thrust = 0.0     # modelled thrust along world up, in weights
         self.lift = 0.0       # the same, corrected by the baseline
-        self._thrusts = np.zeros(ROTORS)    # of each rotor, as built up [N]
+        self._thrusts = np.zeros(ROTORS)    # modelled thrust of each rotor [N]
 
     def update(self, command: Command | None, quaternion: np.ndarray, dt: float,
                specific_force_up: float | None, learn: bool) -> None:
-        """One tick."""
+        """Update in one tick."""
         now, share = 0.0, 1.0 - exp(-dt / self._lag)
         self._thrusts += share * ((0.0 if command is None else command.thrust) - self._thrusts)
         if command is not None:
@@ -48,7 +48,7 @@ class SupportGauge:
 
     def motion(self, tilt: np.ndarray, inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        What the rotors do to the body, by the model.
+        Accelerations of the body by the rotors, from the model.
 
         Args:
             tilt: (4,) true [rad].
@@ -62,6 +62,6 @@ class SupportGauge:
         return self._baseline * force / self._allocator.mass, torque / inertia
 
     def support(self, specific_force_up: float | None) -> float:
-        """Share of the weight that something else carries."""
+        """Share of the weight that the rotors do not carry."""
         felt = 1.0 if specific_force_up is None else specific_force_up / self._gravity
         return felt - self.lift

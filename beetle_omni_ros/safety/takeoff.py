@@ -1,4 +1,4 @@
-"""Takeoff: joints to their places, then a climb by the hover controller."""
+"""Takeoff: joints to their hover angles, then a climb by the hover controller."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from beetle_omni_ros.safety.levelling import Way
 from beetle_omni_ros.safety.parameters import TakeoffParameters
 from beetle_omni_ros.safety.ramp import Ramp
 
-LEVEL_RATE = 0.5  # [rad/s] of what the ground was not level
-AIRBORNE = 0.05   # [m] of rise; below it a fault just stops the motors
+LEVEL_RATE = 0.5  # [rad/s] rate at which an inclination of the ground is levelled
+AIRBORNE = 0.05   # [m] of rise; below it the reaction to a fault is motors off
 
 
 class Takeoff:
@@ -28,7 +28,7 @@ class Takeoff:
         state: where it starts.
 
     Attributes:
-        failure: '' or why it was given up.
+        failure: '' or the reason of an abort.
         done: whether the height is reached.
         airborne: whether it has left the ground.
 
@@ -47,7 +47,7 @@ class Takeoff:
         hover.reset()
 
     def step(self, state: State, in_force: Command | None, dt: float) -> Command:
-        """The command of this instant."""
+        """The command for the present time."""
         self.airborne |= bool(state.position[2] > self._start.position[2] + AIRBORNE)
         if self._ramp is None:
             return self._align(state, dt)
@@ -58,13 +58,13 @@ class Takeoff:
 
     @property
     def target(self) -> np.ndarray:
-        """(3,) where it ends [m]."""
+        """(3,) position at its end [m]."""
         height = self._parameters.height
         rise = max(height - self._start.position[2], self._parameters.clearance)
         return self._start.position + np.array([0.0, 0.0, rise])
 
     def clock_went_back(self, by: float) -> None:
-        """Keep the climb where it was when the clock is set back by ``by`` [s]."""
+        """Continue the climb after the clock was set back by ``by`` [s]."""
         if self._ramp is not None:
             self._ramp = replace(self._ramp, stamp=self._ramp.stamp - by)
 
@@ -93,7 +93,7 @@ class Takeoff:
         if near and np.linalg.norm(state.velocity) < p.speed_tolerance:
             self.done = True
         elif over > p.patience:
-            # In the air, off target: it flies, so the hand-over goes on. On the ground: give up.
+            # In the air, off target: the hand-over follows. On the ground: abort.
             self.done = self.airborne
             if not self.airborne:
                 self.failure = f'still on the ground {p.patience:g} s after the climb'

@@ -1,11 +1,11 @@
 """
-A joint that is wound the wrong way turns over while its rotor rests.
+A joint that is wound in the wrong direction turns over while its rotor is off.
 
-Upside down each tilt may be +-pi. Opposite arms see up on opposite sides, so on every way to level
-one joint of a pair turns forwards and the other backwards. Where both are wound the same way, one
-of them ends at its stop. It has to turn back by a whole turn, during which its rotor pushes in
-every direction. The robot therefore flies to an attitude that the other three rotors hold with a
-margin, rests that rotor, turns its joint, and goes on with four.
+Upside down each tilt may be +pi or -pi. On every way to level, one joint of an opposite pair turns
+forwards and the other backwards. If both are wound in the same direction, one of them reaches its
+stop. It must turn back by a full turn, during which its thrust points in wrong directions. The
+robot therefore flies to an attitude that the other three rotors hold with a margin, stops this
+rotor, turns its joint, and continues with four rotors.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TURN = 2 * np.pi
 
 @dataclass(frozen=True, kw_only=True)
 class TurnoverParameters:
-    """When a joint turns over with its rotor at rest, and how; params/supervisor.yaml says why."""
+    """Tuning of the turnover; params/supervisor.yaml gives the reasons."""
 
     lost_lift: float = parameter(
         0.3, doc='a way to level that loses more lift, in hover thrusts of one rotor, waits until '
@@ -49,11 +49,11 @@ class TurnoverParameters:
 @dataclass(frozen=True)
 class Turnover:
     """
-    Which joint turns over, where, and to which angle.
+    A planned turnover of a joint.
 
     Attributes:
         joint: index of the joint and its rotor.
-        quaternion: (4,) attitude in which its rotor rests.
+        quaternion: (4,) attitude in which its rotor is off.
         tilt: angle at which the joint ends [rad].
 
     """
@@ -63,7 +63,7 @@ class Turnover:
     tilt: float
 
     def health(self, thrust: float = 0.0) -> ActuatorHealth:
-        """The robot while the rotor gives ``thrust`` [N], or rests."""
+        """Health of the actuators while the rotor gives ``thrust`` [N], or is off."""
         if thrust <= 0:
             return ActuatorHealth(rotors=tuple(i != self.joint for i in range(ROTORS)))
         return ActuatorHealth(held=tuple(thrust if i == self.joint else None
@@ -74,7 +74,7 @@ def find_turnover(quaternion: np.ndarray, tilt: np.ndarray, robot: RobotParamete
                   allocator: Allocator, level: LevellingParameters,
                   p: TurnoverParameters) -> Turnover | None:
     """
-    Find the first joint to turn over, so that the way to level needs no other under load.
+    Find the first joint to turn over, so that no joint turns over under load on the way to level.
 
     Args:
         quaternion: (4,) present attitude, base_link to world, xyzw.
@@ -85,7 +85,7 @@ def find_turnover(quaternion: np.ndarray, tilt: np.ndarray, robot: RobotParamete
         p: tuning.
 
     Returns:
-        what to do first, or None where no turnover helps.
+        the first turnover, or None if none helps.
 
     """
     for joint in _wrong_joints(quaternion, tilt, allocator, level, p.lost_lift):
@@ -96,7 +96,7 @@ def find_turnover(quaternion: np.ndarray, tilt: np.ndarray, robot: RobotParamete
 
 
 def _wrong_joints(quaternion, tilt, allocator, level, lost_lift):
-    """The joints of the smallest set that, turned over, leaves a way that loses no lift."""
+    """The smallest set of joints whose turnover gives a way to level without loss of lift."""
     turned = tilt - np.copysign(TURN, tilt)
     wound = np.flatnonzero(np.abs(turned) <= allocator.tilt_limit)
     for count in range(1, len(wound) + 1):
@@ -112,7 +112,7 @@ def _with(tilt, turned, joints):
 
 
 def _place(joint, quaternion, tilt, robot, allocator, p):
-    """Nearest attitude that three rotors hold and where both turns of the joint are legal."""
+    """Nearest attitude that three rotors hold and where both joint angles are legal."""
     resting = Turnover(joint, quaternion, 0.0).health()
     holding = Holding(robot, resting)
     others = np.arange(ROTORS) != joint

@@ -1,4 +1,4 @@
-"""What the supervisor knows of the vehicle: estimate, joints, raw sensors, battery; its checks."""
+"""State of the vehicle for the supervisor: estimate, joints, raw sensors, battery; checks."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from beetle_omni_ros.safety.events import Silence
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.ramp import inclination
 
-TRACKING = ('tracking', 'dead_reckoning')   # statuses whose estimate may be flown on
+TRACKING = ('tracking', 'dead_reckoning')   # statuses with a usable estimate
 UNIT_TOLERANCE = 0.02                       # of a quaternion's squared length
-ABSURD = 1e4                                # [m, m/s, rad/s] no robot is there, no sum overflows
+ABSURD = 1e4                                # [m, m/s, rad/s] beyond any robot; no overflow
 
 
 class Vehicle:
     """
-    The latest of everything, and how long each source has been silent.
+    The latest data of all sources, and their timeouts.
 
     Attributes:
-        state: the last good estimate, or None.
-        status: the estimator's status that came with it.
+        state: the last valid estimate, or None.
+        status: the estimator's status at that time.
         tilt, tilt_velocity, tilt_stamp: latest joint feedback.
-        stuck: whether joints do not follow commands: then a silent one is where it was last seen.
+        stuck: whether joints do not follow commands: then silent joints keep their last angles.
         voltage: of the pack [V], None before the first.
         refused: 'estimate: stale stamp' and the like -> count.
-        last_refusal: reason of the last refused estimate, '' after a good one.
+        last_refusal: reason of the last refused estimate, '' after a valid one.
 
     """
 
@@ -57,10 +57,10 @@ class Vehicle:
     @property
     def known(self) -> State:
         """
-        The last good estimate, without which nothing takes off.
+        The last valid estimate, a condition for take-off.
 
         Raises:
-            RuntimeError: there was none yet.
+            RuntimeError: there is none yet.
 
         """
         if self.state is None:
@@ -78,14 +78,14 @@ class Vehicle:
         self._lost = self._lost + dt if self.state is not None and self._tumbling() else 0.0
 
     def clock_went_back(self, now: float, by: float) -> None:
-        """Stamps from before the clock was set back by ``by`` [s] must not block newer data."""
+        """Accept new stamps after the clock was set back by ``by`` [s]."""
         if self.state is not None and self.state.stamp > now:
             self.state = replace(self.state, stamp=now)
         self.tilt_stamp = min(self.tilt_stamp, now)
         self.backup.clock_went_back(by)
 
     def on_state(self, state: State, status: str, now: float | None) -> str:
-        """Take an estimate; '' when it is good, else the reason of the refusal."""
+        """Receive an estimate; '' when it is valid, else the reason of the refusal."""
         reason = self._check_state(state, status, now)
         if reason:
             self.refused[f'estimate: {reason}'] += 1
@@ -99,9 +99,9 @@ class Vehicle:
 
     def on_joints(self, stamp: float, position: np.ndarray, velocity: np.ndarray) -> bool:
         """
-        Take joint feedback when it is newer; where an angle is nan the last one stays.
+        Receive newer joint feedback; for a nan the last angle is kept.
 
-        Only a complete one ends the joints' silence.
+        Only complete feedback resets the timeout of the joints.
         """
         if not (isfinite(stamp) and stamp > self.tilt_stamp):
             return False
@@ -119,7 +119,7 @@ class Vehicle:
         return True
 
     def seen(self, in_force: Command | None, state: State | None = None) -> State:
-        """A state for the hover controller; silent joints that may follow are as modelled."""
+        """A state for the hover controller; angles of silent, working joints are modelled."""
         state = self.known if state is None else state
         if self.joints.silent and in_force is not None and not self.stuck:
             tilt = in_force.tilt if self.modelled_tilt is None else self.modelled_tilt
@@ -128,7 +128,7 @@ class Vehicle:
                        tilt_stamp=self.tilt_stamp, command=in_force)
 
     def backup_state(self, now: float) -> State:
-        """The estimate of last resort at ``now``."""
+        """The backup estimate at ``now``."""
         return self.backup.state(self.tilt, self.tilt_velocity, self.tilt_stamp, now)
 
     def attitude(self, now: float) -> np.ndarray:
@@ -138,7 +138,7 @@ class Vehicle:
 
     @property
     def _best(self) -> State:
-        """The estimate, or that of last resort where it is in use."""
+        """The estimate, or the backup estimate while it is used."""
         return self.backup.latest(self.known) if self.backup.running else self.known
 
     @property
@@ -151,11 +151,11 @@ class Vehicle:
 
     @property
     def mocap_lost(self) -> bool:
-        """Whether MoCap was there and is silent."""
+        """Whether MoCap has sent poses and is silent now."""
         return self.mocap.silent and isfinite(self.mocap.elapsed)
 
     def why_not_arm(self) -> str:
-        """'' when the motors may start, else what is missing."""
+        """'' when the motors may start, else the missing condition."""
         limits, battery = self._parameters.arming, self._parameters.battery
         if self.state is None or self.estimate.silent:
             return f'no fresh state estimate (ekf_node {self.estimate.text})'
@@ -190,7 +190,7 @@ class Vehicle:
 
     @property
     def lost(self) -> bool:
-        """Whether it has been tumbling or falling for long enough."""
+        """Whether the robot has been tumbling or falling for long enough."""
         return self._lost >= self._parameters.envelope.lost_time
 
     @property
@@ -200,7 +200,7 @@ class Vehicle:
 
     @property
     def far_outside_fence(self) -> bool:
-        """Whether it lies beyond the margin around the fence."""
+        """Whether the estimate lies beyond the margin around the fence."""
         return self._outside(self._parameters.envelope.fence_margin)
 
     def _outside(self, margin):

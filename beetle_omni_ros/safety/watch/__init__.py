@@ -1,1 +1,1 @@
-"""Detectors of faults in flight: pure functions of what was commanded and what was measured."""
+"""Detectors of faults in flight: pure functions of commands and measurements."""

@@ -1,4 +1,4 @@
-"""All detectors of one vehicle: faults by name, and which actuators work."""
+"""All detectors of one vehicle: detected faults, and the health of the actuators."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from beetle_omni_ros.safety.watch.wrench import ContactWatch, WrenchWatch
 CRASH, DISPLACED = 'crash', 'mocap_jumped'
 BUILD_UP = 0.5          # [s] five time constants of a rotor
 RACES = 2.0             # [-] of the largest thrust: the speed of a motor without propeller
-NOTICEABLE = 0.3        # [N] by which a held thrust or the pack's limit may drift untold
+NOTICEABLE = 0.3        # [N] change of a held thrust or of the pack's limit that is not reported
 
 
 class FaultWatch:
     """
-    Feeds the detectors and keeps what they have named.
+    Runs the detectors and stores the detected faults.
 
-    A fault that was named stays until :meth:`reset`: an actuator that has failed once is not
-    trusted again in the same flight.
+    A detected fault stays until :meth:`reset`: an actuator that has failed once is not used again
+    in the same flight.
 
     Args:
         parameters: thresholds.
@@ -37,7 +37,7 @@ class FaultWatch:
         allocator: of the robot.
 
     Attributes:
-        faults: name -> when it was named [s].
+        faults: name -> time of detection [s].
         health: which actuators work, and the zeros of encoders that jumped.
 
     """
@@ -56,7 +56,7 @@ class FaultWatch:
         self.reset()
 
     def reset(self) -> None:
-        """A new flight: everything is well."""
+        """Reset for a new flight without faults."""
         self.faults: dict[str, float] = {}
         self.health: ActuatorHealth = ALL_WELL
         self._new: list[str] = []
@@ -66,9 +66,9 @@ class FaultWatch:
 
     def restart(self, now: float) -> None:
         """
-        Begin to watch anew after a pause or a step of the clock; what is known stays.
+        Restart the detectors after a pause or a step of the clock; detected faults stay.
 
-        For BUILD_UP the rotors' thrusts are not those of the commands.
+        For BUILD_UP seconds the thrusts differ from the commands.
         """
         self._stamp, self._blind_until = -np.inf, now + BUILD_UP
         for watch in (self._wrench, self._contact, self._joints, self._speeds, self._mocap):
@@ -76,16 +76,16 @@ class FaultWatch:
 
     @property
     def contact(self) -> str:
-        """'' or why the robot counts as on the ground."""
+        """'' or the reason why the robot is treated as on the ground."""
         return self._contact.reason
 
     def news(self) -> list[str]:
-        """Texts of faults that were named since the last call."""
+        """Texts of faults that were detected since the last call."""
         news, self._new = self._new, []
         return news
 
     def on_voltage(self, stamp: float, voltage: float) -> None:
-        """Take the pack's voltage [V]: a low one limits every rotor, which is no fault of one."""
+        """Receive the pack's voltage [V]: a low voltage limits all rotors."""
         if self._map is None or self._pack is None:
             return
         self._limit_now = self._map.thrust_limit_below(voltage)
@@ -103,15 +103,15 @@ class FaultWatch:
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                command: Command | None, height: float | None) -> None:
         """
-        Take an IMU sample of a robot in the air.
+        Receive an IMU sample of a robot in the air.
 
         Args:
             stamp: [s].
             force: (3,) specific force in base_link [m/s^2].
             rate: (3,) in base_link [rad/s].
-            tilt: (4,) measured [rad], None: unknown, and only an impact can be told.
-            command: in force, None: rotors off.
-            height: of base_link above where it stood [m], None: unknown.
+            tilt: (4,) measured [rad], None: unknown, and only an impact can be detected.
+            command: the executed command, None: rotors off.
+            height: of base_link above its height on the ground [m], None: unknown.
 
         """
         dt, self._stamp = stamp - self._stamp, stamp
@@ -120,7 +120,7 @@ class FaultWatch:
         self._wrench.on_imu(stamp, force, rate, tilt, thrust, self.health)
         self._contact.update(min(max(dt, 0.0), 0.05), height, self._wrench)
         if height is not None and height < self._p.contact.near_ground:
-            return      # the floor pushes, too
+            return      # the floor also exerts a force
         if stamp < self._blind_until:
             return self._wrench.forget()
         if self._wrench.lost is not None:
@@ -134,7 +134,7 @@ class FaultWatch:
                 self._name(f'joint{joint + 1}_slipped', stamp, text)
 
     def on_command(self, command: Command) -> None:
-        """Take what goes out."""
+        """Receive the executed command."""
         self._joints.on_command(command.stamp, command.tilt)
         thrust = self._possible(command.thrust)
         self._speeds.on_command(command.stamp, thrust)
@@ -143,9 +143,9 @@ class FaultWatch:
 
     def on_joints(self, stamp: float, tilt: np.ndarray, trusted: bool) -> None:
         """
-        Take a complete reading.
+        Receive a complete reading.
 
-        An encoder that jumps keeps its joint where it was: its zero moves by the jump.
+        If an encoder jumps, the joint angle is assumed unchanged: the zero moves by the jump.
 
         Args:
             stamp: [s].
@@ -174,20 +174,20 @@ class FaultWatch:
         self._follow(tilt)
 
     def silent_joints(self, now: float) -> np.ndarray | None:
-        """True tilts (4,) [rad] at ``now`` [s] by the servos' model, for want of readings."""
+        """True tilts (4,) [rad] at ``now`` [s] by the servo model, if there are no readings."""
         self._joints.advance(now)
         model = self._joints.model
         return None if model is None else self.health.true(model)
 
     def without_imu(self, stamp: float, position: np.ndarray, height: float | None) -> None:
-        """Look for a crash in a MoCap position (3,) [m], see :meth:`ContactWatch.on_pose`."""
+        """Check a MoCap position (3,) [m] for a crash, see :meth:`ContactWatch.on_pose`."""
         self._contact.on_pose(stamp, np.asarray(position, dtype=float), height)
 
     def on_mocap(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                  attitude: np.ndarray | None, rate: np.ndarray | None,
                  place: np.ndarray | None = None, velocity: np.ndarray | None = None) -> bool:
         """
-        Take a MoCap pose, see :meth:`MocapWatch.on_pose`.
+        Receive a MoCap pose, see :meth:`MocapWatch.on_pose`.
 
         Returns:
             whether it may be used.
@@ -209,7 +209,7 @@ class FaultWatch:
         return watch.good
 
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
-        """Take ESC speeds (4,) [rad/s], nan where unknown."""
+        """Receive ESC speeds (4,) [rad/s], nan where unknown."""
         self._speeds.on_speeds(stamp, speed)
         if stamp < self._blind_until:
             return self._speeds.forget()
@@ -228,7 +228,7 @@ class FaultWatch:
                 self._hold(rotor, self._speeds.thrust[rotor])
 
     def name(self, name: str, now: float, text: str) -> bool:
-        """Enter a fault that others found; False where it is known."""
+        """Add a fault detected elsewhere; False if it is already known."""
         return self._name(name, now, text)
 
     def _lose_rotor(self, rotor, stamp, by):
@@ -252,7 +252,7 @@ class FaultWatch:
             zero + by if k == joint else zero for k, zero in enumerate(self.health.zeros)))
 
     def _follow(self, tilt):
-        """Where joints that do not obey are now."""
+        """Update the angles of joints that do not follow commands."""
         for joint, angle in enumerate(self.health.stuck):
             if angle is not None and abs(angle - tilt[joint]) > 0.02:
                 self._stick(joint, float(np.clip(tilt[joint], -self._limit, self._limit)))

@@ -12,9 +12,9 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.watch.parameters import ServoLimits
 
 KEPT = 64               # commands, 0.3 s at 200 Hz
-LONGEST = 0.1           # [s] between two readings; after a longer gap the model starts anew
+LONGEST = 0.1           # [s] between two readings; after a longer gap the model is reset
 NO_JUMP = np.zeros(ROTORS)
-AT_REST = 0.05          # [rad] by which a jammed joint may move while it is judged
+AT_REST = 0.05          # [rad] by which a jammed joint may move during the decision
 
 
 class JointWatch:
@@ -26,11 +26,11 @@ class JointWatch:
         robot: as believed.
 
     Attributes:
-        jammed: joints (4,) bool that stand still beside their command.
-        astray: joints (4,) bool that move otherwise than commanded.
-        jump: (4,) [rad] by which the last reading jumped beyond the motion before it, where that
-            is farther than a joint can turn, else 0.
-        model: (4,) readings that the servos would give [rad], None before the first.
+        jammed: joints (4,) bool that stand still away from their command.
+        astray: joints (4,) bool whose motion differs from the command.
+        jump: (4,) [rad] jump of the last reading relative to the motion before it, if it is larger
+            than a joint can turn, else 0.
+        model: (4,) readings by the servo model [rad], None before the first.
 
     """
 
@@ -41,7 +41,7 @@ class JointWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew at the next reading."""
+        """Reset; start again at the next reading."""
         self._commands: deque = deque(maxlen=KEPT)
         self._stamp, self._change = -np.inf, np.zeros(ROTORS)
         self.model: np.ndarray | None = None
@@ -50,19 +50,19 @@ class JointWatch:
         self.jammed = np.zeros(ROTORS, dtype=bool)
         self.astray = np.zeros(ROTORS, dtype=bool)
         self.jump = NO_JUMP
-        self._suspects = False      # whether a joint was off its model at the last reading
+        self._suspects = False      # whether a joint differed from its model at the last reading
 
     @property
     def well(self) -> bool:
-        """Whether no joint jumped, and none is off its model, at the last reading."""
+        """Whether no joint jumped or differed from its model at the last reading."""
         return self.jump is NO_JUMP and not self._suspects
 
     def on_command(self, stamp: float, tilt: np.ndarray) -> None:
-        """Take what the joints were asked at ``stamp`` [s], (4,) [rad]."""
+        """Receive the joint targets (4,) [rad] of the time ``stamp`` [s]."""
         self._commands.append((stamp, tilt))
 
     def on_joints(self, stamp: float, tilt: np.ndarray) -> bool:
-        """Take a complete reading (4,) [rad] of the time ``stamp`` [s]; False where it is old."""
+        """Receive a complete reading (4,) [rad] of the time ``stamp`` [s]; False if it is old."""
         dt = stamp - self._stamp
         if dt <= 0:
             self.jump = NO_JUMP
@@ -87,7 +87,7 @@ class JointWatch:
         return True
 
     def advance(self, stamp: float) -> None:
-        """Go on with the model alone to ``stamp`` [s], for want of readings."""
+        """Continue with the model to ``stamp`` [s], without readings."""
         dt, asked = stamp - self._stamp, self._asked(stamp - self._p.delay)
         if self.model is None or asked is None or dt <= 0:
             return

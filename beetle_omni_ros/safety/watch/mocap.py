@@ -1,4 +1,4 @@
-"""MoCap that contradicts the estimate, and which of the two is to blame."""
+"""Detection of contradictions between MoCap and estimate, and their cause."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.safety.watch.parameters import MocapLimits
 
-AGE = 0.05              # [s] by which pose and estimate may be apart
-LONGEST = 0.1           # [s] between two poses across which a jump is seen
-FASTEST = 6.0           # [m/s] nothing that flies in the hall is faster
+AGE = 0.05              # [s] largest time between pose and estimate
+LONGEST = 0.1           # [s] largest time between two poses for the detection of a jump
+FASTEST = 6.0           # [m/s] largest speed of a robot in a hall
 
 
 class MocapWatch:
     """
-    Looks for jumps that no body makes, for repeated values, and for lasting contradiction.
+    Detects impossible jumps, repeated values, and lasting contradictions.
 
     Args:
         limits: thresholds.
 
     Attributes:
         good: whether the last pose may be used.
-        jumped: whether MoCap itself jumped, since when it contradicts the estimate.
+        jumped: whether the contradiction began with a jump of MoCap.
         contradicts: whether pose and estimate have contradicted each other for long enough.
-        displaced: whether the position jumped, and has long contradicted the estimate's.
+        displaced: whether the position jumped and has contradicted the estimate for long enough.
 
     """
 
@@ -34,7 +34,7 @@ class MocapWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Reset the detector."""
         self._stamp = -np.inf
         self._quaternion: np.ndarray | None = None
         self._position: np.ndarray | None = None
@@ -45,14 +45,14 @@ class MocapWatch:
 
     @property
     def frozen(self) -> bool:
-        """Whether the pose repeats itself."""
+        """Whether equal poses repeat."""
         return self._same >= self._p.frozen
 
     def on_pose(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
                 attitude: np.ndarray | None, rate: np.ndarray | None,
                 place: np.ndarray | None = None, velocity: np.ndarray | None = None) -> None:
         """
-        Take a pose.
+        Receive a pose.
 
         Args:
             stamp: of its capture [s].
@@ -86,7 +86,7 @@ class MocapWatch:
         self.good = not off and not far and not self.frozen
 
     def _is_far(self, dt, position, place, velocity) -> bool:
-        """Whether the position is not the estimate's, and whether it jumped there."""
+        """Whether the position contradicts the estimate, and whether it jumped."""
         before, self._position = self._position, position
         if before is not None and 0 < dt < LONGEST \
                 and _length(position - before) > self._p.distance + FASTEST * dt:
@@ -98,5 +98,5 @@ class MocapWatch:
 
 
 def _length(vector):
-    """As np.linalg.norm, for a fraction of its time."""
+    """Norm, faster than np.linalg.norm."""
     return sqrt(float(vector @ vector))

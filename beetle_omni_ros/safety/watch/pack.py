@@ -1,4 +1,4 @@
-"""The thrust that a sagging pack still allows, from its voltage under the rotors' load."""
+"""Thrust limit of a sagging pack, from its voltage under load."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 from beetle_omni_ros.safety.watch.parameters import PackLimits
 
-DIRECTIONS = 200        # of up in the body whose hover load is looked at, 14 deg apart
+DIRECTIONS = 200        # of up in the body, with a computed hover load, 14 deg apart
 BISECTIONS = 20
-SURPRISE = 3.0          # [-] standard deviations of a reading that only a fault explains
-UNKNOWN = 1.0           # [ohm W/N^1.5] of a pack that was not yet loaded; a good one has 0.4
+SURPRISE = 3.0          # [-] standard deviations beyond which a reading means a fault
+UNKNOWN = 1.0           # [ohm W/N^1.5] initial value; a good pack has 0.4
 
 
 class PackWatch:
     """
-    Tells the rest voltage of the pack from its resistance while the load varies.
+    Separates open-circuit voltage and resistance of the pack while the load varies.
 
-    A rotor draws power with thrust to the power of 1.5, so the voltage under load is
-    ``V = rest - drop * load / V`` with the load being the sum of those powers. A Kalman filter
-    estimates ``rest`` and ``drop``. Charge falls slowly; a reading far from the expected one is a
-    resistance (a contact, a cell) that has changed.
+    A rotor draws power with thrust to the power of 1.5, so the voltage under load is ``V = rest -
+    drop * load / V`` with the load being the sum of those powers. A Kalman filter estimates
+    ``rest`` and ``drop``. Charge falls slowly. A reading far from the expected value means that a
+    resistance (a contact, a cell) has changed.
 
-    The pack is weak where it cannot hold every attitude: at one of them the voltage that its load
-    leaves gives less than the thrust that it needs.
+    The pack is weak if it cannot hold every attitude: at some attitude the thrust at the voltage
+    under load is less than required.
 
     Args:
         limits: noise and times.
@@ -35,7 +35,8 @@ class PackWatch:
         rotor_map: thrust limits by voltage.
 
     Attributes:
-        limit: thrust that all rotors can give together [N], None while the pack is strong enough.
+        limit: thrust that all rotors can give at the same time [N], None while the pack is strong
+            enough.
 
     """
 
@@ -50,7 +51,7 @@ class PackWatch:
         self.reset()
 
     def reset(self) -> None:
-        """A new flight, perhaps on another pack."""
+        """Reset for a new flight, perhaps with another pack."""
         self.limit: float | None = None
         self._thrust, self._commanded_at = np.zeros(ROTORS), -np.inf
         self._state = np.array([np.nan, 0.0])      # rest [V], drop [ohm W/N^1.5]
@@ -58,20 +59,20 @@ class PackWatch:
         self._read_at, self._weak_for = -np.inf, 0.0
 
     def on_command(self, stamp: float, thrust: np.ndarray) -> None:
-        """Take thrusts (4,) [N] that are asked for from ``stamp`` [s] on, as far as possible."""
+        """Receive the commanded thrusts (4,) [N] from ``stamp`` [s] on."""
         since = max(0.0, stamp - self._commanded_at)
         self._thrust = self._thrust - np.expm1(-since / self._lag) * (thrust - self._thrust)
         self._commanded_at = stamp
 
     def on_voltage(self, stamp: float, voltage: float) -> None:
-        """Take a reading [V]."""
+        """Receive a reading [V]."""
         since, self._read_at = min(stamp - self._read_at, 1.0), stamp
         if since <= 0 or voltage <= 0:
             return
         if np.isnan(self._state[0]):
             self._state[0] = voltage
         self._estimate(voltage, since)
-        # Once weak, always weak: a pack that recovers is not trusted in the same flight.
+        # A weak pack stays weak in the same flight, even if its voltage recovers.
         weak = bool(np.any(self._allowed(self._loads) < self._needs))
         self._weak_for = self._weak_for + since if weak else 0.0
         if self.limit is not None or self._weak_for > self._p.time:
@@ -93,7 +94,7 @@ class PackWatch:
         self._covariance -= np.outer(gain, gain) * variance
 
     def _allowed(self, load):
-        """Largest thrust of a rotor [N] at the voltage that loads [N^1.5] leave."""
+        """Largest thrust of a rotor [N] at the voltage under loads [N^1.5]."""
         rest, drop = self._state
         # V (rest - V) = drop * load; beyond the pack's largest power V is half of rest.
         voltage = 0.5 * (rest + np.sqrt(np.maximum(rest * rest - 4 * drop * load, 0.0)))

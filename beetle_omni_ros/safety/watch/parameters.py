@@ -1,4 +1,4 @@
-"""Thresholds of all detectors; params/supervisor.yaml says why each has its value."""
+"""Thresholds of all detectors; params/supervisor.yaml gives the reasons of their values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from beetle_omni_ros.robot.schema import group, parameter
 
 @dataclass(frozen=True, kw_only=True)
 class ContactLimits:
-    """When something other than the rotors pushes the robot."""
+    """Detection of contact forces."""
 
     near_ground: float = parameter(
         0.3, doc='base_link at most this far above where it stood: the floor is in reach',
@@ -29,7 +29,7 @@ class ContactLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class RotorLimits:
-    """When a rotor gives less than asked."""
+    """Detection of a rotor with too little thrust."""
 
     share: float = parameter(0.5, doc='part of its thrust that is missing', low=0.1, high=1)
     least_thrust: float = parameter(1.5, doc='a rotor asked for less is not judged', unit='N',
@@ -69,7 +69,7 @@ class RotorLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class ServoLimits:
-    """When a joint does not follow its command as its model does."""
+    """Detection of a joint that differs from its model."""
 
     error: float = parameter(0.25, doc='distance from the model', unit='rad', low=0.02, high=3)
     time: float = parameter(0.12, doc='for this long', unit='s', low=0.01, high=2)
@@ -84,7 +84,7 @@ class ServoLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class MocapLimits:
-    """When MoCap contradicts the gyroscope."""
+    """Detection of MoCap that contradicts estimate or gyroscope."""
 
     attitude: float = parameter(0.35, doc='jump of the attitude against the gyroscope',
                                 unit='rad', low=0.05, high=3)
@@ -100,7 +100,7 @@ class MocapLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class ImuLimits:
-    """Samples of the IMU that no body makes."""
+    """Detection of impossible IMU samples."""
 
     force_change: float = parameter(
         30.0, doc='change of the specific force of a lone sample that is not used', unit='m/s^2',
@@ -113,7 +113,7 @@ class ImuLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class PackLimits:
-    """When the pack sags so far that the robot cannot hold every attitude."""
+    """Detection of a pack with which the robot cannot hold every attitude."""
 
     noise: float = parameter(0.02, doc='standard deviation of a reading', unit='V', low=1e-4,
                              high=1)

@@ -1,4 +1,4 @@
-"""Rotors whose ESC reports another speed than the commanded thrust needs."""
+"""Detection of rotors whose ESC speed differs from the commanded thrust."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from beetle_omni_ros.robot.allocation import ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.watch.parameters import RotorLimits
 
-LEARNT = 1.0            # [s] over which each rotor's speed at a thrust is learnt
+LEARNT = 1.0            # [s] time constant of the learnt factor between speed and thrust
 DELAY = 0.01            # [s] from a command's stamp until it acts
 KEPT = 64               # commands, 0.3 s at 200 Hz
 ONES = np.ones(ROTORS)
-LONGEST = 0.2           # [s] between two reports that still count as one stretch
+LONGEST = 0.2           # [s] longest time between two reports of one sequence
 
 
 class SpeedWatch:
     """
-    Thrust goes with the square of the speed; the factor of each rotor is learnt in flight.
+    Thrust is proportional to the squared speed; the factor of each rotor is learnt in flight.
 
-    A rotor that no longer answers is told by the slope of the measured over the modelled thrust,
-    a regression over the last half second. It is 1 for a healthy rotor, its share for a weak one,
-    and 0 for one that holds its thrust. It is judged where the modelled thrust has varied enough.
-    A rotor that gives clearly more than asked is told at once: neither lag nor weakness does that.
+    A rotor that does not follow commands is detected by the slope of the measured over the
+    modelled thrust, a regression over the last half second. The slope is 1 for a healthy rotor,
+    less for a weak rotor, and 0 for a rotor that holds its thrust. It is used if the modelled
+    thrust has varied enough. A rotor that gives clearly more thrust than commanded is detected at
+    once, because neither lag nor weakness causes this.
 
     Args:
         limits: thresholds.
@@ -34,7 +35,7 @@ class SpeedWatch:
     Attributes:
         lost: the rotor (0 to 3) that turns too slowly, or None.
         deaf: the rotor (0 to 3) whose speed does not follow its commands, or None.
-        thrust: (4,) by the speeds [N], nan where unknown.
+        thrust: (4,) computed from the speeds [N], nan where unknown.
         slow: (4,) bool, rotors that turn noticeably too slowly at the last report.
 
     """
@@ -44,7 +45,7 @@ class SpeedWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew, with nothing learnt."""
+        """Reset all learnt factors."""
         self._stamp = -np.inf
         self._commands: deque = deque(maxlen=KEPT)
         self._thrust = np.zeros(ROTORS)
@@ -58,7 +59,7 @@ class SpeedWatch:
         self.slow = np.zeros(ROTORS, dtype=bool)
 
     def on_command(self, stamp: float, thrust: np.ndarray) -> None:
-        """Take what the rotors were asked at ``stamp`` [s], (4,) [N]."""
+        """Receive the commanded thrusts (4,) [N] of the time ``stamp`` [s]."""
         self._commands.append((stamp + DELAY, thrust))
 
     def forget(self) -> None:
@@ -80,7 +81,7 @@ class SpeedWatch:
 
     def on_speeds(self, stamp: float, speed: np.ndarray) -> None:
         """
-        Take a report.
+        Receive a report.
 
         Args:
             stamp: [s].
@@ -113,7 +114,7 @@ class SpeedWatch:
         self._learnt_for = np.where(learn, self._learnt_for + dt, self._learnt_for)
 
     def _judge(self, known, dt):
-        """Whose measured thrust does not follow the modelled one."""
+        """Rotor whose measured thrust does not follow the modelled thrust, or None."""
         x, y = np.where(known, [self._thrust, self.thrust], 0.0)
         self._sums *= np.where(known, exp(-dt / self._p.slope_window), 0.0)
         self._sums += np.where(known, dt * np.array([ONES, x, y, x * x, x * y]), 0.0)

@@ -1,4 +1,4 @@
-"""Forces and torques that the rotors do not explain: a lost rotor, or contact."""
+"""Detection of a lost rotor or contact by unexplained forces and torques."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.watch.parameters import ContactLimits, RotorLimits
 
-LONGEST = 0.05          # [s] between two IMU samples; a longer gap starts the filters anew
-AFTER_HIT = 1.0         # [s] after an impact in which a push is contact at any height
+LONGEST = 0.05          # [s] between two IMU samples; a longer gap resets the filters
+AFTER_HIT = 1.0         # [s] after an impact, in which a push at any height is contact
 SPAN, LONGEST_TRACK = 3, 0.12   # poses of either velocity; [s] of both
-USUAL = 1.0             # [s] over which a push that was there in the air is learnt
+USUAL = 1.0             # [s] time constant of the learnt steady push in the air
 
 
 class WrenchWatch:
@@ -39,9 +39,9 @@ class WrenchWatch:
         lost: the rotor (0 to 3) that is missing, or None.
         slipped: (joint 0 to 3, true tilt less encoder [rad]) of a tilt that differs, or None.
         impact: largest specific force of the last sample beyond the rotors' reach [m/s^2], or 0.
-        supported: (4,) bool, rotors that their ESC says are slow, too; set by the caller.
-        unexplained: (3,) filtered force that neither the rotors nor another vector of one of them
-            explain, in base_link [m/s^2].
+        supported: (4,) bool, rotors that are also slow by their ESC; set by the caller.
+        unexplained: (3,) filtered force that neither the rotors nor another thrust vector of one
+            rotor explains, in base_link [m/s^2].
 
     """
 
@@ -58,7 +58,7 @@ class WrenchWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew, with rotors that stand still."""
+        """Reset, with stopped rotors."""
         self._thrust = np.zeros(ROTORS)
         self._stamp: float | None = None
         self.supported = np.zeros(ROTORS, dtype=bool)
@@ -77,13 +77,13 @@ class WrenchWatch:
     def on_imu(self, stamp: float, force: np.ndarray, rate: np.ndarray, tilt: np.ndarray | None,
                thrust: np.ndarray, health: ActuatorHealth) -> None:
         """
-        Take one IMU sample.
+        Receive one IMU sample.
 
         Args:
             stamp: [s].
             force: (3,) specific force in base_link [m/s^2].
             rate: (3,) angular rate in base_link [rad/s].
-            tilt: (4,) measured [rad], None: unknown, and only an impact can be told.
+            tilt: (4,) measured [rad], None: unknown, and only an impact can be detected.
             thrust: (4,) commanded [N].
             health: of the actuators, as known.
 
@@ -118,7 +118,7 @@ class WrenchWatch:
         self._judge(dt)
 
     def _judge(self, dt):
-        """Which rotor's vector explains the residual, and what it then is."""
+        """The rotor whose thrust vector explains the residual, and this vector."""
         p = self._p
         residual = self._filtered * self._weights
         size = float(residual @ residual)
@@ -166,7 +166,7 @@ class ContactWatch:
         gravity: [m/s^2].
 
     Attributes:
-        reason: '' or why the robot counts as on the ground.
+        reason: '' or the reason why the robot is treated as on the ground.
 
     """
 
@@ -181,14 +181,14 @@ class ContactWatch:
 
     def update(self, dt: float, height: float | None, wrench: WrenchWatch) -> None:
         """
-        Take one IMU sample's verdict.
+        Update with the result of one IMU sample.
 
-        Near the ground an impact is enough, or a push. Elsewhere, where the height may be wrong,
-        it takes both: what hits something in the air and flies on is not pushed afterwards.
+        Near the ground an impact or a push is sufficient. At other heights, which may be wrong,
+        both are required: after a collision in the air there is no further push.
 
         Args:
             dt: since the one before [s].
-            height: of base_link above where it stood [m], None where that is unknown.
+            height: of base_link above its height on the ground [m], None if unknown.
             wrench: of the same sample.
 
         """
@@ -209,7 +209,7 @@ class ContactWatch:
 
     def on_pose(self, stamp: float, position: np.ndarray, height: float | None) -> None:
         """
-        Look for a bump in MoCap alone, for want of an IMU.
+        Detect a bump from MoCap only, if there is no IMU.
 
         Args:
             stamp: [s].
