@@ -184,7 +184,8 @@ class ErrorStateEkf:
             return False
         self._doubt_until = stamp + self._parameters.doubt.time
         self.rejected['imu_contradicts'] += 1
-        return track.correct(stamp, position, quaternion, doubtful=True)
+        since = stamp - self._good_pose[0] if self._good_pose is not None else 0.0
+        return track.correct(stamp, position, quaternion, doubtful=since)
 
     def _goes_on(self, track: Track, stamp, position, quaternion) -> bool:
         """Whether a pose goes on smoothly from the last good one."""

@@ -68,7 +68,6 @@ class ErrorStateModel:
         variance[POSITION] = doubt.position_std ** 2
         variance[VELOCITY], variance[ATTITUDE] = doubt.velocity_std ** 2, doubt.attitude_std ** 2
         variance[ACCELEROMETER_BIAS] = doubt.accelerometer_bias_std ** 2
-        variance[GYROSCOPE_BIAS] = doubt.gyroscope_bias_std ** 2
         self._doubt = np.diag(variance)
 
         # the marker body, as seen from the navigated point (the IMU), in base_link axes
@@ -141,9 +140,18 @@ class ErrorStateModel:
         change[TIME_OFFSET] = 1.0
         node.covariance = node.covariance + deviation ** 2 * np.outer(change, change)
 
-    def doubt(self, node: Node) -> Node:
-        """The node with velocity, attitude and biases as uncertain as the parameters say."""
-        return replace(node, covariance=node.covariance + self._doubt)
+    def doubt(self, node: Node, span: float) -> Node:
+        """
+        The node with velocity, attitude and biases as uncertain as the parameters say.
+
+        A gyroscope bias that was wrong for ``span`` [s] has turned the attitude by span times
+        itself. Both errors are therefore correlated, and a pose corrects the rate at once.
+        """
+        covariance = node.covariance + self._doubt
+        change = np.zeros((STATES, 3))
+        change[GYROSCOPE_BIAS], change[ATTITUDE] = np.eye(3), -span * np.eye(3)
+        covariance += self.parameters.doubt.gyroscope_bias_std ** 2 * change @ change.T
+        return replace(node, covariance=covariance)
 
     def forget(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray) -> Node:
         """Move a state across an unknown lapse of time: only the biases are still worth much."""

@@ -176,11 +176,11 @@ class DoubtParameters:
     velocity_std: float = parameter(
         0.5, doc='then added to the deviation of the velocity', unit='m/s', low=0.001, high=100)
     attitude_std: float = parameter(
-        0.1, doc='then added to that of the attitude', unit='rad', low=0.001, high=3)
+        0.01, doc='then added to that of the attitude', unit='rad', low=0.001, high=3)
     accelerometer_bias_std: float = parameter(
         1.0, doc='then added to that of the accelerometer bias', unit='m/s^2', low=1e-6, high=100)
     gyroscope_bias_std: float = parameter(
-        0.3, doc='then added to that of the gyroscope bias', unit='rad/s', low=1e-6, high=10)
+        3.0, doc='then added to that of the gyroscope bias', unit='rad/s', low=1e-6, high=100)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -62,7 +62,7 @@ class Track:
             del nodes[0]
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
-                doubtful: bool = False) -> bool:
+                doubtful: float = 0.0) -> bool:
         """
         Apply a pose at its capture time and replay what came after.
 
@@ -70,7 +70,7 @@ class Track:
             stamp: capture time, not after the newest node; before the oldest, that is used [s].
             position: (3,) of the marker body in world [m].
             quaternion: (4,) marker body to world.
-            doubtful: whether velocity, attitude and biases are less certain than they seem.
+            doubtful: for how long the IMU may have been wrong [s], 0: not at all.
 
         Returns:
             False when the pose does not fit; the track is then unchanged.
@@ -86,7 +86,7 @@ class Track:
                 stamp, (prior.stamp, prior.force, prior.rate),
                 (after.stamp, after.force, after.rate)), after.shaken)
         if doubtful:
-            prior = self._model.doubt(prior)
+            prior = self._model.doubt(prior, doubtful)
         posterior = self._model.correct(prior, position, quaternion)
         if posterior is None:
             return False

@@ -20,6 +20,8 @@ from beetle_omni_ros.safety.watch.faults import FaultWatch
 
 TILT_AGE = 0.05     # [s] older joint angles are not used for thrust directions
 LATEST = 0.1    # [s] between a MoCap pose and the estimate for its check
+IMU_AXES = (*(f'specific force along {axis}' for axis in 'xyz'),
+            *(f'angular rate about {axis}' for axis in 'xyz'))
 
 
 class Inputs:
@@ -45,8 +47,8 @@ class Inputs:
         self._in_force: Command | None = None
         imu = parameters.detection.imu
         self._spikes = SpikeFilter(imu.force_change, imu.rate_change)
-        self._sample: tuple[float, ...] | None = None
-        self._same_samples = 0
+        self._sample: tuple[float, ...] = ()
+        self._same = [0] * len(IMU_AXES)    # samples for which an axis has kept its value
         self._floor = 0.0       # height of base_link on the ground before the flight [m]
         self.events = EventLog(parameters.quiet_time)
         self._now: float | None = None
@@ -121,13 +123,28 @@ class Inputs:
         values = (*force.tolist(), *rate.tolist())
         if not all(map(isfinite, values)):
             return False
-        self._same_samples = self._same_samples + 1 if values == self._sample else 0
+        self._same = [count + 1 if value == before else 0 for count, value, before in zip(
+            self._same, values, self._sample or (None,) * len(values))]
         self._sample = values
-        limits = self._parameters.detection.imu
-        if self.airborne and self._same_samples >= limits.frozen:
-            self.watch.name('imu_frozen', self._now or 0.0, 'the IMU repeats the same sample')
-            return False
-        return self._spikes.passes(force, rate)
+        return not (self.airborne and self._is_frozen()) and self._spikes.passes(force, rate)
+
+    def _is_frozen(self):
+        """
+        Whether an IMU that repeats itself may not be used; names that.
+
+        With one frozen axis the estimator still has MoCap, but the descent on raw sensors is
+        better off without the IMU.
+        """
+        limits, now = self._parameters.detection.imu, self._now or 0.0
+        if min(self._same) >= limits.frozen:
+            self.watch.name('imu_frozen', now, 'the IMU repeats the same sample')
+            return True
+        longest = max(self._same)
+        if longest >= limits.axis_frozen:
+            axis = IMU_AXES[self._same.index(longest)]
+            self.watch.name('imu_axis_frozen', now, f'the IMU repeats the same {axis}')
+            return self.vehicle.backup.running
+        return False
 
     def on_rotors(self, stamp: float, speed: np.ndarray) -> bool:
         """Receive the rotor speeds (4,) reported by the ESCs [rad/s], nan where unknown."""

@@ -200,6 +200,9 @@ class Supervisor(Inputs):
     def _look_for_faults(self, now, dt):
         """React to the detectors."""
         paused, self._before = now - (now if self._before is None else self._before), now
+        if self.airborne and self.vehicle.imu_lost \
+                and not self.faults.keys() & {'imu_frozen', 'imu_axis_frozen'}:
+            self.watch.name('imu_lost', now, f'the raw IMU is {self.vehicle.imu.text}')
         for text in self.watch.news():
             self._say(now, ERROR, text)
         if not self.airborne:
@@ -393,9 +396,11 @@ class Supervisor(Inputs):
         command = stream.in_force
         if command is None:
             estimate = self.vehicle.estimate
-            cause = f' (ekf_node {estimate.text} too)' if estimate.elapsed > 0.5 * estimate.limit \
-                else ''
-            self.watch.name('controller_silent', now, '')
+            cause = ''
+            if estimate.elapsed > 0.5 * estimate.limit:     # a controller answers estimates
+                cause = f' (ekf_node {estimate.text} too)'
+            else:
+                self.watch.name('controller_silent', now, '')
             self._fall_back(now, ERROR, f'{self.active}_node {stream.complaint}{cause}: '
                                         'fallback to hover')
             return self._hold(now, dt)

@@ -154,6 +154,11 @@ class Vehicle:
         """Whether MoCap has sent poses and is silent now."""
         return self.mocap.silent and isfinite(self.mocap.elapsed)
 
+    @property
+    def imu_lost(self) -> bool:
+        """Whether the raw IMU was there and is silent."""
+        return self.imu.silent and isfinite(self.imu.elapsed)
+
     def why_not_arm(self) -> str:
         """'' when the motors may start, else the missing condition."""
         limits, battery = self._parameters.arming, self._parameters.battery

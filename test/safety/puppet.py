@@ -81,7 +81,8 @@ class Puppet:
         supervisor, alive = self.supervisor, self.alive
         tilt = self.command.tilt if self.command is not None else np.zeros(4)
         if 'imu' in alive:
-            supervisor.on_imu(self.now, self._felt(tilt), self.rate)
+            noise = 1e-6 * np.sin(1e3 * self.now + np.arange(6))   # no sensor repeats itself
+            supervisor.on_imu(self.now, self._felt(tilt) + noise[:3], self.rate + noise[3:])
         if 'mocap' in alive:
             noise = 1e-6 * np.array([round(self.now / TICK) % 2, 0, 0])
             supervisor.on_mocap(self.now - 0.01, self.position + noise, self.quaternion)

@@ -454,3 +454,27 @@ def test_a_flip_of_the_markers_leads_to_a_landing_without_mocap():
     puppet.run(2.0)
     assert 'mocap_flipped' in puppet.supervisor.faults
     assert puppet.supervisor.state == 'landing'
+
+
+def test_a_silent_imu_is_named_and_not_the_controller_that_waits_for_the_estimate():
+    puppet = flown()
+    puppet.alive -= {'imu', 'estimate', 'nmpc'}
+    puppet.run(0.1)
+    assert 'imu_lost' in puppet.supervisor.faults
+    assert 'controller_silent' not in puppet.supervisor.faults
+
+
+def test_one_frozen_axis_of_the_imu_is_named_and_the_flight_goes_on():
+    puppet = flown()
+    limit = PARAMETERS.detection.imu.axis_frozen
+    talk = puppet.supervisor.on_imu
+    puppet.supervisor.on_imu = lambda stamp, force, rate: talk(stamp, force, [0.0, *rate[1:]])
+    puppet.run((limit - 1) * TICK)
+    assert 'imu_axis_frozen' not in puppet.supervisor.faults
+    puppet.run(3 * TICK)
+    assert 'imu_axis_frozen' in puppet.supervisor.faults
+    assert puppet.supervisor.state == 'flying' and not puppet.supervisor.vehicle.imu_lost
+    puppet.alive.discard('estimate')    # the descent on raw sensors goes without the IMU
+    puppet.run(0.5)
+    assert puppet.supervisor.state == 'landing' and puppet.supervisor.vehicle.imu_lost
+    assert 'imu_lost' not in puppet.supervisor.faults

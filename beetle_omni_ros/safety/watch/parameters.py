@@ -109,6 +109,8 @@ class ImuLimits:
         3.0, doc='change of the angular rate, likewise', unit='rad/s', low=0.1, high=200)
     frozen: int = parameter(10, doc='samples in a row that are the same to the last digit', low=2,
                             high=10000)
+    axis_frozen: int = parameter(40, doc='samples in a row in which one axis has the same value',
+                                 low=2, high=10000)
 
 
 @dataclass(frozen=True, kw_only=True)
