@@ -119,7 +119,7 @@ class LandingParameters:
     blind_acceleration: float = parameter(2.0, doc='the same', unit='m/s^2', low=0.05, high=10)
     flare_height: float = parameter(0.5, doc='above the floor, where it slows down to speed',
                                     unit='m', low=0, high=10)
-    time_limit: float = parameter(60.0, doc='longest landing, then motors off', unit='s', low=1,
+    time_limit: float = parameter(90.0, doc='longest landing, then motors off', unit='s', low=1,
                                   high=600)
     overdue_acceleration: float = parameter(
         0.6, doc='without MoCap, growth of the descent speed once the ground is overdue',

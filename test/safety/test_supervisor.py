@@ -435,6 +435,13 @@ def test_limits_hold_while_landing(spoil):
     assert puppet.supervisor.state == 'emergency_stop'
 
 
+def test_a_landing_from_the_highest_place_inside_the_limits_ends_before_its_time_limit():
+    envelope, landing = PARAMETERS.envelope, PARAMETERS.landing
+    turns = np.pi / landing.level.rate + landing.turnover.time_limit
+    sinking = (envelope.height + envelope.fence_margin) / landing.speed
+    assert sinking + turns < landing.time_limit
+
+
 def test_landing_and_fallback_end_in_time():
     puppet = flown()
     puppet.alive -= {'nmpc', 'rl'}
