@@ -20,7 +20,7 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, PoseTarget, State
 from beetle_omni_ros.control.feasible import feasible_target
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.holding import Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.tasks import pose_target, random_poses
@@ -52,7 +52,7 @@ class Robot:
         self.sim.reset(position, quaternion)
         self._link = CommandLink(robot, parameters.actuators, self.sim.conditions)
         self._joints = self.command = None
-        self.broken = ALL_WELL
+        self.broken = ALL_HEALTHY
 
     def state(self):
         """Advance one tick; the state that a perfect estimator and the encoders give."""
@@ -110,10 +110,10 @@ class Flight:
         self.controllers, self.flying = controllers, controllers[registry.pilot()]
         self.after = controllers[arguments.controller]
         self.told_after = arguments.told_after
-        self.told = ALL_WELL
+        self.told = ALL_HEALTHY
         self.trace = []
         for controller in controllers.values():
-            controller.set_health(ALL_WELL)
+            controller.set_health(ALL_HEALTHY)
             controller.reset()
 
     def fly(self, target, until, watch=False):

@@ -327,10 +327,10 @@ def _wrapped(text: str) -> str:
 
 def effects() -> str:
     """The catalogue of effects."""
-    from beetle_omni_ros.robot.effects import CATALOGUE, CONSUMERS, stand
-    stands = {(name, key): stand(key, name) for name in CATALOGUE for key in CONSUMERS}
+    from beetle_omni_ros.robot.effects import CATALOGUE, CONSUMERS, treatment
+    treatments = {(name, key): treatment(key, name) for name in CATALOGUE for key in CONSUMERS}
     apart: dict[tuple, list] = {}
-    for (name, key), found in stands.items():
+    for (name, key), found in treatments.items():
         if not found.acts:
             apart.setdefault((CONSUMERS[key], 'refuses' if found.error else 'leaves',
                               found.reason), []).append(f'[{name}](#{name})')
@@ -344,11 +344,11 @@ def effects() -> str:
             'file, both are fractions of it.\nA robot file may leave out a parameter that has a '
             '*default*.\n\n## Who acts on what\n\n'
             'A consumer acts on an effect, leaves it to another, or refuses a robot file that has '
-            'it. The test\n`test/gap/test_consumers.py` tries every pair. The reasons stand '
+            'it. The test\n`test/gap/test_consumers.py` tries every pair. The reasons are '
             'below the table.\n\n'
             + table(['effect', 'layer', 'acts through', *CONSUMERS.values()],
                     [[f'[{name}](#{name})', entry.layer, _acts(entry),
-                      *('acts' if (found := stands[name, key]).acts
+                      *('acts' if (found := treatments[name, key]).acts
                         else 'refuses' if found.error else 'leaves' for key in CONSUMERS)]
                      for name, entry in CATALOGUE.items()])
             + '\n' + table(['consumer', '', 'effects', 'why'],

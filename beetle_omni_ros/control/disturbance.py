@@ -18,7 +18,7 @@ from beetle_omni_ros.control.base import Command, State
 from beetle_omni_ros.control.call import FunctionCall
 from beetle_omni_ros.control.nmpc_parameters import DisturbanceParameters
 from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 LONGEST_STEP = 0.1  # [s] a longer gap between states restarts the actuator model
@@ -53,7 +53,7 @@ class DisturbanceEstimator:
         self._force_gain = p.force_bandwidth * robot.mass
         self._torque_gain = p.torque_bandwidth * robot.inertia
         self._tilt_bandwidth, self._tilt_correction = p.tilt_bandwidth, p.tilt_correction
-        self._health = ALL_WELL
+        self._health = ALL_HEALTHY
         self._movable = np.ones(4)
         self.reset()
 

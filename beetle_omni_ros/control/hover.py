@@ -26,7 +26,7 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, Followed, State
 from beetle_omni_ros.robot import rotations, schema
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.degraded_allocation import allocator, DegradedAllocator, LocalWeights
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
@@ -95,7 +95,7 @@ class HoverController:
         self.parameters = parameters or HoverParameters.load()
         self.period = self.parameters.period
         self._robot = robot
-        self.set_health(ALL_WELL)
+        self.set_health(ALL_HEALTHY)
         self.reset()
 
     def set_health(self, health: ActuatorHealth) -> None:

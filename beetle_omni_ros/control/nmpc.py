@@ -16,7 +16,7 @@ from beetle_omni_ros.control.references import ReferencePlanner
 from beetle_omni_ros.control.rti import CompiledRti, InterpretedRti
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import effects
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.native import CompilerError
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -76,7 +76,7 @@ class NmpcController:
                              # lead of a held target at which the lag has the rate limit
                              p.limits.tilt_rate * intervals / -np.expm1(
                                  -intervals / p.model.servo_lag)]
-        self._health, self._bounds = ALL_WELL, self._all_bounds
+        self._health, self._bounds = ALL_HEALTHY, self._all_bounds
         self.reset()
 
     def set_health(self, health: ActuatorHealth) -> None:

@@ -28,7 +28,7 @@ from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
 from beetle_omni_ros.evaluation.processes import Processes
 from beetle_omni_ros.messages.values import Odom, Wrench
-from beetle_omni_ros.robot.actuator_health import ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.runs.target_checks import out_of_reach
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
 from beetle_omni_ros.safety.supervisor import Supervisor
@@ -86,7 +86,7 @@ class FlightLoop:
         self._joints = self._battery = self._command = self._estimated = None
         self._ticks = 0
         self._state_name = self._told = ''
-        self._health = ALL_WELL
+        self._health = ALL_HEALTHY
         self._crashed = False
         self._ending = ''
 

@@ -22,7 +22,7 @@ from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import health, runner
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
-from beetle_omni_ros.robot.actuator_health import ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.target_checks import out_of_reach, TargetChecks
@@ -65,7 +65,7 @@ class ControllerNode(FlightNode):
             parameters=self.parameters if entry.parameters else None)
         self._target = self._joints = self._command = None
         self._hold = self._wish = self._position = None
-        self._actuators = ALL_WELL
+        self._actuators = ALL_HEALTHY
         self._checks = TargetChecks(RobotParameters.load(self.parameters.robot_file or None))
         self._mode, self._own_mode = '', f'flying:{entry.name}'
         self._last_step = 0.0

@@ -15,7 +15,7 @@ from beetle_omni_ros.messages.values import ToldHealth, Wish
 from beetle_omni_ros.nodes import health, runner
 from beetle_omni_ros.nodes.command_source import new_identity, TOPIC
 from beetle_omni_ros.nodes.node import FlightNode
-from beetle_omni_ros.robot.actuator_health import ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.safety.events import ERROR, WARNING
@@ -71,7 +71,7 @@ class SupervisorNode(FlightNode):
         self._states = self.publisher('supervisor/state')
         self._targets = self.publisher('supervisor/target')
         self._actuators = self.publisher('supervisor/actuators')
-        self._wish, self._healthy = None, ALL_WELL
+        self._wish, self._healthy = None, ALL_HEALTHY
         self._listen()
         for name in ('arm', 'disarm', 'land', 'emergency_stop'):
             self.create_service(Trigger, f'~/{name}', self._request(name))

@@ -1,16 +1,15 @@
 """
-What the robot is: parameters, dynamics, allocation, rotations, effects.
+Model of the robot: parameters, dynamics, allocation, rotations, effects.
 
-Called, ``beetle_omni_ros.robot(file)`` reads a robot file: it is also a function of the public
-module.
+The package is also callable, as a function of the public interface:
+``beetle_omni_ros.robot(file)`` reads a robot file.
 """
 
 import sys
 from types import ModuleType
 
 
-class _Room(ModuleType):
-    """The room, which reads a robot file when it is called."""
+class _CallableModule(ModuleType):
 
     def __call__(self, file=None):
         """
@@ -20,15 +19,15 @@ class _Room(ModuleType):
             file: path; None for the shipped params/robot.yaml.
 
         Returns:
-            :class:`~beetle_omni_ros.robot.parameters.RobotParameters`; ``dataclasses.replace``
-            makes another robot of it.
+            :class:`~beetle_omni_ros.robot.parameters.RobotParameters`. Use
+            ``dataclasses.replace`` to derive another robot from it.
 
         Raises:
-            ParameterError: file, key and what was expected, in one line.
+            ParameterError: one line with file, key and expected value.
 
         """
         from beetle_omni_ros.robot.parameters import RobotParameters
         return RobotParameters.load(file)
 
 
-sys.modules[__name__].__class__ = _Room
+sys.modules[__name__].__class__ = _CallableModule

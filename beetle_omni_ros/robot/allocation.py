@@ -1,13 +1,13 @@
 """
-Allocation: which thrusts and tilts make a wished body wrench.
+Allocation of a body wrench to thrusts and tilts.
 
 In the rotor force components u = (f_1 cos q_1, f_1 sin q_1, ..., f_4 cos q_4, f_4 sin q_4) the
-wrench is linear, w = B u with B (6, 8), so the minimum-norm components are u = B^+ w. Thrust is
-the length of each rotor's component pair and tilt its angle, on the legal turn nearest the
-present angle: the joints wind, and the neighbouring turn is up to a full revolution away.
+wrench is linear, w = B u with B (6, 8). The minimum-norm components are u = B^+ w. The thrust of
+a rotor is the length of its component pair, and its tilt is the angle of the pair. Joints turn by
+more than a revolution. The tilt is therefore taken on the legal turn nearest the present angle.
 
-The body's known effects (mass, thrust and torque coefficients, wind) are part of B and of the
-hover wrench, so that an identified robot file allocates for the identified robot.
+B and the hover wrench include the known effects of the robot file: mass, thrust and torque
+coefficients, wind.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 ROTORS = 4
-NEGLIGIBLE = 1e-6   # of the hover thrust: below it a rotor's direction is rounding noise
-SINGULAR = 1e-6     # of the largest singular value: a direction that no rotor can push
+NEGLIGIBLE = 1e-6   # of the hover thrust: below it the direction of a rotor is rounding noise
+SINGULAR = 1e-6     # of the largest singular value: below it the rotors cannot push a direction
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Allocation:
     Attributes:
         tilt: (4,) tilt angles [rad], inside the joints' travel.
         thrust: (4,) thrusts [N], inside the rotors' range.
-        saturated: (4,) bool, True where a limit cut the rotor off, so that the wrench is not met.
+        saturated: (4,) bool, True for a rotor at a limit; the wrench is then not met.
 
     """
 
@@ -44,16 +44,16 @@ class Allocation:
 
 class Allocator:
     """
-    Minimum-norm allocation for one robot, precomputed.
+    Precomputed minimum-norm allocation of one robot.
 
     Args:
-        robot: the robot.
+        robot: parameters of the robot.
 
     Attributes:
-        matrix: (6, 8) from the interleaved components u to (force, torque) in base_link.
-        inverse: (8, 6) its pseudo-inverse.
-        mass: the mass that the hover wrench carries [kg].
-        weight: (3,) force in world that holds it against gravity and steady wind [N].
+        matrix: (6, 8) map from the components u to (force, torque) in base_link.
+        inverse: (8, 6) pseudo-inverse of ``matrix``.
+        mass: mass in the hover wrench [kg].
+        weight: (3,) force in world that balances gravity and steady wind [N].
         axes: (4, 3) unit tilt axes in base_link.
         tilt_limit: travel of the joints to each side [rad].
 
@@ -83,7 +83,7 @@ class Allocator:
 
     def wrench(self, tilt: np.ndarray, thrust: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Forward map.
+        Wrench of given tilts and thrusts.
 
         Args:
             tilt: (4,) [rad].
@@ -104,13 +104,13 @@ class Allocator:
         """
         Minimum-norm thrusts and tilts for a body wrench.
 
-        A rotor with practically no thrust keeps its present angle, because its direction is
-        undetermined. A limit cuts thrust or tilt off and is reported, never exceeded.
+        A rotor with negligible thrust keeps its present angle, because its direction is
+        undetermined. Thrust and tilt stay within their limits.
 
         Args:
             force: (3,) in base_link [N].
             torque: (3,) about the centre of gravity in base_link [N m].
-            present_tilt: (4,) angles from which the nearest turn is counted [rad].
+            present_tilt: (4,) present angles, for the choice of the nearest turn [rad].
 
         """
         components = self.inverse[:, :3] @ force + self.inverse[:, 3:] @ torque
@@ -134,12 +134,12 @@ class Allocator:
               extra_force_world: np.ndarray | None = None,
               extra_torque_body: np.ndarray | None = None) -> Allocation:
         """
-        Allocate the wrench that holds the robot still at an attitude.
+        Allocate the wrench that holds the robot at rest at an attitude.
 
         Args:
             quaternion: (4,) body to world (x, y, z, w), unit.
             present_tilt: (4,) [rad].
-            extra_force_world: (3,) beside the weight's support, in world [N].
+            extra_force_world: (3,) force beside the support of the weight, in world [N].
             extra_torque_body: (3,) in base_link [N m].
 
         """
@@ -149,10 +149,10 @@ class Allocator:
 
     def upright(self, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Tilts and thrusts of hovering at many attitudes, travel and range left aside.
+        Tilts and thrusts of hovering at many attitudes, without limits of travel and thrust.
 
         Args:
-            up: (P, 3) world's z in base_link.
+            up: (P, 3) world z axis in base_link.
 
         Returns:
             tilts (P, 4) within +-pi [rad] and thrusts (P, 4) [N].
@@ -163,7 +163,7 @@ class Allocator:
         return np.arctan2(across, along), np.hypot(along, across)
 
     def _nearest_turn(self, angle, present):
-        """Angle + 2 pi k nearest ``present`` inside the travel; (angle, whether cut off)."""
+        """Angle + 2 pi k nearest ``present`` inside the travel; (angle, whether limited)."""
         turned = angle + 2 * pi * round((present - angle) / (2 * pi))
         if abs(turned) > self.tilt_limit:
             other = turned - copysign(2 * pi, turned)
@@ -179,12 +179,12 @@ class Allocator:
 
 def allocate(robot: RobotParameters, force: np.ndarray, torque: np.ndarray,
              present_tilt: np.ndarray) -> Allocation:
-    """One allocation, see :meth:`Allocator.allocate`; keep an Allocator where it is repeated."""
+    """One allocation by :meth:`Allocator.allocate`; for many, construct an Allocator once."""
     return Allocator(robot).allocate(force, torque, present_tilt)
 
 
 def hover_allocation(robot: RobotParameters, quaternion: np.ndarray, present_tilt: np.ndarray,
                      extra_force_world: np.ndarray | None = None,
                      extra_torque_body: np.ndarray | None = None) -> Allocation:
-    """One hover allocation, see :meth:`Allocator.hover`; keep an Allocator where repeated."""
+    """One allocation by :meth:`Allocator.hover`; for many, construct an Allocator once."""
     return Allocator(robot).hover(quaternion, present_tilt, extra_force_world, extra_torque_body)

@@ -1,13 +1,14 @@
 """
-Allocation with the actuators that are left.
+Allocation for a robot with failed actuators.
 
-A rotor that gives no thrust has no column in the wrench map, one whose joint is stuck has one,
-along its present direction and with a thrust that cannot be negative; every other rotor keeps
-its two force components. The minimum-norm solution under the sign constraints has the stuck
-rotors either pushing or off, so it is the best of at most 2^stuck pseudo-inverses. A rotor
-that asks for more than its limit is held there, in its direction, and the others solve for the
-rest: a short active-set iteration. A rotor that holds a thrust whatever it is asked pushes along
-the direction of its minimum-norm share; the others solve for what that leaves.
+A lost rotor has no column in the wrench map. A rotor with a stuck joint has one column, along its
+present direction, and a thrust that cannot be negative. Every other rotor keeps its two force
+components. Under the sign constraints each stuck rotor of the minimum-norm solution either pushes
+or is off. The solution is therefore the best of at most 2^stuck pseudo-inverses.
+
+A rotor beyond its limit is fixed at the limit in its direction, and the others are solved again
+for the remaining wrench (active set). A rotor with a fixed thrust pushes along its minimum-norm
+share. The others are solved for the remaining wrench.
 """
 
 from __future__ import annotations
@@ -17,48 +18,50 @@ from itertools import combinations
 
 import numpy as np
 
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.allocation import Allocation, Allocator, ROTORS, SINGULAR
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
 
-RESIDUAL = 1e-3  # [m/s^2, rad/s^2] two solutions meet a wrench equally well
+RESIDUAL = 1e-3  # [m/s^2, rad/s^2] below it a wrench counts as met
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocalWeights:
-    """Tuning of the allocation near present tilts; params/hover.yaml says why."""
+    """Weights of the allocation near present tilts; params/hover.yaml gives the reasons."""
 
     turning: float = parameter(1.0, doc='weight of an angular against a linear acceleration',
                                unit='m/rad', low=0.1, high=100)
-    tilt: float = parameter(0.3, doc='pull of tilts towards the aim', unit='m/s^2/rad', low=1e-4,
-                            high=100)
-    thrust: float = parameter(0.05, doc='pull of thrusts towards the aim', unit='1/kg', low=1e-4,
-                              high=100)
-    tilt_reach: float = parameter(0.6, doc='of tilts from the present ones', unit='rad',
+    tilt: float = parameter(0.3, doc='weight of the distance from the target tilts',
+                            unit='m/s^2/rad', low=1e-4, high=100)
+    thrust: float = parameter(0.05, doc='weight of the distance from the target thrusts',
+                              unit='1/kg', low=1e-4, high=100)
+    tilt_reach: float = parameter(0.6, doc='largest distance from the present tilts', unit='rad',
                                   low=0.01, high=4)
-    iterations: int = parameter(6, doc='of Gauss-Newton', low=1, high=20)
-    missed: float = parameter(3.0, doc='acceleration short of the wished one that counts as '
-                              'saturation', unit='m/s^2', low=0, high=20)
+    iterations: int = parameter(6, doc='Gauss-Newton iterations at most', low=1, high=20)
+    missed: float = parameter(3.0, doc='error of the acceleration that counts as saturation',
+                              unit='m/s^2', low=0, high=20)
 
 
 class DegradedAllocator(Allocator):
     """
-    As :class:`Allocator` for a robot of which some actuators fail.
+    :class:`Allocator` for a robot with failed actuators.
 
-    Where the wrench cannot be met, thrusts are the least-squares solution in linear and angular
-    acceleration. Lost rotors get no thrust and keep their tilt, stuck joints their angle.
+    If the wrench cannot be met, thrusts are the least-squares solution in linear and angular
+    acceleration. Lost rotors get no thrust and keep their tilt. Stuck joints keep their angle.
 
     Args:
-        robot: the robot.
-        health: what is left of it.
+        robot: parameters of the robot.
+        health: state of the actuators.
 
     Attributes:
-        matrix: (6, 8) as the healthy one, with zero columns for lost rotors.
-        stuck, held: rotors with a stuck joint; rotor -> thrust that it holds [N].
-        choices: list of (columns (6, 8), inverse (8, 6), rest (8, 6)): the map with some of the
-            stuck rotors off, most first, its pseudo-inverse, and that without the rotors that
-            hold a thrust; a stuck rotor's thrust stands in its first component.
+        matrix: (6, 8) map of the base class, with zero columns for lost rotors.
+        stuck: list of rotors with a stuck joint.
+        held: rotor -> its fixed thrust [N].
+        choices: list of (columns (6, 8), inverse (8, 6), rest (8, 6)) for each choice of stuck
+            rotors that are off. Columns are the map, with the thrust of a stuck rotor in its
+            first component. The inverses are the pseudo-inverses with and without the rotors of
+            fixed thrust.
 
     """
 
@@ -85,21 +88,21 @@ class DegradedAllocator(Allocator):
                 chosen[:, [2 * i for i in off]] = 0.0
                 inverse = self._pseudo_inverse(chosen)
                 self.choices.append((chosen, inverse, self._pseudo_inverse(
-                    self._obeying(chosen)) if self.held else inverse))
+                    self._without_held(chosen)) if self.held else inverse))
 
-    def _obeying(self, columns):
-        """The columns without those of rotors that hold a thrust."""
-        obeying = columns.copy()
-        obeying[:, [k for i in self.held for k in (2 * i, 2 * i + 1)]] = 0.0
-        return obeying
+    def _without_held(self, columns):
+        """Map with zero columns for rotors of fixed thrust."""
+        columns = columns.copy()
+        columns[:, [k for i in self.held for k in (2 * i, 2 * i + 1)]] = 0.0
+        return columns
 
     def components(self, columns: np.ndarray, inverse: np.ndarray, rest: np.ndarray,
                    wrenches: np.ndarray) -> np.ndarray:
         """
-        Force components (..., 8) for wrenches (..., 6) by one of the choices.
+        Force components (..., 8) for wrenches (..., 6) by one of the ``choices``.
 
-        Rotors that hold a thrust give it along their minimum-norm share, and straight up where
-        that is nothing.
+        A rotor of fixed thrust pushes along its minimum-norm share. It pushes along its zero tilt
+        if this share vanishes.
         """
         found = wrenches @ inverse.T
         if not self.held:
@@ -114,17 +117,17 @@ class DegradedAllocator(Allocator):
         return fixed + (wrenches - fixed @ columns.T) @ rest.T
 
     def _along(self, rotor, angle):
-        """(6,) wrench of one newton of a rotor at a tilt [rad]."""
+        """(6,) wrench of 1 N of a rotor at a tilt [rad]."""
         return self.matrix[:, 2 * rotor] * np.cos(angle) \
             + self.matrix[:, 2 * rotor + 1] * np.sin(angle)
 
     def _pseudo_inverse(self, columns):
-        """Minimum norm, and least squares in accelerations where the rank is not full."""
+        """Minimum norm; if the rank is not full, least squares in accelerations."""
         return np.linalg.pinv(self._scale[:, None] * columns, rcond=SINGULAR) * self._scale
 
     def allocate(self, force: np.ndarray, torque: np.ndarray,
                  present_tilt: np.ndarray) -> Allocation:
-        """As :meth:`Allocator.allocate`, with what is left."""
+        """As :meth:`Allocator.allocate`, with the remaining actuators."""
         wrench = np.concatenate([force, torque])
         components, met = self._within_limits(*self._solved(wrench), wrench)
         tilt, thrust = np.array(present_tilt, dtype=float), np.zeros(ROTORS)
@@ -146,18 +149,19 @@ class DegradedAllocator(Allocator):
     def allocate_near(self, force: np.ndarray, torque: np.ndarray, tilt: np.ndarray,
                       aim: Allocation, weights: LocalWeights) -> Allocation:
         """
-        Thrusts and tilts near given ones that come nearest a wrench.
+        Thrusts and tilts near the present tilts that approximate a wrench.
 
-        Minimum norm swings a joint by half a turn when its rotor's share passes through zero.
-        This is damped Gauss-Newton on tilts and thrusts instead: least squares in accelerations
-        within the thrust range and a reach of tilt, drawn weakly to the aim.
+        The minimum-norm solution turns a joint by half a revolution when the share of its rotor
+        passes through zero. This method instead takes damped Gauss-Newton steps in tilts and
+        thrusts. They minimise the squared error of the accelerations and the weighted distance
+        from the target, within the thrust range and a reach of tilt.
 
         Args:
             force: (3,) in base_link [N].
             torque: (3,) in base_link [N m].
             tilt: (4,) present tilts [rad].
-            aim: what shall be approached in the end.
-            weights: of the terms.
+            aim: target of tilts and thrusts.
+            weights: weights of the terms.
 
         """
         scale = self._scale * np.r_[np.ones(3), np.full(3, weights.turning)]
@@ -201,8 +205,8 @@ class DegradedAllocator(Allocator):
             + matrix[:, 1::2] @ (z[ROTORS:] * np.sin(z[:ROTORS]))
 
     def _solved(self, wrench) -> tuple[np.ndarray, np.ndarray]:
-        """Best choice of stuck rotors: its columns and the (8,) components."""
-        found = []      # one choice leaves all stuck rotors out, and is never refused
+        """Columns and (8,) components of the best choice of stuck rotors."""
+        found = []      # never empty: one choice has all stuck rotors off
         for columns, inverse, others in self.choices:
             components = self.components(columns, inverse, others, wrench)
             if any(components[2 * i] < -self._negligible for i in self.stuck):
@@ -217,8 +221,8 @@ class DegradedAllocator(Allocator):
         return float(np.linalg.norm(self._scale * (columns @ components - wrench)))
 
     def _within_limits(self, columns, components, wrench):
-        """Components with no rotor beyond its limit, and whether they meet the wrench."""
-        limit, free = self._thrust_max, self._obeying(columns)
+        """Components with all rotors within their limit, and whether they meet the wrench."""
+        limit, free = self._thrust_max, self._without_held(columns)
         for _ in range(ROTORS):
             lengths = np.hypot(components[0::2], components[1::2])
             over = lengths > limit * (1 + 1e-9)
@@ -238,7 +242,7 @@ class DegradedAllocator(Allocator):
 
 
 def _bounded_step(jacobian, error, pull, towards, low, high):
-    """Damped least-squares step (8,) within bounds: those that it would cross hold it."""
+    """Damped least-squares step (8,) within bounds, by an active set."""
     step = np.zeros(len(pull))
     free = high > low
     for _ in range(ROTORS):
@@ -254,6 +258,6 @@ def _bounded_step(jacobian, error, pull, towards, low, high):
     return step
 
 
-def allocator(robot: RobotParameters, health: ActuatorHealth = ALL_WELL) -> Allocator:
-    """Allocator of a robot with what is left of it."""
+def allocator(robot: RobotParameters, health: ActuatorHealth = ALL_HEALTHY) -> Allocator:
+    """Allocator of a robot with this state of the actuators."""
     return Allocator(robot) if health.healthy else DegradedAllocator(robot, health)

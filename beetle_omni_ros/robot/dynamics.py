@@ -1,10 +1,10 @@
 """
-The robot's dynamics, written once in CasADi: x' = f(x, u, p).
+The robot's dynamics in CasADi: x' = f(x, u, p).
 
-Rigid body with four tilted thrusts and their reaction torques, first-order rotor
-lag and second-order tilt servos within limits, plus the robot file's named effects.
-The NMPC predicts with it, C code is generated from it, identification fits it.
-MuJoCo stays an independent description of the same robot.
+The model is a rigid body with four tilted thrusts and their reaction torques, first-order rotor
+lag and second-order tilt servos within limits. It includes the effects that the robot file names.
+The NMPC predicts with it, C code is generated from it, and identification fits it. The MuJoCo
+model is independent of it.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ TILT, TILT_RATE, THRUST = slice(13, 17), slice(17, 21), slice(21, 25)
 STATE_SIZE, INPUT_SIZE = 25, 8
 # Slices of the input (8): tilt targets [rad], thrust targets [N].
 TILT_COMMAND, THRUST_COMMAND = slice(0, 4), slice(4, 8)
-# Slices of the disturbance (10): force in world [N], torque in body [N m], offset of each servo's
-# resting angle from its target [rad].
+# Slices of the disturbance (10): force in world [N], torque in body [N m], offset of the resting
+# angle of each servo from its target [rad].
 FORCE, TORQUE, TILT_OFFSET = slice(0, 3), slice(3, 6), slice(6, 10)
 DISTURBANCE_SIZE = 10
 
@@ -47,7 +47,7 @@ def quaternion_rate(quaternion, angular_velocity):
 
 
 def thrust_direction(arm_yaw: float, tilt):
-    """Unit thrust vector (3,) in base_link of a rotor tilted by ``tilt`` [rad] about its arm."""
+    """Unit thrust vector (3,) in base_link of a rotor at ``tilt`` [rad] about its arm."""
     return ca.vertcat(ca.sin(tilt) * np.sin(arm_yaw), -ca.sin(tilt) * np.cos(arm_yaw),
                       ca.cos(tilt))
 
@@ -59,12 +59,12 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
     """
     Newton-Euler equations of the robot as one rigid body.
 
-    Forces are summed at base_link, the body turns about its centre of mass, and the
-    acceleration is that of base_link's origin, which is the centre of mass unless an
-    effect moves it.
+    Forces are summed at base_link, and the body turns about its centre of mass. The acceleration
+    is that of the origin of base_link. The two points differ only if an effect moves the centre
+    of mass. An absent argument counts as zero, unless stated otherwise.
 
     Args:
-        robot: parameters, with the effects that apply.
+        robot: parameters and effects.
         velocity: (3,) in world [m/s].
         quaternion: (4,) body to world, (x, y, z, w).
         angular_velocity: (3,) in body [rad/s].
@@ -72,12 +72,12 @@ def rigid_body(robot: RobotParameters, velocity, quaternion, angular_velocity, t
         thrust: (4,) after the rotors' lag [N].
         force_world: (3,) external force in world [N].
         torque_body: (3,) external torque in body [N m].
-        tilt_acceleration: (4,) of the joints [rad/s^2], for effects that react to it.
+        tilt_acceleration: (4,) [rad/s^2].
         effects: name -> parameter -> value or symbol, in place of the robot file's.
-        tilt_rate: (4,) of the joints [rad/s], for effects that need it.
-        thrust_rate: (4,) [N/s], likewise.
-        position: (3,) in world [m], likewise; without it there is no ground.
-        voltage_ratio: pack voltage over that of a full pack; without it there is no sag.
+        tilt_rate: (4,) [rad/s].
+        thrust_rate: (4,) [N/s].
+        position: (3,) in world [m]; None: no ground effect.
+        voltage_ratio: pack voltage over that of a full pack; None: no voltage sag.
         rotor_positions: (4, 3) in place of the robot file's [m].
 
     Returns:
@@ -129,10 +129,10 @@ def _given(value, size):
 
 def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
     """
-    Force in world [N] and torque in base_link [N m] at base_link that some effects add.
+    Force in world [N] and torque in base_link [N m] at base_link that the named effects add.
 
-    The robot without them has the mass and inertia of its file. The effect of the torque
-    coefficient counts on both sides, for added thrusts turn the body, too.
+    The reference is the robot without these effects, with the mass and inertia of its file. It
+    has the effect torque_coefficient, because added thrusts also turn the body.
 
     Returns:
         f(quaternion, velocity, rate, tilt, tilt_rate, tilt_acceleration, thrust, thrust_rate,
@@ -161,7 +161,7 @@ def added_wrench(robot: RobotParameters, names: list[str]) -> ca.Function:
 
 
 def gyroscopic_load(robot: RobotParameters, angular_velocity, tilt, thrust, joint: int):
-    """Torque of a spinning rotor on its tilt joint for each N m s of its momentum in hover."""
+    """Load on a tilt joint for each N m s of its rotor's angular momentum in hover [rad/s]."""
     n = thrust_direction(robot.rotors.arm_yaw[joint], tilt)
     speed = ca.sqrt(ca.fmax(thrust, 0) / robot.hover_thrust + 1e-9)
     return -float(robot.rotors.spin[joint]) * speed * ca.dot(
@@ -171,9 +171,10 @@ def gyroscopic_load(robot: RobotParameters, angular_velocity, tilt, thrust, join
 def servo_acceleration(robot: RobotParameters, tilt, tilt_rate, target, thrust=0.0, joint=0,
                        gyroscopic=0.0):
     """
-    Second-order tilt servo within its torque and rate limits, [rad/s^2].
+    Acceleration of a tilt servo [rad/s^2], within its torque and rate limits.
 
     The equation is that of :mod:`beetle_omni_ros.robot.servo` with the robot file's effects.
+    Arguments as of :func:`tilt_servo`.
     """
     servo, terms = tilt_servo(robot, joint, target, thrust, gyroscopic)
     return servo.acceleration(CASADI, terms.target, tilt, tilt_rate, terms.load)
@@ -182,14 +183,14 @@ def servo_acceleration(robot: RobotParameters, tilt, tilt_rate, target, thrust=0
 def tilt_servo(robot: RobotParameters, joint: int, target, thrust=0.0,
                gyroscopic=0.0) -> tuple[Servo, ServoTerms]:
     """
-    Servo of one joint and what acts on it, with the robot file's effects.
+    Servo of one joint and the terms that act on it, with the robot file's effects.
 
     Args:
         robot: parameters and effects.
         joint: index, 0 to 3.
-        target: angle asked for [rad].
-        thrust: of the joint's rotor [N].
-        gyroscopic: as :func:`gyroscopic_load` gives it [rad/s].
+        target: commanded angle [rad].
+        thrust: thrust of the joint's rotor [N].
+        gyroscopic: value of :func:`gyroscopic_load` [rad/s].
 
     """
     terms = ServoTerms(target, thrust, gyroscopic)
@@ -221,7 +222,7 @@ def derivative(robot: RobotParameters, x, u, d):
 
 
 def full_model(robot: RobotParameters) -> ca.Function:
-    """State derivative f(x (25), u (8), d (10)) -> (25,), in this module's slices."""
+    """State derivative f(x (25), u (8), d (10)) -> (25,); slices of this module."""
     x, u, d = ca.SX.sym('x', STATE_SIZE), ca.SX.sym('u', INPUT_SIZE), \
         ca.SX.sym('d', DISTURBANCE_SIZE)
     return ca.Function('dynamics', [x, u, d], [derivative(robot, x, u, d)],
@@ -239,7 +240,7 @@ def body_acceleration(robot: RobotParameters) -> ca.Function:
 
 
 def integrator(robot: RobotParameters, substeps: int = 2) -> ca.Function:
-    """advance(x (25), u (8), d (10), dt) -> x after dt [s], fourth-order Runge-Kutta."""
+    """advance(x (25), u (8), d (10), dt) -> x after dt [s], by fourth-order Runge-Kutta."""
     x, u, d, dt = ca.SX.sym('x', STATE_SIZE), ca.SX.sym('u', INPUT_SIZE), \
         ca.SX.sym('d', DISTURBANCE_SIZE), ca.SX.sym('dt')
     f = full_model(robot)

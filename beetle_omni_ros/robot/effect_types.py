@@ -1,4 +1,4 @@
-"""What a catalogue entry is made of."""
+"""Types of which the catalogue of effects consists."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ LAYERS = ('body', 'rotor', 'joint', 'timing', 'sensor')
 @dataclass(frozen=True)
 class LogNumber:
     """
-    A parameter as a fit of a servo's response log has it.
+    How a servo's response log determines a parameter.
 
     Attributes:
-        scale: a change that matters; of the logarithm where ``logarithmic``.
-        low: smallest value; of friction as a dead band [rad].
+        scale: smallest significant change; of the logarithm if ``logarithmic``.
+        low: smallest value; of friction, as a dead band [rad].
         high: largest value.
         logarithmic: whether the logarithm is fitted.
-        each: whether each joint has its own.
-        better: name and unit of a number that a log determines better, or nothing.
+        each: whether each joint has its own value.
+        better: (name, unit) of a quantity that a log determines better, or nothing.
 
     """
 
@@ -41,22 +41,22 @@ class EffectParameter:
 
     Attributes:
         unit: SI.
-        neutral: value of no effect; NaN where that is the robot file's own number.
+        neutral: value without effect; NaN if that is the robot file's own number.
         low: smallest legal value.
         high: largest legal value.
-        typical: realistic deviation from neutral; a fraction where neutral is NaN.
-        smallest: deviation below which nobody would act on it; likewise.
-        default: value where a file leaves it out; None: it must be there.
-        of_each: whether a file may have a list of four in place of the number, one for each joint.
-        number: dotted key of the robot file's own number that it stands for.
-        sensor: number of a sensor that it stands for, as in :class:`SensorErrors`.
-        tolerance: kind of tolerance by which robots of one type differ in it, a number
-            ``tolerance_...`` of params/gap.yaml.
-        least: smallest ratio to the robot file's own number that a fit may reach.
-        step: change by which a fit takes derivatives; of the logarithm for the file's own numbers.
-        curved: whether those derivatives change along a fit.
-        form: whether it only chooses between forms of the effect and is not fitted.
-        log: how a servo's response log shows it, or None.
+        typical: realistic deviation from neutral; a fraction if neutral is NaN.
+        smallest: smallest significant deviation; a fraction if neutral is NaN.
+        default: value if a file omits it; None: it is required.
+        of_each: whether a file may give a list of four, one for each joint.
+        number: dotted key of the robot file's number that it replaces.
+        sensor: field of :class:`SensorErrors` that it sets.
+        tolerance: kind of tolerance between robots of one type, a number ``tolerance_...`` of
+            params/gap.yaml.
+        least: smallest ratio to the robot file's own number in a fit.
+        step: step of a fit's derivatives; of the logarithm for the file's own numbers.
+        curved: whether these derivatives change during a fit.
+        form: whether it only chooses a form of the effect and is not fitted.
+        log: how a servo's response log determines it, or None.
 
     """
 
@@ -79,14 +79,14 @@ class EffectParameter:
 
 
 @dataclass(frozen=True)
-class Asked:
+class LimitStarts:
     """
-    Start values of a limit: where it begins to cut what a flight asks for.
+    Start values of a fitted limit, relative to the demand of a flight.
 
     Attributes:
         of: 'tilt_rate', 'torque' or 'thrust'.
-        parts: of the most that the flight asks for, one start each.
-        below: part of the limit, below which a start must lie.
+        parts: fractions of the largest demand, one start each.
+        below: fraction of the file's limit below which a start must lie.
 
     """
 
@@ -98,17 +98,17 @@ class Asked:
 @dataclass(frozen=True)
 class SensorErrors:
     """
-    What a robot's sensors say beside the truth, as effects of the robot file have it.
+    Errors of the robot's sensors by the effects of the robot file.
 
     Attributes:
         accelerometer_bias: (3,) measured minus true [m/s^2].
-        gyroscope_bias: (3,) [rad/s].
-        imu_rotation: (3,) rotation vector of the IMU's axes seen from base_link [rad].
-        imu_position: (3,) of the IMU in base_link [m].
-        mocap_rotation: (3,) rotation vector of the markers' axes seen from base_link [rad].
-        imu_delay: by which readings are older than their stamps [s].
-        mocap_delay: likewise [s].
-        encoder_delay: likewise [s].
+        gyroscope_bias: (3,) measured minus true [rad/s].
+        imu_rotation: (3,) rotation vector from base_link to the IMU's axes [rad].
+        imu_position: (3,) position of the IMU in base_link [m].
+        mocap_rotation: (3,) rotation vector from base_link to the markers' axes [rad].
+        imu_delay: age of readings at their stamps [s].
+        mocap_delay: age of poses at their stamps [s].
+        encoder_delay: age of readings at their stamps [s].
 
     """
 
@@ -125,31 +125,31 @@ class SensorErrors:
 @dataclass
 class Terms:
     """
-    The forces of one instant while they are put together, CasADi expressions throughout.
+    Terms of the body's equations at one instant, as CasADi expressions; effects change them.
 
     Attributes:
         mass: [kg].
         inertia: (3,) diagonal about the centre of mass [kg m^2].
-        centre_of_mass: (3,) seen from base_link's origin [m], or None where it is the origin.
-        torque: (3,) torque added on the body, in base_link [N m].
+        centre_of_mass: (3,) in base_link [m], or None for its origin.
+        torque: (3,) added torque on the body, in base_link [N m].
         tilt: (4,) tilt angles [rad].
-        tilt_acceleration: (4,) of the tilt joints [rad/s^2].
+        tilt_acceleration: (4,) [rad/s^2].
         tilt_axes: list of four (3,) unit vectors in base_link, outward along the arms.
         thrust: (4,) rotor thrusts after their lag [N].
         velocity: (3,) of the centre of gravity in world [m/s].
         angular_velocity: (3,) in base_link [rad/s].
         rotation: (3, 3) body to world.
         thrust_directions: list of four (3,) unit vectors in base_link.
-        rotor_positions: list of four (3,) [m] in base_link.
-        hover_thrust: of each rotor [N].
-        force_world: (3,) force added in world [N].
-        rotor_forces: list of four (3,) forces added at the rotors, in base_link [N].
+        rotor_positions: list of four (3,) in base_link [m].
+        hover_thrust: thrust of each rotor in hover [N].
+        force_world: (3,) added force in world [N].
+        rotor_forces: list of four (3,) added forces at the rotors, in base_link [N].
         torque_ratio: reaction torque for each newton [m].
-        tilt_rate: (4,) of the joints [rad/s].
-        thrust_rate: (4,) change of the thrusts [N/s].
+        tilt_rate: (4,) [rad/s].
+        thrust_rate: (4,) [N/s].
         spin: (4,) direction of rotation, +1 along the thrust.
-        position: (3,) of base_link in world [m], or None where nobody knows it.
-        voltage_ratio: pack voltage over that of a full pack, or None.
+        position: (3,) of base_link in world [m], or None if unknown.
+        voltage_ratio: pack voltage over that of a full pack, or None if unknown.
 
     """
 
@@ -177,11 +177,11 @@ class Terms:
     voltage_ratio: ca.SX | None = None
 
     def rotor_speeds(self) -> list:
-        """Each rotor's speed over that in hover, from its thrust; list of four scalars."""
+        """Rotor speeds relative to hover, computed from thrust; list of four scalars."""
         return [ca.sqrt(ca.fmax(self.thrust[i], 0) / self.hover_thrust + 1e-9) for i in range(4)]
 
     def hub_velocities(self) -> list:
-        """List of four (3,) velocities of the rotor hubs through still air, in base_link."""
+        """List of four (3,) velocities of the rotor hubs through still air in base_link [m/s]."""
         body = self.rotation.T @ self.velocity
         return [body + ca.cross(self.angular_velocity, r) for r in self.rotor_positions]
 
@@ -189,15 +189,15 @@ class Terms:
 @dataclass
 class ServoTerms:
     """
-    What acts on one tilt servo at one instant, numbers of any namespace.
+    Terms that act on one tilt servo at one instant, numbers of any namespace.
 
     Attributes:
-        target: angle asked for [rad].
-        thrust: of the joint's rotor [N].
-        gyroscopic: what the rotor's spin puts on the joint for each N m s of its angular
-            momentum in hover [rad/s], or 0 where the body's rate is unknown.
+        target: commanded angle [rad].
+        thrust: thrust of the joint's rotor [N].
+        gyroscopic: load on the joint for each N m s of the rotor's angular momentum in hover
+            [rad/s]; 0 if the body's rate is unknown.
         load: torque beside the motor's [N m].
-        coulomb: friction while it slides [N m], or None.
+        coulomb: sliding friction [N m], or None.
         stiction: friction at rest [N m], or None.
 
     """
@@ -211,14 +211,14 @@ class ServoTerms:
 
 
 @dataclass(frozen=True)
-class Stand:
+class Treatment:
     """
-    What a consumer makes of an effect.
+    How a consumer treats an effect.
 
     Attributes:
-        acts: whether a change of its parameters changes what the consumer computes.
-        reason: why not.
-        error: whether a robot file with the effect is refused.
+        acts: whether a change of its parameters changes the consumer's results.
+        reason: reason why it does not act.
+        error: whether the consumer refuses a robot file with the effect.
 
     """
 
@@ -235,27 +235,29 @@ class Effect:
     Attributes:
         layer: 'body', 'rotor', 'joint', 'timing' or 'sensor'.
         parameters: name -> :class:`EffectParameter`.
-        source: the equation and where it comes from.
-        excited_by: flight in which it shows.
-        confused_with: names of entries that look alike in poor data.
-        separated_by: experiment that tells them apart.
-        apply: body: changes :class:`Terms` in place, called as apply(terms, **values).
-        servo: joint: changes :class:`ServoTerms` in place, servo(terms, joint, **values).
-        each: 'rotor' or 'joint' where the parameters are (4,), one for each.
-        delays: what comes late, 'tilt' and 'thrust' commands or readings of 'imu', 'mocap' and
+        source: equation and its source.
+        excited_by: flight that excites it.
+        confused_with: names of entries that poor data cannot distinguish from it.
+        separated_by: experiment that distinguishes them.
+        apply: equation of a body effect; changes :class:`Terms` in place, called as
+            apply(terms, **values).
+        servo: equation of a joint effect; changes :class:`ServoTerms` in place, called as
+            servo(terms, joint, **values).
+        each: 'rotor' or 'joint' if the parameters are (4,), one for each.
+        delays: delayed quantities, 'tilt' and 'thrust' commands or readings of 'imu', 'mocap' and
             'encoders'.
-        own_clock: whether a clock of its own stamps those readings, which may then seem early.
-        channels: where it shows. B: forces and torques, J: joints, A: MoCap's acceleration,
-            W: MoCap's rate of turn; A and W against the IMU.
-        starts: values from which a fit starts, where the effect has no slope at its neutral value.
-        forms: deviations of the parameters that choose a form, one mapping for each form.
-        one_regime: whether it acts in one regime alone, such as near the ground.
+        own_clock: whether these readings are stamped by another clock and may appear early.
+        channels: measurements that it affects. B: forces and torques, J: joints, A: MoCap's
+            acceleration, W: MoCap's angular velocity; A and W against the IMU.
+        starts: start values of a fit, if the effect has no slope at its neutral value.
+        forms: for each form of the effect, the parameters that choose it.
+        one_regime: whether it acts in one regime only, such as near the ground.
         same_response: entry that is another form of the same response.
-        log_rival: entry that a servo's response log can hardly tell from this one.
-        allocated: whether the allocation of thrusts has it.
-        plant: how the simulated plant has a body effect: 'model' as numbers of its bodies and
-            rotors, 'own' by equations of its own, else by this entry's.
-        stands: consumer -> its stand, where that does not follow from the kind of effect.
+        log_rival: entry that a servo's response log hardly distinguishes from it.
+        allocated: whether the allocation includes it.
+        plant: how the simulated plant includes a body effect. 'model': numbers of its bodies and
+            rotors, 'own': equations of its own, else the equation of this entry.
+        treatments: consumer -> :class:`Treatment` that does not follow from the kind of effect.
 
     """
 
@@ -271,23 +273,23 @@ class Effect:
     delays: tuple[str, ...] = ()
     own_clock: bool = False
     channels: str = 'B'
-    starts: tuple[tuple[float, ...], ...] | Asked = ()
+    starts: tuple[tuple[float, ...], ...] | LimitStarts = ()
     forms: tuple[dict[str, float], ...] = ({},)
     one_regime: bool = False
     same_response: str = ''
     log_rival: str = ''
     allocated: bool = False
     plant: str = ''
-    stands: dict[str, Stand] = field(default_factory=dict)
+    treatments: dict[str, Treatment] = field(default_factory=dict)
 
     @property
     def settings(self) -> dict[str, str]:
-        """Parameter -> dotted key of the number that it replaces when a robot file is read."""
+        """Parameter -> dotted key of the robot file's number that it replaces."""
         return {} if self.apply else {name: spec.number for name, spec in self.parameters.items()
                                       if spec.number}
 
     def in_readings(self, parameter: str) -> bool:
-        """Whether a parameter only shows in what sensors read, not in the model's equations."""
+        """Whether a parameter affects sensor readings only, not the model's equations."""
         return bool(self.parameters[parameter].sensor) or self.kind == 'play'
 
     @property
@@ -295,9 +297,9 @@ class Effect:
         """
         How it acts.
 
-        'body' or 'servo' by its equation, 'number' in place of one of the robot file, 'command'
-        as a delay of commands, 'sensor' in readings of IMU and MoCap, 'feedback' in those of the
-        encoders, and 'play' between encoder and rotor.
+        'body' or 'servo': by its equation. 'number': replaces one of the robot file. 'command':
+        delays commands. 'sensor': in readings of IMU and MoCap. 'feedback': in readings of the
+        encoders. 'play': between encoder and rotor.
         """
         if self.apply or self.servo:
             return 'body' if self.apply else 'servo'
@@ -309,11 +311,11 @@ class Effect:
 
     @property
     def numbers(self) -> list[str]:
-        """Names of the parameters that a fit determines."""
+        """Names of the fitted parameters."""
         return [name for name, spec in self.parameters.items() if not spec.form]
 
 
 def vector(values):
-    """(n,) column of a tuple's numbers or symbols; anything else as it is."""
+    """(n,) column of a tuple of numbers or symbols; any other value unchanged."""
     return ca.vertcat(*ca.vertsplit(ca.SX(ca.vertcat(*values)))) if isinstance(values, tuple) \
         else values

@@ -1,17 +1,16 @@
 """
-The catalogue of named effects: what reality may add to the model.
+The catalogue of named effects: terms that reality may add to the model.
 
-Each effect is declared once: equation and source, its parameters with unit, neutral value (at
-which the effect vanishes), physical range, realistic magnitude and smallest size worth naming,
-what excites it, what it is confused with and what separates the two. A robot file switches an
-effect on by naming it. Its equation then acts where its kind says:
+Each effect is declared once, with equation, source, parameters, excitation and the effects that
+it is confused with. A robot file enables an effect by naming it. Its place of action follows from
+its kind:
 
-- body effects and those of rotors on the body change the terms of the Newton-Euler equations,
-- joint effects change the servo's equation,
-- effects that only replace a number of the robot file (a lag, a gain, a limit) replace it when
-  the file is read, so that plant, NMPC and training all see the number,
-- delays of commands stand in :attr:`RobotParameters.command_delays`,
-- those of sensors are values that the gap finder fits and whoever reads the sensor may use.
+- Effects on the body change the terms of the Newton-Euler equations.
+- Joint effects change the equation of the servo.
+- Effects that replace a number of the robot file (a lag, a gain, a limit) do so when the file is
+  read. Plant, NMPC and training then use the new number.
+- Delays of commands are in :attr:`RobotParameters.command_delays`.
+- Sensor effects are in :attr:`RobotParameters.sensors`. The gap finder fits them.
 """
 
 from __future__ import annotations
@@ -22,42 +21,42 @@ from difflib import get_close_matches
 import numpy as np
 
 from beetle_omni_ros.robot.effect_types import (
-    Asked,
     Effect,
     EffectParameter,
+    LimitStarts,
     SensorErrors,
     ServoTerms,
-    Stand,
     Terms,
+    Treatment,
 )
 from beetle_omni_ros.robot.effects_actuator import ACTUATOR, SENSOR
 from beetle_omni_ros.robot.effects_body import BODY
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.yaml_file import quoted, shortened
 
-# In the order in which they act together: the true tilt first, for it turns the thrusts.
+# In order of application: the true tilt first, because it changes the thrust directions.
 CATALOGUE: dict[str, Effect] = {'joint_offset': ACTUATOR['joint_offset'], **BODY, **ACTUATOR,
                                 **SENSOR}
 
-MEMBERS = 4         # joints of this kind of robot
+JOINTS = 4
 
-__all__ = ['Asked', 'CATALOGUE', 'command_delays', 'delaying', 'Effect', 'EffectParameter',
-           'sensor_errors', 'SensorErrors', 'separating', 'ServoTerms', 'settings', 'Terms',
-           'validated']
+__all__ = ['CATALOGUE', 'command_delays', 'delaying', 'Effect', 'EffectParameter', 'LimitStarts',
+           'sensor_errors', 'SensorErrors', 'separating_experiment', 'ServoTerms', 'settings',
+           'Terms', 'validated']
 CONSUMERS = {'nmpc': 'NMPC and allocation', 'training': 'training', 'plant': 'simulated plant',
              'estimator': 'estimator', 'buses': 'delays of the buses', 'gap': 'gap finder'}
-ACTS = Stand(True)
-_CORRECTED = Stand(False, 'the estimator corrects the readings first')
-_NO_MODEL = Stand(False, 'the filter follows the IMU and has no model of forces or servos')
-_NO_DELAY = Stand(False, 'the effect delays no command')
-_NO_JOINTS = Stand(False, 'the filter does not read the joints')
-_STANDS = {
-    'nmpc': {'sensor': _CORRECTED, 'play': Stand(
+ACTS = Treatment(True)
+_CORRECTED = Treatment(False, 'the estimator corrects the readings first')
+_NO_MODEL = Treatment(False, 'the filter integrates the IMU and has no model of forces or servos')
+_NO_DELAY = Treatment(False, 'the effect delays no command')
+_NO_JOINTS = Treatment(False, 'the filter does not read the joints')
+_TREATMENTS = {
+    'nmpc': {'sensor': _CORRECTED, 'play': Treatment(
         False, 'a play is an offset of the servos, which is estimated in flight')},
-    'training': {'sensor': _CORRECTED, 'play': Stand(
+    'training': {'sensor': _CORRECTED, 'play': Treatment(
         False, 'the model of the servos has no play: train with joint_deflection or '
                'joint_friction, or take the effect out of the file', error=True)},
-    'plant': {'play': Stand(
+    'plant': {'play': Treatment(
         False, 'MuJoCo has no play between encoder and rotor', error=True)},
     'estimator': {**dict.fromkeys(('body', 'servo', 'number', 'command', 'play'), _NO_MODEL),
                   'feedback': _NO_JOINTS},
@@ -66,13 +65,13 @@ _STANDS = {
 
 
 def settings(effects: dict[str, dict]) -> dict[str, float]:
-    """Dotted keys of the robot file that checked effects replace, with the new values."""
+    """Dotted keys of the robot file that validated effects replace, with the new values."""
     return {key: effects[name][parameter] for name in effects
             for parameter, key in CATALOGUE[name].settings.items()}
 
 
-def separating(names: Sequence[str]) -> str:
-    """Experiment that tells entries apart: of the one that names most others as confused."""
+def separating_experiment(names: Sequence[str]) -> str:
+    """Experiment that distinguishes entries, from the one with most others as confused."""
     return CATALOGUE[max(names, key=lambda name: len(
         set(CATALOGUE[name].confused_with) & set(names) - {name}))].separated_by
 
@@ -83,14 +82,14 @@ def delaying(*what: str) -> tuple[str, ...]:
 
 
 def command_delays(effects: dict[str, dict]) -> tuple[float, float]:
-    """Delays of tilt and of thrust commands [s] that checked effects add."""
+    """Delays of tilt and of thrust commands [s] from validated effects."""
     tilt, thrust = (sum(effects.get(name, {}).get('delay', 0.0) for name in delaying(what))
                     for what in ('tilt', 'thrust'))
     return tilt, thrust
 
 
 def sensor_errors(effects: dict[str, dict]) -> SensorErrors:
-    """What checked effects say of the sensors."""
+    """Sensor errors from validated effects."""
     return SensorErrors(**{spec.sensor: values[parameter] for name, values in effects.items()
                            for parameter, spec in CATALOGUE[name].parameters.items()
                            if spec.sensor})
@@ -98,10 +97,10 @@ def sensor_errors(effects: dict[str, dict]) -> SensorErrors:
 
 def validated(effects: dict | None) -> dict[str, dict]:
     """
-    Check a robot file's ``effects`` mapping against the catalogue.
+    Validate a robot file's ``effects`` mapping against the catalogue.
 
     Returns:
-        name -> parameter -> float or tuple of floats, parameters complete.
+        name -> parameter -> float or tuple of floats, with all parameters of each effect.
 
     Raises:
         ParameterError: unknown effect or parameter, wrong shape, value out of range.
@@ -134,10 +133,10 @@ def _value(at, spec, value):
         raise ParameterError(f'{at}: expected numbers [{spec.unit}], '
                              f'found {quoted(value)}') from None
     shape = np.shape(spec.neutral)
-    if spec.of_each and array.shape == (MEMBERS,):
+    if spec.of_each and array.shape == (JOINTS,):
         shape = array.shape
     if array.shape != shape:
-        each = f' or {(MEMBERS,)}' if spec.of_each else ''
+        each = f' or {(JOINTS,)}' if spec.of_each else ''
         raise ParameterError(f'{at}: expected shape {shape}{each}, found {array.shape}')
     if not np.all((array >= spec.low) & (array <= spec.high)):
         raise ParameterError(f'{at}: {quoted(value)} is outside '
@@ -145,32 +144,32 @@ def _value(at, spec, value):
     return tuple(map(float, array)) if shape else float(array)
 
 
-def stand(consumer: str, name: str) -> Stand:
+def treatment(consumer: str, name: str) -> Treatment:
     """
-    Stand of a consumer on an effect: whether it acts on it, leaves it to another or refuses it.
+    How a consumer treats an effect: it acts on it, leaves it to another consumer or refuses it.
 
-    It follows from how the effect acts (:attr:`Effect.kind`), so that a new entry of the
-    catalogue has a stand everywhere. One test over all of them holds that the stand is true.
+    This follows from the kind of effect (:attr:`Effect.kind`), so that each new entry has a
+    treatment. ``test/gap/test_consumers.py`` checks every pair against the consumer's results.
 
     Args:
         consumer: one of ``CONSUMERS``.
-        name: of the catalogue.
+        name: name in the catalogue.
 
     """
     effect = CATALOGUE[name]
-    return effect.stands.get(consumer) or _STANDS[consumer].get(effect.kind, ACTS)
+    return effect.treatments.get(consumer) or _TREATMENTS[consumer].get(effect.kind, ACTS)
 
 
 def check(consumer: str, effects: Iterable[str]) -> None:
     """
-    Refuse effects of a robot file that the consumer cannot have.
+    Refuse effects of a robot file that a consumer cannot represent.
 
     Raises:
-        ParameterError: naming the effect and the reason.
+        ParameterError: names the effect and the reason.
 
     """
     for name in effects:
-        found = stand(consumer, name)
+        found = treatment(consumer, name)
         if found.error:
             raise ParameterError(f'effects.{name}: the {CONSUMERS[consumer]} refuses this effect: '
                                  f'{found.reason}')

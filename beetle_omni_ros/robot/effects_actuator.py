@@ -5,11 +5,11 @@ from __future__ import annotations
 import casadi as ca
 
 from beetle_omni_ros.robot.effect_types import (
-    Asked,
     Effect,
     EffectParameter,
+    LimitStarts,
     LogNumber,
-    Stand,
+    Treatment,
     vector,
 )
 
@@ -35,7 +35,7 @@ def _joint_deflection(servo, joint, deflection_per_newton):
 
 
 def per_joint(value, joint: int):
-    """Value of the joint with this index, of one number for all or of four."""
+    """Value of a joint, from one number for all joints or a tuple of four."""
     return value[joint] if isinstance(value, tuple) else value
 
 
@@ -65,26 +65,26 @@ def _number(key, unit, low, high, typical, smallest, step=0.01, **more):
 ACTUATOR: dict[str, Effect] = {
     'voltage_sag': Effect(
         'rotor', {'exponent': EffectParameter('1', 0.0, -1.0, 5.0, 1.0, 0.15)},
-        'f = f* (V / V_full)^k: a thrust map that does not know the voltage; 6.9 %/V on this '
+        'f = f* (V / V_full)^k: thrust of a thrust map without voltage; 6.9 %/V on this '
         "robot's map", 'flights at several states of charge', ('thrust_coefficient', 'mass'),
         'three flights at different charge; thrust steps by internal force', _voltage_sag,
-        stands=dict.fromkeys(('nmpc', 'training'), Stand(
-            False, 'it does not know the voltage and takes the pack as full'))),
+        treatments=dict.fromkeys(('nmpc', 'training'), Treatment(
+            False, 'it has no voltage and assumes a full pack'))),
     'rotor_lag': Effect(
         'rotor', {'time_constant': _number('rotors.time_constant', 's', 0.001, 2.0, 0.4, 0.12,
                                            step=0.02, tolerance='lag')},
         "T f' + f = f*", 'thrust steps', ('rotor_dead_time', 'axial_inflow', 'command_latency'),
-        'thrust chirp 0.5 to 8 Hz: a lag shrinks the answer, a delay only shifts it',
+        'thrust chirp 0.5 to 8 Hz: a lag reduces the amplitude, a delay shifts the phase only',
         same_response='rotor_dead_time'),
     'rotor_dead_time': Effect(
-        'rotor', _delay(0.015), 'f*(t - d): speed controllers, PWM', 'thrust steps',
+        'rotor', _delay(0.015), 'f*(t - d): delay of speed controllers and PWM', 'thrust steps',
         ('rotor_lag', 'command_latency'), 'thrust chirp 0.5 to 8 Hz', delays=('thrust',),
         same_response='rotor_lag'),
     'thrust_saturation': Effect(
         'rotor', {'thrust_max': _number('rotors.thrust_max', 'N', 1.0, 200, 0.3, 0.02)},
         'f = min(f*, f_max): voltage or speed controller limit', 'commands at the limit',
         ('voltage_sag', 'thrust_coefficient'), 'climb at full thrust',
-        starts=Asked('thrust', (0.95, 0.8), 1.2)),
+        starts=LimitStarts('thrust', (0.95, 0.8), 1.2)),
     'command_latency': Effect(
         'timing', _delay(0.02), 'all commands act d later', 'fast tilting and thrust steps',
         ('joint_command_latency', 'rotor_dead_time', 'joint_bandwidth'),
@@ -112,16 +112,16 @@ ACTUATOR: dict[str, Effect] = {
                                       log=_logged(0.2, 1e3))},
         "|q'| <= limit: voltage and gearing", 'large tilt steps',
         ('joint_torque_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
-        channels='J', starts=Asked('tilt_rate', (0.95, 0.8), 0.95),
+        channels='J', starts=LimitStarts('tilt_rate', (0.95, 0.8), 0.95),
         log_rival='joint_torque_limit'),
     'joint_torque_limit': Effect(
         'joint', {
-            # The file's 3 N m is sixty times what quick poses ask for, where a real limit may lie.
+            # The file's 3 N m is 60 times the demand of quick poses; the real limit may be lower.
             'effort_limit': _number('joints.effort_limit', 'N m', 0.001, 100, 0.8, 0.05,
                                     least=1e-3, log=_logged(1e-3, 1e3))},
         '|tau| <= limit: current limit, stall', 'large tilt steps',
         ('joint_velocity_limit', 'joint_bandwidth'), 'tilt steps of 30, 90 and 180 deg',
-        channels='J', starts=Asked('torque', (1.1, 0.8, 0.5), 0.98),
+        channels='J', starts=LimitStarts('torque', (1.1, 0.8, 0.5), 0.98),
         log_rival='joint_velocity_limit'),
     'joint_friction': Effect(
         'joint', {
@@ -132,19 +132,19 @@ ACTUATOR: dict[str, Effect] = {
         'smooth over 0.05 rad/s in the model', 'slow reversals of the tilts',
         ('joint_backlash', 'joint_bandwidth'), 'triangle of 2 deg at 0.1 Hz',
         servo=_joint_friction, channels='J', starts=((0.004, 0.004), (0.012, 0.015)),
-        log_rival='joint_backlash', stands={'plant': Stand(
-            False, 'friction that holds a joint needs the contact solver, which the plant runs '
-                   'near the floor alone', error=True)}),
+        log_rival='joint_backlash', treatments={'plant': Treatment(
+            False, 'friction that holds a joint needs the contact solver, which the plant uses '
+                   'near the floor only', error=True)}),
     'joint_backlash': Effect(
         'joint', {'gap': EffectParameter('rad', 0.0, 0.0, 0.3, 0.01, 0.003, curved=True,
                                          log=LogNumber(0.002, 0.0, 0.3))},
-        'play of gap between encoder and rotor', 'reversals of the tilts',
+        'play of width gap between encoder and rotor', 'reversals of the tilts',
         ('joint_friction', 'joint_feedback_delay'), 'reversals loaded and unloaded',
         starts=((0.005,), (0.02,)), log_rival='joint_friction'),
     'joint_deflection': Effect(
         'joint', {'deflection_per_newton': EffectParameter('rad/N', 0.0, -0.05, 0.05, 0.002,
                                                            0.0004, step=1e-4, curved=True)},
-        'thrust off the axis turns the servo from its target: q* + c f', 'thrust steps',
+        'thrust off the axis deflects the servo from its target: q* + c f', 'thrust steps',
         ('joint_friction', 'joint_offset'), 'internal force at rest, two levels',
         servo=_joint_deflection, channels='J'),
     'joint_offset': Effect(
@@ -156,20 +156,20 @@ ACTUATOR: dict[str, Effect] = {
         'attitudes with different sets of tilts; a jig', _joint_offset, each='joint'),
     'joint_feedback_delay': Effect(
         'timing', _delay(0.01, sensor='encoder_delay', tolerance='delay'),
-        'the encoder reading is d older than its stamp',
+        'the encoder reading is older than its stamp by d',
         'fast tilting', ('joint_command_latency', 'mocap_time_offset', 'joint_backlash'),
-        'tilting by internal force while the body rests', delays=('encoders',), channels='BJ'),
+        'tilting by internal force with the body at rest', delays=('encoders',), channels='BJ'),
 }
 
 SENSOR: dict[str, Effect] = {
     'mocap_time_offset': Effect(
         'timing', _delay(0.01, 0.002, sensor='mocap_delay', tolerance='delay'),
-        'the pose is d older than its stamp', 'fast turns', ('imu_filter_lag',),
+        'the pose is older than its stamp by d', 'fast turns', ('imu_filter_lag',),
         'any turn above 1 rad/s', delays=('mocap',), own_clock=True, channels='AW'),
     'imu_filter_lag': Effect(
         'timing', _delay(0.01, 0.002, sensor='imu_delay', tolerance='delay'),
-        'specific force and rates are d older than their stamp: '
-        'filters of the inertial unit', 'fast turns', ('mocap_time_offset', 'rotor_dead_time'),
+        'specific force and rates are older than their stamp by d: '
+        'filters of the IMU', 'fast turns', ('mocap_time_offset', 'rotor_dead_time'),
         'turns above 1 rad/s with thrust steps; log the raw gyroscope', delays=('imu',),
         channels='BAWJ'),
     'imu_accelerometer_bias': Effect(
@@ -186,7 +186,7 @@ SENSOR: dict[str, Effect] = {
         'sensor', {'rotation': EffectParameter('rad', (0.0,) * 3, -0.5, 0.5, 0.02, 0.004,
                                                sensor='imu_rotation', tolerance='angle',
                                                curved=True)},
-        'a sensor with axes rotated by exp(rotation) against base_link',
+        'IMU axes rotated by exp(rotation) against base_link',
         'several attitudes', ('mocap_misalignment', 'wind', 'joint_offset'),
         'hover in three attitudes', channels='BAW'),
     'imu_lever_arm': Effect(
@@ -198,6 +198,6 @@ SENSOR: dict[str, Effect] = {
         'sensor', {'rotation': EffectParameter('rad', (0.0,) * 3, -0.5, 0.5, 0.02, 0.004,
                                                sensor='mocap_rotation', tolerance='angle',
                                                curved=True)},
-        'markers with axes rotated by exp(rotation) against base_link', 'several attitudes',
+        'marker axes rotated by exp(rotation) against base_link', 'several attitudes',
         ('imu_misalignment', 'wind'), 'hover at yaw 0, 90, 180 and 270 deg', channels='AW'),
 }

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import casadi as ca
 
-from beetle_omni_ros.robot.effect_types import Effect, EffectParameter, Stand, vector
+from beetle_omni_ros.robot.effect_types import Effect, EffectParameter, Treatment, vector
 
 NAN = float('nan')
 UP = ca.DM([0, 0, 1])
-REFERENCE_HEIGHT = 0.25     # [m] of the rotor, at which the ground effect's gain is stated
+REFERENCE_HEIGHT = 0.25     # [m] of the rotor, for which the gain of the ground effect is given
 EXPONENTIAL_HEIGHT = 0.25   # [m] over which the exponential form falls to 1/e
-LEAST_HEIGHT = 0.08         # [m] below which the forms are not meant
+LEAST_HEIGHT = 0.08         # [m] below which the forms are not valid
 
 
 def _mass(terms, mass):
@@ -35,8 +35,8 @@ def _module_reaction(terms, module_inertia, mass_moment):
         rate, acceleration = terms.tilt_rate[i], terms.tilt_acceleration[i]
         n, e = terms.thrust_directions[i], terms.tilt_axes[i]
         terms.torque = terms.torque - module_inertia * acceleration * e
-        # The module's centre of mass hangs below the joint axis: it moves against the thrust,
-        # and pushes back on the axis as it is accelerated.
+        # The centre of mass of the module is below the joint axis. It moves against the thrust,
+        # and its acceleration pushes back on the axis.
         shift = shift - mass_moment / terms.mass * (n - UP)
         sideways = ca.cross(e, n)
         terms.rotor_forces[i] = terms.rotor_forces[i] + mass_moment * (
@@ -151,7 +151,7 @@ BODY: dict[str, Effect] = {
         'flips by 90 and 180 deg about each axis', _inertia, plant='model'),
     'centre_of_mass': Effect(
         'body', {'offset': EffectParameter('m', (0.0,) * 3, -0.2, 0.2, 0.005, 0.0015)},
-        'forces turn the body about its centre of mass; base_link moves with it',
+        'forces turn the body about its centre of mass, which is displaced from base_link',
         'hover in several attitudes', ('rotor_thrust_coefficient', 'module_reaction'),
         'hover at roll 0, 90, 180 deg and pitch 90 deg', _centre_of_mass, plant='model'),
     'module_reaction': Effect(
@@ -160,12 +160,12 @@ BODY: dict[str, Effect] = {
                  'mass_moment': EffectParameter('kg m', 0.0, 0.0, 1.0, 2e-3, 3e-4, 0.0,
                                                 step=2e-4)},
         "servo torque J q'' on the body; centre of mass moved by -moment / m (t(q) - t(0)), "
-        "moment (n'' + 2 w x n') pushed back; "
+        "reaction force moment (n'' + 2 w x n'); "
         'multibody section of the robot file', 'fast tilting, turned attitudes',
         ('centre_of_mass', 'inertia'), 'the same attitude with tilts turned by 180 deg',
-        _module_reaction, channels='BJ', plant='model', stands={'plant': Stand(
-            False, 'its modules turn and swing as bodies of their own, as the multibody section '
-                   'has them; without that section it acts')}),
+        _module_reaction, channels='BJ', plant='model', treatments={'plant': Treatment(
+            False, 'its modules are bodies with the masses of the multibody section; without '
+                   'that section it acts')}),
     'thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', 1.0, 0.2, 2.0, 0.05, 0.01, tolerance='thrust')},
         'f = scale f*, all rotors', 'any flight', ('mass', 'voltage_sag', 'tilt_thrust_loss'),
@@ -174,7 +174,7 @@ BODY: dict[str, Effect] = {
     'rotor_thrust_coefficient': Effect(
         'body', {'scale': EffectParameter('1', (1.0,) * 4, 0.0, 2.0, 0.08, 0.015,
                                           tolerance='thrust')},
-        'f_i = scale_i f*_i: a damaged propeller, a speed controller of its own',
+        'f_i = scale_i f*_i: damaged propeller or other speed controller',
         'hover in several attitudes', ('centre_of_mass', 'rotor_thrust_coefficient'),
         'tilted attitudes; exchange propellers 1 and 2', _rotor_thrust_coefficient, each='rotor',
         allocated=True, plant='model'),
@@ -240,7 +240,7 @@ BODY: dict[str, Effect] = {
     'rotor_acceleration_torque': Effect(
         'body', {'angular_momentum_at_hover': EffectParameter('N m s', 0.0, 0.0, 1.0, 0.066,
                                                               0.008)},
-        "-h' s n with h ~ sqrt(f): spinning up turns the body", 'thrust steps',
+        "-h' s n with h ~ sqrt(f): a change of rotor speed turns the body", 'thrust steps',
         ('torque_coefficient', 'propeller_gyroscopic_torque', 'rotor_lag'),
         'differential thrust chirp', _rotor_acceleration_torque),
 }

@@ -1,17 +1,18 @@
 """
-Which attitudes can be held with the actuators that are left, and how firmly.
+Attitudes that a robot with failed actuators can hold, and the margin of each.
 
-Holding an attitude depends on the direction of up in the body alone, not on heading. For each of
-a grid of directions the allocation of the weight gives tilts and thrusts. About these the
+Whether an attitude can be held depends on the direction of up in the body, not on heading. For a
+grid of directions the allocation of the weight gives tilts and thrusts. About these the
 accelerations [m/s^2, rad/s^2] are linear in small changes of tilt and thrust,
 
-    (a, alpha) = J (thrust change / thrust reach, tilt change / tilt reach),
+    (a, alpha) = J (thrust change / thrust reach, tilt change / tilt reach).
 
-where a thrust may go down to zero or up to its limit and a tilt as far as its servo turns within
-the reach time. The margin is the radius of the largest ball of accelerations for which no
-actuator exceeds its reach with the minimum-norm change: 1 / max_i |row i of J^+|. It is zero
-where the weight cannot be held, or where a direction of the six cannot be pushed: at level with
-a rotor lost the opposite one carries nothing, its tilt moves no force.
+The reach of a thrust is its distance from zero or from its limit. The reach of a tilt is the
+travel of its servo within the reach time. The margin is the radius of the largest ball of
+accelerations for which the minimum-norm change stays within every reach:
+1 / max_i |row i of J^+|. It is zero if the weight cannot be held, or if one of the six directions
+cannot be pushed. An example is level flight with a lost rotor: the opposite rotor has no thrust,
+so that its tilt has no effect.
 """
 
 from __future__ import annotations
@@ -27,31 +28,31 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter
 
-WAY = 9                 # points of the way to level that are looked at, 22 deg apart at most
-BISECTIONS = 5          # towards a wished attitude: 6 deg / 2^5
+PATH_POINTS = 9         # evaluated points of the path to level, 22 deg apart at most
+BISECTIONS = 5          # towards a desired attitude: 6 deg / 2^5
 LITTLE = 1.0            # [N] a rotor with less may turn its joint later
-NEARLY = 0.8            # [-] of the largest margin, where none is large enough
+NEARLY = 0.8            # [-] fraction of the largest margin, if none is large enough
 GOLDEN = np.pi * (1 + np.sqrt(5))
 
 
 @dataclass(frozen=True, kw_only=True)
 class HoldingParameters:
-    """Tuning of the choice of attitudes; params/degraded.yaml says why."""
+    """Selection of attitudes; params/degraded.yaml gives the reasons."""
 
-    reach_time: float = parameter(0.1, doc='within which actuators shall act', unit='s',
+    reach_time: float = parameter(0.1, doc='time within which actuators must act', unit='s',
                                   low=0.01, high=1)
-    tilt_rate: float = parameter(7.0, doc='of the servos', unit='rad/s', low=0.1, high=100)
-    directions: int = parameter(1000, doc='of gravity in the body that are compared', low=50,
-                                high=10000)
-    flying_margin: float = parameter(2.0, doc='of the attitude to fly in',
+    tilt_rate: float = parameter(7.0, doc='rate of the servos', unit='rad/s', low=0.1, high=100)
+    directions: int = parameter(1000, doc='number of compared directions of gravity in the body',
+                                low=50, high=10000)
+    flying_margin: float = parameter(2.0, doc='required margin of the attitude for flight',
                                      unit='m/s^2, rad/s^2', low=0, high=20)
-    turn_rate: float = parameter(6.0, doc='at which the body turns', unit='rad/s', low=0.1,
+    turn_rate: float = parameter(6.0, doc='rate of turns of the body', unit='rad/s', low=0.1,
                                  high=50)
-    coast_time: float = parameter(0.1, doc='of a turn that is being stopped, at its first rate',
-                                  unit='s', low=0, high=1)
-    escape_time: float = parameter(1.5, doc='for which the attitude reached soonest is held, '
-                                   'before a landing turns on', unit='s', low=0.01, high=20)
-    holding_margin: float = parameter(1.0, doc='with which a wished attitude is held as it is',
+    coast_time: float = parameter(0.1, doc='duration at the initial rate that gives the angle '
+                                  'in which a turn stops', unit='s', low=0, high=1)
+    escape_time: float = parameter(1.5, doc='hold time of the attitude of an escape, before a '
+                                   'landing turns on', unit='s', low=0.01, high=20)
+    holding_margin: float = parameter(1.0, doc='margin at which a target attitude is not replaced',
                                       unit='m/s^2, rad/s^2', low=0, high=20)
 
     @classmethod
@@ -62,23 +63,23 @@ class HoldingParameters:
 
 class Holding:
     """
-    The attitudes that a robot can hold.
+    Table of the attitudes that a robot can hold.
 
     Args:
-        robot: the robot.
-        health: what is left of it.
-        parameters: by default params/degraded.yaml.
+        robot: parameters of the robot.
+        health: state of the actuators.
+        parameters: selection of attitudes, by default params/degraded.yaml.
 
     Attributes:
         directions: (N, 3) unit vectors, up in base_link.
-        margins: (N,) margin of each [m/s^2, rad/s^2], 0 where it cannot be held.
-        tilts: (N, 4) tilts that hold each, within +-pi [rad].
+        margins: (N,) margin of each direction [m/s^2, rad/s^2], 0 if it cannot be held.
+        tilts: (N, 4) tilts that hold each direction, within +-pi [rad].
 
     """
 
     def __init__(self, robot: RobotParameters, health: ActuatorHealth,
                  parameters: HoldingParameters | None = None):
-        """Compute the table, about 10 ms."""
+        """Compute the table in about 10 ms."""
         self.parameters = parameters or HoldingParameters.load()
         self._robot, self._health = robot, health
         self._allocator = DegradedAllocator(robot, health)
@@ -86,55 +87,55 @@ class Holding:
         self._thrust_max = health.limited(robot.rotors.thrust_max)
         self.directions = sphere(self.parameters.directions)
         self.tilts, self._thrusts, met = self._held(self.directions)
-        self.margins = self._measured(self.tilts, self._thrusts, met)
+        self.margins = self._margins(self.tilts, self._thrusts, met)
 
     def margin(self, quaternion: np.ndarray) -> float:
-        """Margin of one attitude (4,) [m/s^2, rad/s^2], 0 where it cannot be held."""
-        return float(self._margins(up(quaternion)[None])[0])
+        """Margin of one attitude (4,) [m/s^2, rad/s^2], 0 if it cannot be held."""
+        return float(self._margins(*self._held(up(quaternion)[None]))[0])
 
     def nearest(self, quaternion: np.ndarray, margin: float) -> np.ndarray:
         """
-        Nearest attitude with a margin, or with nearly the largest where none has it.
+        Nearest attitude with a margin.
 
         Args:
-            quaternion: (4,) wished.
-            margin: [m/s^2, rad/s^2].
+            quaternion: (4,) desired attitude.
+            margin: required margin [m/s^2, rad/s^2]; if no attitude has it, 80 % of the largest.
 
         Returns:
-            (4,) quaternion: the wished one turned about a horizontal axis.
+            (4,) quaternion: the desired attitude, turned about a horizontal axis.
 
         """
         margin = self._attainable(margin)
         if self.margin(quaternion) >= margin:
             return rotations.normalized(quaternion)
-        wished = up(quaternion)
+        desired = up(quaternion)
         firm = np.flatnonzero(self.margins >= margin)
-        best = firm[np.argmax(self.directions[firm] @ wished)]
+        best = firm[np.argmax(self.directions[firm] @ desired)]
         turn = leaned(quaternion, self.directions[best])
         whole = rotations.log(rotations.multiply(rotations.conjugate(quaternion), turn))
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
-            way = rotations.multiply(quaternion, rotations.exp(middle * whole))
-            low, high = (low, middle) if self.margin(way) >= margin else (middle, high)
+            between = rotations.multiply(quaternion, rotations.exp(middle * whole))
+            low, high = (low, middle) if self.margin(between) >= margin else (middle, high)
         return rotations.normalized(rotations.multiply(quaternion, rotations.exp(high * whole)))
 
     def quickest(self, quaternion: np.ndarray, angular_velocity: np.ndarray, tilt: np.ndarray,
                  margin: float, levelling_rate: float) -> np.ndarray:
         """
-        Attitude with a margin that is reached soonest: how far body and joints have to turn.
+        Attitude with a margin that body and joints reach soonest.
 
-        The way on from there to level counts as far as it cannot be held.
+        The unheld part of the path from there to level adds to the time.
 
         Args:
-            quaternion: (4,) present.
-            angular_velocity: (3,) in base_link [rad/s]; the turn that it leads to counts.
+            quaternion: (4,) present attitude.
+            angular_velocity: (3,) in base_link [rad/s]; includes the turn until the body stops.
             tilt: (4,) present [rad].
-            margin: [m/s^2, rad/s^2].
-            levelling_rate: at which it will turn on to level [rad/s].
+            margin: as of :meth:`nearest`.
+            levelling_rate: rate of the later turn to level [rad/s].
 
         Returns:
-            (4,) quaternion: where the present turn comes to a stop, leaned.
+            (4,) quaternion: attitude at which the present turn stops, leaned.
 
         """
         p = self.parameters
@@ -145,22 +146,22 @@ class Holding:
         travel = np.abs(self._on_nearest_turn(self.tilts[firm], tilt) - tilt)
         travel[self._thrusts[firm] < LITTLE] = 0.0
         time = angle / p.turn_rate + travel.max(axis=1) / p.tilt_rate \
-            + self._falling(self.directions[firm]) / levelling_rate
+            + self._unheld_angle(self.directions[firm]) / levelling_rate
         return leaned(quaternion, self.directions[firm[np.argmin(time)]])
 
     def _attainable(self, margin):
-        """A margin [m/s^2, rad/s^2], or most of the largest where no attitude has it."""
+        """Limit a margin [m/s^2, rad/s^2] to 80 % of the largest one."""
         return min(margin, NEARLY * float(self.margins.max()))
 
-    def _falling(self, directions):
-        """Angles (N,) [rad] of the straight ways from directions (N, 3) of up to level unheld."""
+    def _unheld_angle(self, directions):
+        """Unheld part (N,) [rad] of the shortest paths from directions of up (N, 3) to level."""
         angle = np.arccos(np.clip(directions[:, 2], -1.0, 1.0))
         side = directions[:, :2] / np.maximum(np.linalg.norm(directions[:, :2], axis=1), 1e-9)[
             :, None]
-        passed = angle[:, None] * np.linspace(0.0, 1.0, WAY)
-        way = np.concatenate([np.sin(passed)[:, :, None] * side[:, None],
-                              np.cos(passed)[:, :, None]], axis=2).reshape(-1, 3)
-        nearest = np.argmax(way @ self.directions.T, axis=1)
+        passed = angle[:, None] * np.linspace(0.0, 1.0, PATH_POINTS)
+        path = np.concatenate([np.sin(passed)[:, :, None] * side[:, None],
+                               np.cos(passed)[:, :, None]], axis=2).reshape(-1, 3)
+        nearest = np.argmax(path @ self.directions.T, axis=1)
         return angle * (self.margins[nearest] <= 0.0).reshape(passed.shape).mean(axis=1)
 
     def _on_nearest_turn(self, tilt, present):
@@ -169,10 +170,7 @@ class Holding:
         turned = tilt + 2 * np.pi * np.round((present - tilt) / (2 * np.pi))
         return np.where(np.abs(turned) > limit, turned - 2 * np.pi * np.sign(turned), turned)
 
-    def _margins(self, directions):
-        return self._measured(*self._held(directions))
-
-    def _measured(self, tilt, thrust, met):
+    def _margins(self, tilt, thrust, met):
         jacobian = self._jacobian(tilt, thrust)
         squared = jacobian @ jacobian.transpose(0, 2, 1) + 1e-9 * np.eye(6)
         needed = jacobian.transpose(0, 2, 1) @ np.linalg.inv(squared)
@@ -180,7 +178,7 @@ class Holding:
         return np.where(met & (thrust.max(axis=1) <= self._thrust_max), margins, 0.0)
 
     def _held(self, directions):
-        """Tilts (N, 4), thrusts (N, 4) that carry the weight, and whether they do."""
+        """Tilts (N, 4), thrusts (N, 4) that hold the weight, and whether they meet it (N,)."""
         weight = np.linalg.norm(self._allocator.weight)
         wrenches = np.pad(weight * directions, ((0, 0), (0, 3)))
         pairs, cost = np.zeros((len(directions), 8)), np.full(len(directions), np.inf)
@@ -222,12 +220,12 @@ def sphere(count: int) -> np.ndarray:
 
 
 def up(quaternion: np.ndarray) -> np.ndarray:
-    """(3,) world's z in the body."""
-    return rotations.matrix(rotations.normalized(quaternion))[2]
+    """(3,) world z axis in the body, for a quaternion of any length."""
+    return rotations.up(rotations.normalized(quaternion))
 
 
 def leaned(quaternion: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Attitude (4,) by the shortest turn from ``quaternion`` in which up is ``direction`` (3,)."""
+    """Attitude (4,) by the shortest turn from ``quaternion`` with up at ``direction`` (3,)."""
     present = up(quaternion)
     axis = np.cross(direction, present)
     length = float(np.linalg.norm(axis))

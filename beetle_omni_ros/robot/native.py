@@ -1,4 +1,4 @@
-"""CasADi functions as machine code: generated C, compiled once and cached."""
+"""Compilation of CasADi functions: generated C code, compiled once and cached."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ import casadi as ca
 
 log = logging.getLogger(__name__)
 FLAGS = ('-O2', '-fPIC', '-shared', '-std=gnu99', '-w')
-EXACT = ('-ffp-contract=off', '-lm')     # each operation rounded, as the interpreter does it
+EXACT = ('-ffp-contract=off', '-lm')     # rounds each operation, as CasADi's interpreter does
 
 
 class CompilerError(RuntimeError):
-    """No usable C compiler, or it failed; the text says which and its first complaint."""
+    """No usable C compiler, or a failed compilation; the text gives the first error."""
 
 
 def cache_folder() -> Path:
-    """Where compiled code is kept: $XDG_CACHE_HOME (or ~/.cache) / beetle_omni_ros."""
+    """Folder of compiled code: $XDG_CACHE_HOME (or ~/.cache) / beetle_omni_ros."""
     base = os.environ.get('XDG_CACHE_HOME') or os.path.join(os.path.expanduser('~'), '.cache')
     return Path(base) / 'beetle_omni_ros'
 
@@ -40,20 +40,20 @@ def generated(functions: Sequence[ca.Function]) -> str:
 
 def built(name: str, source: str, options: Sequence[str] = ()) -> Path:
     """
-    Compile C source to a shared library, if that has not been done before.
+    Compile C source to a shared library, unless the cache has it.
 
     The cache key covers the source, the compiler, its flags and the casadi version.
 
     Args:
-        name: first part of the library's.
-        source: C.
-        options: of the compiler, beyond ``FLAGS``, which stand after the source.
+        name: first part of the library's file name.
+        source: C source.
+        options: compiler options after ``FLAGS`` and the source file.
 
     Returns:
-        the library's path.
+        path of the library.
 
     Raises:
-        CompilerError: no compiler, no write access to a cache, or compilation failed.
+        CompilerError: no compiler, no write access to the cache, or compilation failed.
 
     """
     compiler = os.environ.get('CC') or shutil.which('gcc') or shutil.which('cc')
@@ -68,14 +68,14 @@ def built(name: str, source: str, options: Sequence[str] = ()) -> Path:
 
 def compiled(function: ca.Function) -> ca.Function:
     """
-    Same function from machine code, to the last digit, or itself where nothing compiles.
+    Compile a function; without a usable compiler, return the function itself.
 
-    CasADi's interpreter takes some six times as long.
+    The results are equal to the last digit. CasADi's interpreter takes about six times as long.
     """
     try:
         return ca.external(function.name(),
                            str(built(function.name(), generated([function]), EXACT)))
-    except (CompilerError, RuntimeError) as error:     # the latter: casadi cannot load it
+    except (CompilerError, RuntimeError) as error:     # RuntimeError: casadi cannot load it
         log.info('%s stays interpreted: %s', function.name(), str(error).splitlines()[0])
         return function
 
@@ -93,6 +93,6 @@ def _compile(compiler, source, options, library):
             if done.returncode:
                 lines = done.stderr.strip().splitlines() or ['no message']
                 raise CompilerError(f'{compiler[0]} failed: {lines[0]}')
-            os.replace(output, library)  # atomic: another process may build the same
+            os.replace(output, library)  # atomic, because other processes may build the same
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CompilerError(f'cannot build in {library.parent}: {error}') from None

@@ -1,4 +1,4 @@
-"""The robot's parameters; the only reader of robot files."""
+"""Parameters of the robot, and the reader of robot files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RotorMapRow:
 
 @dataclass(frozen=True, kw_only=True)
 class RotorParameters:
-    """Four rotors: where they sit and how thrust arises."""
+    """Positions of the four rotors and their thrust."""
 
     positions: np.ndarray = parameter(
         doc='rotor centres from the centre of gravity', unit='m', shape=(4, 3), low=-5, high=5)
@@ -48,7 +48,7 @@ class RotorParameters:
     map: tuple = parameter((), doc='thrust-to-PWM rows, one for each measured voltage')
 
     def __post_init__(self):
-        """Bind the map's rows; refuse a thrust range that is empty."""
+        """Bind the rows of the map, and check the thrust range and the spin."""
         rows = tuple(row if isinstance(row, RotorMapRow) else
                      schema.bind(RotorMapRow, row, prefix=f'rotors.map[{k}]')
                      for k, row in enumerate(self.map))
@@ -89,7 +89,7 @@ class JointParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class BatteryParameters:
-    """The pack."""
+    """Battery pack."""
 
     cells: int = parameter(doc='cells in series', low=1, high=20)
     full_voltage: float = parameter(doc='open-circuit voltage when full', unit='V', low=3, high=90)
@@ -98,10 +98,12 @@ class BatteryParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class MainBodyParameters:
-    """The body that carries the arms."""
+    """The body without arms and modules."""
 
-    centre_of_mass: np.ndarray = parameter(doc='in its frame', unit='m', shape=(3,))
-    inertia: np.ndarray = parameter(doc='diagonal, there', unit='kg m^2', shape=(3,), low=0)
+    centre_of_mass: np.ndarray = parameter(doc='centre of mass in its own frame', unit='m',
+                                           shape=(3,))
+    inertia: np.ndarray = parameter(doc='diagonal about its centre of mass', unit='kg m^2',
+                                    shape=(3,), low=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +115,8 @@ class ModuleParameters:
     joint_height: float = parameter(doc='z of the joint origin', unit='m', low=-5, high=5)
     centre_of_mass: np.ndarray = parameter(
         doc='outward, sideways, up from the joint axis', unit='m', shape=(3,))
-    inertia: np.ndarray = parameter(doc='diagonal, there', unit='kg m^2', shape=(3,), low=0)
+    inertia: np.ndarray = parameter(doc='diagonal about its centre of mass', unit='kg m^2',
+                                    shape=(3,), low=0)
     rotor_offset: float = parameter(doc='rotor centre, outward on the axis', unit='m', low=-5,
                                     high=5)
 
@@ -123,30 +126,30 @@ class EndEffectorParameters:
     """A ball on a stalk above the body."""
 
     mass: float = parameter(doc='mass', unit='kg', low=0, high=20)
-    height: float = parameter(doc='above the main body origin', unit='m', low=-5, high=5)
+    height: float = parameter(doc='height above the main body origin', unit='m', low=-5, high=5)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MultibodyParameters:
-    """The parts that make up the rigid-body totals."""
+    """Parts whose sum is the rigid body."""
 
     main_body: MainBodyParameters = parameter(doc='main body')
     module: ModuleParameters = parameter(doc='tilting module')
     end_effector: EndEffectorParameters = parameter(doc='end-effector')
     centre_of_gravity_height: float = parameter(
-        doc='of the robot above the main body origin', unit='m', low=-5, high=5)
+        doc='height above the main body origin', unit='m', low=-5, high=5)
 
     @classmethod
-    def undescribed(cls, inertia: np.ndarray, module_inertia: float = 0.0,
+    def from_totals(cls, inertia: np.ndarray, module_inertia: float = 0.0,
                     mass_moment: float = 0.0) -> MultibodyParameters:
         """
-        Parts of a robot of which only the totals and the effect ``module_reaction`` are known.
+        Parts of a robot that has only totals and perhaps the effect ``module_reaction``.
 
         Args:
             inertia: (3,) diagonal of the whole robot [kg m^2].
-            module_inertia: of a tilting module about its joint axis [kg m^2]; half of it is
-                taken for its own, half for its mass below the axis.
-            mass_moment: of that mass [kg m].
+            module_inertia: inertia of a tilting module about its joint axis [kg m^2]. Half of it
+                is assigned to its own inertia, half to its mass below the axis.
+            mass_moment: moment of that mass [kg m].
 
         """
         depth = 0.5 * module_inertia / mass_moment if mass_moment else 0.0
@@ -164,13 +167,13 @@ class MultibodyParameters:
 @dataclass(frozen=True, kw_only=True)
 class RobotParameters:
     """
-    Everything that describes one robot.
+    All parameters of one robot.
 
     Attributes:
         mass: [kg].
         gravity: [m/s^2].
         inertia: (3,) diagonal about the centre of gravity [kg m^2].
-        effects: catalogue name -> parameter name -> value; deviations from the model.
+        effects: deviations from the model, effect -> parameter -> value.
 
     """
 
@@ -181,13 +184,13 @@ class RobotParameters:
     joints: JointParameters = parameter(doc='tilt servos')
     battery: BatteryParameters = parameter(doc='battery')
     multibody: MultibodyParameters | None = parameter(
-        None, doc='parts; without them nothing that tilts weighs anything')
+        None, doc='parts; without them tilting parts have no mass')
     name: str = parameter('robot', doc='name of the robot')
     effects: dict = parameter({}, doc='known deviations from the model, by catalogue name')
-    provenance: dict = parameter({}, doc='where a written file comes from; free text')
+    provenance: dict = parameter({}, doc='origin of a written file, free text')
 
     def __post_init__(self):
-        """Refuse effects that the catalogue does not know; set the numbers that they replace."""
+        """Validate the effects and set the numbers that they replace."""
         object.__setattr__(self, 'effects', catalogue.validated(self.effects))
         for key, value in catalogue.settings(self.effects).items():
             part, name = key.split('.')
@@ -202,11 +205,11 @@ class RobotParameters:
         """
         Read a robot file; without a path, the shipped one.
 
-        A file may begin with ``extends: FILE`` (beside it, or one of the shipped params) and
-        then names only what differs.
+        A file may begin with ``extends: FILE``, a file in the same folder or of the shipped
+        params. It then contains the differences only.
 
         Raises:
-            ParameterError: naming file, key and what was expected.
+            ParameterError: names file, key and expected value.
 
         """
         path = Path(path) if path else share_path('params/robot.yaml')
@@ -214,8 +217,8 @@ class RobotParameters:
 
     @property
     def parts(self) -> MultibodyParameters:
-        """The parts as described, or as the effect ``module_reaction`` alone has them."""
-        return self.multibody or MultibodyParameters.undescribed(
+        """The described parts, else parts from the totals."""
+        return self.multibody or MultibodyParameters.from_totals(
             self.inertia, **self.effects.get('module_reaction', {}))
 
     @property
@@ -226,26 +229,26 @@ class RobotParameters:
 
     @property
     def command_delays(self) -> tuple[float, float]:
-        """Delays of tilt and of thrust commands [s] that the effects add."""
+        """Delays of tilt and of thrust commands [s] by the effects."""
         return catalogue.command_delays(self.effects)
 
     @property
     def sensors(self) -> catalogue.SensorErrors:
-        """What the effects say of the sensors."""
+        """Sensor errors by the effects."""
         return catalogue.sensor_errors(self.effects)
 
     @property
     def hover_thrust(self) -> float:
-        """Thrust of each rotor in level hover [N]."""
+        """Thrust of each rotor in level hover without effects [N]."""
         return self.mass * self.gravity / 4
 
     def hash(self) -> str:
-        """Short digest of all physical values, for caches and policy contracts."""
+        """Short digest of all physical values, for caches and policy files."""
         text = yaml.safe_dump(self.as_dict(), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def as_dict(self) -> dict:
-        """All physical values as plain nested data (without name and provenance)."""
+        """All physical values as plain nested data, without name and provenance."""
         def plain(value):
             if hasattr(value, '__dataclass_fields__'):
                 return {key: plain(getattr(value, key)) for key in value.__dataclass_fields__}
@@ -262,7 +265,7 @@ class RobotParameters:
 
 
 def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
-    """Content of a robot file on top of the one that it extends."""
+    """Content of a robot file, merged with the file that it extends."""
     content = schema.load_yaml(path)
     if 'extends' not in content:
         return content
@@ -271,7 +274,7 @@ def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
         raise ParameterError(f"{path}: key 'extends': expected the name of a file, "
                              f'found {quoted(name)}')
     base = path.parent / name
-    # `extends: robot.yaml` in somebody's robot.yaml means the shipped one
+    # `extends: robot.yaml` in a file named robot.yaml means the shipped file
     itself = base.resolve() == path.resolve()
     if itself or not base.is_file():
         try:
@@ -287,7 +290,7 @@ def _merged(path: Path, seen: tuple[Path, ...]) -> dict:
 
 
 def _overlaid(base: dict, content: dict) -> dict:
-    """Nested mappings merged, ``content`` first; the effects of a file replace those below."""
+    """Merge nested mappings; ``content`` overrides, and its effects replace those of ``base``."""
     merged = dict(base)
     for key, value in content.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)

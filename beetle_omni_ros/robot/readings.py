@@ -1,4 +1,4 @@
-"""What sensors and devices say, simulated or real: stamps of capture [s], SI units."""
+"""Readings of sensors and devices, simulated or real: stamps of capture [s], SI units."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ class ImuReading:
     One IMU reading (REP-145), in the IMU's own axes.
 
     Attributes:
-        stamp: when it was measured [s].
-        specific_force: (3,) acceleration minus gravity [m/s^2]; +g along up at rest.
+        stamp: time of measurement [s].
+        specific_force: (3,) acceleration minus gravity [m/s^2]; +g upward at rest.
+        angular_velocity: (3,) [rad/s].
         angular_velocity: (3,) [rad/s].
 
     """
@@ -33,9 +34,9 @@ class PoseReading:
     One MoCap pose of the tracked body in world.
 
     Attributes:
-        stamp: when it was captured [s], not when it arrived.
+        stamp: time of capture [s], not of arrival.
         position: (3,) [m].
-        quaternion: (4,) body to world (x, y, z, w); its sign is free.
+        quaternion: (4,) body to world (x, y, z, w), of either sign.
 
     """
 
@@ -47,14 +48,14 @@ class PoseReading:
 @dataclass(frozen=True, slots=True)
 class JointReading:
     """
-    Measured tilt joints.
+    One reading of the tilt joints.
 
     Attributes:
-        stamp: of capture [s].
+        stamp: time of capture [s].
         position: (4,) [rad].
-        velocity: (4,) [rad/s], or None where none were measured.
-        effort: (4,) [N m], or None where none were measured.
-        names: of the joints, where a message is written for fewer than four.
+        velocity: (4,) [rad/s], or None if not measured.
+        effort: (4,) [N m], or None if not measured.
+        names: joint names; fewer than four are legal in a written message.
 
     """
 
@@ -67,7 +68,7 @@ class JointReading:
 
 @dataclass(frozen=True, slots=True)
 class BatteryReading:
-    """Pack voltage under load [V] and current [A, negative while discharging]; cells, if known."""
+    """Pack voltage under load [V], current [A], negative in discharge, and cells (0: unknown)."""
 
     stamp: float
     voltage: float
@@ -77,7 +78,7 @@ class BatteryReading:
 
 @dataclass(frozen=True, slots=True)
 class RotorReading:
-    """Speeds of the rotors by their ESCs (4,) [rad/s], positive for both spins; NaN unknown."""
+    """Rotor speeds from the ESCs (4,) [rad/s], positive for both spins; NaN: unknown."""
 
     stamp: float
     speed: np.ndarray
@@ -85,15 +86,15 @@ class RotorReading:
 
 class SpikeFilter:
     """
-    Holds a reading that is far from the one before; the next one tells whether it was real.
+    Rejects single outliers of the IMU: a jump is used only if the next reading confirms it.
 
     Args:
-        force_change: of the specific force between two readings that is far [m/s^2].
-        rate_change: of the angular rate, likewise [rad/s].
+        force_change: largest change of the specific force between two readings [m/s^2].
+        rate_change: largest change of the angular rate between two readings [rad/s].
 
     Attributes:
-        lasted: whether the reading just passed follows one that was held and is far, too: an
-            impact, of which one reading is missing.
+        lasted: whether the latest reading confirmed a held one. That is an impact, of which one
+            reading is missing.
 
     """
 
@@ -102,12 +103,12 @@ class SpikeFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew at the next reading."""
+        """Forget the readings so far."""
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         self._held = self.lasted = False
 
     def passes(self, force: np.ndarray, rate: np.ndarray) -> bool:
-        """Whether a reading (3,) [m/s^2], (3,) [rad/s] may be used now."""
+        """Whether a reading (3,) [m/s^2], (3,) [rad/s] is used; False holds it back."""
         far = self._last is not None and any(
             float(change @ change) > limit for change, limit in zip(
                 (force - self._last[0], rate - self._last[1]), self._limits))

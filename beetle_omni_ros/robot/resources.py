@@ -1,4 +1,4 @@
-"""Where the package's data files lie: a checkout, a pip or a colcon installation."""
+"""Location of the package's data files: a checkout, a pip or a colcon installation."""
 
 import os
 from pathlib import Path
@@ -11,12 +11,11 @@ def share_path(relative: str) -> Path:
     """
     Locate a shipped file such as ``params/robot.yaml``.
 
-    A source checkout wins over an installation, so that editing a parameter file
-    takes effect at once; then each prefix of ``AMENT_PREFIX_PATH`` (colcon, apt),
-    then the Python environment's prefix (pip).
+    The order is: source checkout, prefixes of ``AMENT_PREFIX_PATH`` (colcon, apt), prefix of the
+    Python environment (pip). Edits of a parameter file in a checkout thus take effect at once.
 
     Raises:
-        FileNotFoundError: no installation holds the file; the text lists where it looked.
+        FileNotFoundError: no installation has the file; the text lists the searched places.
 
     """
     roots = [Path(__file__).resolve().parents[2]]

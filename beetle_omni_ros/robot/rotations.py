@@ -1,9 +1,8 @@
 """
-Rotations in one convention: scipy's quaternion order (x, y, z, w), body to world.
+Rotations with quaternions in scipy's order (x, y, z, w), body to world.
 
-Small and allocation-light, because the estimator calls these hundreds of times a
-second; the tests hold them equal to scipy.spatial.transform. Arrays are taken apart into plain
-floats first: arithmetic on numpy's scalars costs several times as much.
+The estimator calls these functions hundreds of times a second. They convert arrays to plain
+floats first, because arithmetic on numpy scalars takes several times as long.
 """
 
 from collections.abc import Sequence
@@ -60,7 +59,7 @@ def exp(vector: Vector) -> np.ndarray:
 
 
 def log(quaternion: Vector) -> np.ndarray:
-    """Rotation vector [rad] of the shorter of the two rotations of a unit quaternion."""
+    """Rotation vector [rad] of a unit quaternion, at most pi long."""
     x, y, z, w = quaternion if quaternion[3] >= 0 else -np.asarray(quaternion)
     norm = sqrt(x * x + y * y + z * z)
     scale = 2.0 if norm < 1e-9 else 2 * atan2(norm, w) / norm
@@ -86,7 +85,7 @@ def cross(a: Vector, b: Vector) -> np.ndarray:
 
 
 def geodesic_angle(a: Vector, b: Vector) -> float:
-    """Angle [rad] of R(b)^T R(a), the package's orientation error, 0 to pi."""
+    """Angle [rad] of R(b)^T R(a), 0 to pi; the orientation error of this package."""
     bx, by, bz, bw = _floats(b)
     x, y, z, w = product(-bx, -by, -bz, bw, *_floats(a))
     return 2 * atan2(sqrt(x * x + y * y + z * z), abs(w))

@@ -1,8 +1,7 @@
 """Parameter files bound to dataclasses, with units, ranges and one-line errors.
 
-A parameter file is YAML, either plain or in the ROS 2 form
-(``/**: ros__parameters: ...``), so that the same file serves a node's
-``--params-file`` and the tools that run without ROS.
+A parameter file is YAML, either plain or in the ROS 2 form (``/**: ros__parameters: ...``). The
+same file serves a node's ``--params-file`` and tools without ROS.
 """
 
 from dataclasses import field, fields, is_dataclass, MISSING
@@ -15,7 +14,7 @@ import numpy as np
 
 from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, shortened, YamlError
 
-# Parameters that hold more than numbers, from lists and mappings of a file.
+# Parameters with more than numbers, from lists and mappings of a file.
 STRUCTURED: dict[Any, tuple[tuple[type, ...], str]] = {
     tuple: ((list, tuple), 'a list'), dict: ((dict, type(None)), 'a mapping')}
 NAMES = tuple[str, ...]     # type of a parameter that is a list of names
@@ -23,7 +22,7 @@ FILE_NAME, KEY, WHOLE = 500, 80, 1000    # characters of them in a message
 
 
 class ParameterError(ValueError):
-    """A parameter file or value cannot be used; the text names file, key and expectation."""
+    """A parameter file or value cannot be used; the text names file, key and expected value."""
 
 
 def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | None = None,
@@ -33,13 +32,13 @@ def parameter(default: Any = MISSING, *, doc: str, unit: str = '', low: float | 
     Declare one dataclass field as a parameter.
 
     Args:
-        default: value when the file does not name it; a list is copied into an array.
-        doc: what it does, one sentence.
+        default: value if the file omits it; a list is copied into an array.
+        doc: meaning in one phrase, for the reference page and ROS.
         unit: SI unit, '' for a pure number.
         low: smallest legal value, inclusive (each element of an array).
         high: largest legal value, inclusive.
         shape: shape of an array parameter.
-        choices: the legal strings.
+        choices: legal strings.
         read_only: whether it can change only at start.
 
     """
@@ -60,10 +59,10 @@ def group(cls: type, doc: str = ''):
 
 def load_yaml(path: str | Path) -> dict:
     """
-    Read a YAML mapping, unwrapped from ``ros__parameters`` where that form is used.
+    Read a YAML mapping, plain or below ``ros__parameters``.
 
     Raises:
-        ParameterError: missing or unreadable file, broken YAML, or no mapping in it.
+        ParameterError: missing or unreadable file, broken YAML, or no mapping.
 
     """
     try:
@@ -93,8 +92,8 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
     Args:
         cls: a dataclass whose fields come from :func:`parameter` or :func:`group`.
         mapping: keys to values, nested like the dataclass.
-        where: the file, for messages.
-        prefix: the dotted path of ``cls`` in the file, for messages.
+        where: file name, for messages.
+        prefix: dotted path of ``cls`` in the file, for messages.
 
     Raises:
         ParameterError: unknown or missing key, wrong type, shape or range.
@@ -131,18 +130,18 @@ def bind(cls: type, mapping: dict, where: str = '', prefix: str = ''):
 
 
 def _nested(hint):
-    """Dataclass that a field holds, perhaps as ``Class | None``, else None."""
+    """Dataclass of a nested field, also as ``Class | None``; else None."""
     return next((part for part in (hint, *get_args(hint)) if is_dataclass(part)), None)
 
 
 def check(entry, hint: type, value: Any, at: str) -> Any:
     """
-    Validate one value against its declaration; return it in its declared type.
+    Validate one value against its declaration and convert it to its declared type.
 
     Args:
-        entry: the dataclass field made by :func:`parameter`.
-        hint: its annotated type.
-        value: what the file or the user gave.
+        entry: dataclass field made by :func:`parameter`.
+        hint: annotated type of the field.
+        value: value of the file or the user.
         at: file and key, for messages.
 
     """
@@ -187,7 +186,7 @@ def _check_number(entry, hint, value, at):
         raise ParameterError(found)
     try:
         number = float(value)
-    except (OverflowError, TypeError):      # an integer beyond any float; a complex number
+    except (OverflowError, TypeError):      # an integer beyond float's range; a complex number
         raise ParameterError(found) from None
     _check_range(entry.metadata, number, at)
     if hint is int and value != int(value):
@@ -237,10 +236,10 @@ def _at(where, key):
 
 def flatten(instance, prefix: str = ''):
     """
-    Walk a parameter dataclass.
+    Iterate over the leaves of a parameter dataclass.
 
     Yields:
-        (dotted name, dataclass field, annotated type, value) for each leaf.
+        (dotted name, dataclass field, annotated type, value) of each leaf.
 
     """
     hints = get_type_hints(type(instance))

@@ -1,12 +1,11 @@
 """
-The tilt servo: one equation and one step, for whatever the numbers are kept in.
+Equation and time step of the tilt servo, for numpy, CasADi and torch.
 
     J q'' = clip(Kp (q* - q) - Kd q', effort limit) + load - friction,   |q'| <= rate limit
 
-Friction is Coulomb's, and at low rates up to the stiction (Armstrong-Helouvry 1994). The motor's
-torque is limited, what others put on the joint is not. A namespace holds the functions in
-which numpy, CasADi and torch differ; torch and C code for training and control are written out
-from CasADi.
+Friction is Coulomb friction, and at low rates up to the stiction (Armstrong-Helouvry 1994). The
+limit applies to the motor's torque, not to the load. A namespace holds the functions in which the
+libraries differ. Torch and C code for training and control are generated from CasADi.
 """
 
 from __future__ import annotations
@@ -19,11 +18,11 @@ import numpy as np
 
 from beetle_omni_ros.robot.parameters import JointParameters
 
-SLIDING_RATE = 0.05     # [rad/s] over which friction falls from stiction to Coulomb's
+SLIDING_RATE = 0.05     # [rad/s] over which friction falls from stiction to Coulomb friction
 
 
 class Namespace(NamedTuple):
-    """Functions of one kind of number."""
+    """Functions of one library."""
 
     minimum: Any
     maximum: Any
@@ -41,20 +40,20 @@ CASADI = Namespace(ca.fmin, ca.fmax, ca.exp, ca.sqrt, ca.if_else, ca.sin, ca.cos
 @dataclass(frozen=True)
 class Servo:
     """
-    Numbers of a servo, or arrays of them; None stands for what the servo lacks.
+    Numbers of a servo, or arrays of them; None disables a limit or friction.
 
     Attributes:
         inertia: [kg m^2].
         kp: stiffness [N m/rad].
         kd: damping [N m s/rad].
         velocity_limit: [rad/s].
-        effort_limit: of the motor [N m].
-        position_limit: stop to each side [rad].
-        coulomb: friction while it slides [N m].
+        effort_limit: largest torque of the motor [N m].
+        position_limit: travel to each side [rad].
+        coulomb: sliding friction [N m].
         stiction: friction at rest [N m].
-        fading_rate: over which the one becomes the other [rad/s].
-        gaussian: whether stiction fades as exp(-x^2), else as exp(-|x|); x is the rate over
-            the fading rate.
+        fading_rate: rate over which stiction falls to sliding friction [rad/s].
+        gaussian: whether stiction fades as exp(-x^2), else as exp(-|x|), with x = rate / fading
+            rate.
 
     """
 
@@ -71,31 +70,31 @@ class Servo:
 
     @classmethod
     def of(cls, joints: JointParameters, **more) -> Servo:
-        """Servo of a robot file; ``more`` adds to it or replaces its numbers."""
+        """Servo of a robot file; ``more`` adds or replaces numbers."""
         own = {'inertia': joints.inertia, 'kp': joints.kp, 'kd': joints.kd,
                'velocity_limit': joints.velocity_limit, 'effort_limit': joints.effort_limit}
         return cls(**{**own, **more})
 
     def friction(self, space: Namespace, rate):
-        """Largest friction at a rate of turn [N m]."""
+        """Largest friction at a rate [N m]."""
         return self.coulomb + (self.stiction - self.coulomb) * self.fading(space, rate)
 
     def fading(self, space: Namespace, rate):
-        """Share of the stiction that a rate of turn leaves."""
+        """Remaining fraction of the excess of stiction at a rate."""
         x = rate / self.fading_rate
         return space.exp(-x * x if self.gaussian else space.minimum(x, -x))
 
     def motor(self, space: Namespace, error, rate):
-        """Torque of the motor [N m] at an error of position [rad] and a rate of turn [rad/s]."""
+        """Torque of the motor [N m] at a position error [rad] and a rate [rad/s]."""
         torque = self.kp * error - self.kd * rate
         return torque if self.effort_limit is None else _within(space, torque, self.effort_limit)
 
     def acceleration(self, space: Namespace, target, tilt, rate, load=0.0):
         """
-        Acceleration of one instant [rad/s^2], smooth but at the limits.
+        Acceleration [rad/s^2] at one instant, smooth except at the limits.
 
-        Friction turns round smoothly over the sliding rate. At the rate limit the servo no longer
-        accelerates outward.
+        Friction changes its sign smoothly over the sliding rate. At the rate limit the
+        acceleration outward is zero.
         """
         torque = self.motor(space, target - tilt, rate) + load
         if self.coulomb is not None:
@@ -111,12 +110,12 @@ class Step:
     """
     Motion of servos over one step: leapfrog, second order, stable for any damping.
 
-    Damping and friction are implicit: a joint that friction can hold stands exactly still.
+    Damping and friction are implicit, so that a joint below its stiction is exactly at rest.
 
     Args:
-        space: of the servo's numbers and the states.
-        servo: numbers.
-        duration: of the step [s].
+        space: functions for the type of the numbers and states.
+        servo: numbers of the servo.
+        duration: duration of the step [s].
 
     """
 
@@ -125,7 +124,7 @@ class Step:
         per_torque = duration / servo.inertia
         damping = 0.5 * per_torque * servo.kd
         self.gain = per_torque / (1 + damping)      # change of rate for each N m [rad/s]
-        self._loss = 2 * damping / (1 + damping)    # share of the rate that damping takes
+        self._loss = 2 * damping / (1 + damping)    # fraction of the rate lost by damping
         self._keep, self._stiff = 1 - self._loss, servo.kp * self.gain
         self._per_torque, self._damping = per_torque, damping
         if servo.effort_limit is not None:
@@ -139,9 +138,9 @@ class Step:
         Rate after the step [rad/s].
 
         Args:
-            target: angle asked for [rad].
-            tilt: in the middle of the step [rad].
-            rate: before it [rad/s].
+            target: commanded angle [rad].
+            tilt: angle in the middle of the step [rad].
+            rate: rate before the step [rad/s].
             load: torque beside the motor's [N m].
 
         """
@@ -181,15 +180,15 @@ class Step:
 def play(positions: np.ndarray, half: float | np.ndarray,
          first: np.ndarray | None = None) -> np.ndarray:
     """
-    Follow a loosely coupled shaft.
+    Motion of a shaft that is coupled with play.
 
     Args:
-        positions: (K, ...) of the driving side [rad].
+        positions: (K, ...) positions of the driving side [rad].
         half: play to each side [rad].
-        first: (...) of the driven side before it moves; by default the driving side's.
+        first: (...) first position of the driven side; by default the driving side's.
 
     Returns:
-        (K, ...) of the driven side.
+        (K, ...) positions of the driven side.
 
     """
     made, shown = np.empty_like(positions), positions[0] if first is None else first

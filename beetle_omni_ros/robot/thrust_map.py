@@ -1,9 +1,9 @@
 """
-Thrust and PWM duty of a rotor at any pack voltage, each from the other.
+Conversion between thrust and PWM duty of a rotor at any pack voltage.
 
 The robot file gives the duty as a cubic in thrust at a few voltages. Between two voltages the
-duty is interpolated at equal fractions of the largest thrust, because the measurements end at
-the same duty whatever the voltage; so no cubic is used beyond the thrusts it was fitted to.
+duty is interpolated at equal fractions of the largest thrust, because all measurements end at the
+same duty. No cubic is therefore used beyond its measured thrusts.
 """
 
 from __future__ import annotations
@@ -13,31 +13,31 @@ import numpy as np
 from beetle_omni_ros.robot.parameters import RotorParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
-STOP_DUTY, FULL_DUTY = 50.0, 100.0  # [% of 2000 us] the unit of the map: 1000 us and 2000 us
-CELLS = 2048                        # linear pieces of a cubic; 1e-5 of 0.5 N at most
+STOP_DUTY, FULL_DUTY = 50.0, 100.0  # [% of 2000 us] 1000 us and 2000 us
+CELLS = 2048                        # linear pieces of a cubic; error at most 1e-5 of 0.5 N
 SLOPE_MIN = 1e-3                    # [% of duty / whole thrust range] keeps flat parts invertible
 
 
 class ThrustMap:
     """
-    The measured map of one kind of rotor.
+    Measured map of one type of rotor.
 
-    Thrust 0 stops the rotor; any more starts at the duty of the map's zero thrust.
+    Thrust 0 stops the rotor. The duty of the smallest positive thrust is the map's at zero thrust.
 
     Attributes:
         voltages: (rows,) rising [V].
-        thrust_limits: (rows,) largest measured thrust there [N].
-        repaired: voltages at which the cubic falls somewhere and was replaced by its running
+        thrust_limits: (rows,) largest measured thrust at each voltage [N].
+        repaired: voltages at which the cubic is not monotonic and was replaced by its running
             maximum.
 
     """
 
     def __init__(self, rotors: RotorParameters):
         """
-        Tabulate the cubics.
+        Tabulate the cubics of a robot file.
 
         Raises:
-            ParameterError: no row, two rows at one voltage, a duty outside stop to full.
+            ParameterError: no row, two rows at one voltage, or a duty outside stop to full.
 
         """
         rows = sorted(rotors.map, key=lambda row: row.voltage)
@@ -61,27 +61,27 @@ class ThrustMap:
                 repaired.append(row.voltage)
                 duty[:] = _rising(duty)
         self.repaired = tuple(repaired)
-        self._blend_voltage, self._blend = np.nan, np.zeros(0)      # of the last voltage asked
+        self._blend_voltage, self._blend = np.nan, np.zeros(0)      # of the latest voltage
 
     def thrust_limit(self, voltage):
-        """Largest thrust [N] at ``voltage`` [V], of its shape; as at the ends beyond the rows."""
+        """Largest thrust [N] at ``voltage`` [V]; beyond the rows, that of the nearest row."""
         return np.interp(voltage, self.voltages, self.thrust_limits)
 
     def thrust_limit_below(self, voltage):
-        """As :meth:`thrust_limit` [N], continued along the lowest two rows, at least zero."""
+        """As :meth:`thrust_limit` [N], but extrapolated below the lowest row, at least zero."""
         (v, w), (f, g) = self.voltages[:2], self.thrust_limits[:2]
         low = f + (voltage - v) * (g - f) / (w - v)
         return np.maximum(0.0, np.where(voltage < v, low, self.thrust_limit(voltage)))
 
     def saturated(self, thrust, voltage) -> np.ndarray:
-        """Whether ``thrust`` [N] cannot be given at ``voltage`` [V]; shapes broadcast."""
+        """Whether ``thrust`` [N] exceeds the limit at ``voltage`` [V]; shapes broadcast."""
         return np.asarray(thrust) > self.thrust_limit(voltage)
 
     def duty(self, thrust, voltage) -> np.ndarray:
         """
-        Duty [% of 2000 us] that gives ``thrust`` [N] at ``voltage`` [V]; shapes broadcast.
+        Duty [% of 2000 us] for ``thrust`` [N] at ``voltage`` [V]; shapes broadcast.
 
-        Thrust is limited to what the voltage allows; zero or less stops the rotor.
+        Thrust is limited to the largest at this voltage; zero or less stops the rotor.
         """
         thrust = np.asarray(thrust, dtype=float)
         low, weight = self._rows(voltage)
@@ -96,8 +96,8 @@ class ThrustMap:
         """
         Thrust [N] at ``duty`` [% of 2000 us] and ``voltage`` [V]; shapes broadcast.
 
-        The exact inverse of :meth:`duty`; no thrust below the duty where it begins, the limit
-        beyond the largest measured duty.
+        Exact inverse of :meth:`duty`. Thrust is zero below the duty of zero thrust, and the limit
+        above the largest measured duty.
         """
         if np.ndim(voltage) == 0:
             if voltage != self._blend_voltage:
@@ -115,11 +115,11 @@ class ThrustMap:
         return command_of_duty(self.duty(thrust, voltage))
 
     def torque(self, thrust) -> np.ndarray:
-        """Size of the reaction torque [N m] about the rotor's axis at ``thrust`` [N]."""
+        """Magnitude of the reaction torque [N m] about the rotor's axis at ``thrust`` [N]."""
         return self._torque_ratio * np.asarray(thrust)
 
     def _rows(self, voltage):
-        """Row below ``voltage`` and weight of the next one."""
+        """Row below ``voltage`` and weight of the row above."""
         rows = len(self.voltages)
         if rows == 1:
             return np.zeros(np.shape(voltage), dtype=int)[()], np.zeros(np.shape(voltage))[()]
@@ -128,7 +128,7 @@ class ThrustMap:
         return low, place - low
 
     def _fractions(self, duty, voltage):
-        """Fraction of the thrust limit, by bisection in the blend of each element's rows."""
+        """Fraction of the thrust limit, by bisection in the interpolated rows of each element."""
         low, weight = self._rows(voltage)
         high = np.minimum(low + 1, len(self.voltages) - 1)
 
@@ -158,9 +158,9 @@ def duty_of_command(command) -> np.ndarray:
 
 def _rising(duty):
     """
-    Least change upwards that makes samples rise; a falling end is cut off at its peak.
+    Smallest upward change that makes samples increase; a falling end keeps the peak value.
 
-    The slope added to flat parts is taken from the whole, so that the peak stays.
+    The slope of flat parts is subtracted from the whole table, so that the peak is unchanged.
     """
     ramp = SLOPE_MIN * np.linspace(-1, 0, len(duty))
     return np.maximum(np.maximum.accumulate(duty) + ramp, STOP_DUTY + SLOPE_MIN + ramp)

@@ -1,4 +1,4 @@
-"""The robot as its URDF describes it: links, what is seen of them, and how joints move them."""
+"""Reader of URDF files: links, their visible shapes, and their joints."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ UNUSABLE = (ElementTree.ParseError, AttributeError, KeyError, TypeError, ValueEr
 @dataclass(frozen=True)
 class Joint:
     """
-    How one link is held by another.
+    Connection of a link to its parent.
 
     Attributes:
-        name: of the joint.
-        parent, child: links.
+        name: joint name.
+        parent, child: link names.
         position, quaternion: (3,) [m], (4,) of the child in the parent's frame at angle 0.
-        axis: (3,) about which it turns, in the child's frame; None where it is fixed.
+        axis: (3,) axis of rotation in the child's frame; None if fixed.
 
     """
 
@@ -56,7 +56,7 @@ class Visual:
         size: edges; radius and length; radius; scale along each axis [m, mesh: 1].
         position, quaternion: (3,) [m], (4,) in the link's frame.
         colour: red, green, blue, opacity, each 0 to 1.
-        file: of a mesh.
+        file: path of a mesh.
 
     """
 
@@ -71,12 +71,12 @@ class Visual:
 @dataclass(frozen=True)
 class Link:
     """
-    A link, the joint that holds it (None: the root), and what is seen of it.
+    A link with its joint and its visible shapes.
 
     Attributes:
-        name: of the link.
-        joint: that holds it.
-        visuals: its shapes.
+        name: link name.
+        joint: joint to its parent; None for the root.
+        visuals: visible shapes.
 
     """
 
@@ -86,7 +86,7 @@ class Link:
 
     @property
     def moves(self) -> str:
-        """Name of the joint by which it moves; '' where it is fixed."""
+        """Name of its joint; '' if it is fixed."""
         return self.joint.name if self.joint is not None and self.joint.axis is not None else ''
 
     def turned(self, angle: float = 0.0) -> np.ndarray:
@@ -111,10 +111,10 @@ class Model:
     @classmethod
     def load(cls, path: str | Path | None = None) -> Model:
         """
-        Read a URDF file; None: the shipped one.
+        Read a URDF file, by default the shipped one.
 
         Raises:
-            ParameterError: it cannot be read, or is no URDF; one line.
+            ParameterError: one line; unreadable file or no URDF.
 
         """
         path = Path(path) if path else share_path(SHIPPED)
@@ -129,10 +129,10 @@ class Model:
 
     def poses(self, angles: dict[str, float]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """
-        Place every link.
+        Poses of all links.
 
         Args:
-            angles: joint -> angle [rad]; 0 where not given.
+            angles: joint -> angle [rad]; 0 for absent joints.
 
         Returns:
             Link -> (3,) position [m] and (4,) quaternion in the root's frame.
@@ -152,10 +152,10 @@ class Model:
 
 def description(path: str | Path = '') -> str:
     """
-    Text of a URDF; '' for the shipped one.
+    Text of a URDF file; '' for the shipped one.
 
     Raises:
-        ParameterError: it cannot be read.
+        ParameterError: the file is unreadable.
 
     """
     path = path or share_path(SHIPPED)
@@ -170,7 +170,7 @@ def joints(text: str) -> list[Joint]:
     List the joints of a URDF.
 
     Raises:
-        ParameterError: it is no URDF, or a joint is neither fixed nor turns about an axis.
+        ParameterError: no URDF, or a joint that is neither fixed nor rotates about an axis.
 
     """
     try:

@@ -1,4 +1,4 @@
-"""YAML files of unknown origin: bounded in size, depth and aliases, refused in one line."""
+"""Reader of untrusted YAML files: limits of size, depth and aliases, errors of one line."""
 
 from pathlib import Path
 import reprlib
@@ -11,17 +11,17 @@ MAX_NODES = 50_000      # with every alias written out
 MAX_DEPTH = 40          # nested lists and mappings
 QUOTED = 200            # characters of a value in a message
 
-# What the constructors of PyYAML raise, beside its own errors, on `0b_`, `!!bool x`, a date of
+# Errors of PyYAML's constructors beside its own, for example for `0b_`, `!!bool x`, a date with
 # month 13, or an integer of more than 4300 digits.
 CONSTRUCTION = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 
 
 class YamlError(ValueError):
-    """A file cannot be read as YAML; the text is one line without the file's name."""
+    """A file that cannot be read as YAML; the text is one line without the file's name."""
 
 
 class _Short(reprlib.Repr):
-    """Representations whose length and cost have a bound, whatever the value."""
+    """Representations of bounded length and cost."""
 
     def __init__(self):
         super().__init__()
@@ -29,7 +29,7 @@ class _Short(reprlib.Repr):
         self.maxstring, self.maxother = 120, 120
 
     def repr_int(self, x, level):
-        """Decimal digits, but of those that Python refuses to write only how many bits."""
+        """Decimal digits; for a large integer, the number of its bits."""
         return repr(x) if x.bit_length() < 256 else f'an integer of {x.bit_length()} bits'
 
 
@@ -42,7 +42,7 @@ def quoted(value: Any) -> str:
 
 
 def shortened(text: str, length: int = QUOTED) -> str:
-    """One line of at most ``length`` characters, the end left out where it is longer."""
+    """Shorten to one line of at most ``length`` characters."""
     line = ' '.join(text[:4 * length].split())
     return line if len(line) <= length and len(text) <= 4 * length else f'{line[:length - 3]}...'
 
@@ -52,8 +52,8 @@ def read_yaml(path: str | Path) -> Any:
     Read the one document of a YAML file.
 
     Raises:
-        YamlError: missing, unreadable or too large a file, broken YAML, too deep, or aliases
-            that stand for more than ``MAX_NODES`` values.
+        YamlError: missing, unreadable or too large file, broken YAML, too deep nesting, or
+            aliases that stand for more than ``MAX_NODES`` values.
 
     """
     try:
@@ -98,7 +98,7 @@ def parse_yaml(data: bytes | str) -> Any:
 
 
 def _size(node, sizes, depth):
-    """Count the values that a node stands for, aliases written out."""
+    """Number of values of a node, with aliases expanded."""
     if depth > MAX_DEPTH:
         raise YamlError(f'nested deeper than {MAX_DEPTH} levels')
     if isinstance(node, yaml.ScalarNode):
@@ -113,7 +113,7 @@ def _size(node, sizes, depth):
 
 
 def _problem(error):
-    """One line about a syntax error, with its place where the parser knows it."""
+    """One line about a syntax error, with its position if known."""
     mark = getattr(error, 'problem_mark', None)
     where = f' at line {mark.line + 1}, column {mark.column + 1}' if mark else ''
     problem = getattr(error, 'problem', None) or str(error).splitlines()[0]

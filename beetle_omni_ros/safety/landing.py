@@ -9,7 +9,7 @@ import numpy as np
 
 from beetle_omni_ros.control.base import Command, Fallback, Reference, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.holding import Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -56,7 +56,7 @@ class Landing:
         self.grounded, self.given_up = False, ''
         self._standing_for, self._still_for, self._blind_for = 0.0, 0.0, 0.0
         self._blind = False
-        self._robot, self._health = robot, ALL_WELL
+        self._robot, self._health = robot, ALL_HEALTHY
         self._turnover: Turnover | None = None
 
     @property

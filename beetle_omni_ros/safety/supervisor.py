@@ -14,7 +14,7 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, Fallback, PoseTarget, Target
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL, NO_ZEROS
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY, NO_ZEROS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import Answer, ERROR, INFO, WARNING
 from beetle_omni_ros.safety.handover import Handover
@@ -68,7 +68,7 @@ class Supervisor(Inputs):
         self._target: PoseTarget
         self._stop_left = 0.0
         self._landing_for = self._fallback_for = 0.0
-        self._health = ALL_WELL
+        self._health = ALL_HEALTHY
         self._landing_way: Target | None = None
         self._resuming = 0.0    # remaining time of the check after a pause of this process [s]
         self._before: float | None = None   # time of the update before [s]
@@ -87,8 +87,8 @@ class Supervisor(Inputs):
         self._in_force = None
         self._floor = float(self.vehicle.known.position[2])
         self.watch.reset()
-        self._health = ALL_WELL
-        self._hover.set_health(ALL_WELL)
+        self._health = ALL_HEALTHY
+        self._hover.set_health(ALL_HEALTHY)
         self._landing_for = self._fallback_for = 0.0
         return self._enter(TAKEOFF, now, INFO, 'armed: takeoff')
 

@@ -10,7 +10,7 @@ from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.nmpc import NmpcController
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.holding import Holding
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -35,7 +35,7 @@ class Body:
         self.advance = FunctionCall(model.integrator(ROBOT, 4), None)
         self.x = np.zeros(25)
         self.x[:3], self.x[9], self.x[21:] = PLACE, 1.0, ROBOT.hover_thrust
-        self.time, self.broken = 0.0, ALL_WELL
+        self.time, self.broken = 0.0, ALL_HEALTHY
         self.command = Command(-0.01, self.x[model.TILT], self.x[model.THRUST])
         self.lowest = np.inf
 
@@ -60,7 +60,7 @@ def nmpc():
 @pytest.fixture(params=['nmpc', 'hover'])
 def controller(request, nmpc):
     chosen = nmpc if request.param == 'nmpc' else HoverController(ROBOT)
-    chosen.set_health(ALL_WELL)
+    chosen.set_health(ALL_HEALTHY)
     chosen.reset()
     return chosen
 
@@ -93,7 +93,7 @@ def test_a_repaired_controller_commands_as_one_that_never_failed(controller):
     fresh = Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.3).command
     controller.set_health(LOST)
     Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.3)
-    controller.set_health(ALL_WELL)
+    controller.set_health(ALL_HEALTHY)
     controller.reset()
     again = Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.3).command
     np.testing.assert_array_equal(fresh.tilt, again.tilt)
@@ -101,7 +101,7 @@ def test_a_repaired_controller_commands_as_one_that_never_failed(controller):
 
 
 def test_the_estimator_forgets_what_it_learnt_from_the_loss(nmpc):
-    nmpc.set_health(ALL_WELL)
+    nmpc.set_health(ALL_HEALTHY)
     nmpc.reset()
     body = Body().fly(nmpc, PoseTarget(PLACE, LEVEL), 0.5)
     body.broken = LOST
@@ -112,7 +112,7 @@ def test_the_estimator_forgets_what_it_learnt_from_the_loss(nmpc):
 
 
 def test_the_plan_knows_the_bounds(nmpc):
-    nmpc.set_health(ALL_WELL)
+    nmpc.set_health(ALL_HEALTHY)
     nmpc.reset()
     body = Body().fly(nmpc, PoseTarget(PLACE, LEVEL), 0.3)
     nmpc.set_health(LOST)
@@ -128,7 +128,7 @@ def test_a_feasible_pose_is_held_firmly_at_the_same_place():
         np.testing.assert_array_equal(got.position, PLACE)
         assert got.stamp == 3.0
         assert Holding(ROBOT, health).margin(got.quaternion) >= 1.0 - 1e-9
-    assert feasible_target(wished, ALL_WELL, ROBOT) is wished
+    assert feasible_target(wished, ALL_HEALTHY, ROBOT) is wished
 
 
 def test_a_trajectory_that_cannot_be_held_is_flown_in_one_attitude():

@@ -15,7 +15,7 @@ from beetle_omni_ros.identify.gap.candidates import candidates
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys
 from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.robot import effects
-from beetle_omni_ros.robot.effects import CATALOGUE, separating
+from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 
 PAGE = Path(__file__).resolve().parents[2] / 'docs/how-to/add_an_effect.md'
 ENTRY, TEST = re.findall(r'```python\n(.*?)```', PAGE.read_text(), flags=re.S)
@@ -48,8 +48,8 @@ def test_what_flies_acts_on_it(consumer):
 
 
 def test_the_experiment_that_separates_it_is_its_own():
-    assert separating(['thrust_coefficient', NAME]) == CATALOGUE[NAME].separated_by
-    assert separating(['mass', 'thrust_coefficient']) == CATALOGUE['mass'].separated_by
+    assert separating_experiment(['thrust_coefficient', NAME]) == CATALOGUE[NAME].separated_by
+    assert separating_experiment(['mass', 'thrust_coefficient']) == CATALOGUE['mass'].separated_by
 
 
 def test_the_gap_finder_looks_for_it_and_finds_its_size(monkeypatch):

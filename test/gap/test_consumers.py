@@ -14,7 +14,7 @@ from beetle_omni_ros.estimation.ekf import ErrorStateEkf, ImuReading, PoseReadin
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.robot import dynamics, effects
 from beetle_omni_ros.robot.allocation import Allocator
-from beetle_omni_ros.robot.effects import Asked, CATALOGUE
+from beetle_omni_ros.robot.effects import CATALOGUE, LimitStarts
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.sim.command_link import CommandLink
@@ -146,7 +146,7 @@ def flight_model():
 def gap(name):
     """Whether a fit's number of the effect changes the residual."""
     made = flight_model()
-    limit = isinstance(CATALOGUE[name].starts, Asked)     # far above this calm flight
+    limit = isinstance(CATALOGUE[name].starts, LimitStarts)     # far above this calm flight
     theta = {key.name: np.log(0.05 if limit else 1 - key.typical) if key.relative
              else key.typical for key in KEYS.values() if key.effect == name and not key.form}
     before, after = made.residual({}), made.residual(theta)
@@ -165,21 +165,21 @@ def plain(consumer):
 @pytest.mark.parametrize('name', CATALOGUE)
 @pytest.mark.parametrize('consumer', OUTPUTS)
 def test_a_consumer_acts_on_an_effect_or_says_why_not(consumer, name):
-    stand, robot = effects.stand(consumer, name), with_effect(name)
-    if stand.error:
+    treatment, robot = effects.treatment(consumer, name), with_effect(name)
+    if treatment.error:
         with pytest.raises(ParameterError, match=f'effects.{name}: the .* refuses') as error:
             OUTPUTS[consumer](robot)
-        assert stand.reason in str(error.value) and '\n' not in str(error.value)
+        assert treatment.reason in str(error.value) and '\n' not in str(error.value)
         return
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](robot)])
     changed = found.shape != plain(consumer).shape or not np.array_equal(found, plain(consumer))
-    assert changed == stand.acts, stand.reason or f'{name} changes nothing'
-    assert stand.acts or stand.reason
+    assert changed == treatment.acts, treatment.reason or f'{name} changes nothing'
+    assert treatment.acts or treatment.reason
 
 
 @pytest.mark.parametrize('name', CATALOGUE)
 def test_the_gap_finder_acts_on_every_effect(name):
-    assert gap(name) and effects.stand('gap', name).acts
+    assert gap(name) and effects.treatment('gap', name).acts
 
 
 def test_training_refuses_delays_that_it_cannot_remember():

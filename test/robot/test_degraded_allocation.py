@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.allocation import Allocation, Allocator
 from beetle_omni_ros.robot.degraded_allocation import (
     allocator,
@@ -56,7 +56,7 @@ def test_makes_the_wrench_with_what_is_left_within_the_limits(health):
 
 
 def test_with_all_actuators_it_is_the_healthy_allocation():
-    ours, healthy = DegradedAllocator(ROBOT, ALL_WELL), Allocator(ROBOT)
+    ours, healthy = DegradedAllocator(ROBOT, ALL_HEALTHY), Allocator(ROBOT)
     assert type(allocator(ROBOT)) is Allocator
     for force, torque, present in draws(50, 2):
         got, right = (a.allocate(force, torque, present) for a in (ours, healthy))
@@ -132,4 +132,4 @@ def test_a_rotor_that_holds_a_thrust_gives_it_and_the_others_meet_the_wrench():
 def test_health_refuses_what_is_not_four():
     with pytest.raises(ValueError, match='rotors: expected four, found 3'):
         ActuatorHealth(rotors=(True,) * 3)
-    assert ALL_WELL.healthy and not lost(1).healthy and not stuck(0, 0.0).healthy
+    assert ALL_HEALTHY.healthy and not lost(1).healthy and not stuck(0, 0.0).healthy

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.degraded_allocation import allocator
 from beetle_omni_ros.robot.holding import Holding, leaned, sphere, up
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -17,7 +17,7 @@ STUCK = ActuatorHealth(stuck=(None, 1.5, None, None))
 
 @pytest.fixture(scope='module')
 def holdings():
-    return {health: Holding(ROBOT, health) for health in (ALL_WELL, LOST, STUCK)}
+    return {health: Holding(ROBOT, health) for health in (ALL_HEALTHY, LOST, STUCK)}
 
 
 def attitudes(count, seed=0):
@@ -25,7 +25,7 @@ def attitudes(count, seed=0):
 
 
 def test_a_healthy_robot_holds_every_attitude(holdings):
-    assert holdings[ALL_WELL].margins.min() > 0.0
+    assert holdings[ALL_HEALTHY].margins.min() > 0.0
 
 
 def test_with_a_rotor_lost_every_attitude_near_level_is_held_but_level_is_singular(holdings):
@@ -83,9 +83,9 @@ def test_without_any_firm_one_the_nearest_of_the_firmest_is_taken(holdings):
 
 
 def test_the_quickest_attitude_needs_no_turn_where_all_is_firm(holdings):
-    got = holdings[ALL_WELL].quickest(LEVEL, np.zeros(3), np.zeros(4), 1.0, 0.8)
+    got = holdings[ALL_HEALTHY].quickest(LEVEL, np.zeros(3), np.zeros(4), 1.0, 0.8)
     assert rotations.geodesic_angle(got, LEVEL) < 0.2
-    turning = holdings[ALL_WELL].quickest(LEVEL, np.array([5.0, 0, 0]), np.zeros(4), 1.0,
+    turning = holdings[ALL_HEALTHY].quickest(LEVEL, np.array([5.0, 0, 0]), np.zeros(4), 1.0,
                                             0.8)
     assert rotations.log(turning)[0] > rotations.log(got)[0] + 0.05
 
@@ -122,7 +122,7 @@ def test_on_its_side_the_escape_leads_towards_level(lost, up_now, rate, tilt):
 
 def test_less_thrust_leaves_no_attitude_firmer_and_level_the_firmest(holdings):
     weak = Holding(ROBOT, ActuatorHealth(thrust_limit=8.8))
-    assert np.all(weak.margins <= holdings[ALL_WELL].margins + 1e-9)
+    assert np.all(weak.margins <= holdings[ALL_HEALTHY].margins + 1e-9)
     on_its_side = np.abs(weak.directions[:, 2]) < 0.5
     assert np.all(weak.margins[on_its_side] == 0.0)
     got = weak.quickest(rotations.from_rpy(np.radians(170.0), 0, 0), np.zeros(3), np.zeros(4),

@@ -5,7 +5,7 @@ import pytest
 
 from beetle_omni_ros.control.base import Command
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.robot.actuator_health import ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.robot.allocation import Allocator
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.parameters import SupervisorParameters
@@ -41,7 +41,7 @@ class Body:
                 self.rate, ROBOT.inertia * self.rate)) / ROBOT.inertia
             noise = self.random.normal(size=6) * [*[0.05] * 3, *[0.005] * 3]
             watch.on_imu(self.time, (force + push) / ALLOCATOR.mass + noise[:3],
-                         self.rate + noise[3:], self.hover.tilt, self.hover.thrust, ALL_WELL)
+                         self.rate + noise[3:], self.hover.tilt, self.hover.thrust, ALL_HEALTHY)
             if watch.lost is not None or watch.slipped is not None:
                 return (k + 1) * TICK
         return None
@@ -110,7 +110,7 @@ def test_contact_is_an_impact_or_a_push_near_the_ground_alone():
     for impact in (10.0, 0.9 * P.contact.impact * 4 * ROBOT.rotors.thrust_max / ALLOCATOR.mass):
         watch = wrench_watch()
         watch.on_imu(0.0, np.array([0, 0, impact]), np.zeros(3), np.zeros(4), np.zeros(4),
-                     ALL_WELL)
+                     ALL_HEALTHY)
         assert watch.impact == 0.0
 
 
@@ -260,7 +260,7 @@ def test_a_burst_of_samples_after_a_pause_is_neither_crash_nor_fault(pause, spac
         force, _ = ALLOCATOR.wrench(body.hover.tilt, body.thrust)
         watch.on_imu(t, force / ALLOCATOR.mass + 0.05 * noise.normal(size=3),
                      body.rate + 0.005 * noise.normal(size=3), body.hover.tilt,
-                     body.hover.thrust, ALL_WELL)
+                     body.hover.thrust, ALL_HEALTHY)
         contact.update(min(spacing, 0.05), 0.2, watch)
         t += spacing
     assert not watch.impact and not contact.reason

@@ -10,7 +10,7 @@ from beetle_omni_ros.identify.gap.fit import State
 from beetle_omni_ros.identify.gap.keys import Key, MODULES
 from beetle_omni_ros.identify.gap.residual import FlightModel
 from beetle_omni_ros.identify.inference.blocks import HeldOut
-from beetle_omni_ros.robot.effects import Asked, CATALOGUE
+from beetle_omni_ros.robot.effects import CATALOGUE, LimitStarts
 from beetle_omni_ros.robot.servo import NUMPY, Servo
 
 TOO_SMALL = 'too small to matter'
@@ -47,7 +47,7 @@ class Candidate:
 
     def large_enough(self, keys: dict[str, Key], theta: dict[str, float]) -> bool:
         """Whether anyone would act on it."""
-        if isinstance(CATALOGUE[self.name].starts, Asked):
+        if isinstance(CATALOGUE[self.name].starts, LimitStarts):
             return True
         return any(abs(theta.get(name, 0.0)) >= keys[name].smallest for name in self.keys)
 
@@ -68,7 +68,7 @@ def candidates(keys: dict[str, Key], models: list[FlightModel]) -> list[Candidat
                      Candidate(name, own, label=name)]
         else:
             starts = _started(keys[own[0]], effect.starts, models) \
-                if isinstance(effect.starts, Asked) else effect.starts
+                if isinstance(effect.starts, LimitStarts) else effect.starts
             if effect.starts and not starts:
                 continue
             made += [Candidate(name, own, {f'{name}.{part}': x for part, x in form.items()},

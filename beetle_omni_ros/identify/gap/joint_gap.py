@@ -27,7 +27,7 @@ from beetle_omni_ros.identify.joint_servos import file_servos
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.pages.figures import legend, line, panels, STYLE, svg
-from beetle_omni_ros.robot.effects import CATALOGUE, separating
+from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 
@@ -209,7 +209,7 @@ def _effects(found: Found):
             effect['rivals'] = [{'name': t.entry.name, 'gain': t.gain, 'evidence': _evidence(t),
                                  'parameters': _parameters(found, t.entry, t.point)}
                                 for t in members[1:]]
-            effect['separated_by'] = separating(effect['names'])
+            effect['separated_by'] = separating_experiment(effect['names'])
         also = _also(found, members)
         if also:
             effect['also'] = also

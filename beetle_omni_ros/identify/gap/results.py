@@ -14,7 +14,7 @@ from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.rollouts import HORIZONS
 from beetle_omni_ros.identify.gap.verdict import hidden
 from beetle_omni_ros.pages.table import ABSENT, Grid
-from beetle_omni_ros.robot.effects import CATALOGUE, separating
+from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 MOST_ROWS = 12
@@ -90,7 +90,7 @@ def _effect(a, trial, robot):
                if t.candidate.member else {}),
             'parameters': parameters(a, t.candidate.name, t.candidate.keys, t.theta, robot,
                                      with_intervals=False)} for t in rivals]
-        made['separated_by'] = separating(names)
+        made['separated_by'] = separating_experiment(names)
     return made
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from beetle_omni_ros.identify.gap.candidates import FOUGHT, NOT_HELD, TOO_SMALL
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.patterns import SWINGING
-from beetle_omni_ros.robot.effects import CATALOGUE, separating
+from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 
 if TYPE_CHECKING:
     from beetle_omni_ros.identify.gap.analysis import Analysis
@@ -168,7 +168,7 @@ def _experiment(a, sets, out_of_sight):
     if a.verdict in ('named_set', 'not_decidable') and sets:
         members = max(sets, key=len)
         others = sorted({t.candidate.name for t in members[1:]})
-        return (f'{separating([t.candidate.name for t in members])} (separates '
+        return (f'{separating_experiment([t.candidate.name for t in members])} (separates '
                 f'{members[0].candidate.name} from {", ".join(others) or "the rest"})')
     if a.verdict == 'not_decidable':
         flights = list(dict.fromkeys(CATALOGUE[name].excited_by for name in out_of_sight))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from beetle_omni_ros.control.base import Command
-from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_WELL
+from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.allocation import Allocator, ROTORS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
@@ -58,7 +58,7 @@ class FaultWatch:
     def reset(self) -> None:
         """Reset for a new flight without faults."""
         self.faults: dict[str, float] = {}
-        self.health: ActuatorHealth = ALL_WELL
+        self.health: ActuatorHealth = ALL_HEALTHY
         self._new: list[str] = []
         if self._pack is not None:
             self._pack.reset()
@@ -156,7 +156,7 @@ class FaultWatch:
         watch = self._joints
         if not watch.on_joints(stamp, tilt) or not trusted:
             return
-        if watch.well and self.health.stuck == ALL_WELL.stuck:
+        if watch.well and self.health.stuck == ALL_HEALTHY.stuck:
             return
         for joint in np.flatnonzero(watch.jump):
             self._name(f'joint{joint + 1}_encoder_jump', stamp, f'the encoder of '
