@@ -42,7 +42,7 @@ def test_the_pages_own_test_passes_with_its_entry_and_fails_without(monkeypatch)
 
 @pytest.mark.parametrize('consumer', ['nmpc', 'training', 'plant'])
 def test_what_flies_acts_on_it(consumer):
-    assert effects.stand(consumer, NAME).acts
+    assert effects.treatment(consumer, NAME).acts
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](with_effect(NAME))])
     assert not np.array_equal(found, plain(consumer))
 
