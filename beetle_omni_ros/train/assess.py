@@ -1,8 +1,8 @@
 """
-How good a policy is, measured in the training environment: the task metrics for many robots.
+Task metrics of a policy in the training environment, for many robots at once.
 
-A quick and independent figure while training; what counts is ``beetle_omni evaluate``, with
-the multibody plant, the estimator and the floor.
+This is a quick independent measurement during training. The reference is ``beetle_omni
+evaluate``, with the multibody plant, the estimator and the floor.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from beetle_omni_ros.train import batch
 from beetle_omni_ros.train.environment import TiltableQuadrotorEnv
 from beetle_omni_ros.train.parameters import RandomParameters, StartParameters, TrainParameters
 
-SEGMENT = 8.0                       # [s] of a pose, and the windows of the task metrics [s]
+SEGMENT = 8.0                       # [s] duration of a pose; windows of the task metrics [s]
 AT_TARGET, ON_THE_WAY = (7.0, 7.5), (1.0, 7.0)
-# Latencies of the simulated robot, and the publication's table in full.
+# Latencies of the simulated robot, and the conditions of the publication's table.
 NOMINAL = {'command_latency': [0.010, 0.010], 'velocity_latency': [0.0, 0.0],
            'tilt_latency': [0.010, 0.010]}
 PUBLISHED = {'command_latency': [0.005, 0.015], 'velocity_latency': [0.015, 0.025],
@@ -31,7 +31,7 @@ DISTURBANCES = ('force_share', 'strong_share', 'payload_share', 'push_share')
 
 
 def conditions(name: str, random: RandomParameters) -> RandomParameters:
-    """The randomisation of 'nominal' or 'published' conditions."""
+    """Randomisation of the conditions 'nominal' or 'published'."""
     if name == 'published':
         own = {key: np.array(value) if isinstance(value, list) else value
                for key, value in PUBLISHED.items()}
@@ -50,17 +50,19 @@ def assess(mean: Callable[[torch.Tensor], torch.Tensor], parameters: TrainParame
 
     Args:
         mean: (N, 33 or 39) observations to (N, 8) actions.
-        parameters: of its training.
+        mean: function from (N, 33 or 39) observations to (N, 8) actions.
+        parameters: parameters of its training.
         robot: nominal robot.
         device: torch device.
         name: 'nominal' or 'published'.
         robots: N.
-        segments: poses for each robot; the first, from the start, is flown and not counted.
+        segments: poses for each robot, after a first one that does not count.
         random: randomisation in place of the named one.
 
     Returns:
-        means U_*, L_* of robots never lost, share of poses reached, share of robots lost,
-        command change in the U windows, share of joints at a stop there, mean thrust, how far
+        means U_*, L_* of robots never lost, fraction of poses reached, fraction of robots lost,
+        command change in the U windows, fraction of joints at a stop there, mean thrust, and the
+        99 and 99.9 % quantiles of the depth of moves below start and target.
         the worst hundredth and thousandth of the moves sank below start and target.
 
     """
@@ -129,6 +131,6 @@ def _fly(mean, env, length, segments, period):
 
 
 def _quantile(values, share):
-    """Like torch.quantile, for any number of values."""
+    """As torch.quantile without interpolation, for any number of values."""
     ordered = values.flatten().sort().values
     return float(ordered[round(share * (len(ordered) - 1))])

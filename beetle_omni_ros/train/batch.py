@@ -1,4 +1,4 @@
-"""Rotations and random numbers of a batch, in torch: rows are robots."""
+"""Rotations and random numbers of a batch in torch; rows are robots."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def from_rotation_vector(vector: torch.Tensor) -> torch.Tensor:
 
 
 def geodesic(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Angle (N,) [rad] between rotation matrices (N, 3, 3), exact also for small angles."""
-    relative = turned_back(a, b)
+    """Angle (N,) [rad] between rotation matrices (N, 3, 3), accurate also for small angles."""
+    relative = transpose_product(a, b)
     sine = 0.5 * torch.stack((relative[:, 2, 1] - relative[:, 1, 2],
                               relative[:, 0, 2] - relative[:, 2, 0],
                               relative[:, 1, 0] - relative[:, 0, 1]), -1).norm(dim=-1)
@@ -40,7 +40,7 @@ def geodesic(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.atan2(sine, cosine)
 
 
-def turned_back(rotation: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+def transpose_product(rotation: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     """R^T other for matrices (N, 3, 3) or vectors (N, 3), without a batched matrix product."""
     if other.dim() == 2:
         return (rotation * other[:, :, None]).sum(1)
@@ -49,10 +49,10 @@ def turned_back(rotation: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
 
 class Draw:
     """
-    Hands out columns of a tensor of uniform random numbers, one after the other.
+    Source of random numbers, columns of one tensor of uniform numbers.
 
-    Drawn at once and handed out by position, so that a step needs one random kernel and a
-    captured step gets fresh numbers.
+    The numbers are drawn in advance and used in order. A step then needs one random kernel, and
+    a captured step gets new numbers.
 
     Args:
         numbers: (N, K) uniform in [0, 1).
@@ -66,7 +66,7 @@ class Draw:
         """(N, size) uniform in [low, high)."""
         first, self._used = self._used, self._used + size
         if self._used > self._numbers.shape[1]:
-            raise ValueError(f'{self._used} random numbers asked for, {self._numbers.shape[1]} '
+            raise ValueError(f'{self._used} random numbers needed, {self._numbers.shape[1]} '
                              'drawn')
         return low + (high - low) * self._numbers[:, first:self._used]
 
@@ -80,10 +80,10 @@ class Draw:
 
     def attitude(self) -> torch.Tensor:
         """
-        (N, 4) quaternions: half of them uniform on SO(3), half a uniform axis and angle.
+        (N, 4) quaternions, half uniform on SO(3), half with uniform axis and uniform angle.
 
-        The first after K. Shoemake, Uniform random rotations (1992); the second is the
-        publication's.
+        The first half follows K. Shoemake, Uniform random rotations (1992), the second the
+        publication.
         """
         a, b, c = self.uniform(3).unbind(-1)
         low, high = torch.sqrt(1 - a), torch.sqrt(a)

@@ -1,9 +1,9 @@
 """
-CasADi functions as source for torch and Triton.
+Translation of CasADi functions to torch and Triton source.
 
-A scalar CasADi function (SX) is a list of elementary operations on numbers. Written out with
-tensors in place of the numbers it steps a whole batch: as plain torch for any device, and as
-one Triton kernel, in which a GPU thread keeps its robot in registers.
+A scalar CasADi function (SX) is a list of elementary operations on numbers. With tensors in place
+of the numbers it steps a whole batch: in plain torch on any device, or in one Triton kernel, in
+which each GPU thread keeps its robot in registers.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _UNARY = {ca.OP_ASSIGN: '{}', ca.OP_NEG: '-{}', ca.OP_SQ: '{0} * {0}', ca.OP_TWI
           ca.OP_COS: 'cos({})', ca.OP_EXP: 'exp({})', ca.OP_FABS: 'fabs({})',
           ca.OP_NOT: '(1.0 - {})'}
 
-# The words that both languages spell differently.
+# Functions with a different name in each language.
 TORCH = {'minimum': '_minimum', 'maximum': '_maximum', 'sqrt': 'torch.sqrt', 'sin': 'torch.sin',
          'cos': 'torch.cos', 'exp': 'torch.exp', 'fabs': 'torch.abs', 'number': '_number'}
 TRITON = {'minimum': 'tl.minimum', 'maximum': 'tl.maximum', 'sqrt': 'tl.sqrt', 'sin': 'tl.sin',
@@ -31,17 +31,17 @@ TRITON = {'minimum': 'tl.minimum', 'maximum': 'tl.maximum', 'sqrt': 'tl.sqrt', '
 
 def statements(function: ca.Function, words: dict[str, str]) -> list[str]:
     """
-    Write a scalar function as assignments.
+    Translate a scalar function to assignments.
 
-    Inputs are read as ``NAME_K`` and outputs assigned to ``NAME_K``, with the function's
-    own names of inputs and outputs and the index K of the entry.
+    Inputs are read from ``NAME_K`` and outputs assigned to ``NAME_K``, with the function's own
+    names of inputs and outputs and the index K of the entry.
 
     Args:
-        function: an SX function with dense inputs.
-        words: spelling of the elementary functions.
+        function: SX function with dense inputs.
+        words: names of the elementary functions.
 
     Raises:
-        NotImplementedError: an operation that no table here has.
+        NotImplementedError: an operation that is not in the tables.
 
     """
     lines = []
@@ -69,7 +69,7 @@ def statements(function: ca.Function, words: dict[str, str]) -> list[str]:
 
 
 def torch_source(function: ca.Function) -> str:
-    """Source of ``FUNCTION(inputs...) -> output`` on tensors (..., size of the entry)."""
+    """Source of ``FUNCTION(inputs...) -> output`` on tensors (..., number of entries)."""
     names = function.name_in()
     lines = [f'def {function.name()}({", ".join(names)}):']
     for i, name in enumerate(names):
@@ -84,7 +84,7 @@ def torch_source(function: ca.Function) -> str:
 
 
 def torch_function(function: ca.Function) -> Callable:
-    """Compile a one-output SX function to torch, in the precision of its inputs."""
+    """Translate a one-output SX function to torch, in the precision of its inputs."""
     import torch
 
     def number(condition):

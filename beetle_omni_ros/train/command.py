@@ -1,4 +1,4 @@
-"""`beetle_omni train`: from a parameter file to an ONNX policy."""
+"""`beetle_omni train`: trains a policy from a parameter file and exports it to ONNX."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from beetle_omni_ros.train.run_folder import (
     read_parameters,
     write_parameters,
 )
-from beetle_omni_ros.train.runner import is_first, Runner
+from beetle_omni_ros.train.runner import is_rank_zero, Runner
 
 POLICY_FILE = 'policy.onnx'
-# A run that shows within a minute on a CPU that everything fits together; it learns nothing.
+# A run of less than a minute on a CPU that executes every part; the policy learns nothing.
 SMOKE = {'iterations': 3, 'log_every': 1, 'save_every': 2, 'ppo.robots': 32, 'ppo.steps': 8,
          'ppo.epochs': 2, 'ppo.minibatches': 2, 'network.hidden': [32, 16, 16]}
-ROBOTS, CPU_ROBOTS = 8192, 64            # of the final assessment
+ROBOTS, CPU_ROBOTS = 8192, 64            # robots of the final assessment
 COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}'),
            ('samples_per_second', 'samples/s', '{:.2e}'), ('reward', 'reward', '{:+.4f}'),
            ('success_rate', 'reached', '{:.1%}'), ('position_error_m', 'error m', '{:.3f}'),
@@ -38,15 +38,15 @@ COLUMNS = (('iteration', 'iteration', '{:.0f}'), ('seconds', 'time s', '{:.0f}')
 
 
 class TrainingError(RuntimeError):
-    """The training cannot go on, or its policy not be written; one line."""
+    """The training cannot continue, or its policy cannot be written; one line."""
 
 
 def choose_device(name: str) -> str:
     """
-    The torch device of a name; 'auto' takes a GPU where there is one.
+    Torch device for a name; 'auto' is a GPU if available.
 
     Raises:
-        ParameterError: a GPU is asked for where there is none.
+        ParameterError: a requested GPU is not available.
 
     """
     local = os.environ.get('LOCAL_RANK')
@@ -74,10 +74,10 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
               smoke: bool = False, stop_after: float | None = None,
               json_path: Path | None = None, console: Console | None = None) -> dict:
     """
-    Train, assess, export.
+    Train, assess and export a policy.
 
-    Arguments are the options of `beetle_omni train`; ``changes`` holds a value for each dotted
-    parameter name, over the file.
+    Arguments are the options of `beetle_omni train`; ``changes`` maps dotted parameter names to
+    values that override the file.
 
     Returns:
         ``policy`` (path), ``iterations``, ``seconds``, ``metrics`` by conditions.
@@ -85,10 +85,10 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
     Raises:
         ParameterError: unusable input, one line.
         TrainingError: the loss is not finite, or the exported file is wrong; one line.
-        KeyboardInterrupt: after a checkpoint was written.
+        KeyboardInterrupt: raised again after a checkpoint.
 
     """
-    console = console or Console(quiet=not is_first())
+    console = console or Console(quiet=not is_rank_zero())
     if json_path:
         check_writable(json_path)
     if output is None and resume is None:
@@ -100,31 +100,31 @@ def run_train(*, output: Path | None, config: Path | None = None, robot: Path | 
         config = checkpoint.parent / PARAMETER_FILE
     changes = {**(SMOKE if smoke and not checkpoint else {}), **(changes or {})}
     parameters = read_parameters(config, changes)
-    believed = RobotParameters.load(robot)
-    if is_first():
+    nominal = RobotParameters.load(robot)
+    if is_rank_zero():
         make_folder(output, checkpoint)
     torch.set_float32_matmul_precision('high')
     if smoke:
-        torch.set_num_threads(1)    # several wait for each other where other programs run
+        torch.set_num_threads(1)    # on a loaded machine several threads wait for each other
     with redirect_stdout(io.StringIO()):     # rsl-rl prints its models
-        runner = Runner(parameters, believed, output, where)
+        runner = Runner(parameters, nominal, output, where)
     if checkpoint:
         runner.resume(checkpoint)
-    if is_first():
+    if is_rank_zero():
         write_parameters(parameters, output / PARAMETER_FILE)
     processes = f'{runner.gpu_world_size} x ' if runner.is_distributed else ''
     console.print(f'{processes}{parameters.ppo.robots} robots on {where}, seed '
                   f'{parameters.seed}, iterations {runner.current_learning_iteration} to '
-                  f'{parameters.iterations}; everything lands in {output}', soft_wrap=True)
+                  f'{parameters.iterations}; all files are in {output}', soft_wrap=True)
     try:
-        runner.train(Rows(console), stop_after)
+        runner.train(ProgressTable(console), stop_after)
         runner.close()
-        return _finish(runner, believed, output, where, smoke, json_path, console) \
-            if is_first() else {}
+        return _finish(runner, nominal, output, where, smoke, json_path, console) \
+            if is_rank_zero() else {}
     except KeyboardInterrupt:
-        if is_first():
+        if is_rank_zero():
             path = runner.checkpoint()
-            console.print(f'interrupted; go on with: beetle_omni train --resume {path.parent}',
+            console.print(f'interrupted; continue with: beetle_omni train --resume {path.parent}',
                           soft_wrap=True)
         raise
     except (FloatingPointError, ExportError) as error:
@@ -142,7 +142,8 @@ def _finish(runner, robot, output, device, smoke, json_path, console):
                 'samples': runner.current_learning_iteration * parameters.ppo.steps
                 * parameters.ppo.robots * runner.gpu_world_size,
                 'seconds': round(runner.trained_seconds, 1), 'processes': runner.gpu_world_size,
-                'device': _model(device)}
+                'device': torch.cuda.get_device_name(device) if device.startswith('cuda')
+                else 'cpu'}
     difference = export_policy(actor, path, robot, parameters, training, metrics)
     for name, values in metrics.items():
         console.print(f'{name}, training environment: ' + ', '.join(
@@ -156,12 +157,8 @@ def _finish(runner, robot, output, device, smoke, json_path, console):
     return result
 
 
-def _model(device):
-    return torch.cuda.get_device_name(device) if device.startswith('cuda') else 'cpu'
-
-
-class Rows:
-    """Prints progress as rows of a table, with the header now and then."""
+class ProgressTable:
+    """Prints progress as rows of a table, with a header every ``EVERY`` rows."""
 
     EVERY = 20
 

@@ -1,9 +1,9 @@
 """
-The batched environment: thousands of robots that fly from target to target.
+The batched training environment: thousands of robots that fly from target to target.
 
-Physics is the robot's own model (:mod:`train.model`); observations are those of
-:mod:`control.observation`, delayed and noisy as on board. One step has no synchronisation
-with the host, so that a whole rollout can be captured as one CUDA graph.
+The physics is the robot's own model (:mod:`train.model`). Observations are those of
+:mod:`control.observation`, delayed and noisy as on the robot. A step does not synchronise with
+the host, so that a whole rollout can be captured as one CUDA graph.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from beetle_omni_ros.train import batch, rewards, starts
 from beetle_omni_ros.train.model import CENTRE, INERTIA, MASS, module_reaction, nominal_body
 from beetle_omni_ros.train.observations import (
     actor_observation,
-    carried_on,
     critic_observation,
+    extrapolated,
     Signals,
 )
 from beetle_omni_ros.train.parameters import TrainParameters
@@ -35,8 +35,8 @@ from beetle_omni_ros.train.replays import (
     spread,
 )
 
-NUMBERS = 141       # random numbers of a robot and a step
-REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] as the task metrics
+NUMBERS = 141       # random numbers for each robot and step
+REACHED_POSITION, REACHED_ATTITUDE = 0.10, 0.17453    # [m], [rad] limits of the task metrics
 
 
 class TiltableQuadrotorEnv(VecEnv):
@@ -44,20 +44,20 @@ class TiltableQuadrotorEnv(VecEnv):
     N robots in one tensor program.
 
     Args:
-        parameters: of the training.
-        robot: what the robots are.
+        parameters: training parameters (params/train.yaml).
+        robot: nominal robot.
         device: torch device.
-        compiled: whether to compile the step (pays on a GPU only).
+        compiled: whether to compile the step; by default on a GPU only.
 
     Raises:
-        ParameterError: an effect of the robot file that training refuses.
+        ParameterError: the robot file has an effect that training refuses.
 
     Attributes:
-        state: name -> (N, ...) tensor, everything that lasts from step to step.
-        weights: (R,) reward weights in the order of ``rewards.TERMS``, on the device; may be
-            changed between steps.
-        severity: () factor on forces, payloads and pushes, likewise.
-        depth_limit: () how far below both start and target the floor is [m], likewise.
+        state: name -> (N, ...) tensor, all quantities that persist between steps.
+        weights: (R,) reward weights in the order of ``rewards.TERMS``, on the device. They may
+            change between steps, as may ``severity`` and ``depth_limit``.
+        severity: () factor on forces, payloads and pushes.
+        depth_limit: () depth below both start and target that ends an episode [m].
 
     """
 
@@ -88,7 +88,7 @@ class TiltableQuadrotorEnv(VecEnv):
                                           for name in rewards.TERMS]) * parameters.reward.scale
         self.weights = self.base_weights.clone()
         numbers = self._numbers()
-        # clones: entries that start equal must not share memory
+        # clones, because equal initial entries must not share memory
         self.state = {name: value.clone()
                       for name, value in self._starts.draw(batch.Draw(numbers)).items()}
         age = torch.rand(self.num_envs, device=self.device) * self.max_episode_length
@@ -98,9 +98,9 @@ class TiltableQuadrotorEnv(VecEnv):
         self.state.update(self._replays.state(self.state))
         # sums since the last reading: targets finished, reached, errors, rewards, ends
         self.tally = torch.zeros(8 + len(rewards.TERMS), device=self.device)
-        self._finish = self._after
+        self._finish = self._after_physics
         if compiled if compiled is not None else self.device.type == 'cuda':
-            self._finish = torch.compile(self._after, fullgraph=True, dynamic=False)
+            self._finish = torch.compile(self._after_physics, fullgraph=True, dynamic=False)
         self.observation, self.critic = self._observe(self.state, batch.Draw(numbers[:, 104:]))
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -119,22 +119,22 @@ class TiltableQuadrotorEnv(VecEnv):
                           batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor):
-        """One period for all robots; see :class:`rsl_rl.env.VecEnv`."""
+        """One period of all robots; see :class:`rsl_rl.env.VecEnv`."""
         self.advance(actions)
         self.episode_length_buf = self.state['age'].long()
         return self.get_observations(), self.reward.clone(), self.done.clone(), \
             {'time_outs': self.timeout.float()}
 
     def advance(self, actions: torch.Tensor) -> None:
-        """:meth:`step` in place: results stand in observation, critic, reward, done, timeout."""
-        asked = self.offset + self.scale * actions
-        command = torch.clamp(asked, self._low, self._high)
+        """:meth:`step` in place: sets observation, critic, reward, done, timeout."""
+        requested = self.offset + self.scale * actions
+        command = torch.clamp(requested, self._low, self._high)
         s = self.state
         limit = self._thrust_limit()
         given = tuple(torch.cat((c[:, :4], torch.minimum(c[:, 4:], limit)), -1)
                       for c in (command, s['previous'], s['older']))
         x = self.physics.advance(s['x'], given, s['delays'][:, :2], s['wrench'], s['body'])
-        results = self._finish(s, x, asked, command, self._numbers(), self.weights)
+        results = self._finish(s, x, requested, command, self._numbers(), self.weights)
         new, observation, critic, reward, done, timeout, tally = results
         torch._foreach_copy_([s[name] for name in new], list(new.values()))
         self.observation.copy_(observation)
@@ -145,40 +145,40 @@ class TiltableQuadrotorEnv(VecEnv):
         self.tally.add_(tally)
 
     def _thrust_limit(self):
-        """(N, 1) largest thrust that the pack gives under the present load [N]."""
+        """(N, 1) largest thrust that the pack allows under the present load [N]."""
         load = (self.state['x'][:, model.THRUST].clamp(min=0) ** 1.5).sum(-1, keepdim=True)
         beyond = (load - 4 * self.robot.hover_thrust ** 1.5).clamp(min=0)
         return (self.state['thrust_limit'] - self.cfg.random.thrust_sag * beyond).clamp(min=0)
 
-    def _after(self, s, x, asked, command, numbers, weights):
-        """All that follows the physics: push, reward, end, new targets, reset, observation."""
+    def _after_physics(self, s, x, requested, command, numbers, weights):
+        """Push, reward, end of the episode, new targets, reset and observation."""
         draw, limits = batch.Draw(numbers), self.cfg.episode
         x = self._push(s, x, draw)
         rotation, target = batch.matrix(x[:, model.QUATERNION]), batch.matrix(s['target_attitude'])
-        moment = self._moment(s, x, asked, rotation, target)
-        terms = rewards.terms(moment)
+        inputs = self._reward_inputs(s, x, requested, rotation, target)
+        terms = rewards.terms(inputs)
         broken = ~torch.isfinite(x).all(-1)
         calm = s['disturbed'][:, 0] < 0.5
-        died = broken | (moment.position_error > limits.position_limit) \
-            | (moment.speed > limits.velocity_limit) | (moment.rate > limits.rate_limit) \
-            | ((moment.depth > self.depth_limit) & calm)
+        died = broken | (inputs.position_error > limits.position_limit) \
+            | (inputs.speed > limits.velocity_limit) | (inputs.rate > limits.rate_limit) \
+            | ((inputs.depth > self.depth_limit) & calm)
         reward = torch.where(broken, 0.0, terms @ weights) \
             + died * (self.cfg.reward.termination * self.cfg.reward.scale)
         age = s['age'] + 1
         timeout = (age >= self.max_episode_length) & ~died
         done = died | timeout
         due = (s['target_left'] <= 1) & ~done
-        reached = (moment.position_error < REACHED_POSITION) \
-            & (moment.attitude_error < REACHED_ATTITUDE)
+        reached = (inputs.position_error < REACHED_POSITION) \
+            & (inputs.attitude_error < REACHED_ATTITUDE)
         finished = due & calm & (s['source'] < 0)
         tally = torch.cat([torch.stack([
             finished.sum(), (finished & reached).sum(),
-            (finished * moment.position_error).sum(), (finished * moment.attitude_error).sum(),
+            (finished * inputs.position_error).sum(), (finished * inputs.attitude_error).sum(),
             reward.sum(), died.sum(), timeout.sum(), torch.ones_like(reward).sum()]),
             torch.where(broken[:, None], 0.0, terms).sum(0)])
-        new = self._carry_on(s, x, command, rotation, age, moment.depth)
+        new = self._continued(s, x, command, rotation, age, inputs.depth)
         missed = calm & ((died & ~broken) | due & (
-            (moment.position_error > MISSED_POSITION) | (moment.attitude_error > MISSED_ATTITUDE)
+            (inputs.position_error > MISSED_POSITION) | (inputs.attitude_error > MISSED_ATTITUDE)
             | (new['deepest'] > MISSED_DEPTH)))
         new = self._retarget(new, due, rotation, draw)
         new = self._replays.step(s, new, self._starts.draw(draw),
@@ -190,20 +190,20 @@ class TiltableQuadrotorEnv(VecEnv):
         r = self.cfg.random
         chance = s['pushed'] * (self.cfg.episode.period / r.push_period)
         push = draw.uniform(1) < chance
-        # uniform with the standard deviation that the parameters state
+        # uniform, with the standard deviation of the parameters
         kick = torch.cat((draw.around(3 ** 0.5 * r.push_velocity, 3),
                           draw.around(3 ** 0.5 * r.push_rate, 3)), -1) * push * self.severity
         return torch.cat((x[:, model.POSITION], x[:, model.VELOCITY] + kick[:, :3],
                           x[:, model.QUATERNION], x[:, model.RATE] + kick[:, 3:], x[:, 13:]), -1)
 
-    def _moment(self, s, x, asked, rotation, target):
-        return rewards.Moment(
+    def _reward_inputs(self, s, x, requested, rotation, target):
+        return rewards.RewardInputs(
             position_error=(x[:, model.POSITION] - s['target_position']).norm(dim=-1),
             attitude_error=batch.geodesic(rotation, target),
             speed=x[:, model.VELOCITY].norm(dim=-1), rate=x[:, model.RATE].norm(dim=-1),
             tilt=x[:, model.TILT], tilt_rate=x[:, model.TILT_RATE],
             previous_tilt_rate=s['x'][:, model.TILT_RATE], thrust=x[:, model.THRUST],
-            tilt_command=asked[:, :4], thrust_command=asked[:, 4:],
+            tilt_command=requested[:, :4], thrust_command=requested[:, 4:],
             previous_tilt_command=s['previous'][:, :4],
             previous_thrust_command=s['previous'][:, 4:],
             z_axis=rotation[:, :, 2], target_z_axis=target[:, :, 2],
@@ -211,27 +211,27 @@ class TiltableQuadrotorEnv(VecEnv):
             tilt_limit=self.robot.joints.position_limit,
             thrust_limit=self.robot.rotors.thrust_max)
 
-    def _carry_on(self, s, x, command, rotation, age, depth):
-        """The state after a step in which nothing ended."""
+    def _continued(self, s, x, command, rotation, age, depth):
+        """State after a step without resets and new targets."""
         new = dict(s)
         old = batch.matrix(s['x'][:, model.QUATERNION])
-        motion = torch.cat((batch.turned_back(old, s['x'][:, model.VELOCITY]),
+        motion = torch.cat((batch.transpose_product(old, s['x'][:, model.VELOCITY]),
                             s['x'][:, model.RATE]), -1)
         new.update(
             x=x, previous=command, older=s['previous'], age=age,
             target_left=s['target_left'] - 1, deepest=torch.maximum(s['deepest'], depth),
             past_motion=torch.cat((motion[:, None], s['past_motion'][:, :3]), 1),
             past_tilt=torch.cat((s['x'][:, None, model.TILT], s['past_tilt'][:, :1]), 1),
-            estimate=self._follow(s, x, rotation))
+            estimate=self._disturbance_estimate(s, x, rotation))
         return new
 
-    def _follow(self, s, x, rotation):
+    def _disturbance_estimate(self, s, x, rotation):
         """
-        The disturbance estimate: what the nominal model cannot explain, through a lag.
+        Disturbance estimate (N, 6): the wrench outside the nominal model, through a lag.
 
-        The estimator compares the body rate that it gets with what the present commands should
-        do; where the rate is late, its change of long ago, carried on as the rate is, is held
-        against that of now.
+        The estimator compares the measured body rate with the effect of the present commands. A
+        delayed rate gives an error: the difference of the delayed, extrapolated change of rate
+        and the present change.
         """
         e, period = self.cfg.estimate, self.cfg.episode.period
         mass = s['body'][:, MASS]
@@ -242,22 +242,22 @@ class TiltableQuadrotorEnv(VecEnv):
         up = torch.zeros_like(thrusts)
         up[:, 2] = (torch.cos(tilt) - 1).sum(-1)
         centre = s['body'][:, CENTRE] - self._module_moment / mass * (thrusts + up)
-        pull = batch.turned_back(rotation, weight * mass)
+        pull = batch.transpose_product(rotation, weight * mass)
         force = s['wrench'][:, :3] + (mass - self._nominal_mass) * weight
         torque = s['wrench'][:, 3:] + torch.linalg.cross(centre, pull) \
-            + s['body'][:, INERTIA] / period * self._late_change(s, x)
+            + s['body'][:, INERTIA] / period * self._delay_error(s, x)
         lag = torch.cat((torch.full_like(force, e.force_bandwidth * period),
                          torch.full_like(torque, e.torque_bandwidth * period)), -1)
         return s['estimate'] + lag * (torch.cat((force, torque), -1) - s['estimate'])
 
     @staticmethod
-    def _late_change(s, x):
-        """(N, 3) change of the delayed body rate over the last step, less that of the true one."""
+    def _delay_error(s, x):
+        """(N, 3) change of the delayed body rate over the last step, minus the true change."""
         rates = torch.cat((x[:, None, model.RATE], s['x'][:, None, model.RATE],
                            s['past_motion'][:, :, 3:]), 1)
         changes = rates[:, :-1] - rates[:, 1:]
         delay = s['delays'][:, 2:3]
-        return carried_on(changes, delay, s['carried'] * delay) - changes[:, 0]
+        return extrapolated(changes, delay, s['extrapolated'] * delay) - changes[:, 0]
 
     def _retarget(self, new, due, rotation, draw):
         target = self._starts.target(draw, new['x'][:, model.POSITION],
@@ -276,7 +276,7 @@ class TiltableQuadrotorEnv(VecEnv):
                                                self.cfg.memory)
 
     def read_tally(self) -> dict[str, float]:
-        """Averages since the last reading, then start anew; this waits for the device."""
+        """Averages since the last call, which then restart; waits for the device."""
         values = self.tally.tolist()
         self.tally.zero_()
         targets, steps = max(values[0], 1.0), max(values[7], 1.0)

@@ -1,4 +1,4 @@
-"""A trained actor as an ONNX file that carries its own contract."""
+"""Export of a trained actor to an ONNX file with its policy contract."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from beetle_omni_ros.train.network import ActorModel, ExportedPolicy
 from beetle_omni_ros.train.parameters import TrainParameters
 
 OPSET = 18
-AGREEMENT = 1e-5     # between torch and onnxruntime, relative to the largest action
-PROBES = 256         # observations on which they are compared
+AGREEMENT = 1e-5     # largest difference of torch and onnxruntime, relative to the largest action
+PROBES = 256         # compared observations
 
 
 class ExportError(RuntimeError):
-    """The written file does not compute what the network computes."""
+    """The written file and the network compute different actions."""
 
 
 def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
@@ -38,18 +38,18 @@ def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
     Write an actor as ONNX and compare the file with it.
 
     Args:
-        actor: the trained network.
-        path: of the file.
-        robot: that it was trained for.
-        parameters: of the training.
-        training: more to state about it, e.g. its duration.
-        metrics: what it reached.
+        actor: trained network.
+        path: path of the file.
+        robot: robot of the training.
+        parameters: parameters of the training.
+        training: further facts of the training for the file, e.g. its duration.
+        metrics: results of the policy for the file.
 
     Returns:
-        the largest difference between torch and onnxruntime, relative to the largest action.
+        largest difference of torch and onnxruntime, relative to the largest action.
 
     Raises:
-        ExportError: they differ by more than ``AGREEMENT``.
+        ExportError: the difference exceeds ``AGREEMENT``.
 
     """
     import onnx
@@ -88,7 +88,7 @@ def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
 
 
 def compare(mean: Callable[[torch.Tensor], torch.Tensor], path: Path, size: int) -> float:
-    """Largest difference of torch and onnxruntime on random observations, relative."""
+    """Largest relative difference of torch and onnxruntime on random observations."""
     session = onnx_runtime.load().InferenceSession(str(path), providers=['CPUExecutionProvider'])
     generator = torch.Generator().manual_seed(0)
     probes = torch.randn(PROBES, size, generator=generator)
@@ -100,7 +100,7 @@ def compare(mean: Callable[[torch.Tensor], torch.Tensor], path: Path, size: int)
 
 
 def strip_paths(proto) -> None:
-    """Take out the exporter's notes on where each node comes from, which name local files."""
+    """Remove the exporter's notes on the origin of nodes, because they contain local paths."""
     for node in proto.graph.node:
         del node.metadata_props[:]
         node.doc_string = ''
@@ -112,7 +112,7 @@ def strip_paths(proto) -> None:
 
 
 def commit() -> str:
-    """Commit of the working tree this package runs from, '' outside of one."""
+    """Commit of the working tree of this package, '' outside of one."""
     try:
         done = subprocess.run(['git', 'describe', '--always', '--dirty', '--abbrev=12'],
                               cwd=Path(__file__).parent, capture_output=True, text=True,

@@ -1,11 +1,11 @@
 """
-The robot as the training environment steps it: one CasADi function, exported to the GPU.
+Model of the robot in the training environment, as one CasADi function.
 
-Newton and Euler, the rotors' lag and every effect of the robot file come from
-:mod:`robot.dynamics`; what is added is the integration over one short substep, the limits of
-the servos and what differs from robot to robot: mass, inertia and centre of mass. Where the
-robot file has a multibody section, the tilting modules' reaction and shifting centre of mass
-belong to the model, which is what makes a policy level on the true robot.
+Rigid-body equations, rotor lag and effects come from :mod:`robot.dynamics`. This module adds the
+integration over a short substep, the limits of the servos and the quantities that differ between
+robots: mass, inertia and centre of mass. With a multibody section in the robot file, the model
+includes the reaction of the tilting modules and their shift of the centre of mass. Without these a
+policy does not hold level attitudes on the multibody plant.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import CASADI, Step
 
-# What differs from robot to robot: mass [kg], inertia (3) [kg m^2], centre of mass (3) [m].
+# Quantities of each robot: mass [kg], inertia (3) [kg m^2], centre of mass (3) [m].
 MASS, INERTIA, CENTRE = slice(0, 1), slice(1, 4), slice(4, 7)
 BODY_SIZE = 7
-SERVO_STEPS = 2    # in a substep; a servo reaches its rate limit within a millisecond
+SERVO_STEPS = 2    # servo steps in a substep; a servo reaches its rate limit within 1 ms
 WRENCH_SIZE = 6    # external force in world [N], torque in body [N m]
 
 
 def module_reaction(robot: RobotParameters) -> dict[str, float]:
     """
-    Parameters of the effect ``module_reaction`` that follow from the multibody section.
+    Parameters of the effect ``module_reaction`` from the multibody section.
 
     Returns:
-        module_inertia [kg m^2] about the joint axis, mass_moment [kg m] of a module.
+        module_inertia [kg m^2] about the joint axis, and mass_moment [kg m] of a module.
 
     """
     module = robot.multibody.module
@@ -41,7 +41,7 @@ def module_reaction(robot: RobotParameters) -> dict[str, float]:
 
 
 def nominal_body(robot: RobotParameters) -> list[float]:
-    """(7,) mass, inertia and centre of mass as the robot file states them, effects included."""
+    """(7,) mass, inertia and centre of mass of the robot file, with its effects."""
     effects = robot.effects
     return [effects.get('mass', {}).get('mass', robot.mass),
             *effects.get('inertia', {}).get('inertia', tuple(robot.inertia)),
@@ -66,14 +66,14 @@ def _servos(robot, x, target, h):
 
 def substep(robot: RobotParameters, duration: float) -> ca.Function:
     """
-    Build one integration step of the full state.
+    One integration step of the full state.
 
-    The servos take shorter steps of their own, within rate limit and stops, the rotors' lag
-    is exact, the body with the acceleration at the middle thrust and the new tilt.
+    The servos take shorter steps within rate limit and stops. The rotor lag is exact. The body
+    uses the acceleration at the mean thrust and the new tilt.
 
     Args:
         robot: parameters and effects.
-        duration: of the step [s].
+        duration: duration of the step [s].
 
     Returns:
         substep(x (25), u (8), wrench (6), body (7)) -> x_next (25), in the slices of

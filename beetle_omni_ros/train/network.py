@@ -1,10 +1,10 @@
 """
 Actor and critic: rsl-rl's MLP models on features of the raw observation.
 
-The features are functions of the 33 (or 39) numbers alone and part of the exported graph, so
-that the interface stays the raw observation: target attitude seen from the body, direction of
-gravity in both frames, sines and cosines of the tilts, errors on a scale of centimetres as
-well as metres. None of them depends on the heading of the world's axes.
+The features are functions of the 33 (or 39) observed numbers and part of the exported graph. The
+interface is therefore the raw observation. The features are the target attitude in the body
+frame, gravity in both frames, sines and cosines of the tilts, and errors on scales of metres and
+centimetres. They do not depend on the heading of the world frame.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rsl_rl.modules import MLP
 from rsl_rl.modules.distribution import GaussianDistribution
 import torch
 
-NEAR = 0.1           # [m or rad] below which an error's fine feature is linear
+NEAR = 0.1           # [m or rad] below which the normalised error is linear
 # Scales that bring the features to about one.
 RATE, FORCE, TORQUE, THRUST, TILT_ACTION, THRUST_ACTION = 0.5, 0.1, 2.0, 0.1, 0.25, 0.1
 # Blocks of the observation; the critic has eight rotor columns between tilt and action.
@@ -58,7 +58,7 @@ def _shared(o, action):
 
 
 def _fine(error):
-    """The direction of an error, going to zero linearly where it is small."""
+    """Normalised error vector, linear for small errors."""
     return error / torch.sqrt((error * error).sum(-1, keepdim=True) + NEAR ** 2)
 
 
@@ -68,11 +68,11 @@ def _disturbance(block):
 
 class ActorModel(MLPModel):
     """
-    Raw observation to the mean action: scale * mlp(features) + carry * previous action.
+    Actor with the mean action scale * mlp(features) + carry * previous action.
 
     Args:
         output_scale: action for each unit of the last layer.
-        carry: part of the previous action that the output is added to.
+        carry: factor of the previous action in the output.
         last_gain: initial gain of the last layer.
 
     """
@@ -91,7 +91,7 @@ class ActorModel(MLPModel):
         return out + self.carry * observation[..., ACTION] if self.carry else out
 
     def forward(self, obs, masks=None, hidden_state=None, stochastic_output=False):
-        """As rsl-rl's model, with the features in front."""
+        """As rsl-rl's model, on features."""
         mean = self.mean(torch.cat([obs[group] for group in self.obs_groups], -1))
         if stochastic_output:
             self.distribution.update(mean)
@@ -103,14 +103,14 @@ class ActorModel(MLPModel):
 
 
 class CriticModel(MLPModel):
-    """Privileged state to its value."""
+    """Critic: value of the privileged state."""
 
     def value(self, state: torch.Tensor) -> torch.Tensor:
         """(N, 1) values of (N, 41 or 47) states."""
         return self.mlp(critic_features(state))
 
     def forward(self, obs, masks=None, hidden_state=None, stochastic_output=False):
-        """As rsl-rl's model, with the features in front."""
+        """As rsl-rl's model, on features."""
         return self.value(torch.cat([obs[group] for group in self.obs_groups], -1))
 
     def _get_latent_dim(self):
@@ -118,7 +118,7 @@ class CriticModel(MLPModel):
 
 
 class BoundedGaussian(GaussianDistribution):
-    """Gaussian with one standard deviation for each action, bounded from above by a schedule."""
+    """Gaussian with a standard deviation for each action and an upper bound from the schedule."""
 
     def __init__(self, output_dim: int, stds: list[float]):
         super().__init__(output_dim, std_type='log')
@@ -126,18 +126,18 @@ class BoundedGaussian(GaussianDistribution):
             self.log_std_param.copy_(torch.log(torch.tensor(stds)))
 
     def bound(self, limits: torch.Tensor) -> None:
-        """Bring the standard deviations down to (8,) ``limits``."""
+        """Limit the standard deviations to (8,) ``limits``."""
         with torch.no_grad():
             self.log_std_param.copy_(torch.minimum(self.log_std_param, torch.log(limits)))
 
 
 class ExportedPolicy(torch.nn.Module):
     """
-    What the ONNX file holds: raw observation in, mean action out, in few operations.
+    Network of the ONNX file, from the raw observation to the mean action in few operations.
 
-    The same function as :meth:`ActorModel.mean`, written for a single observation on one core,
-    where an operation costs more than its arithmetic: whatever is linear between two products is
-    one constant matrix, and all scales and the carried action are in such matrices, too.
+    The function is that of :meth:`ActorModel.mean`, written for a single observation on one CPU
+    core, where the number of operations determines the time. All linear operations between two
+    products, with their scales and the previous action, are therefore one constant matrix.
     """
 
     def __init__(self, actor: ActorModel):
@@ -182,13 +182,13 @@ class ExportedPolicy(torch.nn.Module):
                                           torch.cat((last.weight, self.carry), -1), last.bias)
 
 
-# Blocks of :func:`features` with their sizes, and those that come last in the exported graph.
+# Blocks of :func:`features` with their sizes, and the blocks at the end of the exported graph.
 BLOCKS = (('velocity', 3), ('rate', 3), ('target', 3), ('target_fine', 3), ('relative', 9),
           ('turn_fine', 3), ('up', 3), ('target_up', 3), ('tilt', 4), ('sine', 4), ('cosine', 4),
           ('tilt_action', 4), ('thrust_action', 4), ('force', 3), ('torque', 3))
 NOT_LINEAR = ('target_fine', 'turn_fine', 'sine', 'cosine')
-# Places of the observation whose products make y = z x x of body and target: first the six that
-# count positively.
+# Indices of the observation whose products are y = z x x of body and target. The first six
+# products have a positive sign.
 CROSSED = ((13, 14, 12, 19, 20, 18, 14, 12, 13, 20, 18, 19),
            (11, 9, 10, 17, 15, 16, 10, 11, 9, 16, 17, 15))
 
@@ -199,26 +199,26 @@ def _matrix(function, size):
 
 
 def _axes(known):
-    """Axes of body and target from the observation and the products after it."""
+    """Axes of body and target from the observation and the subsequent products."""
     x, z, x_goal, z_goal = known[:, ATTITUDES].split(3, -1)
     y, y_goal = (known[:, -12:-6] - known[:, -6:]).split(3, -1)
     return (x, y, z), (x_goal, y_goal, z_goal)
 
 
 def _left(known):
-    """Entries of the body's axes, each of which is multiplied ..."""
+    """Left factors of the products of the body's axes with the target's axes."""
     body, goals = _axes(known)
     return torch.cat([axis for axis in body for _ in goals], -1)
 
 
 def _right(known):
-    """... with one of a target's axis."""
+    """Right factors of the products of the body's axes with the target's axes."""
     body, goals = _axes(known)
     return torch.cat([goal for _ in body for goal in goals], -1)
 
 
 def _linear(known):
-    """Features that are linear in observation and products; errors (6) and angles (8)."""
+    """Features that are linear in observation and products, errors (6) and angles (8)."""
     o, products = known[:, :-27], known[:, -27:]
     body, goals = _axes(o)
     relative = products.reshape(-1, 9, 3).sum(-1)

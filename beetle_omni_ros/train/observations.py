@@ -1,4 +1,4 @@
-"""What actor and critic see of a batch of robots: :mod:`control.observation`, many at once."""
+"""Observations of actor and critic for a batch of robots, as :mod:`control.observation`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from beetle_omni_ros.train import batch
 
 class Signals:
     """
-    The estimated state as the policy gets it: late, biased and noisy.
+    Estimated state as observed by the policy: delayed, biased and noisy.
 
     Args:
         random: :class:`train.parameters.RandomParameters`.
         s: environment state.
-        draw: random numbers.
+        draw: source of random numbers.
 
     Attributes:
         position: (N, 3) [m].
@@ -30,29 +30,29 @@ class Signals:
         r, x, scale, bias = random, s['x'], s['noise'], s['bias']
         self.position = x[:, model.POSITION] + bias[:, 0:3] \
             + scale * draw.around(r.position_noise, 3)
-        wrong = bias[:, 3:6] + scale * draw.around(r.attitude_noise, 3)
+        error = bias[:, 3:6] + scale * draw.around(r.attitude_noise, 3)
         self.rotation = batch.matrix(batch.product(
-            x[:, model.QUATERNION], batch.from_rotation_vector(wrong)))
-        now = torch.cat((batch.turned_back(batch.matrix(x[:, model.QUATERNION]),
-                                           x[:, model.VELOCITY]), x[:, model.RATE]), -1)
-        ahead = s['carried'] * s['delays'][:, 2:3]
-        motion = carried_on(torch.cat((now[:, None], s['past_motion']), 1),
-                            s['delays'][:, 2:3], ahead)
+            x[:, model.QUATERNION], batch.from_rotation_vector(error)))
+        now = torch.cat((batch.transpose_product(batch.matrix(x[:, model.QUATERNION]),
+                                                 x[:, model.VELOCITY]), x[:, model.RATE]), -1)
+        ahead = s['extrapolated'] * s['delays'][:, 2:3]
+        motion = extrapolated(torch.cat((now[:, None], s['past_motion']), 1),
+                              s['delays'][:, 2:3], ahead)
         self.velocity = motion[:, :3] + bias[:, 6:9] + scale * draw.around(r.velocity_noise, 3)
-        # A trend through two noisy readings: the newer one counts 1 + a times, the older one -a.
-        louder = ((1 + ahead / PERIOD) ** 2 + (ahead / PERIOD) ** 2).sqrt()
-        self.rate = motion[:, 3:] + bias[:, 9:12] + scale * louder * draw.around(r.rate_noise, 3)
+        # A trend through two noisy readings has the weights 1 + a and -a.
+        gain = ((1 + ahead / PERIOD) ** 2 + (ahead / PERIOD) ** 2).sqrt()
+        self.rate = motion[:, 3:] + bias[:, 9:12] + scale * gain * draw.around(r.rate_noise, 3)
         tilts = torch.cat((x[:, None, model.TILT], s['past_tilt']), 1)
-        self.tilt = late(tilts, s['delays'][:, 3:4]) + bias[:, 12:16] \
+        self.tilt = delayed(tilts, s['delays'][:, 3:4]) + bias[:, 12:16] \
             + scale * draw.around(r.tilt_noise, 4)
 
 
-PERIOD = 0.01   # s between two entries of a history
+PERIOD = 0.01   # [s] between two entries of a history
 
 
-def late(history: torch.Tensor, delay: torch.Tensor) -> torch.Tensor:
+def delayed(history: torch.Tensor, delay: torch.Tensor) -> torch.Tensor:
     """
-    Value ``delay`` ago, linear between the entries of a history.
+    Value before ``delay``, interpolated linearly between the entries of a history.
 
     Args:
         history: (N, H, K), newest first, one control period apart.
@@ -64,12 +64,12 @@ def late(history: torch.Tensor, delay: torch.Tensor) -> torch.Tensor:
     return (history * weights[:, :, None]).sum(1)
 
 
-def carried_on(history: torch.Tensor, delay: torch.Tensor, ahead: torch.Tensor) -> torch.Tensor:
+def extrapolated(history: torch.Tensor, delay: torch.Tensor, ahead: torch.Tensor) -> torch.Tensor:
     """
-    Value ``delay`` ago, carried on for ``ahead`` by its change over the period before.
+    Value before ``delay``, extrapolated by ``ahead`` with its change over the preceding period.
 
-    So the estimator treats a rate that turns out old (:class:`estimation.mounting.Mounting`),
-    there by a line through three readings in 10 ms.
+    The estimator extrapolates delayed rates likewise (:class:`estimation.mounting.Mounting`),
+    but with a line through three readings within 10 ms.
 
     Args:
         history: (N, H, K), newest first, one control period apart.
@@ -77,34 +77,34 @@ def carried_on(history: torch.Tensor, delay: torch.Tensor, ahead: torch.Tensor) 
         ahead: (N, 1) [s].
 
     """
-    value = late(history, delay)
-    return value + ahead / PERIOD * (value - late(history, delay + PERIOD))
+    value = delayed(history, delay)
+    return value + ahead / PERIOD * (value - delayed(history, delay + PERIOD))
 
 
 def actor_observation(signals: Signals, s, previous_action, estimate=None, draw=None):
-    """(N, 33) observation, or (N, 39) with the parameters of the disturbance estimate."""
+    """(N, 33) observation; with ``estimate``, (N, 39) with the disturbance estimate."""
     target = batch.matrix(s['target_attitude'])
     blocks = [signals.velocity, signals.rate,
-              batch.turned_back(signals.rotation, s['target_position'] - signals.position),
+              batch.transpose_product(signals.rotation, s['target_position'] - signals.position),
               signals.rotation[:, :, 0], signals.rotation[:, :, 2], target[:, :, 0],
               target[:, :, 2], signals.tilt, previous_action]
     if estimate is not None:
-        wrong = s['bias'][:, 16:22] + s['noise'] * torch.cat(
+        error = s['bias'][:, 16:22] + s['noise'] * torch.cat(
             (draw.around(estimate.force_noise, 3), draw.around(estimate.torque_noise, 3)), -1)
-        blocks += [batch.turned_back(signals.rotation, s['estimate'][:, :3]) + wrong[:, :3],
-                   s['estimate'][:, 3:] + wrong[:, 3:]]
+        blocks += [batch.transpose_product(signals.rotation, s['estimate'][:, :3]) + error[:, :3],
+                   s['estimate'][:, 3:] + error[:, 3:]]
     return torch.cat(blocks, -1)
 
 
 def critic_observation(s, previous_action, torque_ratio, memory: bool = False):
-    """(N, 41) true state with the rotors' reaction torques and thrusts; + 6 with memory."""
+    """(N, 41) true state with reaction torques and thrusts of the rotors; + 6 with memory."""
     x = s['x']
     rotation, target = batch.matrix(x[:, model.QUATERNION]), batch.matrix(s['target_attitude'])
     thrust = x[:, model.THRUST]
-    blocks = [batch.turned_back(rotation, x[:, model.VELOCITY]), x[:, model.RATE],
-              batch.turned_back(rotation, s['target_position'] - x[:, model.POSITION]),
+    blocks = [batch.transpose_product(rotation, x[:, model.VELOCITY]), x[:, model.RATE],
+              batch.transpose_product(rotation, s['target_position'] - x[:, model.POSITION]),
               rotation[:, :, 0], rotation[:, :, 2], target[:, :, 0], target[:, :, 2],
               x[:, model.TILT], torque_ratio * thrust, thrust, previous_action]
     if memory:
-        blocks += [batch.turned_back(rotation, s['estimate'][:, :3]), s['estimate'][:, 3:]]
+        blocks += [batch.transpose_product(rotation, s['estimate'][:, :3]), s['estimate'][:, 3:]]
     return torch.cat(blocks, -1)

@@ -1,4 +1,4 @@
-"""Every number of the training; params/train.yaml holds the shipped ones with their sources."""
+"""Parameters of the training; params/train.yaml has the shipped values and their sources."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 
 
 def _check_ranges(parameters, *names):
-    """Refuse a range that ends before it begins."""
+    """Check that ranges are in ascending order."""
     for name in names:
         low, high = getattr(parameters, name)
         if low > high:
@@ -25,52 +25,53 @@ def _check_ranges(parameters, *names):
 class EpisodeParameters:
     """Time, targets and the end of an episode."""
 
-    period: float = parameter(0.01, doc='between two actions, as the policy file promises',
+    period: float = parameter(0.01, doc='time between two actions, as in the policy file',
                               unit='s', low=0.01, high=0.01)
     substeps: int = parameter(4, doc='integration steps in a period', low=1, high=100)
     duration: float = parameter(16.0, doc='longest episode', unit='s', low=1, high=1000)
     target_time: np.ndarray = parameter(
-        [3.0, 8.0], doc='range of the time for which a target stands', unit='s', shape=(2,),
+        [3.0, 8.0], doc='range of the duration of a target', unit='s', shape=(2,),
         low=0.1, high=1000)
     region: np.ndarray = parameter(
         [4.0, 4.0, 3.0], doc='edges of the box of targets', unit='m', shape=(3,), low=0.1, high=50)
-    position_limit: float = parameter(9.0, doc='farther from the target ends the episode',
+    position_limit: float = parameter(9.0, doc='distance from the target that ends the episode',
                                       unit='m', low=1, high=100)
-    velocity_limit: float = parameter(15.0, doc='faster ends it', unit='m/s', low=1, high=100)
-    rate_limit: float = parameter(30.0, doc='turning faster ends it', unit='rad/s', low=1,
-                                  high=200)
-    hold_targets: float = parameter(0.1, doc='share of new targets that are near the present '
-                                             'pose, so that holding is trained', low=0, high=1)
+    velocity_limit: float = parameter(15.0, doc='speed that ends the episode', unit='m/s', low=1,
+                                      high=100)
+    rate_limit: float = parameter(30.0, doc='angular rate that ends the episode', unit='rad/s',
+                                  low=1, high=200)
+    hold_targets: float = parameter(0.1, doc='fraction of new targets near the present pose, '
+                                             'to train holding', low=0, high=1)
     replay_share: float = parameter(
-        0.3, doc='share of the episodes, at most, that begin with a situation that was missed',
+        0.3, doc='largest fraction of the episodes that begin with an earlier miss',
         low=0, high=0.9)
 
     def __post_init__(self):
-        """Refuse ranges in the wrong order."""
+        """Check the ranges."""
         _check_ranges(self, 'target_time')
 
 
 @dataclass(frozen=True, kw_only=True)
 class StartParameters:
-    """Shares of the robots in the strata of initial states; they are normalised to one."""
+    """Shares of the robots in the strata of initial states, normalised to a sum of one."""
 
     wound_back: float = parameter(1.0, doc='all joints at -pi', low=0, high=100)
     level: float = parameter(1.0, doc='all joints at 0', low=0, high=100)
     wound: float = parameter(1.0, doc='all joints at +pi', low=0, high=100)
     mixed: float = parameter(1.0, doc='each joint at -pi, 0 or +pi', low=0, high=100)
-    hover: float = parameter(2.0, doc='hovering at a random attitude', low=0, high=100)
-    hold: float = parameter(3.0, doc='hovering, with the first target at the own attitude', low=0,
+    hover: float = parameter(2.0, doc='hover at a random attitude', low=0, high=100)
+    hold: float = parameter(3.0, doc='hover, with the first target at the same attitude', low=0,
                             high=100)
-    moving: float = parameter(1.0, doc='hovering, but with velocities', low=0, high=100)
+    moving: float = parameter(1.0, doc='hover with initial velocities', low=0, high=100)
     other_branch: float = parameter(
-        0.3, doc='share of the joints of a hover start that are wound by a turn', low=0, high=1)
-    velocity: float = parameter(1.5, doc='of moving starts, each axis up to', unit='m/s', low=0,
-                                high=10)
-    rate: float = parameter(3.0, doc='of moving starts, each axis up to', unit='rad/s', low=0,
-                            high=20)
+        0.3, doc='fraction of the joints of a hover start on another turn', low=0, high=1)
+    velocity: float = parameter(1.5, doc='largest velocity of moving starts, each axis',
+                                unit='m/s', low=0, high=10)
+    rate: float = parameter(3.0, doc='largest angular rate of moving starts, each axis',
+                            unit='rad/s', low=0, high=20)
 
     def __post_init__(self):
-        """Refuse shares that leave no robot."""
+        """Check that a stratum has a share."""
         if not any((self.wound_back, self.level, self.wound, self.mixed, self.hover, self.hold,
                     self.moving)):
             raise ParameterError('all shares are zero')
@@ -78,7 +79,7 @@ class StartParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class RandomParameters:
-    """What differs between robots: half-widths of uniform ranges; latencies are ranges."""
+    """Differences between robots: half-widths of uniform ranges; latencies are ranges."""
 
     mass_scale: float = parameter(0.05, doc='mass', low=0, high=0.5)
     inertia_scale: float = parameter(0.05, doc='inertia, each axis', low=0, high=0.5)
@@ -94,34 +95,36 @@ class RandomParameters:
     tilt_bias: float = parameter(0.0524, doc='each joint', unit='rad', low=0, high=0.5)
     tilt_noise: float = parameter(0.0349, doc='each joint', unit='rad', low=0, high=0.5)
     noise_power: float = parameter(
-        0.7, doc='noise and biases of a robot are scaled by u^power with u uniform in [0, 1]; 0: '
-                 'every robot has them in full', low=0, high=10)
+        0.7, doc='scale of noise and biases of a robot is u^power, u uniform in [0, 1]; 0: full '
+                 'scale for every robot', low=0, high=10)
     velocity_latency: np.ndarray = parameter([0.0, 0.025], doc='age of velocity and rate',
                                              unit='s', shape=(2,), low=0, high=0.03)
     carried_share: float = parameter(
-        0.75, doc='share of robots whose late velocity and rate come carried on along their '
-        'trend, as the estimator gives them', low=0, high=1)
+        0.75, doc='fraction of robots that extrapolate the delayed velocity and rate along their '
+        'trend, as the estimator does', low=0, high=1)
     tilt_latency: np.ndarray = parameter([0.005, 0.015], doc='age of the joint feedback',
                                          unit='s', shape=(2,), low=0, high=0.02)
-    command_latency: np.ndarray = parameter([0.005, 0.015], doc='until a command acts', unit='s',
+    command_latency: np.ndarray = parameter([0.005, 0.015], doc='delay of commands', unit='s',
                                             shape=(2,), low=0, high=0.02)
     thrust_limit: np.ndarray = parameter(
-        [18.0, 22.0], doc='largest thrust that the battery gives while four rotors hover',
+        [18.0, 22.0], doc='largest thrust that the battery allows while four rotors hover',
         unit='N', shape=(2,), low=0, high=100)
     thrust_sag: float = parameter(
-        0.037, doc='what is less of it for each N^1.5 that the rotors draw beyond hover: the '
-        "pack's resistance", unit='N^-0.5', low=0, high=1)
-    force_share: float = parameter(0.3, doc='share of robots with a constant force', low=0, high=1)
-    force: float = parameter(4.0, doc='its size, each axis up to', unit='N', low=0, high=50)
-    strong_share: float = parameter(0.08, doc='share of robots with a strong constant force',
+        0.037, doc='decrease of this thrust for each N^1.5 of the rotors beyond hover, by the '
+        'resistance of the pack', unit='N^-0.5', low=0, high=1)
+    force_share: float = parameter(0.3, doc='fraction of robots with a constant force', low=0,
+                                   high=1)
+    force: float = parameter(4.0, doc='largest constant force, each axis', unit='N', low=0,
+                             high=50)
+    strong_share: float = parameter(0.08, doc='fraction of robots with a strong constant force',
                                     low=0, high=1)
-    strong_force: float = parameter(35.0, doc='its size, each axis up to', unit='N', low=0,
+    strong_force: float = parameter(35.0, doc='largest strong force, each axis', unit='N', low=0,
                                     high=200)
-    payload_share: float = parameter(0.2, doc='share of robots with a payload', low=0, high=1)
-    payload: float = parameter(1.1, doc='its mass up to', unit='kg', low=0, high=10)
-    torque: float = parameter(0.1, doc='constant torque of those with a force, each axis up to',
+    payload_share: float = parameter(0.2, doc='fraction of robots with a payload', low=0, high=1)
+    payload: float = parameter(1.1, doc='largest mass of a payload', unit='kg', low=0, high=10)
+    torque: float = parameter(0.1, doc='largest constant torque with a constant force, each axis',
                               unit='N m', low=0, high=5)
-    push_share: float = parameter(0.25, doc='share of robots that are pushed now and then', low=0,
+    push_share: float = parameter(0.25, doc='fraction of robots with random pushes', low=0,
                                   high=1)
     push_period: float = parameter(3.0, doc='mean time between pushes', unit='s', low=0.1,
                                    high=1000)
@@ -131,20 +134,22 @@ class RandomParameters:
                                  unit='rad/s', low=0, high=30)
 
     def __post_init__(self):
-        """Refuse ranges in the wrong order."""
+        """Check the ranges."""
         _check_ranges(self, 'velocity_latency', 'tilt_latency', 'command_latency',
                       'thrust_limit')
 
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateParameters:
-    """The disturbance estimate that the policy with memory sees, as the controller makes it."""
+    """Disturbance estimate of a policy with memory, as the controller computes it."""
 
-    force_bandwidth: float = parameter(3.0, doc='of the force', unit='rad/s', low=0.1, high=50)
-    torque_bandwidth: float = parameter(4.0, doc='of the torque', unit='rad/s', low=0.1, high=50)
-    force_bias: float = parameter(0.6, doc='half-width, scaled like the other biases', unit='N',
+    force_bandwidth: float = parameter(3.0, doc='bandwidth of the force', unit='rad/s', low=0.1,
+                                       high=50)
+    torque_bandwidth: float = parameter(4.0, doc='bandwidth of the torque', unit='rad/s', low=0.1,
+                                        high=50)
+    force_bias: float = parameter(0.6, doc='half-width, scaled as the other biases', unit='N',
                                   low=0, high=10)
-    torque_bias: float = parameter(0.15, doc='the same, mostly from biased encoders', unit='N m',
+    torque_bias: float = parameter(0.15, doc='half-width, mostly from biased encoders', unit='N m',
                                    low=0, high=1)
     force_noise: float = parameter(0.1, doc='half-width', unit='N', low=0, high=10)
     torque_noise: float = parameter(0.05, doc='half-width', unit='N m', low=0, high=1)
@@ -152,7 +157,7 @@ class EstimateParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class RewardWeights:
-    """Weights of the terms in :mod:`train.rewards`, by the terms' names."""
+    """Weights of the terms in :mod:`train.rewards`, with the terms' names."""
 
     position: float = parameter(-2.5, doc='published -1')
     pose: float = parameter(2.0, doc='published')
@@ -164,8 +169,7 @@ class RewardWeights:
     thrust_limit: float = parameter(-0.01, doc='published')
     joint_action_rate: float = parameter(-0.05, doc='published -5e-4')
     thrust_action_rate: float = parameter(-2e-3, doc='published -1e-4')
-    thrust_power: float = parameter(-1e-4, doc='published -1e-5; wasted thrust is missing '
-                                                'where a low battery limits it')
+    thrust_power: float = parameter(-1e-4, doc='published -1e-5; saves thrust for a low battery')
     joint_acceleration: float = parameter(-1.5e-5, doc='published')
     z_axis_align: float = parameter(-0.1, doc='published')
     thrust_allocation: float = parameter(-1e-5, doc='published')
@@ -178,26 +182,26 @@ class RewardWeights:
     hover_tilt_rate: float = parameter(-5.0, doc='own: smooth commands at the target')
     hover_thrust_rate: float = parameter(-0.15, doc='own: smooth commands at the target')
     sinking: float = parameter(-26.0, doc='own: below both start and target')
-    termination: float = parameter(-800.0, doc='own: less than the worst flight would cost')
-    scale: float = parameter(0.01, doc='of the sum')
+    termination: float = parameter(-800.0, doc='own: smaller than the cost of the worst flight')
+    scale: float = parameter(0.01, doc='scale of the sum')
 
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkParameters:
-    """The actor and the critic."""
+    """Networks of actor and critic."""
 
     hidden: np.ndarray = parameter([512, 256, 128], doc='published')
     output_scale: float = parameter(4.0, doc='action for each unit of the last layer', low=0.01,
                                     high=100)
-    carry: float = parameter(0.7, doc='part of the previous action that the output is added to',
-                             low=0, high=1)
+    carry: float = parameter(0.7, doc='factor of the previous action in the output', low=0, high=1)
     last_gain: float = parameter(0.01, doc='initial gain of the last layer', low=0, high=10)
     tilt_std: float = parameter(0.6, doc='initial standard deviation of the tilt actions', low=0,
                                 high=10)
-    thrust_std: float = parameter(1.7, doc='of the thrust actions', low=0, high=10)
+    thrust_std: float = parameter(1.7, doc='initial standard deviation of the thrust actions',
+                                  low=0, high=10)
 
     def __post_init__(self):
-        """Refuse layers without neurons, and no layers."""
+        """Check the sizes of the layers."""
         sizes = self.hidden
         if sizes.ndim != 1 or not sizes.size or (sizes < 1).any() or (sizes % 1).any():
             raise ParameterError("key 'hidden': expected the sizes of the hidden layers, found "
@@ -209,19 +213,20 @@ class PpoParameters:
     """Proximal policy optimisation; the published hyperparameters."""
 
     robots: int = parameter(4096, doc='published', low=1, high=1 << 20)
-    steps: int = parameter(48, doc='in an iteration; published', low=1, high=10000)
+    steps: int = parameter(48, doc='steps in an iteration; published', low=1, high=10000)
     epochs: int = parameter(5, doc='published', low=1, high=100)
-    minibatches: int = parameter(4, doc='in an epoch', low=1, high=1000)
+    minibatches: int = parameter(4, doc='minibatches in an epoch', low=1, high=1000)
     clip: float = parameter(0.2, doc='published', low=0, high=1)
     discount: float = parameter(0.99, doc='published', low=0, high=1)
     trace: float = parameter(0.95, doc='GAE factor; published', low=0, high=1)
     gradient_norm: float = parameter(1.0, doc='published', low=0, high=1000)
-    value_weight: float = parameter(1.0, doc='of the value loss', low=0, high=100)
-    learning_rate: float = parameter(1e-3, doc='at the start', low=0, high=1)
-    learning_rate_limits: np.ndarray = parameter([3e-5, 1e-2], doc='of the adaptation', shape=(2,))
+    value_weight: float = parameter(1.0, doc='weight of the value loss', low=0, high=100)
+    learning_rate: float = parameter(1e-3, doc='initial learning rate', low=0, high=1)
+    learning_rate_limits: np.ndarray = parameter([3e-5, 1e-2], doc='limits of the adaptation',
+                                                 shape=(2,))
 
     def __post_init__(self):
-        """Refuse empty minibatches."""
+        """Check the range and the size of the minibatches."""
         _check_ranges(self, 'learning_rate_limits')
         if self.minibatches > self.robots * self.steps:
             raise ParameterError(f"key 'minibatches': {self.minibatches} are more than the "
@@ -230,21 +235,23 @@ class PpoParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class ScheduleParameters:
-    """What changes while training: linear between two parts of the iterations."""
+    """Values that change linearly between two fractions of the iterations."""
 
-    begin: float = parameter(0.25, doc='part of the iterations at which the change begins', low=0,
-                             high=1)
-    end: float = parameter(0.8, doc='part at which it is complete', low=0, high=1)
+    begin: float = parameter(0.25, doc='fraction of the iterations at the begin of the change',
+                             low=0, high=1)
+    end: float = parameter(0.8, doc='fraction of the iterations at the end of the change', low=0,
+                           high=1)
     kl: np.ndarray = parameter([0.01, 0.005], doc='desired divergence of an update', shape=(2,))
     entropy: np.ndarray = parameter([5e-4, 0.0], doc='weight of the entropy', shape=(2,))
     tilt_std_limit: np.ndarray = parameter([0.7, 0.12], doc='largest standard deviation of the '
                                            'tilt actions, in actions', shape=(2,))
-    thrust_std_limit: np.ndarray = parameter([2.5, 0.32], doc='the same, thrust', shape=(2,))
+    thrust_std_limit: np.ndarray = parameter([2.5, 0.32], doc='largest standard deviation of the '
+                                             'thrust actions, in actions', shape=(2,))
     smooth: np.ndarray = parameter([0.1, 1.0], doc='factor on the weights of *_action_rate and '
                                    'hover_*_rate', shape=(2,))
     severity: np.ndarray = parameter([0.0, 1.0], doc='factor on forces, payloads and pushes',
                                      shape=(2,))
-    depth_limit: np.ndarray = parameter([9.0, 9.0], doc='farther below both start and target '
+    depth_limit: np.ndarray = parameter([9.0, 9.0], doc='depth below both start and target that '
                                         'ends the episode of an undisturbed robot', unit='m',
                                         shape=(2,))
     near: np.ndarray = parameter([0.5, 1.0], doc='factor on the weights of near_*', shape=(2,))
@@ -253,11 +260,11 @@ class ScheduleParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainParameters:
-    """One training, completely: dumped beside its checkpoints."""
+    """All parameters of a training; each run saves them beside its checkpoints."""
 
-    seed: int = parameter(0, doc='of everything random', low=0, high=2**31 - 1)
+    seed: int = parameter(0, doc='random seed', low=0, high=2**31 - 1)
     iterations: int = parameter(6800, doc='PPO iterations', low=1, high=10**7)
-    memory: bool = parameter(False, doc='whether the policy sees the estimated disturbance')
+    memory: bool = parameter(False, doc='whether the policy observes the disturbance estimate')
     log_every: int = parameter(50, doc='iterations between two rows of progress', low=1,
                                high=10**6)
     save_every: int = parameter(1000, doc='iterations between two checkpoints', low=1, high=10**7)
@@ -268,7 +275,7 @@ class TrainParameters:
     reward: RewardWeights = group(RewardWeights, 'weights')
     network: NetworkParameters = group(NetworkParameters, 'actor and critic')
     ppo: PpoParameters = group(PpoParameters, 'optimisation')
-    schedule: ScheduleParameters = group(ScheduleParameters, 'what changes while training')
+    schedule: ScheduleParameters = group(ScheduleParameters, 'changes during training')
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> TrainParameters:

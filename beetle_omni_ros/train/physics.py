@@ -1,8 +1,8 @@
 """
-One control period of many robots: delayed commands, substeps of the robot's model.
+One control period of many robots: delayed commands and substeps of the robot's model.
 
-On a GPU with Triton all substeps run in one kernel, elsewhere as plain torch; both are
-written out from the same CasADi function (:mod:`codegen`).
+On a GPU with Triton all substeps run in one kernel, elsewhere in plain torch. Both are generated
+from the same CasADi function (:mod:`codegen`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import torch
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.train import codegen, model
 
-BLOCK = 64    # robots of one program; small blocks fill the GPU at a few thousand robots
+BLOCK = 64    # robots in one program; small blocks use the GPU well with a few thousand robots
 
 _KERNEL = '''\
 """Written by beetle_omni_ros.train.physics; do not edit."""
@@ -51,7 +51,7 @@ def advance(x_in, x_out, newest, previous, oldest, delays, wrench, body, count,
 
 
 def _kernel_source(function) -> str:
-    """The Triton module of a substep function."""
+    """Triton module of a substep function."""
     def lines(depth, items):
         return '\n'.join(' ' * depth + item for item in items)
 
@@ -79,7 +79,7 @@ def _kernel_source(function) -> str:
 
 
 def _load_kernel(source: str):
-    """Import a Triton module; its compiler reads the source from a file."""
+    """Import a Triton module from a file, because its compiler reads the source there."""
     folder = Path(tempfile.mkdtemp(prefix='beetle_omni_'))    # other users cannot write there
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     path = folder / 'kernel.py'
@@ -92,14 +92,14 @@ def _load_kernel(source: str):
 
 class Physics:
     """
-    Advances a batch of robots.
+    Time steps of a batch of robots.
 
     Args:
         robot: nominal parameters and effects.
-        period: of control [s].
+        period: control period [s].
         substeps: integration steps in a period.
-        device: of the tensors.
-        kernel: whether to use the Triton kernel; None: where it can run.
+        device: torch device.
+        kernel: whether to use the Triton kernel; None: if it can run.
 
     """
 

@@ -1,10 +1,10 @@
 """
-PPO of rsl-rl, with the same update and rollout as CUDA graphs.
+rsl-rl's PPO, with update and rollout as CUDA graphs.
 
-rsl-rl's loop launches some ten thousand small kernels an iteration and waits for the device
-after each minibatch; the GPU idles most of the time. Here the arithmetic of rsl-rl's
-``PPO.update`` is written without a wait (the learning rate adapts on the device), compiled
-and captured, and so is the rollout. On other devices the same code runs uncaptured.
+rsl-rl's loop launches about ten thousand small kernels in an iteration and waits for the device
+after each minibatch, so that the GPU is mostly idle. This module implements the arithmetic of
+rsl-rl's ``PPO.update`` without a wait, with the adaptation of the learning rate on the device. The
+update and the rollout are compiled and captured. On other devices the same code runs uncaptured.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rsl_rl.algorithms import PPO
 import torch
 from torch import nn
 
-LEARNING_RATE_STEP = 1.5     # rsl-rl's factor of the adaptation
+LEARNING_RATE_STEP = 1.5     # factor of rsl-rl's adaptation
 ADAM_EPSILON = 1e-8          # published
 
 
@@ -25,20 +25,20 @@ class GraphPpo(PPO):
     rsl-rl's PPO; :meth:`collect` and :meth:`learn_batch` run as captured graphs on a GPU.
 
     Attributes:
-        knobs: (4,) on the device: desired KL, entropy weight, bounds of the standard
+        scheduled: (4,) on the device: desired KL, entropy weight, bounds of the standard
             deviations of tilt and thrust actions.
 
     """
 
     def prepare(self, env, learning_rate_limits, graphs: bool, compiled: bool) -> None:
         """
-        Set up the fast path.
+        Prepare buffers, optimiser and graphs.
 
         Args:
-            env: the environment, stepped in place.
-            learning_rate_limits: lowest and highest.
-            graphs: capture CUDA graphs.
-            compiled: compile the loss.
+            env: environment, stepped in place.
+            learning_rate_limits: lowest and highest learning rate.
+            graphs: whether to capture CUDA graphs.
+            compiled: whether to compile the loss.
 
         """
         self.env, self._graphs = env, graphs
@@ -49,8 +49,8 @@ class GraphPpo(PPO):
             [*self.actor.parameters(), *self.critic.parameters()],
             lr=self.rate if self._capturable else float(self.learning_rate), eps=ADAM_EPSILON,
             capturable=self._capturable, fused=self._capturable or None)
-        self.knobs = torch.tensor([self.desired_kl, self.entropy_coef, 10.0, 10.0],
-                                  device=self.device)
+        self.scheduled = torch.tensor([self.desired_kl, self.entropy_coef, 10.0, 10.0],
+                                      device=self.device)
         self._loss: Callable = torch.compile(self._losses, dynamic=False) if compiled \
             else self._losses
         self._mean = torch.compile(self.actor.mean, dynamic=False) if compiled else self.actor.mean
@@ -69,31 +69,31 @@ class GraphPpo(PPO):
         return torch.exp(self.actor.distribution.log_std_param.detach())
 
     def collect(self) -> None:
-        """One rollout into the storage, advantages and returns included."""
+        """Run one rollout into the storage, with advantages and returns."""
         self._run('collect', self._collect)
 
     def learn_batch(self) -> None:
-        """All epochs over the storage; average losses stand in :attr:`losses`."""
+        """Run all epochs over the storage; average losses are in :attr:`losses`."""
         count = self._order.numel()
         self._order.copy_(torch.randperm(count, device=self.device))
         self._run('learn', self._learn)
 
     def update(self) -> dict[str, float]:
-        """rsl-rl's own update with the knobs applied, which averages over several processes."""
-        self.desired_kl, self.entropy_coef = self.knobs[:2].tolist()
+        """Run rsl-rl's own update with the schedule, which averages over several processes."""
+        self.desired_kl, self.entropy_coef = self.scheduled[:2].tolist()
         losses = super().update()
-        self.actor.distribution.bound(self.knobs[2:].repeat_interleave(4))
+        self.actor.distribution.bound(self.scheduled[2:].repeat_interleave(4))
         low, high = self._limits
         self.set_rate(min(max(self.learning_rate, low), high))
-        with torch.no_grad():    # let go of the last minibatch, whose graph cannot be copied
+        with torch.no_grad():    # release the last minibatch, whose graph cannot be copied
             self.actor.distribution.update(torch.zeros_like(self.std))
-        # its divergence it keeps to itself
+        # rsl-rl does not return the divergence
         self.losses.copy_(torch.tensor([losses['value'], losses['surrogate'], losses['entropy'],
                                         0.0]))
         return losses
 
     def set_rate(self, rate: float) -> None:
-        """Go on with a learning rate."""
+        """Set the learning rate."""
         self.learning_rate = rate
         self.rate.fill_(rate)
         self.optimizer.param_groups[0]['lr'] = self.rate if self._capturable else rate
@@ -107,7 +107,7 @@ class GraphPpo(PPO):
         self._replay[name]()
 
     def _capture(self, name, function):
-        """Run once to warm up (compilers, workspaces), then record."""
+        """Run once to initialise compilers and workspaces, then record."""
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
@@ -131,7 +131,7 @@ class GraphPpo(PPO):
             env.advance(action)
             s.rewards[t, :, 0].copy_(env.reward)
             s.dones[t, :, 0].copy_(env.done)
-            # rsl-rl's bootstrap at a time limit, with the value that is filled in below
+            # for rsl-rl's bootstrap at a time limit; overwritten by the advantages below
             s.advantages[t, :, 0].copy_(env.timeout)
         s.distribution_params[1].copy_(std.expand_as(s.distribution_params[1]))
         s.actions_log_prob.copy_(log_probability(
@@ -141,7 +141,7 @@ class GraphPpo(PPO):
         self._returns(self.critic.value(env.critic))
 
     def _returns(self, last):
-        """Generalised advantage estimation, Schulman et al. 2016."""
+        """Generalised advantage estimation (Schulman et al. 2016)."""
         s = self.storage
         alive = 1.0 - s.dones.float()
         following = torch.cat((s.values[1:], last[None]))
@@ -165,7 +165,7 @@ class GraphPpo(PPO):
             for k in range(self.num_mini_batches):
                 self._step([column[k * size:(k + 1) * size] for column in shuffled], old_std)
         self.losses.div_(self.num_learning_epochs * self.num_mini_batches)
-        limits = self.knobs[2:].repeat_interleave(4)
+        limits = self.scheduled[2:].repeat_interleave(4)
         self.actor.distribution.bound(limits)
 
     def _step(self, batch, old_std):
@@ -189,12 +189,12 @@ class GraphPpo(PPO):
         entropy = (log_std + 0.5 * (1 + log(2 * pi))).sum()
         divergence = (torch.log(std / old_std) + (old_std ** 2 + (old_mean - mean) ** 2)
                       / (2 * std ** 2) - 0.5).sum(-1).mean()
-        loss = surrogate + self.value_loss_coef * value - self.knobs[1] * entropy
+        loss = surrogate + self.value_loss_coef * value - self.scheduled[1] * entropy
         return loss, torch.stack((value, surrogate, entropy, divergence)).detach()
 
     def _adapt(self, divergence):
-        """rsl-rl's learning rate by the divergence of the update."""
-        desired, low, high = self.knobs[0], *self._limits
+        """Adapt the learning rate to the divergence of the update, as rsl-rl does."""
+        desired, low, high = self.scheduled[0], *self._limits
         factor = torch.where(divergence > 2 * desired, 1 / LEARNING_RATE_STEP, torch.where(
             (divergence < desired / 2) & (divergence > 0), LEARNING_RATE_STEP, 1.0))
         self.rate.copy_((self.rate * factor).clamp(low, high))

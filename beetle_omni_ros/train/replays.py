@@ -1,11 +1,11 @@
 """
-Situations that were missed are flown again.
+Replay of missed targets.
 
-Of a trained policy's targets one in a thousand is missed, and so rarely met that nothing more is
-learnt from it. So every robot keeps the whole state in which its present target began; where it
-misses, the state is stored, and some of the next episodes begin with a stored one, until it is
-flown well: prioritised sampling of starts, as in T. Schaul et al., Prioritized experience replay
-(2016), but of situations and not of steps.
+A trained policy misses about one target in a thousand. Such situations are too rare in training to
+improve the policy. The environment therefore keeps, for every robot, the state at the start of its
+present target. If the target is missed, this state is stored. A fraction of the next episodes
+begin with stored states, until these are flown well. This is prioritised sampling of initial
+states, similar to that of steps in T. Schaul et al., Prioritized experience replay (2016).
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import torch
 from beetle_omni_ros.train import batch
 
 MISSED_POSITION, MISSED_ATTITUDE = 0.10, 0.10     # [m], [rad] at the end of a target's time
-MISSED_DEPTH = 0.3                                # [m] below both start and target, on the way
-FULL = 0.01          # stored situations, as a share of the robots, from which all replays happen
-FORGET_FLOWN, FORGET_MISSED = 0.5, 0.1            # chance that a replay's situation is dropped
+MISSED_DEPTH = 0.3                                # [m] below both start and target, in between
+FULL = 0.01          # fraction of the robots with a stored state at which all replays happen
+FORGET_FLOWN, FORGET_MISSED = 0.5, 0.1            # probability of deletion after a replay
 
 
 class Replays:
     """
-    A store with one place for each robot; all of it is in the environment's state.
+    Store with one place for each robot; its content is in the environment's state.
 
     Args:
         example: state of N robots, (N, ...) floating point tensors by name.
-        share: of the new episodes that begin with a stored situation, at most.
-        steps: for which such a target stands.
+        share: largest fraction of the new episodes that begin with a stored state.
+        steps: duration of a replayed target in steps.
 
     """
 
@@ -36,35 +36,36 @@ class Replays:
         self._share, self._steps = share, steps
 
     def state(self, example: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Entries of an empty store: 'begun', 'stored' (N, K), 'filled', 'source' (N,)."""
-        begun = self._packed(example)
-        return {'begun': begun, 'stored': begun.clone(), 'filled': torch.zeros_like(begun[:, 0]),
-                'source': torch.full_like(begun[:, 0], -1.0)}
+        """Entries of an empty store: 'target_start', 'stored' (N, K), 'filled', 'source' (N,)."""
+        packed = self._packed(example)
+        return {'target_start': packed, 'stored': packed.clone(),
+                'filled': torch.zeros_like(packed[:, 0]),
+                'source': torch.full_like(packed[:, 0], -1.0)}
 
     def _packed(self, state):
         return torch.cat([state[name].flatten(1) if state[name].dim() > 1 else
                           state[name][:, None] for name in self._parts], -1)
 
     def unpacked(self, packed: torch.Tensor) -> dict[str, torch.Tensor]:
-        """States (N, ...) by name, of stored ones (N, K)."""
+        """States (N, ...) by name, from stored ones (N, K)."""
         sizes = [shape.numel() for shape in self._parts.values()]
         return {name: part.reshape(-1, *shape)
                 for (name, shape), part in zip(self._parts.items(), packed.split(sizes, -1))}
 
     def step(self, s: dict, new: dict, fresh: dict, ends: dict, draw: batch.Draw) -> tuple:
         """
-        Store what was missed, forget what was flown, and choose who begins with a stored one.
+        Store missed states, delete flown ones, and choose the robots that begin with a stored one.
 
         Args:
-            s: the state before the step, with the entries of :meth:`state`.
-            new: the state after it, new targets given, before robots start anew.
-            fresh: new robots, as drawn.
-            ends: (N,) bool 'due' (the target's time is over), 'done' (the episode is),
-                'missed' (a target, or the robot; where this is known).
-            draw: random numbers, three a robot.
+            s: state before the step, with the entries of :meth:`state`.
+            new: state after the step, with new targets, before the reset of robots.
+            fresh: new robots.
+            ends: (N,) bool 'due' (time of the target is over), 'done' (end of the episode),
+                'missed' (target or robot lost, if this can be judged).
+            draw: source of random numbers, three for each robot.
 
         Returns:
-            the state with robots started anew, complete, and new entries.
+            complete state with robots reset, and the new entries.
 
         """
         over, replayed = ends['due'] | ends['done'], s['source'] >= 0
@@ -74,7 +75,7 @@ class Replays:
         place = s['source'].clamp(min=0).long()
         dropped = torch.zeros_like(s['filled']).scatter_add(0, place, drop.float())
         keep = ends['missed'] & ~replayed
-        stored = torch.where(keep[:, None], s['begun'], s['stored'])
+        stored = torch.where(keep[:, None], s['target_start'], s['stored'])
         filled = torch.where(keep, 1.0, torch.where(dropped > 0, 0.0, s['filled']))
         upto = filled.cumsum(0)
         count = upto[-1]
@@ -85,11 +86,11 @@ class Replays:
         again['age'] = torch.zeros_like(again['age'])
         again['target_left'] = torch.full_like(again['target_left'], self._steps)
         for name in self._parts:
-            begun = torch.where(spread(chosen, again[name]), again[name], fresh[name])
-            new[name] = torch.where(spread(ends['done'], begun), begun, new[name])
+            start = torch.where(spread(chosen, again[name]), again[name], fresh[name])
+            new[name] = torch.where(spread(ends['done'], start), start, new[name])
         source = torch.where(chosen, place.float(), torch.where(over, -1.0, s['source']))
-        new.update(stored=stored, filled=filled, source=source,
-                   begun=torch.where(over[:, None], self._packed(new), s['begun']))
+        new.update(stored=stored, filled=filled, source=source, target_start=torch.where(
+            over[:, None], self._packed(new), s['target_start']))
         return new
 
 

@@ -1,4 +1,4 @@
-"""A run's folder: its parameter file and its checkpoints."""
+"""Folder of a training run: its parameter file and its checkpoints."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ PARAMETER_FILE = 'train.yaml'
 
 def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
     """
-    A parameter file with single values replaced.
+    Read a parameter file and replace single values.
 
     Args:
         file: YAML; None: the shipped one.
         changes: dotted name -> value.
 
     Raises:
-        ParameterError: file or value unusable.
+        ParameterError: unusable file or value.
 
     """
     parameters = TrainParameters.load(file)
@@ -38,7 +38,7 @@ def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
 
 
 def write_parameters(parameters: TrainParameters, path: Path) -> None:
-    """Dump as YAML that ``--config`` reads."""
+    """Write parameters as YAML, for ``--config``."""
     flat = {name: value.tolist() if isinstance(value, np.ndarray) else value
             for name, _, _, value in flatten(parameters)}
     path.write_text(yaml.safe_dump(nest(flat), sort_keys=False))
@@ -46,10 +46,10 @@ def write_parameters(parameters: TrainParameters, path: Path) -> None:
 
 def last_checkpoint(folder: Path) -> Path:
     """
-    The newest checkpoint of a run.
+    Latest checkpoint of a run.
 
     Raises:
-        ParameterError: there is none.
+        ParameterError: no checkpoint.
 
     """
     if folder.is_file():
@@ -62,35 +62,35 @@ def last_checkpoint(folder: Path) -> Path:
 
 
 def checkpoints(folder: Path) -> dict[int, Path]:
-    """Iteration -> checkpoint of that iteration."""
+    """Iteration -> its checkpoint."""
     return {int(match[1]): path for path in folder.glob('model_*.pt')
             if (match := re.fullmatch(r'model_(\d+)\.pt', path.name))}
 
 
 def make_folder(output: Path, checkpoint: Path | None) -> None:
     """
-    Make the folder of a run.
+    Create the folder of a run.
 
     Raises:
-        ParameterError: it cannot be made, or holds another run, which would be overwritten.
+        ParameterError: it cannot be created, or contains another run.
 
     """
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ParameterError(f'--output {output}: cannot be made ({error.strerror})') from None
-    goes_on = checkpoint is not None and output.resolve() == checkpoint.parent.resolve()
-    if checkpoints(output) and not goes_on:
+    resumed = checkpoint is not None and output.resolve() == checkpoint.parent.resolve()
+    if checkpoints(output) and not resumed:
         raise ParameterError(f'--output {output}: holds the checkpoints of another run; '
-                             f'--resume {output} goes on with it')
+                             f'--resume {output} continues it')
 
 
 def parse_changes(texts: list[str], **others) -> dict:
     """
-    ``key=value`` texts of the command line, values as YAML; and other keys that are not None.
+    Parse ``key=value`` texts of the command line; add other keys whose value is not None.
 
     Raises:
-        ParameterError: no '=' or no YAML.
+        ParameterError: no '=', or an invalid YAML value.
 
     """
     changes = {}
@@ -106,7 +106,7 @@ def parse_changes(texts: list[str], **others) -> dict:
 
 
 def _number(value):
-    """Number of a text such as 1e-3, which is none in YAML 1.1."""
+    """Number of a text such as 1e-3, which is not a number in YAML 1.1."""
     try:
         return float(value) if isinstance(value, str) else value
     except ValueError:

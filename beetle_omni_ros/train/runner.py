@@ -1,4 +1,4 @@
-"""The training loop: schedule, progress, TensorBoard, checkpoints, resume, several processes."""
+"""Training loop: schedule, progress, TensorBoard, checkpoints, resume, several processes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SCHEDULE_EVERY = 10      # iterations between two changes of the schedule
 
 
 def rsl_rl_configuration(p: TrainParameters) -> dict:
-    """The parameters as the mapping that rsl-rl's runner takes."""
+    """Configuration of rsl-rl's runner for these parameters."""
     hidden = [int(size) for size in p.network.hidden]
     stds = [float(p.network.tilt_std)] * 4 + [float(p.network.thrust_std)] * 4
     place = 'beetle_omni_ros.train'
@@ -49,33 +49,34 @@ def rsl_rl_configuration(p: TrainParameters) -> dict:
                       'rnd_cfg': None, 'symmetry_cfg': None}}
 
 
-def is_first() -> bool:
-    """Whether this is the one process, or the first of those that torchrun started."""
+def is_rank_zero() -> bool:
+    """Whether this is the only process, or the first that torchrun started."""
     return int(os.environ.get('RANK', '0')) == 0
 
 
 class Runner(OnPolicyRunner):
     """
-    rsl-rl's runner with a loop that keeps the GPU busy.
+    rsl-rl's runner with a training loop that does not wait for the GPU.
 
-    Under torchrun each process flies its own robots on its own GPU, and rsl-rl's update averages
-    gradients and divergence over all of them; the first process reports and writes.
+    Under torchrun each process simulates its own robots on its own GPU, and rsl-rl's update
+    averages gradients and divergence over all processes. Only the process of rank 0 reports and
+    writes.
 
     Args:
-        parameters: of the training; ``ppo.robots`` for each process.
+        parameters: training parameters; ``ppo.robots`` is the number of each process.
         robot: nominal robot.
-        folder: for checkpoints and the TensorBoard log; None: nothing is written.
+        folder: folder of checkpoints and TensorBoard log; None: nothing is written.
         device: torch device.
         graphs: whether to capture CUDA graphs and compile; None: on one GPU.
 
     Attributes:
-        trained_seconds: that the iterations so far took, those before a resume included.
+        trained_seconds: duration of the iterations so far, including those before a resume.
 
     """
 
     def __init__(self, parameters: TrainParameters, robot: RobotParameters,
                  folder: Path | None = None, device: str = 'cpu', graphs: bool | None = None):
-        self.parameters, self.folder = parameters, folder if is_first() else None
+        self.parameters, self.folder = parameters, folder if is_rank_zero() else None
         self._robot_hash = robot.hash()
         torch.manual_seed(parameters.seed)
         env = TiltableQuadrotorEnv(parameters, robot, device,
@@ -83,21 +84,21 @@ class Runner(OnPolicyRunner):
         super().__init__(env, rsl_rl_configuration(parameters),
                          str(self.folder) if self.folder else None, device)
         if self.is_distributed:
-            # equal networks were drawn in all processes, different flights follow
+            # the networks are equal in all processes, the later random numbers are not
             torch.manual_seed(parameters.seed + 1000 * self.gpu_global_rank)
         if graphs is None:
             graphs = torch.device(device).type == 'cuda' and not self.is_distributed
         self.alg.prepare(env, parameters.ppo.learning_rate_limits, graphs, graphs)
         self.trained_seconds = 0.0
 
-    def knobs(self, part: float) -> tuple[list[float], dict[str, float]]:
+    def scheduled(self, part: float) -> tuple[list[float], dict[str, float]]:
         """
-        The schedule after a part of the iterations.
+        Values of the schedule after a fraction of the iterations.
 
         Returns:
-            desired KL, entropy weight, bounds of the standard deviations of tilt and thrust
-            actions, severity of disturbances, depth of the floor; factors on reward weights by
-            term.
+            list of desired KL, entropy weight, bounds of the standard deviations of tilt and
+            thrust actions, severity of disturbances, depth limit; and factors of the reward
+            weights by term.
 
         """
         s = self.parameters.schedule
@@ -112,11 +113,11 @@ class Runner(OnPolicyRunner):
                 at(s.severity), at(s.depth_limit)], factors
 
     def apply_schedule(self, part: float) -> None:
-        """Bring optimiser and environment to the schedule's state at a part of the training."""
-        knobs, factors = self.knobs(part)
-        self.alg.knobs.copy_(torch.tensor(knobs[:4]))
-        self.env.severity.fill_(knobs[4])
-        self.env.depth_limit.fill_(knobs[5])
+        """Set optimiser and environment to the schedule after a fraction of the iterations."""
+        values, factors = self.scheduled(part)
+        self.alg.scheduled.copy_(torch.tensor(values[:4]))
+        self.env.severity.fill_(values[4])
+        self.env.depth_limit.fill_(values[5])
         weights = [factors.get(name, 1.0) for name in rewards.TERMS]
         self.env.weights.copy_(self.env.base_weights * torch.tensor(
             weights, device=self.env.device))
@@ -124,11 +125,11 @@ class Runner(OnPolicyRunner):
     def train(self, progress: Callable[[dict], None] = lambda row: None,
               stop_after: float | None = None) -> None:
         """
-        Run the iterations that are left.
+        Run the remaining iterations.
 
         Args:
             progress: called with a row of numbers every ``log_every`` iterations.
-            stop_after: stop early after so many seconds.
+            stop_after: duration after which training stops early [s].
 
         """
         p, writer = self.parameters, self._writer()
@@ -157,7 +158,7 @@ class Runner(OnPolicyRunner):
                 row = self._row(elapsed, done - first)
                 self._write(writer, row)
                 progress(row)
-                if stop_after is not None and self._agree(elapsed > stop_after):
+                if stop_after is not None and self._rank_zero_decision(elapsed > stop_after):
                     break
         if self.folder:
             self.checkpoint()
@@ -165,7 +166,7 @@ class Runner(OnPolicyRunner):
             writer.close()
 
     def checkpoint(self) -> Path:
-        """Write ``model_ITERATION.pt``, whole or not at all."""
+        """Write ``model_ITERATION.pt`` atomically."""
         path = self.folder / f'model_{self.current_learning_iteration}.pt'
         part = path.with_suffix('.part')
         self.save(str(part), {'seconds': self.trained_seconds, 'robot_hash': self._robot_hash})
@@ -177,7 +178,7 @@ class Runner(OnPolicyRunner):
         Continue from a checkpoint.
 
         Raises:
-            ParameterError: unreadable file, or one of another network or robot.
+            ParameterError: unreadable file, or a checkpoint of another network or robot.
 
         """
         try:
@@ -185,7 +186,7 @@ class Runner(OnPolicyRunner):
             group, ours = (optimizer['param_groups'][0] for optimizer in (
                 saved['optimizer_state_dict'], self.alg.optimizer.state_dict()))
             rate = float(group['lr'])
-            # what depends on the device, not on the training
+            # these keys depend on the device, not on the training
             group.update({key: ours[key] for key in ('capturable', 'fused', 'foreach')})
             self.alg.load(saved, None, True)
             self.current_learning_iteration, infos = int(saved['iter']), saved['infos'] or {}
@@ -202,7 +203,7 @@ class Runner(OnPolicyRunner):
         self.alg.set_rate(rate)
 
     def _configure_multi_gpu(self):
-        """As rsl-rl, which knows GPUs alone; several processes on a CPU are for tests."""
+        """As rsl-rl, but with several processes on a CPU for tests."""
         world = int(os.environ.get('WORLD_SIZE', '1'))
         if world == 1 or torch.device(self.device).type != 'cpu':
             super()._configure_multi_gpu()
@@ -215,12 +216,12 @@ class Runner(OnPolicyRunner):
         torch.distributed.init_process_group('gloo', rank=self.gpu_global_rank, world_size=world)
 
     def close(self) -> None:
-        """Leave the group of processes."""
+        """Leave the process group."""
         if self.is_distributed and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
 
-    def _agree(self, decision: bool) -> bool:
-        """What the first process decides; clocks differ, and who stops alone hangs the others."""
+    def _rank_zero_decision(self, decision: bool) -> bool:
+        """Decision of rank 0 for all, because clocks differ and a lone stop blocks the others."""
         if not self.is_distributed:
             return decision
         flag = torch.tensor(float(decision), device=self.env.device)

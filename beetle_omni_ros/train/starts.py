@@ -1,4 +1,4 @@
-"""Initial states, targets and what is random about a robot: drawn for a whole batch."""
+"""Random initial states, targets and differences between robots, for a whole batch."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from beetle_omni_ros.train.parameters import TrainParameters
 
 STRATA = ('wound_back', 'level', 'wound', 'mixed', 'hover', 'hold', 'moving')
 NEAR_POSITION, NEAR_ANGLE = 0.3, 0.6   # [m], [rad] of a target near the present pose
-MEMORY = 2      # periods for which the environment remembers commands and tilts
-PAYLOAD_DEPTH = 0.08                   # [m] below base_link, as the simulated plant hangs it
+HISTORY = 2     # stored periods of commands and tilts
+PAYLOAD_DEPTH = 0.08                   # [m] below base_link, as in the simulated plant
 
 
 def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[float]]:
@@ -23,11 +23,11 @@ def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[
     Ranges of the delays of tilt and thrust commands, of the velocity and of the tilts [s].
 
     Raises:
-        ParameterError: the robot file's delays make one longer than the environment remembers.
+        ParameterError: a delay with the robot file's effects exceeds the stored history.
 
     """
     r, (tilt, thrust) = parameters.random, robot.command_delays
-    made, most = [], MEMORY * parameters.episode.period
+    made, most = [], HISTORY * parameters.episode.period
     for name, span, more in (('tilt commands', r.command_latency, tilt),
                              ('thrust commands', r.command_latency, thrust),
                              ('velocity', r.velocity_latency, 0.0),
@@ -35,19 +35,19 @@ def latencies(parameters: TrainParameters, robot: RobotParameters) -> list[list[
         made.append([max(float(t) + more, 0.0) for t in span])
         if more and made[-1][1] > most + 1e-9:
             raise ParameterError(f'effects: {name} are up to {1e3 * made[-1][1]:g} ms late, '
-                                 f'training remembers {1e3 * most:g} ms')
+                                 f'the training environment stores {1e3 * most:g} ms')
     return made
 
 
 class Starts:
     """
-    Draws new robots; a robot's stratum of initial states follows from its index.
+    Random initial states of robots; the stratum of a robot follows from its index.
 
     Args:
-        parameters: of the training.
-        robot: nominal.
+        parameters: training parameters.
+        robot: nominal robot.
         count: N robots.
-        device: of the tensors.
+        device: torch device.
 
     Attributes:
         severity: () factor on forces and payloads of new robots, set by the schedule.
@@ -64,7 +64,7 @@ class Starts:
 
         shares = np.array([getattr(parameters.start, name) for name in STRATA])
         edges = np.cumsum(shares) / shares.sum()
-        # interleaved, so that any part of the batch holds all strata
+        # interleaved, so that any part of the batch contains all strata
         place = (np.arange(count) * 0.6180339887498949 + 0.5) % 1.0
         stratum = np.searchsorted(edges, place, side='right').clip(0, len(STRATA) - 1)
         self._is = {name: torch.tensor(stratum == k, device=device)[:, None]
@@ -76,7 +76,7 @@ class Starts:
         self._region = tensor(parameters.episode.region)
         self.severity = torch.ones((), device=device)
         self._limit = float(robot.joints.position_limit)
-        # plain numbers: a compiler would take numpy's for tensors of the host
+        # plain floats, because a compiler takes numpy scalars for tensors of the host
         self._target_time = [float(t) / parameters.episode.period
                              for t in parameters.episode.target_time]
         r = parameters.random
@@ -84,7 +84,7 @@ class Starts:
         self._thrust_limit = [float(t) for t in r.thrust_limit]
 
     def draw(self, d: batch.Draw) -> dict[str, torch.Tensor]:
-        """States of N new robots, every entry of the environment's state."""
+        """States of N new robots, with every entry of the environment's state."""
         attitude = d.attitude()
         hovering = self._is['hover'] | self._is['hold'] | self._is['moving']
         tilt, thrust = self._hover(d, attitude)
@@ -99,7 +99,7 @@ class Starts:
         rate = moving * d.around(start.rate, 3)
         zeros = torch.zeros_like(tilt)
         x = torch.cat((zeros[:, :3], velocity, attitude, rate, tilt, zeros, thrust), -1)
-        body_velocity = batch.turned_back(batch.matrix(attitude), velocity)
+        body_velocity = batch.transpose_product(batch.matrix(attitude), velocity)
         motion = torch.cat((body_velocity, rate), -1)
         command = torch.cat((tilt, thrust), -1)
         state = {'x': x, 'previous': command, 'older': command,
@@ -113,8 +113,9 @@ class Starts:
         return {name: value.contiguous() for name, value in state.items()}
 
     def _hover(self, d, attitude):
-        """Tilts and thrusts that carry the robot at an attitude, some joints a turn further."""
-        pull = batch.turned_back(batch.matrix(attitude), self._weight.expand(self._count, 3))
+        """Tilts and thrusts that hold the robot at an attitude, some joints a turn further."""
+        pull = batch.transpose_product(batch.matrix(attitude),
+                                       self._weight.expand(self._count, 3))
         parts = (pull @ self._inverse.T).unflatten(-1, (4, 2))
         tilt = torch.atan2(parts[:, :, 1], parts[:, :, 0])
         turned = tilt - 2 * torch.pi * torch.sign(tilt)
@@ -122,7 +123,7 @@ class Starts:
         return torch.where(other, turned, tilt), parts.norm(dim=-1)
 
     def target(self, d: batch.Draw, position: torch.Tensor, attitude: torch.Tensor) -> dict:
-        """New targets for robots at a pose, some of them near it."""
+        """New targets for robots at a pose, a fraction of them near it."""
         e = self._p.episode
         near = d.chance(e.hold_targets)
         offset = d.uniform(3, -1.0, 1.0)
@@ -157,10 +158,10 @@ class Starts:
             d.around(self._p.estimate.torque_bias, 3)), -1)
         delays = torch.cat([d.uniform(1, *span) for span in self._latencies], -1)
         pushed = d.chance(r.push_share)
-        carried = d.chance(r.carried_share).float()
+        extrapolated = d.chance(r.carried_share).float()
         disturbed = (forced | strong | pushed | (load > 0)).float()
         return {'thrust_limit': d.uniform(1, *self._thrust_limit),
                 'body': torch.cat((total, inertia, centre), -1), 'wrench': wrench,
-                'noise': noise, 'bias': bias, 'delays': delays, 'carried': carried,
+                'noise': noise, 'bias': bias, 'delays': delays, 'extrapolated': extrapolated,
                 'pushed': pushed.float(),
                 'disturbed': disturbed, 'estimate': torch.zeros_like(wrench)}

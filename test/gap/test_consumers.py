@@ -182,7 +182,7 @@ def test_the_gap_finder_acts_on_every_effect(name):
     assert gap(name) and effects.treatment('gap', name).acts
 
 
-def test_training_refuses_delays_that_it_cannot_remember():
+def test_training_refuses_delays_beyond_its_history():
     pytest.importorskip('torch')
     from beetle_omni_ros.train.parameters import TrainParameters
     from beetle_omni_ros.train.starts import latencies

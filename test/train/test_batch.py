@@ -33,10 +33,11 @@ def test_matrices_products_and_exponentials_are_scipys():
 def test_turning_back_is_the_transposed_matrix():
     a, b = rotations(50, 3), rotations(50, 4)
     vector = np.random.default_rng(5).normal(size=(50, 3))
-    np.testing.assert_allclose(batch.turned_back(single(a.as_matrix()), single(vector)),
+    np.testing.assert_allclose(batch.transpose_product(single(a.as_matrix()), single(vector)),
                                a.inv().apply(vector), atol=1e-6)
-    np.testing.assert_allclose(batch.turned_back(single(a.as_matrix()), single(b.as_matrix())),
-                               (a.inv() * b).as_matrix(), atol=1e-6)
+    np.testing.assert_allclose(
+        batch.transpose_product(single(a.as_matrix()), single(b.as_matrix())),
+        (a.inv() * b).as_matrix(), atol=1e-6)
 
 
 @pytest.mark.parametrize('angle', [0.0, 1e-4, 1e-3, 0.02, 1.0, np.pi / 2, 3.0, np.pi - 1e-3,

@@ -197,7 +197,7 @@ def test_the_reward_is_the_weighted_sum_of_the_terms():
     assert not env.done.any()
     body = Rotation.from_quat(x[:, 6:10].numpy())
     goal = Rotation.from_quat(before['target_attitude'].numpy())
-    made = rewards.Moment(
+    made = rewards.RewardInputs(
         position_error=(x[:, :3] - before['target_position']).norm(dim=-1),
         attitude_error=torch.tensor((body.inv() * goal).magnitude(), dtype=torch.float32),
         speed=x[:, 3:6].norm(dim=-1), rate=x[:, 10:13].norm(dim=-1), tilt=x[:, 13:17],
@@ -274,12 +274,12 @@ def test_a_late_rate_enters_the_estimate_as_a_torque():
     x[:, model.RATE], s['x'][:, model.RATE] = history[:, 0], history[:, 1]
     s['past_motion'][:, :, 3:] = history[:, 2:]
     s['delays'][:, 2] = torch.tensor([0.0, 0.02])
-    change = env._late_change(s, x)
+    change = env._delay_error(s, x)
     assert not change[0].any()
     steps = history[1, :-1] - history[1, 1:]
     torch.testing.assert_close(change[1], steps[2] - steps[0])
-    s['carried'].fill_(1.0)
-    torch.testing.assert_close(env._late_change(s, x)[1], 3 * steps[2] - 2 * steps[3] - steps[0])
+    s['extrapolated'].fill_(1.0)
+    torch.testing.assert_close(env._delay_error(s, x)[1], 3 * steps[2] - 2 * steps[3] - steps[0])
 
 
 # ---- all of it

@@ -1,4 +1,4 @@
-"""What actor and critic see of known states: on time and late, with and without noise."""
+"""Observations of actor and critic for known states, with and without delay and noise."""
 
 from learning import environment, only, QUIET, quiet, ROBOT, uniform
 import numpy as np
@@ -10,7 +10,7 @@ from beetle_omni_ros.control.base import Reference, State
 from beetle_omni_ros.control.observation import observation
 from beetle_omni_ros.robot import dynamics as model
 from beetle_omni_ros.train import batch
-from beetle_omni_ros.train.observations import carried_on, late, Signals
+from beetle_omni_ros.train.observations import delayed, extrapolated, Signals
 
 SEEN = {'velocity': slice(0, 3), 'rate': slice(3, 6), 'tilt': slice(21, 25)}
 
@@ -84,7 +84,7 @@ def test_a_late_value_lies_on_the_line_between_two_entries():
         low = min(int(back), 2)
         part = back - low
         expected = (1 - part) * history[:, low] + part * history[:, low + 1]
-        torch.testing.assert_close(late(history, torch.full((7, 1), 0.01 * back)), expected,
+        torch.testing.assert_close(delayed(history, torch.full((7, 1), 0.01 * back)), expected,
                                    atol=1e-5, rtol=1e-5)
 
 
@@ -97,7 +97,7 @@ def test_a_delayed_robot_sees_its_past(delay, weights, late_one):
     for _ in range(8):
         env.advance(torch.randn(16, 8, generator=g))
         x = env.state['x']
-        back = batch.turned_back(batch.matrix(x[:, model.QUATERNION]), x[:, model.VELOCITY])
+        back = batch.transpose_product(batch.matrix(x[:, model.QUATERNION]), x[:, model.VELOCITY])
         truth.insert(0, {'velocity': back, 'rate': x[:, model.RATE].clone(),
                          'tilt': x[:, model.TILT].clone()})
     assert not env.done.any()
@@ -110,36 +110,36 @@ def test_a_delayed_robot_sees_its_past(delay, weights, late_one):
 
 
 @pytest.mark.parametrize('delay', [0.0, 0.012, 0.02, 0.025])
-def test_carried_on_a_steady_change_is_not_late_and_a_swing_lags_less(delay):
+def test_extrapolation_removes_the_delay_of_a_ramp_and_reduces_that_of_a_swing(delay):
     t = -0.01 * torch.arange(5)[None, :, None]
     span = torch.full((1, 1), delay)
     ramp = 3.0 - 2.0 * t
-    torch.testing.assert_close(carried_on(ramp, span, span), ramp[:, 0])
-    torch.testing.assert_close(carried_on(ramp, span, 0 * span), late(ramp, span))
+    torch.testing.assert_close(extrapolated(ramp, span, span), ramp[:, 0])
+    torch.testing.assert_close(extrapolated(ramp, span, 0 * span), delayed(ramp, span))
     swings = torch.stack([torch.sin(2 * torch.pi * 2.0 * t + phase) for phase in
                           torch.linspace(0, 6.2, 40)])[:, 0]
     spans = span.expand(40, 1)
-    wrong = (carried_on(swings, spans, spans) - swings[:, 0]).abs().max()
-    assert wrong <= 0.45 * (late(swings, spans) - swings[:, 0]).abs().max() + 1e-6
+    wrong = (extrapolated(swings, spans, spans) - swings[:, 0]).abs().max()
+    assert wrong <= 0.45 * (delayed(swings, spans) - swings[:, 0]).abs().max() + 1e-6
 
 
-def test_a_robot_whose_rate_is_carried_on_sees_it_louder():
+def test_extrapolation_amplifies_the_noise_of_the_rate():
     env = quiet({'random.rate_noise': 0.04, 'random.noise_power': 0.0,
                  'random.velocity_latency': [0.02, 0.02], 'random.carried_share': 0.5},
                 robots=4000)
-    carried = env.state['carried'][:, 0] > 0.5
-    assert 0.45 < carried.float().mean() < 0.55
+    extrapolates = env.state['extrapolated'][:, 0] > 0.5
+    assert 0.45 < extrapolates.float().mean() < 0.55
     spread = {kind: widths(env, env.cfg.random)['rate'][mask].std()
-              for kind, mask in (('held', ~carried), ('carried', carried))}
-    assert spread['carried'] / spread['held'] == pytest.approx(13 ** 0.5, rel=0.05)
+              for kind, mask in (('delayed', ~extrapolates), ('extrapolated', extrapolates))}
+    assert spread['extrapolated'] / spread['delayed'] == pytest.approx(13 ** 0.5, rel=0.05)
 
 
 def test_the_past_of_a_robot_begins_with_its_start():
     env = quiet({**only('moving'), 'random.velocity_latency': [0.02, 0.02],
                  'random.tilt_latency': [0.02, 0.02]})
     fresh = {name: value.clone() for name, value in env.state.items()}
-    now = torch.cat((batch.turned_back(batch.matrix(fresh['x'][:, 6:10]), fresh['x'][:, 3:6]),
-                     fresh['x'][:, 10:13]), -1)
+    now = torch.cat((batch.transpose_product(batch.matrix(fresh['x'][:, 6:10]),
+                                             fresh['x'][:, 3:6]), fresh['x'][:, 10:13]), -1)
     torch.testing.assert_close(env.observation[:, :6], now)
     torch.testing.assert_close(env.observation[:, 21:25], fresh['x'][:, 13:17])
 
@@ -151,7 +151,7 @@ def widths(env, random):
     x = s['x']
     rotation = Rotation.from_quat(x[:, 6:10].numpy())
     wrong = rotation.inv() * Rotation.from_matrix(seen.rotation.double().numpy())
-    back = batch.turned_back(batch.matrix(x[:, 6:10]), x[:, 3:6])
+    back = batch.transpose_product(batch.matrix(x[:, 6:10]), x[:, 3:6])
     return {'position': (seen.position - x[:, :3]).numpy(), 'attitude': wrong.as_rotvec(),
             'velocity': (seen.velocity - back).numpy(), 'rate': (seen.rate - x[:, 10:13]).numpy(),
             'tilt': (seen.tilt - x[:, 13:17]).numpy()}
@@ -192,6 +192,6 @@ def test_the_estimate_is_seen_with_its_noise_and_bias():
     scattered(env)
     seen, _ = env._observe(env.state, draw(env))
     s = env.state
-    force = batch.turned_back(batch.matrix(s['x'][:, 6:10]), s['estimate'][:, :3])
+    force = batch.transpose_product(batch.matrix(s['x'][:, 6:10]), s['estimate'][:, :3])
     assert 0.295 < float((seen[:, 33:36] - force).abs().max()) < 0.3001
     assert 0.195 < float((seen[:, 36:] - s['estimate'][:, 3:]).abs().max()) < 0.2001

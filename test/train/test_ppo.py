@@ -113,7 +113,7 @@ def test_densities_entropy_and_divergence_are_those_of_torch():
     torch.testing.assert_close(parts[3], divergence.detach())
     assert float(parts[3]) > 0.05
     torch.testing.assert_close(loss.detach(), parts[1] + alg.value_loss_coef * parts[0]
-                               - alg.knobs[1] * parts[2])
+                               - alg.scheduled[1] * parts[2])
 
 
 @pytest.mark.parametrize('schedule', ['adaptive', 'fixed'])
@@ -128,14 +128,14 @@ def test_one_update_is_that_of_rsl_rl(schedule, monkeypatch):
             alg.schedule = 'fixed'
             monkeypatch.setattr(type(alg), '_adapt', lambda self, divergence: None)
         alg.collect()
-        alg.knobs[2:] = 100.0       # no bound, which rsl-rl lacks
+        alg.scheduled[2:] = 100.0       # no bound, which rsl-rl lacks
         torch.manual_seed(7)
         if own:
             losses = PPO.update(alg)
             found = [losses['value'], losses['surrogate'], losses['entropy']]
             rate = alg.learning_rate
         else:
-            alg.desired_kl, alg.entropy_coef = alg.knobs[:2].tolist()
+            alg.desired_kl, alg.entropy_coef = alg.scheduled[:2].tolist()
             alg.learn_batch()
             found, rate = alg.losses[:3].tolist(), alg.optimizer.param_groups[0]['lr']
         results.append((found, rate, [p.detach().clone() for p in (
@@ -152,7 +152,7 @@ def test_one_update_is_that_of_rsl_rl(schedule, monkeypatch):
 def test_rsl_rls_update_is_used_with_the_knobs():
     made = randomised(runner(**{'schedule.tilt_std_limit': [0.3, 0.1]}))
     made.alg.collect()
-    made.alg.knobs[:2] = torch.tensor([0.02, 0.003])
+    made.alg.scheduled[:2] = torch.tensor([0.02, 0.003])
     made.alg.update()
     assert (made.alg.desired_kl, made.alg.entropy_coef) == pytest.approx((0.02, 0.003))
     assert (made.alg.std[:4] <= 0.3 + 1e-6).all()
@@ -162,7 +162,7 @@ def test_rsl_rls_update_is_used_with_the_knobs():
 
 def test_the_learning_rate_follows_the_divergence_within_its_limits():
     alg = runner(**{'ppo.learning_rate_limits': [1e-4, 2e-3]}).alg
-    desired = float(alg.knobs[0])
+    desired = float(alg.scheduled[0])
     for divergence, factor in ((3 * desired, 1 / 1.5), (desired, 1.0), (0.3 * desired, 1.5),
                                (0.0, 1.0)):
         alg.set_rate(1e-3)

@@ -51,7 +51,7 @@ def test_the_state_in_which_a_missed_target_began_is_what_is_stored():
 
 def test_the_next_target_begins_where_the_last_one_ended():
     replays, s, first = store()
-    begun = replays.unpacked(s['begun'])
+    begun = replays.unpacked(s['target_start'])
     for row, expected in ((2, states(1)), (3, states(1)), (4, first)):
         torch.testing.assert_close(begun['past'][row], expected['past'][row])
 

@@ -29,7 +29,7 @@ def moment(**changes):
     rows = max(len(value) for value in values.values())
     values = {key: torch.tensor(np.broadcast_to(value, (rows, *value.shape[1:])).copy())
               for key, value in values.items()}
-    return rewards.Moment(**values, tilt_limit=TILT_LIMIT, thrust_limit=THRUST_LIMIT)
+    return rewards.RewardInputs(**values, tilt_limit=TILT_LIMIT, thrust_limit=THRUST_LIMIT)
 
 
 def moments(count, seed):

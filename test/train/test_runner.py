@@ -45,14 +45,14 @@ def test_the_schedule_is_linear_between_its_ends():
     for part, knobs, smooth, near in ((0.0, begin, 0.1, 0.5), (0.25, begin, 0.1, 0.5),
                                       (0.5, middle, 0.55, 0.75), (0.75, end, 1.0, 1.0),
                                       (1.0, end, 1.0, 1.0)):
-        found, factors = made.knobs(part)
+        found, factors = made.scheduled(part)
         assert found == pytest.approx(knobs)
         assert factors == pytest.approx({
             **dict.fromkeys(('joint_action_rate', 'thrust_action_rate', 'hover_tilt_rate',
                              'hover_thrust_rate', 'sinking'), smooth),
             **dict.fromkeys(('near_position', 'near_attitude', 'near_pose'), near)})
         made.apply_schedule(part)
-        np.testing.assert_allclose(made.alg.knobs, knobs[:4], rtol=1e-6)
+        np.testing.assert_allclose(made.alg.scheduled, knobs[:4], rtol=1e-6)
         assert float(made.env.severity) == pytest.approx(knobs[4])
         assert float(made.env.depth_limit) == pytest.approx(knobs[5])
         for name, weight in zip(rewards.TERMS, made.env.weights.tolist()):

@@ -12,7 +12,7 @@ import pytest
 from beetle_omni_ros.control.policy_network import PolicyNetwork
 from beetle_omni_ros.train import command
 from beetle_omni_ros.train.run_folder import read_parameters
-from beetle_omni_ros.train.runner import is_first, Runner
+from beetle_omni_ros.train.runner import is_rank_zero, Runner
 
 HERE = Path(__file__).parent
 
@@ -71,7 +71,7 @@ def test_one_process_of_torchrun_is_an_ordinary_training(monkeypatch):
     for name in ('WORLD_SIZE', 'RANK', 'LOCAL_RANK'):
         monkeypatch.setenv(name, '1' if name == 'WORLD_SIZE' else '0')
     made = Runner(small(), ROBOT)
-    assert not made.is_distributed and is_first()
+    assert not made.is_distributed and is_rank_zero()
 
 
 def test_each_process_takes_the_gpu_of_its_rank(monkeypatch):

@@ -141,7 +141,7 @@ def test_an_interrupted_run_keeps_its_state(tmp_path, capsys, monkeypatch, place
     assert cli.main(['train', *TINY, '--output', str(folder)]) == 130
     told = capsys.readouterr()
     assert told.err.strip() in ('', 'beetle_omni: error: interrupted')
-    assert f'go on with: beetle_omni train --resume {folder}' in told.out
+    assert f'continue with: beetle_omni train --resume {folder}' in told.out
     assert [path.name for path in folder.glob('model_*')] == ['model_1.pt']
     assert not (folder / 'policy.onnx').exists()
     monkeypatch.undo()
