@@ -1,1 +1,1 @@
-"""Topics, their messages and the values in them: said once, for nodes and bags alike."""
+"""Topics, their messages and the values in them, for nodes and bags."""

@@ -1,4 +1,4 @@
-"""The message classes of bags: rosbags' type store for Jazzy, and CDR."""
+"""Message classes and CDR serialisation of bags, by rosbags' type store for Jazzy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class BagKind:
     """See :class:`~beetle_omni_ros.messages.conversions.Kind`."""
 
     def new(self, name: str) -> Any:
-        """Make a message with zeros, by its ROS type."""
+        """Make a message with zeros from its ROS type."""
         return _maker(name)()
 
     def doubles(self, values: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -33,7 +33,7 @@ class BagKind:
         return np.array(values, dtype=np.float32)
 
     def byte(self, value: int) -> int:
-        """Return it."""
+        """Return the value of a field ``byte``."""
         return int(value)
 
 
@@ -42,7 +42,6 @@ BAG = BagKind()
 
 @cache
 def _maker(name: str) -> Callable[[], Any]:
-    """Find what makes a message of a type."""
     fields = [_field(*description) for _, description in TYPESTORE.fielddefs[name][1]]
     kind = TYPESTORE.types[name]
     return lambda: kind(*[field() for field in fields])
@@ -62,26 +61,25 @@ def _field(node, what):
 
 
 def to_bytes(message: Any, name: str) -> memoryview:
-    """CDR of a message of a type."""
+    """Serialise a message of a ROS type to CDR."""
     return TYPESTORE.serialize_cdr(message, name)
 
 
 def from_bytes(data: bytes | memoryview, name: str) -> Any:
     """
-    Message of a type; whatever broken bytes provoke is raised.
+    Deserialise a message of a ROS type from CDR; broken bytes raise any exception.
 
-    Bytes behind the message are left alone: rclpy's serialize_message returns its whole buffer,
-    whose size is an upper bound.
+    Bytes behind the message are ignored: rclpy's serialize_message returns its whole buffer.
     """
     if len(data) < 4 or data[0] or data[1] > 1:
-        raise ValueError('no CDR of this kind')
+        raise ValueError('not plain CDR')
     definition = TYPESTORE.get_msgdef(name)
     read = definition.deserialize_cdr_le if data[1] else definition.deserialize_cdr_be
     return read(memoryview(data)[4:], 0, definition.cls, TYPESTORE)[0]
 
 
 def offered(qos: Qos) -> interfaces.Qos:
-    """Quality of service as metadata.yaml has it."""
+    """Return the quality of service for metadata.yaml."""
     # rclpy's "infinite" durations, as ros2 bag writes them
     forever = interfaces.QosTime(9223372036, 854775807)
     reliability, durability = interfaces.QosReliability, interfaces.QosDurability

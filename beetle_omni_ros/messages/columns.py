@@ -1,9 +1,10 @@
 """
-Many messages of one type at once: their numbers as arrays, as the definitions lay them out in CDR.
+Vectorised reading of many messages of one type from CDR.
 
-Messages whose texts and lengths are the same have the same layout. One of them is walked through
-field by field, and each number is then a column of the bytes of all. The result looks like a
-message, so that ``read_*`` of :mod:`~beetle_omni_ros.messages.conversions` reads it.
+Messages with equal texts and array lengths have the same layout. The layout is found from one of
+them field by field; each number is then a column of the bytes of all. The result has the
+attributes of a message, so that ``read_*`` of :mod:`~beetle_omni_ros.messages.conversions` reads
+it.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ HEADER = 4          # bytes of encapsulation before the payload, from which alig
 SIZES = {'bool': '?', 'byte': 'u1', 'octet': 'u1', 'char': 'u1', 'int8': 'i1', 'uint8': 'u1',
          'int16': 'i2', 'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4', 'int64': 'i8',
          'uint64': 'u8', 'float32': 'f4', 'float64': 'f8'}
-LAYOUTS = 32        # of one length before messages are walked one by one
+LAYOUTS = 32        # layouts of one length, after which messages are read one by one
 
 
 def read_all(topic: Topic, messages: Sequence[bytes | memoryview]) -> tuple[
@@ -34,20 +35,20 @@ def read_all(topic: Topic, messages: Sequence[bytes | memoryview]) -> tuple[
     Read the messages of a topic.
 
     Args:
-        topic: with values whose fields are numbers, (N,) arrays or None.
-        messages: CDR of each.
+        topic: topic whose values have numbers, (N,) arrays or None as fields.
+        messages: CDR of each message.
 
     Returns:
-        (M,) indices of those that could be read, ascending; one value whose fields are arrays
-        with M rows, or None where no message had any; reason -> number of the others.
+        (M,) ascending indices of the readable messages; one value whose fields are arrays with M
+        rows, or None if no message has this field; reason -> number of refused messages.
 
     """
     parts, refused = [], Counter()
     for rows, message in _alike(topic.type, messages, refused):
         try:
-            with np.errstate(all='ignore'):     # of numbers that are none
+            with np.errstate(all='ignore'):     # NaN and infinity in the messages
                 parts.append((rows, topic.read(message)))
-        except Exception as error:      # whatever broken bytes provoke
+        except Exception as error:      # broken bytes raise anything
             refused[str(error) or type(error).__name__] += len(rows)
     if not parts:
         return np.zeros(0, dtype=int), None, refused
@@ -89,29 +90,29 @@ def _alike(name, messages, refused) -> Iterator[tuple[np.ndarray, SimpleNamespac
                     alike = (block[:, fixed] == block[0, fixed]).all(axis=1)
                 walk = _Walk(block[0].tobytes(), block[alike])
                 yield rows[alike], walk.message(name)
-            except Exception as error:      # whatever broken bytes provoke
+            except Exception as error:      # broken bytes raise anything
                 refused[str(error) or type(error).__name__] += int(alike.sum())
             block, rows = block[~alike], rows[~alike]
 
 
 class _Walk:
     """
-    Takes one message apart; its numbers come from all rows of ``block``.
+    Parser of one message; numbers are read from all rows of ``block``.
 
     Attributes:
-        fixed: offsets of the bytes that make the layout: encapsulation, lengths and texts.
+        fixed: offsets of the bytes that define the layout: encapsulation, lengths and texts.
 
     """
 
     def __init__(self, first: bytes, block: np.ndarray | None = None):
         if len(first) < HEADER or first[0] or first[1] not in (0, 1):
-            raise ValueError('no CDR of this kind')
+            raise ValueError('not plain CDR')
         self._order = '<' if first[1] else '>'
         self._first, self._block, self._at = first, block, HEADER
         self.fixed = list(range(HEADER))
 
     def message(self, name) -> SimpleNamespace:
-        """Take a message of a type."""
+        """Parse a message of a ROS type."""
         return SimpleNamespace(**{field: self._field(*description)
                                   for field, description in TYPESTORE.fielddefs[name][1]})
 
@@ -126,11 +127,11 @@ class _Walk:
         if element == Nodetype.BASE and inner[0] != 'string':
             return self._numbers(inner[0], count)
         if count > len(self._first):
-            raise ValueError('the message is shorter than it says')
+            raise ValueError('the message is shorter than its array length')
         return [self._field(element, inner) for _ in range(count)]
 
     def _take(self, size, unit):
-        """Offset of ``size`` bytes, aligned to ``unit``."""
+        """Offset of the next ``size`` bytes, aligned to ``unit``."""
         begin = HEADER + -(-(self._at - HEADER) // unit) * unit
         if begin + size > len(self._first):
             raise ValueError('the message is shorter than its type')
@@ -149,7 +150,7 @@ class _Walk:
         return self._first[begin:begin + max(0, size - 1)].decode()
 
     def _numbers(self, kind, count):
-        """(count, N) numbers, float where they are."""
+        """(count, N) numbers."""
         dtype = np.dtype(self._order + SIZES[kind])
         if not count:
             return np.zeros((0, 1))

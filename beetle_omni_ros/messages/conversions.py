@@ -1,11 +1,11 @@
 """
-Messages to values and back, by attribute access alone.
+Conversion between messages and values, by attribute access only.
 
-``read_*`` takes a message as it stands: of rclpy, of a bag, or of
-:mod:`~beetle_omni_ros.messages.columns`, whose numbers are arrays over many messages. Vectors then
-have the shape (N, 3). ``take_*`` reads one message for a flight and refuses what cannot be flown
-with. ``write_*`` fills a message of a :class:`Kind`. Every scalar passes through ``float``: a
-wrong Python type in a float field would be serialised as garbage without a word.
+``read_*`` converts a message of rclpy, of a bag, or of :mod:`~beetle_omni_ros.messages.columns`.
+The numbers of the latter are arrays over N messages, so vectors have the shape (N, 3).
+``take_*`` converts one message for use in flight and raises MessageError for unusable values.
+``write_*`` makes a message of a :class:`Kind`. Scalars are converted to ``float``, because ROS
+serialises another Python type in a float field as garbage without an error.
 """
 
 from __future__ import annotations
@@ -41,58 +41,57 @@ JOINTS, ROTORS = list(JOINT_NAMES), list(ROTOR_NAMES)
 COMMAND_NAMES = [*JOINTS, *ROTORS]
 HEALTH_NAMES = [*COMMAND_NAMES, *(f'{name}_zero' for name in JOINT_NAMES)]
 NO_VALUE = [float('nan')] * 4
-# A quaternion further from unit length than this is a broken message, not a rounded one.
-UNIT_TOLERANCE = 0.01
-POINTS = 10_000     # of a trajectory: 100 s at 100 Hz; more would hold up the node that reads it
+UNIT_TOLERANCE = 0.01   # of a quaternion's length; above the rounding of any publisher
+POINTS = 10_000     # of a trajectory: 100 s at 100 Hz; more would block the reading node
 
 
 class Kind(Protocol):
     """A family of message classes."""
 
     def new(self, name: str) -> Any:
-        """Make a message with default values, by its ROS type."""
+        """Make a message with default values from its ROS type."""
 
     def doubles(self, values: Sequence[float] | np.ndarray) -> Any:
-        """Numbers as a field ``float64[]`` takes them."""
+        """Return the value of a field ``float64[]``."""
 
     def singles(self, values: Sequence[float]) -> Any:
-        """Numbers as a field ``float32[]`` takes them."""
+        """Return the value of a field ``float32[]``."""
 
     def byte(self, value: int) -> Any:
-        """Return a number as a field ``byte`` takes it."""
+        """Return the value of a field ``byte``."""
 
 
 # --- times, vectors, names ----------------------------------------------------------------------
 
 def nanoseconds(t: float) -> int:
-    """Seconds to integer nanoseconds, whole seconds apart: an epoch time keeps every bit."""
+    """Convert seconds to integer nanoseconds; whole seconds separately, to keep every bit."""
     whole = floor(t)
     return whole * 1_000_000_000 + round((t - whole) * 1e9)
 
 
 def from_nanoseconds(time: Any) -> Any:
-    """Integer nanoseconds, or an array of them, to seconds; the inverse of :func:`nanoseconds`."""
+    """Convert integer nanoseconds, or an array of them, to seconds."""
     whole, rest = divmod(time, 1_000_000_000)
     return whole + rest * 1e-9
 
 
 def seconds(time: Any) -> float:
-    """Time message, or a duration, to seconds."""
+    """Convert a time or duration message to seconds."""
     return time.sec + time.nanosec * 1e-9
 
 
 def set_time(time: Any, t: float) -> None:
-    """Fill a time message; one before 0 becomes 0."""
+    """Fill a time message; a negative time becomes 0."""
     time.sec, time.nanosec = divmod(max(0, nanoseconds(t)), 1_000_000_000)
 
 
 def xyz(v: Any) -> np.ndarray:
-    """Three fields as an array (3,), or (N, 3)."""
+    """Return the three fields as an array (3,) or (N, 3)."""
     return np.array([v.x, v.y, v.z]).T
 
 
 def xyzw(q: Any) -> np.ndarray:
-    """Four fields as an array (4,), or (N, 4)."""
+    """Return the four fields as an array (4,) or (N, 4)."""
     return np.array([q.x, q.y, q.z, q.w]).T
 
 
@@ -107,7 +106,7 @@ def set_xyzw(q: Any, values: Sequence[float] | np.ndarray) -> None:
 
 
 def finite(values: np.ndarray, what: str) -> np.ndarray:
-    """Refuse what is not finite."""
+    """Return the values; MessageError if one is not finite."""
     if not np.isfinite(values).all():
         raise MessageError(f'{what} is not finite')
     return values
@@ -115,7 +114,7 @@ def finite(values: np.ndarray, what: str) -> np.ndarray:
 
 def unit(q: np.ndarray, low: float = 1 - UNIT_TOLERANCE,
          high: float = 1 + UNIT_TOLERANCE) -> np.ndarray:
-    """Normalise a quaternion; refuse one that was not meant to be one."""
+    """Normalise a quaternion; MessageError if its length is outside (low, high)."""
     norm = float(q @ q) ** 0.5
     if not low < norm < high:      # catches NaN as well
         raise MessageError('orientation is not a unit quaternion')
@@ -157,7 +156,7 @@ def _floats(values):
 # --- sensors ------------------------------------------------------------------------------------
 
 def read_imu(message: Any) -> ImuReading:
-    """Specific force and rates."""
+    """Read specific force and angular rates."""
     return ImuReading(seconds(message.header.stamp), xyz(message.linear_acceleration),
                      xyz(message.angular_velocity))
 
@@ -171,7 +170,7 @@ def take_imu(message: Any) -> ImuReading:
 
 
 def write_imu(kind: Kind, value: ImuReading) -> Any:
-    """Without orientation, as REP-145 has it."""
+    """Write specific force and angular rates, without orientation (REP-145)."""
     message = _begin(kind, 'sensor_msgs/msg/Imu', value.stamp, BODY)
     message.orientation.w = 1.0
     message.orientation_covariance[0] = -1.0
@@ -181,7 +180,7 @@ def write_imu(kind: Kind, value: ImuReading) -> Any:
 
 
 def read_pose(message: Any) -> PoseReading:
-    """Pose of base_link in world."""
+    """Read a pose of base_link in world."""
     return PoseReading(seconds(message.header.stamp), xyz(message.pose.position),
                       xyzw(message.pose.orientation))
 
@@ -195,14 +194,14 @@ def take_pose(message: Any) -> PoseReading:
 
 
 def write_pose(kind: Kind, value: PoseReading | PoseTarget) -> Any:
-    """Pose in world, measured or wanted."""
+    """Write a measured pose or a pose target."""
     message = _begin(kind, 'geometry_msgs/msg/PoseStamped', value.stamp, WORLD)
     _set_pose(message.pose, value.position, value.quaternion)
     return message
 
 
 def read_joints(message: Any) -> JointReading:
-    """Read the four tilt joints, in whatever order the message names them."""
+    """Read the four tilt joints, in any order of names."""
     order = _order(message.name, JOINTS)
     return JointReading(
         seconds(message.header.stamp), _values(message.position, order, 'position'),
@@ -211,7 +210,7 @@ def read_joints(message: Any) -> JointReading:
 
 
 def take_joints(message: Any) -> JointReading:
-    """Refuse what is not finite; joints whose rates are not told stand still."""
+    """Read the four tilt joints for flight; missing rates are 0."""
     order = _order(message.name, JOINTS)
     position = _values(message.position, order, 'position')
     velocity = _values(message.velocity, order, 'velocity') if len(message.velocity) \
@@ -221,7 +220,7 @@ def take_joints(message: Any) -> JointReading:
 
 
 def take_known_joints(message: Any) -> JointReading:
-    """Read those tilt joints that the message names; angle and rate of the others are nan."""
+    """Read the tilt joints that the message contains; angle and rate of the others are NaN."""
     places = [k for k, name in enumerate(JOINTS) if name in message.name]
     order = _order(message.name, [JOINTS[k] for k in places])
     position, velocity = np.full((2, 4), np.nan)
@@ -232,7 +231,7 @@ def take_known_joints(message: Any) -> JointReading:
 
 
 def write_joints(kind: Kind, value: JointReading) -> Any:
-    """All four, or those that the value names."""
+    """Write the joints that the value names."""
     message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
     message.name = list(value.names)
     message.position = kind.doubles(value.position)
@@ -244,14 +243,14 @@ def write_joints(kind: Kind, value: JointReading) -> Any:
 
 
 def read_rotors(message: Any) -> RotorReading:
-    """Read the speeds by the ESCs."""
+    """Read the speeds measured by the ESCs."""
     if list(message.name) != ROTORS or len(message.velocity) != len(ROTORS):
         raise MessageError(f'expected velocities of {ROTORS}')
     return RotorReading(seconds(message.header.stamp), np.array(message.velocity, dtype=float).T)
 
 
 def write_rotors(kind: Kind, value: RotorReading) -> Any:
-    """Speeds as velocities of the rotors."""
+    """Write the speeds."""
     message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
     message.name = ROTORS
     message.velocity = kind.doubles(value.speed)
@@ -259,7 +258,7 @@ def write_rotors(kind: Kind, value: RotorReading) -> Any:
 
 
 def read_battery(message: Any) -> BatteryReading:
-    """Voltage and current."""
+    """Read voltage and current."""
     return BatteryReading(seconds(message.header.stamp), message.voltage, message.current)
 
 
@@ -271,7 +270,7 @@ def take_battery(message: Any) -> BatteryReading:
 
 
 def write_battery(kind: Kind, value: BatteryReading) -> Any:
-    """Voltage and current; what nobody measures is NaN."""
+    """Write voltage and current; unmeasured fields are NaN."""
     message = _begin(kind, 'sensor_msgs/msg/BatteryState', value.stamp)
     message.voltage, message.current = float(value.voltage), float(value.current)
     message.temperature = message.charge = message.capacity = message.design_capacity \
@@ -286,12 +285,12 @@ def write_battery(kind: Kind, value: BatteryReading) -> Any:
 # --- state and commands -------------------------------------------------------------------------
 
 def read_odom(message: Any) -> Odom:
-    """Pose in world, velocity turned to world."""
+    """Read pose and velocity; the velocity is rotated from base_link to world."""
     return _odom(message, xyz(message.pose.pose.position), xyzw(message.pose.pose.orientation))
 
 
 def take_odom(message: Any) -> Odom:
-    """Refuse what is not finite, and an orientation that is none."""
+    """Read pose and velocity for flight."""
     pose = message.pose.pose
     odom = _odom(message, finite(xyz(pose.position), 'position'), unit(xyzw(pose.orientation)))
     finite(odom.velocity, 'linear velocity')
@@ -308,7 +307,7 @@ def _odom(message, position, quaternion):
 
 
 def write_odom(kind: Kind, value: Odom) -> Any:
-    """Pose in world, twist in base_link."""
+    """Write pose in world, twist in base_link, and covariances."""
     message = _begin(kind, 'nav_msgs/msg/Odometry', value.stamp, WORLD)
     message.child_frame_id = BODY
     _set_pose(message.pose.pose, value.position, value.quaternion)
@@ -326,7 +325,7 @@ def _flat(matrix):
 
 
 def read_command(message: Any) -> Command:
-    """Four tilts and four thrusts."""
+    """Read four tilts and four thrusts."""
     order = _order(message.name, COMMAND_NAMES)
     return Command(seconds(message.header.stamp), _values(message.position, order[:4], 'position'),
                    _values(message.effort, order[4:], 'effort'))
@@ -341,7 +340,7 @@ def take_command(message: Any) -> Command:
 
 
 def write_command(kind: Kind, value: Command) -> Any:
-    """Tilts as positions and thrusts as efforts, NaN where not used."""
+    """Write tilts as positions and thrusts as efforts, NaN for unused values."""
     message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
     message.name = COMMAND_NAMES
     message.position = kind.doubles([*_floats(value.tilt), *NO_VALUE])
@@ -350,7 +349,7 @@ def write_command(kind: Kind, value: Command) -> Any:
 
 
 def read_health(message: Any) -> ToldHealth:
-    """Which actuators work."""
+    """Read the health of the actuators, as :func:`write_health` describes it."""
     if len(message.position) != len(HEALTH_NAMES) or len(message.effort) != len(HEALTH_NAMES):
         raise MessageError('expected four joints, four rotors and four zeros')
     stuck, zeros, efforts = message.position[:4], message.position[8:], message.effort[4:8]
@@ -366,11 +365,12 @@ def read_health(message: Any) -> ToldHealth:
 
 def write_health(kind: Kind, value: ToldHealth) -> Any:
     """
-    Which actuators work.
+    Write the health of the actuators.
 
-    Positions: angles of stuck joints, NaN of others, then the encoders' zeros, as if they were
-    joints. Efforts: NaN of rotors that obey, 0 of lost ones, else the thrust that one holds. The
-    four last efforts are the thrust that the pack allows each rotor, NaN where it allows all.
+    Positions: angles of stuck joints (NaN: the joint moves), unused values of the rotors, then
+    zeros of the encoders. Efforts: unused values of the joints, then NaN for a working rotor, 0
+    for a lost one, else the thrust at which it is stuck. The last four efforts are the thrust
+    limit of each rotor by the battery, NaN for none.
     """
     health = value.health
     stuck = [np.nan if angle is None else float(angle) for angle in health.stuck]
@@ -385,7 +385,7 @@ def write_health(kind: Kind, value: ToldHealth) -> Any:
 
 
 def read_wrench(message: Any) -> Wrench:
-    """Force in world and torque in base_link, whatever the frame_id."""
+    """Read force in world and torque in base_link; ignores the frame_id."""
     return Wrench(seconds(message.header.stamp), xyz(message.wrench.force),
                   xyz(message.wrench.torque))
 
@@ -399,7 +399,7 @@ def take_wrench(message: Any) -> Wrench:
 
 
 def write_wrench(kind: Kind, value: Wrench) -> Any:
-    """Force in world and torque in base_link."""
+    """Write force in world and torque in base_link."""
     message = _begin(kind, 'geometry_msgs/msg/WrenchStamped', value.stamp, WORLD)
     set_xyz(message.wrench.force, value.force)
     set_xyz(message.wrench.torque, value.torque)
@@ -409,13 +409,13 @@ def write_wrench(kind: Kind, value: Wrench) -> Any:
 # --- targets ------------------------------------------------------------------------------------
 
 def read_pose_target(message: Any) -> PoseTarget:
-    """Pose that was asked for; its quaternion may be far from unit length."""
+    """Read a pose target, with a wide tolerance of the quaternion's length."""
     return PoseTarget(xyz(message.pose.position), unit(xyzw(message.pose.orientation), 0.5, 2.0),
                       seconds(message.header.stamp))
 
 
 def take_pose_target(message: Any) -> PoseTarget:
-    """Refuse what is no pose in world."""
+    """Read a pose target for flight; MessageError for another frame than world."""
     position = finite(xyz(message.pose.position), 'position')
     quaternion = unit(xyzw(message.pose.orientation))
     _check_frame(message)
@@ -429,7 +429,7 @@ def _check_frame(message):
 
 
 def read_trajectory(message: Any) -> TrajectoryTarget:
-    """Read a trajectory; times count from the header's stamp."""
+    """Read a trajectory; the times of the points count from the header's stamp."""
     start, points = seconds(message.header.stamp), message.points
     if not points or any(len(p.transforms) != 1 or len(p.velocities) != 1 for p in points):
         raise MessageError('each trajectory point needs one transform and one velocity')
@@ -442,7 +442,7 @@ def read_trajectory(message: Any) -> TrajectoryTarget:
 
 
 def take_trajectory(message: Any) -> TrajectoryTarget:
-    """Refuse what is no trajectory in world."""
+    """Read a trajectory for flight; MessageError for another frame than world."""
     if not 2 <= len(message.points) <= POINTS:
         raise MessageError(f'a trajectory of {len(message.points)} points: expected 2 to {POINTS}',
                            'too few or too many points')
@@ -459,7 +459,7 @@ def take_trajectory(message: Any) -> TrajectoryTarget:
 
 
 def write_trajectory(kind: Kind, value: TrajectoryTarget) -> Any:
-    """Angular velocities stay in the reference's body frame."""
+    """Write a trajectory; angular velocities are in the body frame of the reference."""
     message = _begin(kind, 'trajectory_msgs/msg/MultiDOFJointTrajectory', value.stamp, WORLD)
     message.joint_names = [BODY]
     message.points = [_point(kind, value, k) for k in range(len(value.times))]
@@ -480,13 +480,13 @@ def _point(kind, path, k):
 
 
 def take_wish(message: Any) -> Wish:
-    """Read the supervisor's target; a message without points takes it back."""
+    """Read the supervisor's target; None for a message without points."""
     return Wish(seconds(message.header.stamp),
                 take_trajectory(message) if message.points else None)
 
 
 def write_wish(kind: Kind, value: Wish) -> Any:
-    """None takes the target back."""
+    """Write the supervisor's target; a message without points for None."""
     return kind.new('trajectory_msgs/msg/MultiDOFJointTrajectory') if value.target is None \
         else write_trajectory(kind, value.target)
 
@@ -494,19 +494,19 @@ def write_wish(kind: Kind, value: Wish) -> Any:
 # --- text ---------------------------------------------------------------------------------------
 
 def read_text(message: Any) -> str:
-    """One line."""
+    """Read a text."""
     return message.data
 
 
 def write_text(kind: Kind, value: str) -> Any:
-    """One line."""
+    """Write a text."""
     message = kind.new('std_msgs/msg/String')
     message.data = value
     return message
 
 
 def read_diagnostics(message: Any) -> list[Diagnostic]:
-    """Every status of the message, each with the message's stamp."""
+    """Read all statuses; each gets the message's stamp."""
     t = seconds(message.header.stamp)
     return [Diagnostic(t, status.name, ord(status.level) if isinstance(status.level, bytes)
                        else int(status.level), status.message,
@@ -515,7 +515,7 @@ def read_diagnostics(message: Any) -> list[Diagnostic]:
 
 
 def write_diagnostics(kind: Kind, value: Sequence[Diagnostic]) -> Any:
-    """Statuses of one moment, that of the first."""
+    """Write statuses into one message with the stamp of the first."""
     message = _begin(kind, 'diagnostic_msgs/msg/DiagnosticArray', value[0].t)
     for entry in value:
         status = kind.new('diagnostic_msgs/msg/DiagnosticStatus')

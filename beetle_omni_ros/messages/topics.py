@@ -1,5 +1,5 @@
 """
-The topics: one table from which nodes, bags, reports and the reference pages take them.
+The table of topics, used by nodes, bags, reports and the reference pages.
 
 A new topic is one entry. Names are relative; a robot may have a namespace.
 """
@@ -31,14 +31,14 @@ class Qos(NamedTuple):
     latched: bool = False
 
 
-# Sensors are best effort: a late sample is worth less than the next one. Commands and the
-# estimate are offered reliably, so that both kinds of subscriber match them. State and
-# targets are latched, so that a node that starts late, or again, knows them at once.
+# Sensors are best effort: a repeated sample would delay the next one. Commands and the estimate
+# are offered reliably, so that both kinds of subscription match. States and targets are latched,
+# so that a node that starts late, or again, receives them at once.
 SENSOR = Qos(5, reliable=False)
 COMMAND = ESTIMATE = Qos(1)
 EVENT = Qos(10)
 LATCHED = Qos(1, latched=True)
-# For a recorder: whatever the publisher offers matches, and bursts fit.
+# For recorders: matches every publisher, with room for bursts.
 LOG = Qos(200, reliable=False)
 LATCHED_LOG = Qos(50, latched=True)
 
@@ -49,20 +49,20 @@ class Topic:
     One topic.
 
     Attributes:
-        name: relative.
+        name: relative name.
         type: ROS message type.
-        qos: what its publisher offers.
-        value: class of the values in it.
-        read: message -> value as it stands; MessageError where the layout is another.
+        qos: quality of service that its publisher offers.
+        value: class of its values.
+        read: message -> value; MessageError for another layout.
         write: (kind of message classes, value) -> message.
-        meaning: for the reference page.
-        take: message -> value that can be flown with; MessageError where it cannot.
-        required: whether a flight without it is worth a warning.
-        in_flight: whether every bag declares it; the others are told by nodes to each other.
+        meaning: description for the reference page.
+        take: message -> value for use in flight; MessageError for unusable values. Default: read.
+        required: whether a bag without it gets a warning.
+        in_flight: whether every bag declares it.
 
     """
 
-    name: str = field(compare=False)    # two controllers' requests are of one kind
+    name: str = field(compare=False)    # command topics of two controllers are equal otherwise
     type: str
     qos: Qos
     value: type
@@ -74,7 +74,6 @@ class Topic:
     in_flight: bool = True
 
     def __post_init__(self):
-        """Fly with what is read, unless there is more to check."""
         if self.take is None:
             object.__setattr__(self, 'take', self.read)
 
@@ -89,9 +88,9 @@ def _text(name, meaning, in_flight=False):
 
 
 def request(controller: str) -> Topic:
-    """What a controller asks for."""
+    """Return the command topic of a controller."""
     return Topic(f'{controller}/command', JOINT_STATE, COMMAND, Command, c.read_command,
-                 c.write_command, 'command that a controller asks for, under its own name',
+                 c.write_command, 'command of a controller, before the supervisor',
                  c.take_command)
 
 
@@ -118,22 +117,22 @@ TABLE = (
           c.write_trajectory,
           'time-parameterised reference; `reference_node` or a user publishes it',
           c.take_trajectory),
-    *map(request, registry.standing_by()),      # topic_of() knows any controller's
+    *map(request, registry.standing_by()),      # topic_of() makes those of other controllers
     Topic('command', JOINT_STATE, COMMAND, Command, c.read_command, c.write_command,
           'the selected and checked command that the actuators execute', c.take_command,
           required=True),
     _text('supervisor/identity',
-          'identity of the supervisor; actuators obey its commands alone'),
+          'identity of the supervisor; actuators execute its commands only'),
     Topic('supervisor/target', TRAJECTORY, LATCHED, Wish, c.take_wish, c.write_wish,
-          'what controllers fly to in place of the target of the operator; nothing where it has '
+          'target that controllers fly to instead of the target of the operator; none if it has '
           'no points', in_flight=False),
     Topic('supervisor/actuators', JOINT_STATE, LATCHED, ToldHealth, c.read_health, c.write_health,
           '`gimbal1..4`, `rotor1..4`, `gimbal1_zero..4_zero`: `position` holds true angles of '
           'stuck joints (NaN: the joint moves) and the zeros of encoders that jumped, reading '
-          'minus true tilt; `effort` is NaN for a rotor that obeys, 0 for a lost one, else the '
-          'thrust that it holds', in_flight=False),
+          'minus true tilt; `effort` is NaN for a rotor that follows its command, 0 for a lost '
+          'one, else the thrust at which it is stuck', in_flight=False),
     _text('reference/state', '`waiting`, `flying 3/15`, `done`, `done: control lost at level 60`, '
-          'or `aborted` when the flight ended before the task'),
+          'or `aborted` if the flight ended before the task'),
     _text('joint_bridge/state', '`ready`, `waiting: WHY` or `lost: WHY`'),
     _text('rotor_bridge/state', '`ready`, `waiting: WHY`, `silent: WHY` or `lost: WHY`'),
     Topic('ground_truth/odom', 'nav_msgs/msg/Odometry', ESTIMATE, Odom, c.read_odom, c.write_odom,
@@ -149,26 +148,26 @@ TABLE = (
 )
 ALL: dict[str, Topic] = {topic.name: topic for topic in TABLE}
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in TABLE if topic.in_flight}
-"""Those that every bag declares, with the requests of the controllers that stand by."""
+"""Topics that every bag declares, with the commands of the standby controllers."""
 
 
 def topics_with(controllers: Iterable[str]) -> dict[str, Topic]:
-    """Name -> topic of a flight with these controllers, by their names."""
+    """Return name -> topic of a flight with these controllers."""
     return {**TOPICS, **{topic.name: topic for topic in map(request, controllers)}}
 
 
 def requester(name: str) -> str:
-    """Controller of a topic '<controller>/command'; '' for any other name."""
+    """Return the controller of a topic '<controller>/command'; '' for any other name."""
     controller, _, rest = name.partition('/')
     return controller if rest == 'command' else ''
 
 
 def topic_of(name: str) -> Topic:
     """
-    Topic of a name without namespace.
+    Return the topic of a name without namespace.
 
     Raises:
-        KeyError: it is none of ours.
+        KeyError: unknown name.
 
     """
     known = ALL.get(name)
@@ -178,24 +177,24 @@ def topic_of(name: str) -> Topic:
 
 
 def is_ambiguous(topic: str) -> bool:
-    """Whether '/name/command' may be a controller's or a robot's, as nobody knows ``name``."""
+    """Whether ``name`` in '/name/command' may be a controller or the namespace of a robot."""
     _, _, name = topic.removesuffix('/command').rpartition('/')
     return topic.endswith('/command') and bool(name) and name not in registry.names()
 
 
 def split_topic(topic: str, namespaces: Container[str] = ()) -> tuple[str, str] | None:
     """
-    Take a bag's topic apart.
+    Split a bag's topic into namespace and name.
 
     Args:
         topic: full name.
-        namespaces: of the robots that are known to be in the bag, as '' or '/robot1'. Without,
-            '/name/command' is a controller's where one of that name is registered, else the
+        namespaces: known namespaces of the robots in the bag, as '' or '/robot1'. Without them,
+            '/name/command' is the topic of a controller if ``name`` is registered, else the
             command of a robot in '/name'.
 
     Returns:
-        (namespace, name): '/robot1/nmpc/command' -> ('/robot1', 'nmpc/command');
-        None for a topic that no flight has. ``diagnostics`` may also be the global one.
+        (namespace, name): '/robot1/nmpc/command' -> ('/robot1', 'nmpc/command'); None for an
+        unknown topic. ``diagnostics`` may also be the global one.
 
     """
     space, _, last = topic.rpartition('/')

@@ -1,4 +1,4 @@
-"""What messages carry, as the pure code takes it. Stamps in seconds, SI units."""
+"""Values in messages, independent of ROS. Stamps in seconds, SI units."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 
 class MessageError(ValueError):
     """
-    A message cannot be used; the text says why.
+    A message is unusable; the text gives the reason.
 
     Attributes:
-        kind: under which it is counted: one of a few, where the text holds numbers or names.
+        kind: category under which it is counted; default: the text. Needed if the text contains
+            numbers or names.
 
     """
 
     def __init__(self, text: str, kind: str = ''):
-        """Count under ``kind``, or under the text itself."""
         super().__init__(text)
         self.kind = kind or text
 
@@ -38,7 +38,7 @@ class Odom:
         quaternion: (4,) body to world, xyzw.
         angular_velocity: (3,) in base_link [rad/s].
         pose_covariance: (6, 6) of position (world) and small rotation (world axes), or None.
-        twist_covariance: (6, 6) of the twist in base_link, or None. Covariances are not read.
+        twist_covariance: (6, 6) of the twist in base_link, or None. Not read from messages.
 
     """
 
@@ -52,7 +52,7 @@ class Odom:
 
     @classmethod
     def of(cls, state: Any, *covariances: np.ndarray, stamp: float | None = None) -> Odom:
-        """Take over the five of an estimate, a state or the truth, at another stamp if given."""
+        """Copy stamp (unless given), pose and velocities of an estimate, state or the truth."""
         return cls(state.stamp if stamp is None else stamp, state.position, state.velocity,
                    state.quaternion, state.angular_velocity, *covariances)
 
@@ -68,7 +68,7 @@ class Wrench:
 
 @dataclass(frozen=True)
 class ToldHealth:
-    """Which actuators work, by the supervisor."""
+    """Health of the actuators, as the supervisor has determined it."""
 
     stamp: float
     health: ActuatorHealth
@@ -76,14 +76,14 @@ class ToldHealth:
 
 @dataclass(frozen=True)
 class Wish:
-    """What the supervisor wants flown in place of the operator's target, or None."""
+    """Target of the supervisor instead of the operator's target; None: no such target."""
 
     stamp: float
     target: TrajectoryTarget | None
 
     @classmethod
     def of(cls, target: TrajectoryTarget | None) -> Wish:
-        """Make one of a target."""
+        """Take the stamp of the target; 0 for None."""
         return cls(target.stamp if target else 0.0, target)
 
 

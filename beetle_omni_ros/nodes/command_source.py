@@ -1,4 +1,4 @@
-"""Tells the supervisor's commands from anybody else's."""
+"""Filter on commands: actuators execute those of the supervisor only."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import wire
 
 TOPIC = 'supervisor/identity'
-TEXT_LIMIT = 40     # characters of somebody else's text in ours
+TEXT_LIMIT = 40     # characters of a foreign frame_id in an error message
 KIND = 'not from the supervisor'
 
 
 def new_identity(name: str) -> str:
-    """Make the identity of one run of a node: its name and 8 hex digits."""
+    """Return an identity for one run of a node: its name and 8 random hex digits."""
     return f'{name}:{secrets.token_hex(4)}'
 
 
@@ -24,12 +24,11 @@ class CommandSource:
     """
     Reads commands for a node that executes them.
 
-    Before a supervisor was heard, each command is taken. From then on only those are whose
-    frame_id is its identity; the latest supervisor counts.
+    Until a supervisor publishes its identity, every command is accepted. After that, only commands
+    whose frame_id is the newest identity are accepted.
     """
 
     def __init__(self, node):
-        """Listen to the identity, which is latched, for ``node``."""
         self._identity = ''
         wire.subscribe(node, TOPIC, self._on_identity)
 
@@ -37,7 +36,7 @@ class CommandSource:
         self._identity = identity
 
     def read(self, message: Any) -> Command:
-        """Read a command; MessageError when it is malformed or somebody else's."""
+        """Read a command; MessageError if it is malformed or not from the supervisor."""
         source = message.header.frame_id
         if self._identity and source != self._identity:
             name = f"'{source[:TEXT_LIMIT]}'" if source else 'no identity'

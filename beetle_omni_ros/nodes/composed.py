@@ -1,7 +1,7 @@
 """
-Any set of nodes in one process: ``python -m beetle_omni_ros.nodes.composed NODE...``.
+Several nodes in one process: ``python -m beetle_omni_ros.nodes.composed NODE...``.
 
-A NODE is an executable, or a controller: a registered name, or ``package.module:Class``.
+NODE is an executable, a registered controller name, or ``package.module:Class`` of a controller.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ COMMAND = 'composed'
 
 
 def main(args=None):
-    """Run the named nodes on one events executor, as one process."""
+    """Run the named nodes on one events executor."""
     argv = list(sys.argv if args is None else args)
     names = runner.own_arguments(argv, COMMAND)
     usage = ('usage: composed NODE... [--discovery RANGE] [--ros-args -p NODE:KEY:=VALUE ...]; '
@@ -51,7 +51,6 @@ def _class(name):
 
 
 def _controller_class(reference):
-    """Class of the node of one controller."""
     base = _class(GENERIC)
     try:
         entry = registry.find(reference)

@@ -1,4 +1,4 @@
-"""A controller as a node: state and target in, its command out; the same for each controller."""
+"""ROS node of any registered controller: state and target in, command out."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.runs.target_checks import out_of_reach, TargetChecks
 
-ODOM_AGE = 0.05         # s, an older estimate is not worth a command
+ODOM_AGE = 0.05         # s, no command answers an older estimate
 JOINT_AGE = 0.1         # s
-OTHER_CLOCK = 3600.0    # s between a target's stamp and simulated time
-# A step is due when the stamps say so, within half of the smallest estimate interval.
-STEP_TOLERANCE = 0.0025
-NAME = 'controller_node'    # of the executable, before it knows its controller
+# s between a target's stamp and simulated time above which the stamp is of another clock
+OTHER_CLOCK = 3600.0
+STEP_TOLERANCE = 0.0025     # s, half of the smallest interval between estimates
+NAME = 'controller_node'    # of the executable, before its controller is known
 
 
 class ControllerNode(FlightNode):
     """
     Steps a controller once a period, triggered by the estimate.
 
-    Before the first target it holds the pose at which it took over; while another is in
-    charge it follows along, so that it can take over without a jump.
+    Before the first target it holds the pose at which it became active. While another controller
+    is active, it still computes commands, so that it can take over without a jump.
     """
 
     real_time = True
@@ -50,13 +50,13 @@ class ControllerNode(FlightNode):
         Build the controller and subscribe its inputs.
 
         Args:
-            controller: its entry, or by what the registry finds it; '' asks the node's parameter
-                ``controller``. Commands go to '<its name>/command'.
+            controller: registry entry, name or ``package.module:Class``; '' reads the node's
+                parameter ``controller``. Commands go to '<name>/command'.
 
         """
         entry = controller if isinstance(controller, ControllerEntry) else \
             registry.find(controller or _asked())
-        is_own = isinstance(controller, str) and controller     # of an executable for it alone
+        is_own = isinstance(controller, str) and controller     # the executable has one controller
         super().__init__(f'{entry.name}_node', node_parameters(entry, not is_own),
                          entry.parameters_file, entry.file_key, completed=entry.completed)
         self._entry = entry
@@ -73,7 +73,7 @@ class ControllerNode(FlightNode):
         self.listen('odom', self._on_odom, max_age=ODOM_AGE)
         self.listen('joint_states', self._on_joints, max_age=JOINT_AGE)
         self.listen('command', self._on_command, read=CommandSource(self).read, stale_after=None)
-        # Latched by those who follow INTERFACES, volatile from a quick tool: both are heard.
+        # Publishers that follow INTERFACES latch targets; `ros2 topic pub` does not.
         for topic in ('target_pose', 'target_trajectory'):
             self.listen(topic, self._on_target, every_offer=True, stale_after=None,
                         published=True, check=self._check_target)
@@ -90,9 +90,9 @@ class ControllerNode(FlightNode):
         self._command = command
 
     def _check_target(self, target, published):
-        # Held against its publication: a latched target stays good for a node that starts
-        # later. Simulated time has nothing to do with publications: there a stamp is another
-        # clock's when it is very far off, once the clock is known.
+        # The age counts at publication: a latched target stays valid for a node that starts
+        # later. Publication times are system time. In simulated time, only a stamp that is very
+        # far off is refused, once the clock is known.
         then = None if math.isnan(published) else published
         if self.simulated:
             now = self.now()
@@ -103,18 +103,18 @@ class ControllerNode(FlightNode):
             raise MessageError(reason, 'cannot be flown')
 
     def _too_far(self, target):
-        """Why a target cannot be flown from here, '' where it can."""
+        """Return why a target is out of reach from the present position, or ''."""
         return '' if self._position is None else out_of_reach(
             target, self._position, reach_of(self._controller), self.now())
 
     def _on_target(self, target, _=math.nan):
         now = self.now()
-        if target.stamp == 0.0:     # as quick tools send it: now
+        if target.stamp == 0.0:     # `ros2 topic pub` sets no stamp: valid from now on
             target = self._from_now(target)
-        elif target.stamp > now:    # from a clock that is ahead: it must not outlast later ones
+        elif target.stamp > now:    # a clock that is ahead must not make it outlast later targets
             target = replace(target, stamp=now)
-        # Latched and volatile copies may overtake each other: the newest stamp counts, save after
-        # the clock was set back.
+        # Latched and volatile copies may overtake each other: the newest stamp counts, except
+        # after the clock was set back.
         if self._target is None or not target.stamp < self._target.stamp <= now:
             self._target = target
 
@@ -139,7 +139,7 @@ class ControllerNode(FlightNode):
         took_over = mode == self._own_mode != self._mode
         self._mode = mode
         if took_over and self._target is not None and (reason := self._too_far(self._target)):
-            # Another controller was on its way there, or the operator asked in vain.
+            # The target was accepted while another controller was active.
             self.health.rejected('target_pose', f'{reason}; the present pose is held',
                                  'cannot be flown')
             self._target = self._hold = None
@@ -161,15 +161,15 @@ class ControllerNode(FlightNode):
         period = self._controller.period
         since = stamp - self._last_step
         if since < 0:
-            return True     # the clock was set back: on with it
+            return True     # the clock was set back
         if self._in_the_way(stamp):
-            # One estimate later, and from then on between the steps of the one that flies,
-            # whose command would otherwise wait. Not twice, where estimates are few.
+            # One estimate later: from then on this node computes between the steps of the active
+            # controller, whose command would otherwise be delayed.
             period *= 1.5
         return since >= period - STEP_TOLERANCE
 
     def _in_the_way(self, stamp):
-        """Whether another controller flies and answers the same estimates."""
+        """Whether the active controller is another one and answers the same estimates."""
         if self._command is None or not self._mode.startswith('flying:') \
                 or self._mode == self._own_mode:
             return False
@@ -185,23 +185,23 @@ class ControllerNode(FlightNode):
 
 @dataclass(frozen=True, kw_only=True)
 class NoParameters:
-    """Of a controller without parameters."""
+    """Parameters of a controller that has none."""
 
 
 def node_parameters(entry: ControllerEntry, chosen: bool) -> type:
     """
-    Parameters of a controller's node: its own, the robot, and the file to start from.
+    Make the parameter class of a controller's node: controller, robot file and controller file.
 
     Args:
-        entry: of the controller.
-        chosen: whether the node was told which controller it runs.
+        entry: registry entry of the controller.
+        chosen: whether the parameter ``controller`` selects the controller.
 
     """
     base = entry.parameter_class or NoParameters
-    more = {'robot_file': ('', 'robot file that the controller believes; empty: the shipped one'),
+    more = {'robot_file': ('', 'robot file of the controller; empty: the shipped one'),
             entry.file_key: ('', f"controller file; empty: {entry.parameters_file or 'none'}")}
     if chosen:
-        more['controller'] = (entry.reference, 'which controller this node runs')
+        more['controller'] = (entry.reference, 'controller that this node runs')
     return make_dataclass(
         f'{entry.name}_parameters',
         [(name, str, parameter(default, doc=doc, read_only=True))
@@ -210,7 +210,7 @@ def node_parameters(entry: ControllerEntry, chosen: bool) -> type:
 
 
 def _asked() -> str:
-    """Value of the parameter ``controller`` of the node that is about to be."""
+    """Read the parameter ``controller`` by a temporary node, before the real one is made."""
     probe = Node(NAME, start_parameter_services=False, enable_rosout=False)
     given, name = probe._parameter_overrides.get('controller'), probe.get_name()
     probe.destroy_node()

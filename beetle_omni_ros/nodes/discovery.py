@@ -1,9 +1,9 @@
 """
-Who can find the nodes: this computer alone, unless somebody asked for more.
+Range of ROS discovery: by default this computer only.
 
-A second robot, or a student's simulation in the same network, would otherwise publish on the same
-topics. The argument ``--discovery SUBNET`` opens it, or ``BEETLE_OMNI_DISCOVERY=SUBNET``, and so
-does every setting of ROS itself.
+With a larger range, a second robot or simulation in the same network would publish on the same
+topics. The argument ``--discovery SUBNET``, the variable ``BEETLE_OMNI_DISCOVERY=SUBNET`` or a
+discovery setting of ROS itself selects another range.
 """
 
 from collections.abc import MutableMapping, Sequence
@@ -17,28 +17,28 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 OWN, ARGUMENT = 'BEETLE_OMNI_DISCOVERY', '--discovery'
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
-# Settings of ROS by which a user has chosen already; what they say holds.
+# Settings of ROS; if the user set one of them, it has precedence over the default.
 CHOSEN = (RANGE, 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS')
 RANGES = ('LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT')
-# Linux keeps its ephemeral ports clear of domains up to 101; 0 is everybody's default.
+# The ports of domains up to 101 are below the ephemeral ports of Linux; 0 is the default domain.
 DOMAINS = range(101, 0, -1)
-# Ports of the RTPS standard: base + gain * domain + offset. All participants of a domain share the
-# first, for discovery; the second is the first participant's own.
+# Ports of the RTPS standard: base + gain * domain + offset. Offset 0: discovery, shared by all
+# participants of a domain; USER_UNICAST: first participant.
 PORT_BASE, DOMAIN_GAIN, USER_UNICAST = 7400, 250, 11
 _turns = count(os.getpid())
 
 
 def confine(environment: MutableMapping[str, str] | None = None, asked: str | None = None) -> None:
     """
-    Confine discovery to this computer, before the first context is made.
+    Set the range of discovery; must run before the first context is made.
 
     Args:
         environment: variables to change; None: those of this process.
-        asked: one of ``RANGES``, for this process and those that it starts; '' or None: as
-            ``BEETLE_OMNI_DISCOVERY`` says.
+        asked: one of ``RANGES``, for this process and its children; '' or None: the value of
+            ``BEETLE_OMNI_DISCOVERY``, else this computer only.
 
     Raises:
-        ParameterError: what was asked for is none of ``RANGES``; one line.
+        ParameterError: not one of ``RANGES``.
 
     """
     environment = os.environ if environment is None else environment
@@ -55,13 +55,13 @@ def confine(environment: MutableMapping[str, str] | None = None, asked: str | No
 
 def take(arguments: Sequence[str]) -> list[str]:
     """
-    Take ``--discovery RANGE`` out of a node's arguments and obey it.
+    Apply ``--discovery RANGE`` of a node's arguments.
 
     Returns:
         The other arguments.
 
     Raises:
-        ParameterError: no range, or an unknown one; one line.
+        ParameterError: missing or unknown range.
 
     """
     rest = []
@@ -80,14 +80,14 @@ def reserved():
     """
     Reserve a free ROS domain while the context lasts.
 
-    Each call begins its search at another number: participants that are on their way out may
-    still tell the next ones in their domain what they know.
+    Each call begins its search at another number, because participants that are shutting down may
+    still send discovery data to new ones in the same domain.
 
     Yields:
-        Its number.
+        Number of the domain.
 
     Raises:
-        OSError: all are taken, or there is no safe place for the locks.
+        OSError: no domain is free, or there is no safe folder for the locks.
 
     """
     first = next(_turns) % len(DOMAINS)
@@ -101,7 +101,7 @@ def reserved():
                 try:
                     yield number
                 finally:
-                    forget(f'{number}.*.lock')      # of nodes that were killed in it
+                    forget(f'{number}.*.lock')      # files of nodes that were killed
                 return
         finally:
             lock.close()
@@ -109,7 +109,7 @@ def reserved():
 
 
 def _quiet(number):
-    """Whether no participant of another program holds a port of the domain."""
+    """Whether the ports of the domain are free."""
     for offset in (0, USER_UNICAST):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:

@@ -1,4 +1,4 @@
-"""`beetle_omni drive`: an operator whose keys, stick or words become targets."""
+"""`beetle_omni drive`: targets from the keyboard, a joystick or lines of text."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from beetle_omni_ros.runs.target_checks import TargetChecks
 
 OK, FAILED = 0, 1
 PERIOD = 0.05           # s between two targets
-SUPERVISOR_TIMEOUT = 10.0   # s for the supervisor and the estimate to be seen
-SETTLE_TIME = 0.5       # s that `wait` takes at least, so that what was asked has begun
-NEAR, ALIGNED = 0.1, np.radians(10)     # [m], [rad] of the robot from its target: it is there
+SUPERVISOR_TIMEOUT = 10.0   # s until the supervisor and the estimate must have appeared
+SETTLE_TIME = 0.5       # s that `wait` takes at least, so that the motion has begun
+NEAR, ALIGNED = 0.1, np.radians(10)     # [m], [rad] within which the robot is at its target
 SOURCES = ('keyboard', 'joystick', 'terminal')
 RESTING = ('disarmed', 'emergency_stop')
 
 
 class Driver(Operator):
     """
-    An operator who publishes target_pose while somebody flies.
+    Operator that publishes target_pose while a controller flies.
 
     Attributes:
-        odom: the newest estimate, or None.
-        steering: of the target; None while nothing flies.
+        odom: newest estimate, or None.
+        steering: motion of the target; None while no controller flies.
 
     """
 
@@ -70,12 +70,12 @@ class Driver(Operator):
 
     @property
     def flies(self) -> bool:
-        """Whether a controller takes targets."""
+        """Whether a controller flies, and so follows targets."""
         return self.state.startswith('flying')
 
     @property
     def is_there(self) -> bool:
-        """Whether the robot is at its goal, or nothing flies and nothing is on its way up."""
+        """Whether the robot is at its goal; if no controller flies, whether it is at rest."""
         if not self.flies:
             return self.state in RESTING
         steering = self.steering
@@ -84,7 +84,7 @@ class Driver(Operator):
             rotations.geodesic_angle(self.odom.quaternion, steering.quaternion) < ALIGNED
 
     def follow(self, seconds: float) -> str:
-        """Move the target on by ``seconds`` and publish it where it moved; '' or a refusal."""
+        """Move the target for ``seconds`` and publish it if it changed; return '' or a refusal."""
         if not self.flies or self.odom is None:
             self.steering = self._sent = None
             return ''
@@ -99,7 +99,7 @@ class Driver(Operator):
         return refused
 
     def obey(self, action: Shift | Go | Order) -> str:
-        """Do what was asked for; what is to be said about it."""
+        """Execute an action; return the text for the user."""
         if isinstance(action, Order):
             return self._order(action)
         if self.steering is None:
@@ -132,7 +132,7 @@ class Driver(Operator):
         return names[(names.index(now) + 1) % len(names)] if now in names else names[0]
 
     def where(self) -> str:
-        """State, pose of the robot and of its target in one line."""
+        """Return state, pose of the robot and of its target in one line."""
         told = [self.state or 'no supervisor']
         for name, at in (('at', self.odom), ('target', self.steering)):
             if at is not None:
@@ -146,12 +146,10 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
               robot: Path | None = None, domain_id: int | None = None,
               discovery: str | None = None, console: Console | None = None) -> int:
     """
-    Drive until the user quits.
-
-    Arguments are those of `beetle_omni drive`; ``source`` is one of SOURCES.
+    Drive until the user quits; arguments as of `beetle_omni drive`.
 
     Returns:
-        Exit status: 0 left by the user, 1 no flight stack there.
+        Exit status: 0 ended by the user, 1 no supervisor or estimate found.
 
     Raises:
         ParameterError: unusable input.
@@ -164,7 +162,7 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
     believed = RobotParameters.load(robot)
     if source == 'keyboard' and not sys.stdin.isatty():
         raise ParameterError('keyboard: standard input is no terminal; expected one, or the '
-                             'source terminal, which reads lines')
+                             "source 'terminal', which reads lines")
     confine(asked=discovery)
     console = console or Console()
     domain = int(os.environ.get('ROS_DOMAIN_ID') or 0) if domain_id is None else domain_id
@@ -204,7 +202,7 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
 
 
 class _Keyboard:
-    """Single keys of a terminal."""
+    """Actions from single keys of a terminal."""
 
     help = keys.HELP
 
@@ -213,7 +211,7 @@ class _Keyboard:
 
     @contextmanager
     def open(self):
-        """Take keys as they come, without echo, and give the terminal back as it was."""
+        """Switch the terminal to single keys without echo, and restore it."""
         before = termios.tcgetattr(sys.stdin)
         try:
             tty.setcbreak(sys.stdin)
@@ -222,7 +220,7 @@ class _Keyboard:
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 
     def actions(self, seconds):
-        """What the keys since the last call ask for."""
+        """Return the actions of the keys since the last call."""
         found = []
         while select.select([sys.stdin], [], [], 0)[0]:
             for key in os.read(sys.stdin.fileno(), 64).decode(errors='replace') or 'q':
@@ -240,7 +238,7 @@ class _Keyboard:
 
 
 class _Joystick:
-    """The topic joy, of the package joy or another driver."""
+    """Actions from the topic joy."""
 
     help = 'joy: sticks move and turn, buttons arm, land, hold, home; Ctrl-C leaves'
     done = False
@@ -254,7 +252,7 @@ class _Joystick:
         yield
 
     def actions(self, seconds):
-        """What sticks and buttons ask for."""
+        """Return the actions of sticks and buttons."""
         driver, p = self._driver, self._p
         if driver.time() - driver.joy_at > p.joystick_timeout:
             return []
@@ -267,7 +265,7 @@ class _Joystick:
 
 
 class _Terminal:
-    """Lines of standard input; at its end the last one is carried out."""
+    """Actions from lines of standard input; at its end the last one is carried out."""
 
     help = f'{words.HELP}, or the name of a pose'
 
@@ -282,7 +280,7 @@ class _Terminal:
         yield
 
     def actions(self, seconds):
-        """What the next lines ask for, up to one that waits."""
+        """Return the actions of the next lines, up to the next `wait`."""
         found = []
         while not self._waits() and not self.done:
             line = self._line()
@@ -317,7 +315,7 @@ class _Terminal:
         return not over
 
     def _line(self):
-        """Next whole line, or None; at the end of the input it waits once more and is done."""
+        """Next complete line, or None; the end of the input acts as `wait` and `quit`."""
         while '\n' not in self._rest and not self._ended \
                 and select.select([sys.stdin], [], [], 0)[0]:
             read = os.read(sys.stdin.fileno(), 4096).decode(errors='replace')

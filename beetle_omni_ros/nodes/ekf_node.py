@@ -1,4 +1,4 @@
-"""The state estimator as a node."""
+"""ROS node of the state estimator."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
 
-SENSOR_AGE = 0.2        # s, older samples come from a stuck driver or another clock
+SENSOR_AGE = 0.2        # s, an older sample is of a stuck driver or another clock
 
 
 @dataclass(frozen=True, kw_only=True)
 class EkfNodeParameters(EkfParameters):
-    """Parameters of ekf_node: the estimator's own and the robot."""
+    """Parameters of ekf_node: the estimator's parameters and the files."""
 
     robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
     ekf_file: str = parameter(
@@ -51,7 +51,7 @@ class EkfNode(FlightNode):
         if status != self._status:
             self.get_logger().info(f'{self._status} -> {status}')
             self._status = status
-        # A lost or empty estimate is no estimate: silence tells every reader, in time.
+        # A lost estimate is not published: the readers detect the missing messages.
         if accepted and status in ('tracking', 'dead_reckoning'):
             self._publish(self._ekf.estimate)
 

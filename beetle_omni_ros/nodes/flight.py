@@ -1,4 +1,4 @@
-"""The course of one flight: start, arm, take off, watch, land."""
+"""The sequence of one flight: start, arm, take off, fly the task, land."""
 
 from __future__ import annotations
 
@@ -13,29 +13,30 @@ from beetle_omni_ros.nodes.plan import BridgeCounts, BRIDGES
 from beetle_omni_ros.runs.tasks import Task
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
-BRIDGES_TIMEOUT = 20.0  # s; their devices are there as soon as the simulator is
+BRIDGES_TIMEOUT = 20.0  # s; the simulator makes their devices at its start
 ARM_TIMEOUT = 10.0      # s
 TAKEOFF_TIMEOUT = 30.0  # s
 TAKEOFF_ATTEMPTS = 3
-SETTLE_TIME = 1.0       # s before arming, in which all processes come to rest
+SETTLE_TIME = 1.0       # s before arming, in which start-up work ends
 LANDING_TIMEOUT = 30.0  # s
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
-LOOK_PERIOD = 0.1       # s between looks at processes and progress
-WATCH_TIME = 2.0        # s of looking whether the simulator keeps real time, before arming
-LOST_TIME = 0.2         # s that it may lose then
+LOOK_PERIOD = 0.1       # s between checks of processes and progress
+WATCH_TIME = 2.0        # s before arming in which the simulator is checked for real time
+LOST_TIME = 0.2         # s that the simulator may lose in this time
 BUSY = 0.9              # part of a core that the composed nodes may need
-HELD_UP = 0.1           # s that the simulator loses where slowness may have let a flight fail:
-                        # the actuators stop after so long without a command
+# s lost by the simulator above which a failure is attributed to the slow computer: the actuators
+# stop after so long without a command.
+HELD_UP = 0.1
 PAUSED = 'supervisor_paused'
 PACING = 'sim_node: pacing'
 
 
 class FlightError(RuntimeError):
-    """The flight did not go as asked; the text is one line for the operator."""
+    """The flight failed; the text is one line for the operator."""
 
 
 class TooSlowError(FlightError):
-    """The computer cannot do the work of this flight in real time."""
+    """The computer is too slow to fly this flight in real time."""
 
 
 class Flight:
@@ -43,16 +44,16 @@ class Flight:
     One flight of a running graph.
 
     Args:
-        graph: not yet started or just so.
-        operator: in the same domain.
-        task: what to fly.
-        bars: where to show how it goes.
-        may_be_slow: try although the simulator does not keep real time.
-        faults: parameter of sim_node from the task's start on.
+        graph: started nodes.
+        operator: operator in the same ROS domain.
+        task: task to fly.
+        bars: display of the progress.
+        may_be_slow: fly even if the simulator does not keep real time.
+        faults: value of sim_node's parameter ``faults`` from the task's start on.
 
     Attributes:
         measured: CPU of the graph and of its bridges [% of one core], latencies [ms], cycles of
-            the bridges; where time was simulated, its ratio to real time, and no latencies.
+            the bridges; with simulated time, its ratio to real time and no latencies.
 
     """
 
@@ -67,11 +68,11 @@ class Flight:
 
     def fly(self) -> None:
         """
-        Get ready, take off and fly the task to its end.
+        Wait for the graph, take off and fly the task to its end.
 
         Raises:
-            TooSlowError: the simulator did not keep real time and must.
-            FlightError: naming what else went wrong.
+            TooSlowError: the simulator does not keep real time and ``may_be_slow`` is not set.
+            FlightError: any other failure.
 
         """
         operator = self._operator
@@ -97,7 +98,7 @@ class Flight:
         self._take_latencies()
 
     def _watch(self, lost):
-        """Let the nodes run for a while and see whether they keep real time."""
+        """Check for a while whether the nodes keep real time."""
         graph, steady = self._graph, time.monotonic()
         cpu = graph.cpu_seconds() - graph.cpu_seconds(bridges=True)
         self._look(WATCH_TIME)
@@ -108,7 +109,7 @@ class Flight:
             raise TooSlowError(f'the nodes use {busy:.0%} of a core before the start')
 
     def _lost(self):
-        """Time that the simulator has left out because it came too late [s]."""
+        """Return the time that the simulator skipped because it was late [s]."""
         return float(self._operator.values(PACING).get('lost_s', 0.0))
 
     def _fly_task(self):
@@ -135,7 +136,7 @@ class Flight:
                 raise FlightError(f"the task hangs at '{operator.progress}'")
 
     def _strike(self):
-        """Let the time of the faults begin with the task."""
+        """Set the faults as the task begins, so that their times count from there."""
         operator = self._operator
         if not operator.wait(lambda: operator.progress.startswith('flying'), TAKEOFF_TIMEOUT):
             raise FlightError(f"the task does not begin: '{operator.progress}'")
@@ -155,7 +156,7 @@ class Flight:
         self.measured.update(self._counts.measured())
 
     def _take_off(self):
-        """Arm and climb; a start that the busy computer spoilt on the ground is tried again."""
+        """Arm and take off; repeat if the supervisor disarms on the ground."""
         operator = self._operator
         for _ in range(TAKEOFF_ATTEMPTS):
             self._say('arming')
@@ -166,7 +167,7 @@ class Flight:
                     raise FlightError(f'supervisor_node refuses to arm: {answer[1]}')
                 self._look()
             operator.states.clear()
-            # A fault that kept it on the ground stands behind the state: disarmed:joint1_jammed.
+            # The state may name a fault: disarmed:joint1_jammed.
             self._await('taking off', lambda: operator.state.startswith('flying') or any(
                 told.partition(':')[0] == 'disarmed' for told in operator.states),
                         TAKEOFF_TIMEOUT)
@@ -175,7 +176,7 @@ class Flight:
         raise FlightError(f'no take-off in {TAKEOFF_ATTEMPTS} attempts; see the warnings below')
 
     def land(self) -> None:
-        """Land, if there is a supervisor that can; wait for the motors to stop."""
+        """Land if the robot flies, and wait for the motors to stop."""
         operator = self._operator
         if operator.state in ('', 'disarmed', 'emergency_stop'):
             return
@@ -199,7 +200,7 @@ class Flight:
                                   f"'{self._operator.state}'" + (waits and f'; {waits}'))
 
     def _look(self, seconds=LOOK_PERIOD):
-        """Take in messages; a dead process ends the flight."""
+        """Process messages; a process that has ended ends the flight."""
         self._operator.spin(seconds)
         dead = {name: how for name, how in self._graph.dead().items()
                 if name not in self._reported}

@@ -1,4 +1,4 @@
-"""`beetle_omni fly`: the whole graph in real time, a bag, and the table from the bag."""
+"""`beetle_omni fly`: fly the ROS graph, record a bag, and print the results from the bag."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
             view: bool = False, allow_targets: bool = False,
             console: Console | None = None) -> int:
     """
-    Fly a task through the ROS graph and print what the bag says.
+    Fly a task through the ROS graph and print the results of the bag.
 
-    Arguments are the options of `beetle_omni fly`; without ``bag`` it is thrown away.
+    Arguments are the options of `beetle_omni fly`; without ``bag`` the bag is deleted.
 
     Returns:
         Exit status: 0 flown to the end, 1 not, 2 unusable input, 130 interrupted.
@@ -109,7 +109,7 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
 
 
 def _attempt(clocks, actuators, wanted, meta, folder, number, task, faults, console) -> int:
-    """Fly by the first clock that the computer keeps; ``meta`` gets it and what was measured."""
+    """Fly by the first clock that the computer is fast enough for; extends ``meta``."""
     bag = Path(wanted.bag)
     for kind in clocks:
         meta |= {'clock': kind, 'actuators': actuators or (
@@ -128,10 +128,10 @@ def _attempt(clocks, actuators, wanted, meta, folder, number, task, faults, cons
 
 def _actuators_for(faults, actuators):
     """
-    Actuators for a flight with these faults; emulated devices have faults of their own.
+    Return the kind of actuators for a flight with these faults.
 
     Raises:
-        ParameterError: a fault that no simulation of the graph can make.
+        ParameterError: a fault that the simulator cannot make with these actuators.
 
     """
     for fault in faults:
@@ -150,7 +150,7 @@ def _actuators_for(faults, actuators):
 @contextmanager
 def viewed(domain_id: int, robot: Path | None, allow_targets: bool, console: Console
            ) -> Iterator[subprocess.Popen]:
-    """Run `beetle_omni view` beside a flight; its lines appear on the console."""
+    """Run `beetle_omni view` during a flight and print its lines on the console."""
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view',
          '--domain-id', str(domain_id),
@@ -172,7 +172,7 @@ def viewed(domain_id: int, robot: Path | None, allow_targets: bool, console: Con
 
 
 def _clocks(clock, actuators):
-    """Clocks to fly by, one after the other where the computer is too slow."""
+    """Clocks to try in turn, until the computer is fast enough."""
     for key, value, known in (('actuators', actuators, (None, *ACTUATORS)),
                               ('clock', clock, CLOCKS)):
         if value not in known:
@@ -184,7 +184,6 @@ def _clocks(clock, actuators):
 
 
 def _make_graph(wanted, meta, folder, number):
-    """The graph for the clock and the actuators of ``meta``."""
     if meta['actuators'] == 'emulated':
         wanted = replace(wanted, actuators='bridges')
     return Graph(plan(wanted).nodes, folder, number, meta['composed'],
@@ -192,7 +191,7 @@ def _make_graph(wanted, meta, folder, number):
 
 
 def _clear(bag, folder, error, console):
-    """Say why a flight begins again, and remove what is left of the first attempt."""
+    """Print why the flight is repeated, and delete bag and logs of the first attempt."""
     _tell(console, f'this computer is too slow for real time: {error}; again in simulated time, '
           'which waits for the nodes, and without serial devices')
     shutil.rmtree(bag, ignore_errors=True)
@@ -201,7 +200,7 @@ def _clear(bag, folder, error, console):
 
 
 def _keep(bag, meta):
-    """Say in the bag of an interrupted flight what was flown, where the recorder left one."""
+    """Write the metadata into the bag of an interrupted flight, if there is one."""
     with undisturbed():
         try:
             if (bag / 'metadata.yaml').exists():
@@ -220,7 +219,6 @@ def _absolute(path):
 
 def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console,
          faults: str, may_be_slow: bool) -> int:
-    """Start, fly, land, stop; report every fault by the node's name."""
     status = runner.OK
     operator = None
     try:
@@ -256,7 +254,6 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
 
 
 def _report(bag, controller, task, meta, json_path, console) -> int:
-    """Print and write the results, all from the bag."""
     if (bag / 'metadata.yaml').exists():
         add_meta(bag, {k: v for k, v in meta.items() if k != 'graph'})
     log = read_bag(bag)

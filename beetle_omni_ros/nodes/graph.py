@@ -1,4 +1,4 @@
-"""The nodes of one flight as processes of this computer: start, watch, measure, stop."""
+"""The nodes of one flight as processes of this computer: start, CPU time, stop."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.plan import BRIDGES, BRIDGES_COMPOSED, COMPOSED
 
 PORT_TIMEOUT = 30.0     # s for the simulator to make its serial ports
-STOP_TIMEOUT = 8.0      # s for a process to stop by itself before it is killed
+STOP_TIMEOUT = 8.0      # s from SIGINT to SIGKILL
 
 
 class Graph:
@@ -26,11 +26,11 @@ class Graph:
 
     Args:
         parameters: node name -> parameters that differ from the shipped ones.
-        folder: for the parameter file and what the processes print; must exist.
+        folder: existing folder for the parameter file and the output of the processes.
         domain: ROS domain.
-        composed: one process for all but the bridges, which share another: they wait for their
-            serial ports; or one for each.
-        simulated: time is simulated, and waits for nodes that are late.
+        composed: one process for the bridges, which block on serial ports, and one for all other
+            nodes; otherwise one process for each node.
+        simulated: simulated time, which waits for nodes that are late.
 
     """
 
@@ -58,14 +58,14 @@ class Graph:
 
     def start(self) -> None:
         """
-        Start every process, the bridges when the ports of a simulator are there.
+        Start every process; the bridges after the simulator has made its serial ports.
 
-        Each ends with this process, however this one ends.
+        Each process ends with this one, even if this one is killed.
         """
         for name in self._commands:
             if name not in (BRIDGES_COMPOSED, *BRIDGES):
                 self.start_process(name)
-        # They would wait for their ports too, but complain.
+        # Bridges also wait for their ports, but log a warning.
         deadline = time.monotonic() + PORT_TIMEOUT
         while not all(map(os.path.exists, self._ports)) and time.monotonic() < deadline \
                 and not self.dead():
@@ -75,40 +75,41 @@ class Graph:
                 self.start_process(name)
 
     def start_process(self, name: str) -> subprocess.Popen:
-        """Start one process, also again after it died."""
+        """Start one process, or start it again."""
         module, *arguments = self._commands[name]
         with open(self.log(name), 'a') as log:
             self.processes[name] = subprocess.Popen(
                 [sys.executable, '-m', f'{__package__}.{module}', *arguments,
                  '--params-file', str(self._file)],
                 env=child_environment(self.domain), stdin=subprocess.DEVNULL, stdout=log,
-                stderr=log, start_new_session=True)     # Ctrl-C: for the one that stops all
+                stderr=log, start_new_session=True)     # Ctrl-C reaches this process only
         return self.processes[name]
 
     def log(self, name: str) -> Path:
-        """File with what the process printed."""
+        """Return the file with the output of a process."""
         return self.folder / f'{name}.log'
 
     def dead(self) -> dict[str, str]:
-        """Name -> how it ended, of each process that runs no more."""
+        """Return name -> exit status or signal of each process that has ended."""
         return {name: _ending(process.returncode, self.log(name))
                 for name, process in self.processes.items() if process.poll() is not None}
 
     def cpu_seconds(self, bridges: bool = False) -> float:
-        """CPU time that the living processes have used, or those of the bridges alone."""
+        """Return the CPU time of the running processes, or of the bridges only [s]."""
         return sum(_cpu_seconds(p.pid) for name, p in self.processes.items() if p.poll() is None
                    and (not bridges or name in (BRIDGES_COMPOSED, *BRIDGES)))
 
     def kill(self, name: str) -> None:
-        """End one process as a crash would."""
+        """Kill one process."""
         self.processes[name].send_signal(signal.SIGKILL)
         self.processes[name].wait()
 
     def stop(self) -> list[str]:
         """
-        Stop everything: bridges first, which switch the actuators off while these are there.
+        Stop all processes.
 
-        The recorder comes last, so that the bag has the end.
+        Bridges stop first, because they switch off the actuators, which the simulator emulates.
+        The recorder stops last, so that the bag contains the end.
 
         Returns:
             Names of the processes that had to be killed.
@@ -120,7 +121,7 @@ class Graph:
         return self._end(first) + self._end(others) + self._end(last)
 
     def _end(self, names):
-        """Interrupt, again each second: a process that still imports may swallow the first."""
+        """Send SIGINT every second: a process that still imports may lose the first one."""
         deadline = time.monotonic() + STOP_TIMEOUT
         left = list(names)
         while left and time.monotonic() < deadline:
@@ -136,7 +137,7 @@ class Graph:
         return left
 
     def warnings(self) -> list[str]:
-        """Lines that the processes logged as warning or error, once each."""
+        """Return the lines that the processes logged as warning or error, without duplicates."""
         lines = {}
         for name in self.processes:
             for line in self.log(name).read_text(errors='replace').splitlines():
@@ -146,7 +147,7 @@ class Graph:
 
 
 def child_environment(domain: int) -> dict[str, str]:
-    """Variables of a process in ROS domain ``domain`` that ends with this one."""
+    """Return the environment of a process in ROS domain ``domain`` that ends with this one."""
     root = str(Path(beetle_omni_ros.__file__).resolve().parents[1])
     environment = dict(
         os.environ, ROS_DOMAIN_ID=str(domain), BEETLE_OMNI_PARENT=str(os.getpid()),
@@ -163,7 +164,7 @@ def _ending(code: int, log: Path) -> str:
 
 
 def _cpu_seconds(pid: int) -> float:
-    """User and system time from /proc; 0 where that does not exist."""
+    """User and system time from /proc; 0 if that does not exist."""
     try:
         fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
     except OSError:

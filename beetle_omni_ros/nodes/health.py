@@ -14,8 +14,8 @@ from beetle_omni_ros.nodes import wire
 
 OK, WARN, ERROR, STALE = range(4)   # of diagnostic_msgs/DiagnosticStatus
 PERIOD = 1.0            # s between two diagnostics
-REPEAT = 1.0            # s between two lines of the log about refusals of one kind
-KINDS = 20              # of refusals that are told apart for each topic
+REPEAT = 1.0            # s between two log lines about refusals of one kind
+KINDS = 20              # kinds of refusals that are counted separately for each topic
 
 
 class Distribution:
@@ -35,14 +35,14 @@ class Distribution:
         self.max = max(self.max, seconds)
 
     def quantile(self, fraction: float) -> float:
-        """Return the duration [s] below which ``fraction`` of all lie, within 1 %."""
+        """Return a quantile [s], accurate to 1 %; NaN if nothing was counted."""
         if not self.count:
             return float('nan')
         k = int(np.searchsorted(np.cumsum(self.counts), fraction * self.count))
         return min(self.LOW * self.RATIO ** (k + 0.5), self.max)
 
     def milliseconds(self, prefix: str = '') -> dict[str, float]:
-        """Median, 99 % and maximum [ms] under their keys in diagnostics."""
+        """Return median, 99th percentile and maximum [ms] under their keys in diagnostics."""
         return {f'{prefix}median_ms': 1e3 * self.quantile(0.5),
                 f'{prefix}p99_ms': 1e3 * self.quantile(0.99), f'{prefix}max_ms': 1e3 * self.max}
 
@@ -64,10 +64,9 @@ class Input:
 
 class Health:
     """
-    Collects what happened and publishes it on ``diagnostics`` once a second.
+    Collects counts and status values and publishes them on ``diagnostics`` once a second.
 
-    A topic that came and then stayed away is an error of the node that reads it; a
-    topic that never came is waited for without complaint.
+    An input that stops is an error; an input that has never come is not.
     """
 
     def __init__(self, node: Node):
@@ -84,11 +83,11 @@ class Health:
         self._last = node.elapsed()
 
     def watch(self, topic: str, stale_after: float | None) -> None:
-        """Report ``topic``; an error when it is silent for ``stale_after`` [s] once it came."""
+        """Report ``topic``; silence of ``stale_after`` [s] after a message is an error."""
         self._inputs[topic] = Input(stale_after)
 
     def received(self, topic: str, age: float) -> None:
-        """Count a good message whose stamp is ``age`` [s] old."""
+        """Count an accepted message whose stamp is ``age`` [s] old."""
         entry = self._inputs[topic]
         entry.received += 1
         entry.age = age
@@ -97,7 +96,7 @@ class Health:
             self._node.get_logger().info('all has come that it waited for')
 
     def waits_for(self) -> list[str]:
-        """Topics that should come and have not yet."""
+        """Return the required topics without a message so far."""
         return [topic for topic, entry in self._inputs.items()
                 if entry.seen is None and entry.stale_after is not None]
 
@@ -105,8 +104,8 @@ class Health:
         """
         Count a refused message under ``kind``, or under its reason.
 
-        The first of a kind is logged, save backlog at the start; where reasons differ within a
-        kind, one a second is.
+        The first message of a kind is logged, except old stamps before the first accepted message.
+        If reasons differ within a kind, at most one a second is logged.
         """
         entry = self._inputs[topic]
         kind, detailed = kind or reason, bool(kind) and kind != reason
@@ -132,7 +131,7 @@ class Health:
         self._compute, self._deadline = Distribution(), deadline
 
     def computed(self, cpu: float, wall: float) -> None:
-        """Count one cycle: its CPU time and the time that passed [s]."""
+        """Count one cycle: CPU time and wall time [s]."""
         self._compute.add(cpu)
         self._misses += cpu > self._deadline
         self._wall_max = max(self._wall_max, wall)
@@ -189,6 +188,6 @@ class Health:
 
 
 def texts(values: dict) -> dict[str, str]:
-    """Values of a status as text, numbers with six digits."""
+    """Return the values of a status as text, floats with six digits."""
     return {key: f'{value:.6g}' if isinstance(value, float) else str(value)
             for key, value in values.items()}

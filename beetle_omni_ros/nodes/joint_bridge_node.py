@@ -1,4 +1,4 @@
-"""The tilt servos as a node: commands to the bus, measured angles from it."""
+"""ROS node of the tilt servos: commands to the bus, measured angles from it."""
 
 from __future__ import annotations
 
@@ -25,30 +25,29 @@ from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import parameter
 
 COMMAND_AGE = 0.1   # [s] older commands are not written
-LOST_AFTER = 0.3    # [s] without obeying; a servo that is brought back at once is not lost
-LOOK_PERIOD = 0.05  # [s] between looks at what the bus's thread has to say
+LOST_AFTER = 0.3    # [s] after which a servo without response or torque is lost
+LOOK_PERIOD = 0.05  # [s] between checks of the bus thread's events
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointBridgeNodeParameters(ServoBusParameters):
-    """Parameters of joint_bridge_node: the bus, the robot, and how far it starts by itself."""
+    """Parameters of joint_bridge_node: the bus's parameters, the files, and autostart."""
 
     robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
     servo_bus_file: str = parameter(
         '', doc='servo file to start from; empty: the shipped params/servo_bus.yaml',
         read_only=True)
     autostart: str = parameter('none', choices=tuple(AUTOSTART), read_only=True,
-                               doc='transition to make without being asked, until it works')
+                               doc='transition at the start, repeated until it succeeds')
 
 
 class JointBridgeNode(LifecycleFlightNode):
-    """Lifecycle node: configure checks the servos, activate gives them torque."""
+    """Lifecycle node: configure checks the servos, activate switches their torque on."""
 
     real_time = True
     refusals = (ServoBusError,)
 
     def __init__(self):
-        """Wait to be configured; the port stays closed."""
         super().__init__('joint_bridge_node', JointBridgeNodeParameters, 'params/servo_bus.yaml',
                          'servo_bus_file', on_change=self._changed,
                          changeable=('confirm_tilts', 'confirmed_tilts'))
@@ -76,13 +75,13 @@ class JointBridgeNode(LifecycleFlightNode):
         self.changed()
 
     def waits_for(self):
-        """The port, or the operator."""
+        """Return the state of the servos."""
         return self._told.replace('waiting:', 'its servos:')
 
     # --- lifecycle ----------------------------------------------------------------------------
 
     def configure(self):
-        """Open the port, check the servos and make their settings ours; then read angles."""
+        """Open the port, check and write the servos' settings, and start to read angles."""
         self._bus = ServoBus(self.parameters, self._travel, self.now)
         self._bus.open()
         self._bus.configure()
@@ -91,24 +90,24 @@ class JointBridgeNode(LifecycleFlightNode):
         self._loop.start()
 
     def activate(self):
-        """Turn the torque on where the servos stand."""
+        """Switch the torque on; the servos hold their present angles."""
         if self._loop.failure:
             raise ServoBusError(f'{self._loop.failure}; clean up and configure again')
         with self._loop.exclusive() as bus:
             bus.enable()
 
     def deactivate(self):
-        """Take the torque off."""
+        """Switch the torque off."""
         if self._bus.enabled:
             self._was_active = 'no torque, deactivated'
         with self._loop.exclusive() as bus:
             confirmed = bus.disable()
         if not confirmed:
-            self.get_logger().error('torque off is not confirmed by all servos; it is taken off '
-                                    'as soon as they can be reached')
+            self.get_logger().error('torque off is not confirmed by all servos; it is switched '
+                                    'off as soon as they respond')
 
     def release(self):
-        """Take the torque off and close the port."""
+        """Switch the torque off and close the port."""
         loop, bus = self._loop, self._bus
         self._loop = self._bus = None
         if bus is None:
@@ -119,12 +118,12 @@ class JointBridgeNode(LifecycleFlightNode):
             loop.stop()
             self._log(loop)
         bus.close()
-        if loop is not None:    # else a refusal has said what there is to say
+        if loop is not None:    # without a loop, the refusal was logged
             for line in bus.take_events():
                 self.get_logger().warning(line)
 
     def close(self):
-        """Leave no torque behind."""
+        """Switch the torque off and publish the state."""
         self.release()
         self.changed()
 
@@ -170,10 +169,10 @@ class JointBridgeNode(LifecycleFlightNode):
                 readings.stamp, readings.position[good], readings.velocity[good],
                 readings.effort[good], [n for n, is_good in zip(JOINT_NAMES, good) if is_good]))
 
-    # --- what it says -------------------------------------------------------------------------
+    # --- state and diagnostics ----------------------------------------------------------------
 
     def changed(self):
-        """Log what the thread has to say; tell the state when it is another."""
+        """Log the thread's events; publish the state if it changed."""
         if self._loop is not None:
             self._log(self._loop)
         text = self._state_text()
@@ -207,7 +206,7 @@ class JointBridgeNode(LifecycleFlightNode):
 
 
 def bus_status():
-    """Make the source of the bus's status; it remembers what it has told."""
+    """Make a function that returns the bus's status, with rates since its last call."""
     told = {'cycles': 0, 'missed': 0, 'time': time.monotonic(), 'loop': None}
 
     def status(stage, text, bus, loop):

@@ -1,4 +1,4 @@
-"""A flight node with the states of ROS 2: unconfigured, inactive, active, finalized."""
+"""A flight node with the lifecycle states of ROS 2."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 from beetle_omni_ros.nodes.node import FlightNode
 
 UNCONFIGURED, INACTIVE, ACTIVE = 'unconfigured', 'inactive', 'active'
-# autostart -> the state in which it has done its work
+# autostart -> state to reach
 AUTOSTART = {'none': '', 'configure': INACTIVE, 'activate': ACTIVE}
 RETRY = 1.0     # [s] between attempts to start by itself
 
@@ -16,12 +16,12 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
     """
     Base of a node that opens a device when configured and powers it when activated.
 
-    A subclass overrides ``configure``, ``activate``, ``deactivate`` and ``release``. The first
-    two refuse with an exception of ``refusals``, whose text goes to the log and to
-    :attr:`refusal`; the node is then in the state that it came from.
+    A subclass overrides ``configure``, ``activate``, ``deactivate`` and ``release``. The first two
+    refuse a transition by an exception of ``refusals``. Its text goes to the log and to
+    :attr:`refusal`, and the state stays as it was.
 
     Attributes:
-        refusal: why the last transition was refused; '' after one that was not.
+        refusal: why the last transition was refused; '' if it was not.
 
     """
 
@@ -33,25 +33,25 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
         self.refusal = ''
         self._goal = ''
         self._start_timer = None
-        self._starts = False    # by itself, at this moment
-        # rclpy lets an impossible transition end the process.
+        self._starts = False    # during an automatic transition
+        # In rclpy, an impossible transition ends the process.
         self._answer_change = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
 
     def configure(self) -> None:
-        """Open the device; whatever was opened when it raises, :meth:`release` closes."""
+        """Open the device; after an exception, :meth:`release` closes it."""
 
     def activate(self) -> None:
-        """Power the device; when it raises, nothing has power."""
+        """Power the device; an exception must leave it without power."""
 
     def deactivate(self) -> None:
-        """Take the power off."""
+        """Switch the power off."""
 
     def release(self) -> None:
-        """Take the power off and close the device; in any state, more than once."""
+        """Switch the power off and close the device; callable in any state, repeatedly."""
 
     def changed(self) -> None:
-        """React to a transition, done or refused."""
+        """React to a transition, successful or refused."""
 
     @property
     def stage(self) -> str:
@@ -59,7 +59,7 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
         return self._state_machine.current_state[1]
 
     def start_by_itself(self, autostart: str) -> None:
-        """Go to the state that ``autostart`` names, trying once a second until it works."""
+        """Go to the state that ``autostart`` names; repeat every second until it succeeds."""
         self._goal = AUTOSTART[autostart]
         if self._goal:
             self._start_timer = self.create_timer(RETRY, self._try_to_start,
@@ -79,27 +79,27 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
     # --- called by rclpy ----------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Open."""
+        """Open the device."""
         return self._attempt('configure', self.configure, self.release)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Power."""
+        """Power the device."""
         return self._attempt('activate', self.activate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take the power off; the operator has decided, no more starts by itself."""
+        """Switch the power off; ends the automatic start."""
         return self._attempt('deactivate', self._ordered(self.deactivate))
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close."""
+        """Close the device; ends the automatic start."""
         return self._attempt('clean up', self._ordered(self.release))
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close for good."""
+        """Close the device."""
         return self._attempt('shut down', self._ordered(self.release))
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close after a mistake in the code; it can be configured again."""
+        """Close the device after an unexpected exception; it can be configured again."""
         self.release()
         return TransitionCallbackReturn.SUCCESS
 
@@ -126,7 +126,7 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _say_refusal(self, text):
-        """As an error to an operator who asked; who starts by itself waits and tries again."""
+        """Log as an error; as a warning if the automatic start repeats the transition."""
         if self._starts:
             self.get_logger().warning(f'{text}; tries again')
         else:

@@ -1,4 +1,4 @@
-"""Listens to the graph for some seconds, for `beetle_omni check`; publishes nothing."""
+"""Records the traffic of a graph for some seconds, for `beetle_omni check`; publishes nothing."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.robot.schema import ParameterError
 
-# Topic -> what of its values no living sensor repeats.
+# Topic -> attribute of its values that changes with every sample of a working sensor.
 STREAMS = {'mocap/pose': 'position', 'imu/data_raw': 'specific_force',
            'joint_states': 'position', 'battery_state': 'voltage'}
 
 
 def listen(seconds: float, namespace: str = '', discovery: str | None = None) -> Heard:
     """
-    Join the graph and take in what comes.
+    Join the graph and record its messages.
 
     Args:
-        seconds: how long.
-        namespace: of the robot's topics.
-        discovery: who is looked for, see :mod:`discovery`; default this computer alone.
+        seconds: duration [s].
+        namespace: namespace of the robot's topics.
+        discovery: range, see :mod:`discovery`; default this computer only.
 
     Raises:
-        ParameterError: no such namespace or range of discovery is possible.
+        ParameterError: invalid namespace or range of discovery.
 
     """
     confine(asked=discovery)
@@ -89,7 +89,7 @@ def _take_diagnostics(heard, statuses):
 
 
 def _look_at_publishers(node, heard):
-    """Who publishes the topics, and who something else under their name."""
+    """Record the publishers of the topics, and other message types under their names."""
     for topic in STREAMS:
         wanted = TOPICS[topic].type
         for publisher in node.get_publishers_info_by_topic(topic):

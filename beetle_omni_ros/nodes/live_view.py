@@ -1,4 +1,4 @@
-"""`beetle_omni view` without RUN: listens to a graph, and carries the operator's wishes there."""
+"""`beetle_omni view` without RUN: shows a running graph and sends the operator's targets to it."""
 
 from __future__ import annotations
 
@@ -30,28 +30,28 @@ from beetle_omni_ros.view.command import announce
 from beetle_omni_ros.view.frames import Sampler
 from beetle_omni_ros.view.live import Live
 
-# Of these the newest message counts, and no more than one is read for each picture; of the others
-# every message counts.
+# Only the newest message of these is read for each picture. Of EVENTS and TARGETS, every message
+# is read.
 STREAMS = ('odom', 'ground_truth/odom', 'joint_states', 'command', 'battery_state')
 EVENTS = ('supervisor/state', 'disturbance', 'diagnostics')
-TARGETS = ('target_pose', 'target_trajectory')      # of anybody, however they are published
-MOST_EVENTS = 200       # that wait to be read
-NICENESS = 10           # the flight comes first
+TARGETS = ('target_pose', 'target_trajectory')      # with any quality of service
+MOST_EVENTS = 200       # of one topic that are kept until the next picture
+NICENESS = 10           # the nodes of the flight have precedence
 SUPERVISOR = 'supervisor_node'
 
 
 class Listener:
     """
-    The page's ear and voice in a graph; see :class:`~beetle_omni_ros.view.live.Graph`.
+    ROS side of the page; implements :class:`~beetle_omni_ros.view.live.Graph`.
 
     Args:
-        namespace: of the robot's topics.
-        domain: ROS domain; None: as the environment says.
-        discovery: who is looked for, see :mod:`discovery`.
-        speaks: whether targets and the choice of a controller are passed on.
+        namespace: namespace of the robot's topics.
+        domain: ROS domain; None: ``ROS_DOMAIN_ID``.
+        discovery: range, see :mod:`discovery`.
+        speaks: whether targets and the selection of a controller are sent.
 
     Raises:
-        ParameterError: no such namespace or range of discovery is possible.
+        ParameterError: invalid namespace or range of discovery.
 
     """
 
@@ -107,7 +107,7 @@ class Listener:
                 self._waiting[topic].append(data)
 
     def take(self, sampler: Sampler) -> None:
-        """Pass on what came since the last call; what cannot be read is left out."""
+        """Pass on the messages since the last call, without the unreadable ones."""
         now = self._node.get_clock().now().nanoseconds * 1e-9
         with self._lock:
             newest, self._newest = self._newest, {}
@@ -117,18 +117,18 @@ class Listener:
             try:
                 known = topic_of(topic)
                 sampler.write(topic, known.take(from_bytes(data, known.type)), now)
-            except Exception:   # whatever broken bytes provoke: the nodes tell what they refuse
+            except Exception:   # broken bytes raise anything; the nodes report what they refuse
                 continue
 
     def controllers(self) -> list[str]:
-        """Names under which somebody publishes a command."""
+        """Return the names of the controllers whose command topic exists."""
         prefix = self._node.get_namespace().rstrip('/') + '/'
         names = (requester(name.removeprefix(prefix))
                  for name, _ in self._node.get_topic_names_and_types() if name.startswith(prefix))
         return sorted(filter(None, names))
 
     def publish_target(self, target: PoseTarget) -> None:
-        """Publish it, latched, on target_pose."""
+        """Publish a target, latched, on target_pose."""
         if self._targets is not None:
             self._targets.publish(target)
 
@@ -162,19 +162,19 @@ def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: st
     Show a running graph until Ctrl-C.
 
     Args:
-        namespace: of the robot's topics.
-        domain_id: ROS domain; None: as the environment says.
-        discovery: who is looked for; None: this computer alone.
+        namespace: namespace of the robot's topics.
+        domain_id: ROS domain; None: ``ROS_DOMAIN_ID``.
+        discovery: range; None: this computer only.
         robot: robot file; None: the shipped one.
-        urdf: description; None: the shipped one.
+        urdf: robot description; None: the shipped one.
         host: address at which the page is served.
-        port: of it; the next free one is taken.
-        dark: colours to begin with.
+        port: first port that is tried.
+        dark: whether the page starts with dark colours.
         allow_targets: whether the page may publish targets and select controllers.
-        console: where to print.
+        console: output of the address.
 
     Raises:
-        ParameterError: in one line.
+        ParameterError: unusable input.
 
     """
     runner.end_with_parent()
@@ -189,5 +189,5 @@ def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: st
         page.look_at_room()
         live = Live(page, listener, parameters, allow_targets)
         announce(page.url, console or Console())
-        with suppress(KeyboardInterrupt):       # how a viewer is ended
+        with suppress(KeyboardInterrupt):       # the regular end
             live.run()

@@ -1,4 +1,4 @@
-"""The model-predictive controller as a node."""
+"""ROS node of the model-predictive controller."""
 
 from __future__ import annotations
 

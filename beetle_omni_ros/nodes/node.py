@@ -1,4 +1,4 @@
-"""What every node of the package shares: parameters, guarded inputs, diagnostics."""
+"""Base class of the package's nodes: parameters, checked inputs, diagnostics."""
 
 from __future__ import annotations
 
@@ -14,25 +14,24 @@ from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.health import Health
 from beetle_omni_ros.nodes.private import HeldError, Lock
 
-# A stamp this far ahead of the clock comes from another clock.
-FUTURE = 0.05
+FUTURE = 0.05       # s ahead of the clock above which a stamp is refused
 TWIN_CHECKS = 3
 
 
 class StartError(RuntimeError):
-    """A node cannot start or go on; the text is one line for the operator."""
+    """A node cannot start or continue; the text is one line for the operator."""
 
 
 def claim(node: Node):
     """
-    Take the node's lock until it is closed, or the process ends.
+    Take the lock of the node's name, until it is closed or the process ends.
 
-    Two supervisors, or two estimators, on one set of topics would take turns with the robot. A
-    lock file names the holder at once on the same computer and goes with its process, however
-    that ends; a node on another computer is seen in the ROS graph.
+    The commands of two supervisors or the estimates of two estimators would alternate on one
+    topic. The lock file detects a second node on the same computer at once;
+    :func:`refuse_twin` detects one on another computer.
 
     Raises:
-        StartError: another process of this computer holds it.
+        StartError: another process of this computer holds the lock.
 
     """
     domain = node.context.get_domain_id()
@@ -49,7 +48,7 @@ def claim(node: Node):
 
 def refuse_twin(node: Node) -> None:
     """
-    Look for a node of the same name elsewhere in the ROS graph.
+    Check that the ROS graph has no other node of the same name.
 
     Raises:
         StartError: there is one.
@@ -63,12 +62,12 @@ def refuse_twin(node: Node) -> None:
 
 class FlightNode(Node):
     """
-    A node whose inputs are checked before its code sees them.
+    A node with declared parameters, checked inputs and diagnostics.
 
     Attributes:
-        real_time: whether it is part of the control loop and runs before ordinary processes.
-        steady_clock: for timers that have nothing to do with the flight.
-        flight_clock: for those that have; simulated time where ``use_sim_time`` is set.
+        real_time: whether the node is part of the control loop and needs real-time priority.
+        steady_clock: clock for timers that are independent of the flight.
+        flight_clock: clock for timers of the flight; simulated time if ``use_sim_time`` is set.
 
     """
 
@@ -81,30 +80,24 @@ class FlightNode(Node):
         """
         Claim the name, read the parameters, start diagnostics.
 
-        Args:
-            name: default node name.
-            parameter_class: see :func:`parameters.declare`, as for the rest.
-            file: shipped parameter file.
-            file_key: parameter that names another one.
-            on_change: takes a changed instance.
-            changeable: names that may be set in flight.
-            completed: adds to what a file says.
+        The arguments after ``name`` are those of :func:`parameters.declare`.
 
         Raises:
-            ParameterError, StartError: with one line for the operator.
+            ParameterError: unusable parameters.
+            StartError: a node of this name runs already.
 
         """
         super().__init__(name)
         self._claim = claim(self)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        # Simulated time may stand still; what times a flight then goes by it, and by nothing else.
+        # Simulated time may stop, so timers of the flight must use it too.
         self.simulated = bool(self.get_parameter(parameters.CLOCK).value)
         self.flight_clock = self.get_clock() if self.simulated else self.steady_clock
         self.parameters = parameters.declare(self, parameter_class, file, file_key,
                                              on_change, changeable, completed)
         parameters.lock_clock(self)
         self.health = Health(self)
-        self.get_logger().debug('started')      # the first call is slow: not in flight
+        self.get_logger().debug('started')      # the first call is slow: not during a flight
         self._twin_checks = 0
         self._twin_timer = self.create_timer(1.0, self._look_for_twin, clock=self.steady_clock)
 
@@ -113,15 +106,15 @@ class FlightNode(Node):
         return self.get_clock().now().nanoseconds * 1e-9
 
     def elapsed(self) -> float:
-        """Time that nobody sets [s]: steady, or simulated where that is used."""
+        """Return steady time, or simulated time if it is used [s]."""
         return self.now() if self.simulated else time.monotonic()
 
     def publisher(self, topic: str) -> wire.Publisher:
-        """Make a publisher of a topic's values."""
+        """Make the publisher of a topic."""
         return wire.Publisher(self, topic)
 
     def follow(self, topic: str, handle: Callable[[str], None]) -> None:
-        """Pass the latched text of a topic to ``handle``, whenever it changes."""
+        """Pass the texts of a latched topic to ``handle``."""
         wire.subscribe(self, topic, handle)
 
     def listen(self, topic: str, handle: Callable, *, read: Callable | None = None,
@@ -129,20 +122,20 @@ class FlightNode(Node):
                stale_after: float | None = 0.5, published: bool = False,
                check: Callable | None = None) -> None:
         """
-        Subscribe ``topic``: read its values, refuse what is bad, pass on to ``handle``.
+        Subscribe ``topic``; pass valid values to ``handle`` and count refused messages.
 
         Args:
-            topic: relative name, of the table of topics.
-            handle: called with the value.
-            read: message -> value with a ``stamp``, other than the table's ``take``; raises
-                MessageError.
-            qos: other than what the topic's publisher offers.
-            every_offer: hear publishers of any quality of service, see
+            topic: relative name in the table of topics.
+            handle: called with each value.
+            read: message -> value with a ``stamp``, raises MessageError; default: the table's
+                ``take``.
+            qos: quality of service; default: the table's.
+            every_offer: receive from publishers of any quality of service, see
                 :class:`~beetle_omni_ros.nodes.wire.EveryOffer`.
-            max_age: refuse stamps older than this, or ahead of the clock [s]; None: any.
-            stale_after: silence that is an error, once the topic came [s]; None: none.
-            published: pass the time of publication [s, system time, or nan] to ``check`` and
-                ``handle`` too.
+            max_age: limit of a stamp's age [s], also refuses future stamps; None: no check.
+            stale_after: silence after a message that is an error [s]; None: never.
+            published: whether ``check`` and ``handle`` also get the time of publication [s, system
+                time, or nan].
             check: called with the value before ``handle``; raises MessageError.
 
         """
@@ -179,26 +172,26 @@ class FlightNode(Node):
         return result
 
     def _look_for_twin(self):
-        # Discovery takes its time: look a few times after the start, then never again.
+        # Discovery needs some seconds, so one check is not enough.
         refuse_twin(self)
         self._twin_checks += 1
         if self._twin_checks >= TWIN_CHECKS:
             self._twin_timer.cancel()
 
     def waits_for(self) -> str:
-        """What has to come before it does its work; '' where nothing has to."""
+        """Return the inputs without which the node does not work, as text; '' for none."""
         return ', '.join(self.health.waits_for())
 
     def introduce(self) -> None:
-        """Say in one line what it is and what it waits for."""
+        """Log in one line what the node does and which inputs are missing."""
         what, waits = (type(self).__doc__ or '').strip().partition('\n')[0], self.waits_for()
         self.get_logger().info(f"{what} Waits for {waits or 'nothing'}.")
 
     def close(self) -> None:
-        """Release what only this node holds; each node says what."""
+        """Release the resources of the node; overridden by subclasses."""
 
     def destroy_node(self) -> None:
-        """Close, leave the graph, let go of the name."""
+        """Close, leave the graph, release the name."""
         self.close()
         super().destroy_node()
         if self._claim:

@@ -1,4 +1,4 @@
-"""The operator's side of a flight: arm, land, and see how it goes."""
+"""ROS client of an operator: services, parameters, states and diagnostics of a flight."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from beetle_omni_ros.nodes import health, runner, wire
 from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.plan import READY, STATES
 
-# Where time is simulated and slow, or stands still because its source died, waiting ends with this
-# much steady time for each second of it.
+# Simulated time may be slow, or stop if the simulator dies: waiting ends after this much steady
+# time for each second of the timeout.
 SLOWEST = 20.0
 SERVICES = ('arm', 'disarm', 'land', 'emergency_stop')
 
 
 class Operator:
     """
-    A small node with a context of its own, spun only while it is asked something.
+    A node with its own context; it receives messages only during calls of its methods.
 
-    Where time is simulated, seconds are those of /clock.
+    With simulated time, seconds are those of /clock.
 
     Attributes:
-        state: the supervisor's state, '' before it is known.
-        progress: the reference's progress, '' before it is known.
-        bridges: bridge node -> its state, of those that told one.
-        commands: messages of the watched controller so far.
+        state: state of the supervisor, '' before the first message.
+        progress: state of reference_node, '' before the first message.
+        bridges: bridge node -> its newest state.
+        commands: number of commands of the watched controller.
         diagnostics: status name -> newest :class:`Diagnostic`.
 
     """
 
     def __init__(self, domain: int, controller: str = registry.DEFAULT):
-        """Join ``domain`` and watch the flight of ``controller``."""
+        """Join ``domain`` and count the commands of ``controller``."""
         confine()
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context, domain_id=domain,
@@ -74,7 +74,7 @@ class Operator:
         self._simulated = seconds(message.clock)
 
     def time(self) -> float:
-        """Seconds of the flight from some moment on, as far as they are known."""
+        """Return simulated time if it is used, else steady time [s]."""
         return time.monotonic() if self._simulated is None else self._simulated
 
     def _on_state(self, told):
@@ -107,18 +107,18 @@ class Operator:
         return self.commands > 0 and self.answers
 
     def waits_for(self, bridges: Sequence[str]) -> str:
-        """What keeps a bridge of these from flying, in its words; '' when nothing does."""
+        """Return the states of the bridges that are not ready, '' if all are."""
         told = {name: self.bridges.get(name, 'silent') for name in bridges}
         return '; '.join(f'{name} {text}' for name, text in told.items()
                          if not text.startswith(READY))
 
     def spin(self, seconds: float) -> None:
-        """Take in messages for so long."""
+        """Process messages for ``seconds``."""
         for left in self.countdown(seconds):
             self._executor.spin_once(timeout_sec=min(left, 0.1))
 
     def countdown(self, seconds: float) -> Iterator[float]:
-        """Yield the time that is left [s], steady or simulated, until it is over."""
+        """Yield the remaining time [s], steady or simulated, until it is over."""
         simulated, start = self._simulated is not None, self.time()
         steady = time.monotonic()
         while True:
@@ -130,7 +130,7 @@ class Operator:
             yield left
 
     def wait(self, condition, timeout: float) -> bool:
-        """Take in messages until ``condition()`` or ``timeout`` [s]; whether it came true."""
+        """Process messages until ``condition()`` holds; False after ``timeout`` [s]."""
         left = self.countdown(timeout)
         while not condition():
             if next(left, None) is None:
@@ -139,14 +139,14 @@ class Operator:
         return True
 
     def call(self, name: str, timeout: float = 2.0) -> tuple[bool, str]:
-        """Call a service of the supervisor: (accepted, its answer)."""
+        """Call a service of the supervisor; return (accepted, answer)."""
         future = self._clients[name].call_async(Trigger.Request())
         if not self.wait(future.done, timeout):
             return False, f'supervisor_node does not answer to {name}'
         return future.result().success, future.result().message
 
     def set(self, node: str, name: str, value, timeout: float = 5.0) -> tuple[bool, str]:
-        """Set a parameter of a node: (accepted, its answer)."""
+        """Set a parameter of a node; return (accepted, answer)."""
         client = self._node.create_client(SetParameters, f'{node}/set_parameters')
         if not self.wait(client.service_is_ready, timeout):
             return False, f'{node} is not there'
@@ -157,12 +157,12 @@ class Operator:
         return future.result().results[0].successful, future.result().results[0].reason
 
     def values(self, status: str) -> dict[str, str]:
-        """Values of a diagnostic status by key; empty when it never came."""
+        """Return the values of a diagnostic status, empty before the first message."""
         found = self.diagnostics.get(status)
         return found.values if found else {}
 
     def report(self, name: str, text: str, values: dict) -> None:
-        """Put a status of the operator's own into ``diagnostics``, and so into the bag."""
+        """Publish a status on ``diagnostics``, from where it gets into the bag."""
         self._diagnostics.publish([Diagnostic(
             self._node.get_clock().now().nanoseconds * 1e-9, name, health.OK, text,
             health.texts(values))])

@@ -1,39 +1,37 @@
-"""When the simulator's ticks are due, and which stamps they get; plain arithmetic on clocks."""
+"""Due times and stamps of the simulator's ticks, in real and in simulated time."""
 
 from __future__ import annotations
 
-# After a stall of the computer the plant catches up by so much and forgets the rest:
-# a node that tried to make good every lost tick would never be on time again.
+# Ticks that are caught up after a stall of the computer; more would delay the next ones.
 CATCH_UP_TICKS = 8
 EARLY = 0.3             # part of a tick that the timer may come before the tick
-PHASE_WINDOW = 50       # calls of the timer that tell its phase
-SLEW = 0.01             # most that a tick's stamp may be stretched for it
-CLOCK_STEP = 0.005      # s of change between ROS and steady time: the clock was set
-CLOCK_READING = 0.001   # s in which both clocks must have been read to be compared
-# Simulated time waits for who is farther behind than in any flight in real time, where the newest
-# sample is one period old, but not for the dead.
-LAG = 0.02              # s between the newest sample sent and the one that was answered last
-PATIENCE = 0.3          # s of steady time
+PHASE_WINDOW = 50       # calls of the timer from which its phase is estimated
+SLEW = 0.01             # largest shift of a tick towards the timer's phase, in ticks
+CLOCK_STEP = 0.005      # s of change between ROS and steady time above which the clock was set
+CLOCK_READING = 0.001   # s within which both clocks must have been read to be compared
+# Simulated time waits for a node that is farther behind than in real time, where the newest sample
+# is one period old. It does not wait for a node that has stopped.
+LAG = 0.02              # s between the newest sample and the newest answered one
+PATIENCE = 0.3          # s of steady time without an answer after which a node has stopped
 
 
 class Pacing:
     """
-    Ticks on the steady clock, stamps in ROS time.
+    Ticks on the steady clock, stamps in ROS time; starts with the first call of :meth:`due`.
 
     Args:
-        tick: length of one [s].
-        steady: clock that nobody sets; returns seconds.
-        ros: the clock of the stamps; returns seconds.
+        tick: period [s].
+        steady: steady clock [s].
+        ros: clock of the stamps [s].
 
     Attributes:
-        ticks: counted so far.
-        lost_ticks: left out after stalls; the world stood still meanwhile.
+        ticks: number of ticks so far.
+        lost_ticks: ticks skipped after stalls; the simulation stopped meanwhile.
         clock_steps: how often the ROS clock was set.
 
     """
 
     def __init__(self, tick: float, steady, ros):
-        """Start with the first call of :meth:`due`."""
         self._tick, self._steady, self._ros = tick, steady, ros
         self._started: float | None = None
         self._offset = ros() - steady()     # ROS time minus steady time
@@ -52,7 +50,7 @@ class Pacing:
         return self._offset + self._started
 
     def due(self) -> int:
-        """Count and return the ticks that are due now; called by the timer, once a tick."""
+        """Return the number of ticks that are due now; called by the timer, once a tick."""
         now, tick = self._steady(), self._tick
         if self._started is None:
             self._started = now - tick
@@ -68,10 +66,10 @@ class Pacing:
 
     def _follow_timer(self, now, due):
         """
-        Let the times of the ticks glide to those at which the timer fires.
+        Shift the ticks towards the times at which the timer fires.
 
-        Its phase is unknown at first; a tick that is always due some milliseconds before
-        the timer would make every stamp that much too old.
+        The phase of the timer is unknown at first. If ticks were always due some milliseconds
+        before the timer, every stamp would be too old by this time.
         """
         if due > 0:
             self._lateness.append(now - self._started - (self.ticks + due) * self._tick)
@@ -84,12 +82,12 @@ class Pacing:
         self._started += step
 
     def _follow_clock(self):
-        """Keep ROS time minus steady time, unless the clock was set."""
+        """Detect that the ROS clock was set, and update its offset from the steady clock."""
         before = self._steady()
         ros = self._ros()
         after = self._steady()
         if after - before > CLOCK_READING:
-            return      # held up between the readings, they do not belong together
+            return      # preempted between the readings
         offset = ros - 0.5 * (before + after)
         if abs(offset - self._offset) > CLOCK_STEP:
             self.clock_steps += 1
@@ -98,27 +96,26 @@ class Pacing:
 
 class Waiting:
     """
-    Ticks of simulated time: one each time the timer fires, none while somebody is late.
+    Ticks of simulated time: one each time the timer fires, none while a node is late.
 
-    What takes too long on a slow computer then takes longer, and is not missed. Who falls silent
-    is waited for once, and again when it has come back.
+    On a slow computer, time passes more slowly and no deadline is missed. For a node that has
+    stopped, simulated time waits once.
 
     Args:
-        tick: length of one [s].
-        steady: clock that nobody sets; returns seconds.
+        tick: period [s].
+        steady: steady clock [s].
         epoch: time of the stamps at which simulated time is zero [s].
 
     Attributes:
-        ticks: counted so far.
-        waits: calls of :meth:`due` that had to wait.
-        started, lost_ticks, clock_steps: as in :class:`Pacing`; nothing is lost here.
+        ticks: number of ticks so far.
+        waits: calls of :meth:`due` that returned no tick.
+        started, lost_ticks, clock_steps: as in :class:`Pacing`; no tick is lost.
 
     """
 
     started, lost_ticks, clock_steps = True, 0, 0
 
     def __init__(self, tick: float, steady, epoch: float):
-        """Start with the first call of :meth:`due`."""
         self._tick, self._steady, self.epoch = tick, steady, epoch
         self._sent = float('-inf')
         self._heard: dict[str, tuple[float, float]] = {}
@@ -127,19 +124,19 @@ class Waiting:
 
     @property
     def now(self) -> float:
-        """Simulated time, as in the stamps [s]."""
+        """Simulated time [s]."""
         return self.epoch + self.ticks * self._tick
 
     def sent(self, stamp: float) -> None:
-        """Note the stamp of a sample that others answer."""
+        """Record the stamp of a published sample."""
         self._sent = stamp
 
     def heard(self, name: str, stamp: float) -> None:
-        """Note an answer of ``name`` to the sample with this stamp."""
+        """Record that ``name`` has answered the sample with this stamp."""
         self._heard[name] = (stamp, self._steady())
 
     def due(self) -> int:
-        """Count and return the ticks that are due now: one, or none."""
+        """Return the number of ticks that are due now: 1 or 0."""
         now = self._steady()
         late = any(self._sent - stamp > LAG and now - arrived < PATIENCE
                    for stamp, arrived in self._heard.values())

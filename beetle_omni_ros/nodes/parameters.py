@@ -1,9 +1,8 @@
 """
 A parameter dataclass declared as ROS parameters.
 
-ROS ignores an override key that nobody declares, and answers a bad value with a
-traceback. Here both are refused before the node does anything, in one line with the
-key's name, by the same checks that read the parameter files.
+ROS ignores an override of an undeclared key, and a bad value causes a traceback. Here, the checks
+of the parameter files refuse both at the start of the node, in one line that names the key.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import NAMES, ParameterError
 
-# ROS itself puts these into the overrides of a node.
+# Overrides that ROS itself adds.
 CLOCK = 'use_sim_time'
 ROS_OWN = (CLOCK, 'start_type_description_service')
 ROS_OWN_PREFIX = 'qos_overrides.'
@@ -38,24 +37,24 @@ def declare(node: Node, cls: type, file: str | None = None, file_key: str | None
     """
     Declare every leaf of the parameter dataclass ``cls`` on ``node``.
 
-    Values come from the class, then from the shipped ``file``, then from the overrides
-    of the command line (``--params-file``, ``-p``).
+    Overrides of the command line (``--params-file``, ``-p``) precede the values of the file, and
+    these precede the defaults of the class.
 
     Args:
-        node: made with automatically_declare_parameters_from_overrides off.
-        cls: a dataclass of :func:`schema.parameter` and :func:`schema.group` fields.
-        file: shipped file with the values to start from, such as ``params/ekf.yaml``.
-        file_key: the parameter that names another file to start from.
-        on_change: called with the new instance when parameters were set in flight; may
-            raise ParameterError to refuse. Without it every parameter is read-only.
+        node: node with automatically_declare_parameters_from_overrides off.
+        cls: dataclass of :func:`schema.parameter` and :func:`schema.group` fields.
+        file: shipped parameter file, such as ``params/ekf.yaml``.
+        file_key: parameter that names another file.
+        on_change: called with the new instance when parameters are set in flight; may raise
+            ParameterError to refuse. Without it every parameter is read-only.
         changeable: names that may be set in flight; None: all that are not read-only.
-        completed: (values of the file, whether a user named it) -> values to start from.
+        completed: (values of the file, whether the user named it) -> completed values.
 
     Returns:
         The validated instance of ``cls``.
 
     Raises:
-        ParameterError: one line with the file, the key and what was expected.
+        ParameterError: unusable value; names file, key and expectation.
 
     """
     overrides = {name: value.value for name, value in node._parameter_overrides.items()
@@ -115,7 +114,7 @@ def _plain(value, hint):
         return [float(v) for v in value.ravel()]
     if hint == NAMES:
         return list(value)
-    if value is None:       # an optional value that nobody set
+    if value is None:       # an optional value that is not set
         return '' if _kind(hint) is str else float('nan')
     return _kind(hint)(value) if _kind(hint) in (int, float, bool, str) else value
 
@@ -131,7 +130,7 @@ def _descriptor(entry, hint, fixed) -> ParameterDescriptor:
     unit = f" [{meta['unit']}]" if meta.get('unit') else ''
     descriptor = ParameterDescriptor(
         description=meta.get('doc', '') + unit,
-        # ROS takes an empty list for one of another type, and [2] is none of floats.
+        # ROS gives an empty list another type, and [2] is a list of integers.
         dynamic_typing=hint is np.ndarray and meta.get('shape') is None or hint == NAMES,
         read_only=fixed or bool(meta.get('read_only')),
         additional_constraints=f"one of {', '.join(meta['choices'])}" if meta.get('choices')
@@ -154,7 +153,7 @@ def _validate_changes(node, cls, instance, on_change):
     current = {name: value for name, _, _, value in schema.flatten(instance)}
 
     def changed(parameters):
-        # Read-only and unknown names never get here: ROS refuses them itself.
+        # ROS itself refuses read-only and unknown names.
         leaves = _leaves(cls)
         proposed = dict(current)
         for parameter in parameters:
@@ -173,12 +172,12 @@ def _validate_changes(node, cls, instance, on_change):
 
 def lock_clock(node: Node) -> None:
     """
-    Make ``use_sim_time`` read-only from now on: timers and ages go by the clock of the start.
+    Make ``use_sim_time`` read-only: timers and ages use the clock of the start.
 
-    By its descriptor, which rclpy looks at first: its own callback for this parameter switches
-    the clock when it is asked, whatever others answer.
+    The descriptor does this, because rclpy checks it first. Another callback that refuses the
+    change is not enough: rclpy's own callback switches the clock anyway.
     """
     description = node.describe_parameter(CLOCK)
     node.set_descriptor(CLOCK, ParameterDescriptor(
         name=CLOCK, type=description.type, read_only=True,
-        description='go by the time on /clock; expected at the start of the node'))
+        description='use the time on /clock; only at the start of the node'))

@@ -1,8 +1,7 @@
 """
-The graph as data: which nodes there are, with which parameters, in which process.
+Plan of a ROS graph: its nodes, their parameters and their processes, as data.
 
-`beetle_omni fly`, the launch file and `composed` start what is written here, each in its own way.
-No ROS is needed to read it.
+`beetle_omni fly`, the launch file and `composed` start graphs by such a plan. It needs no ROS.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
 STATES = {'joint_bridge_node': 'joint_bridge/state', 'rotor_bridge_node': 'rotor_bridge/state'}
 ACTUATORS = ('emulated', 'direct')
 READY = 'ready'
-# status of the diagnostics, key there -> key of what a flight measured
+# bridge -> (name of its status in diagnostics, prefix of the keys of a flight's measurements)
 MEASURED = {
     'joint_bridge_node': ('bus', 'servos'), 'rotor_bridge_node': ('board', 'motor_board')}
-# Executables; each is a module of this folder with a class of the same name. `controller_node`
-# runs any registered controller, under the name `<controller>_node`.
+# Executables: modules of this folder with a class of the same name. `controller_node` runs any
+# registered controller under the name `<controller>_node`.
 NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'controller_node', 'supervisor_node',
          'joint_bridge_node', 'rotor_bridge_node', 'reference_node', 'recorder_node',
          'viewer_node')
@@ -35,11 +34,14 @@ Parameters = dict[str, dict]        # node name -> parameters that differ from t
 
 def bridged(folder: Path, believed: dict) -> dict[str, dict]:
     """
-    Node name -> parameters of simulator and bridges that meet in ``folder``.
+    Return the parameters of simulator and bridges that share pseudo-terminals.
 
     Args:
-        folder: for the names of the two pseudo-terminals.
-        believed: parameters of every node that believes in a robot file.
+        folder: folder of the names of the two pseudo-terminals.
+        believed: parameters with the robot file of estimator, controllers and bridges.
+
+    Returns:
+        Node name -> parameters.
 
     """
     servos, board = str(Path(folder) / 'servo_bus'), str(Path(folder) / 'motor_board')
@@ -50,10 +52,10 @@ def bridged(folder: Path, believed: dict) -> dict[str, dict]:
 
 class BridgeCounts:
     """
-    What the bridges did in a stretch of a flight, from their diagnostics.
+    Cycles and latencies of the bridges since this object was made, from their diagnostics.
 
     Args:
-        values: status name -> its values, as they were told last.
+        values: status name -> its newest values.
 
     """
 
@@ -63,10 +65,10 @@ class BridgeCounts:
 
     def measured(self) -> dict[str, float]:
         """
-        Count of cycles and of missed ones since the beginning; latencies [ms].
+        Return the counts and latencies [ms].
 
         Keys: ``servos_cycles``, ``servos_missed_cycles``, ``servos_latency_median_ms``,
-        ``..._p99_ms`` and ``..._max_ms``, and the same of ``motor_board``. The latency is from
+        ``..._p99_ms`` and ``..._max_ms``, and the same for ``motor_board``. The latency is from
         the publication of `command` to its last byte written.
         """
         found = {}
@@ -93,25 +95,25 @@ class BridgeCounts:
 @dataclass(frozen=True, kw_only=True)
 class Wanted:
     """
-    What a graph is asked to be.
+    Options of a graph.
 
     Attributes:
-        controller: the active one: a name, or where its class is.
-        standby: whether those that stand by run too, to be selected in flight.
-        policy: file for the controller that `--policy` is for; '' for the shipped one.
-        allow_other_robot: fly a policy that was trained for other robot parameters.
-        simulated: whether the sensors are those of sim_node.
-        actuators: 'bridges', with emulated devices where ``simulated``; 'direct': straight into
-            the plant; 'none': by nodes started elsewhere.
-        ports: folder for the names of the emulated devices' ports.
-        autostart: how far joint_bridge_node goes by itself; '' decides by ``simulated``.
-        servo_bus_file, motor_board_file: parameters of the bridges; '' for the shipped ones.
-        robot_file: what is believed; '' for the shipped one.
-        plant_file: what is true in the simulation; '' for what is believed.
-        conditions, seed: of the simulation.
-        task: for reference_node; '' for targets from elsewhere.
-        bag: folder for recorder_node; '' for no recording.
-        compression: of the bag, 'none' or 'zstd'.
+        controller: active controller: a name, or ``package.module:Class``.
+        standby: whether the standby controllers run too, so that they can be selected in flight.
+        policy: policy file of the controller that has the option `--policy`; '': the shipped one.
+        allow_other_robot: whether a policy trained for other robot parameters may fly.
+        simulated: whether sim_node provides the sensors.
+        actuators: 'bridges', with emulated devices if ``simulated``; 'direct': from the topic to
+            the simulator; 'none': by nodes started elsewhere.
+        ports: folder of the names of the emulated devices' ports.
+        autostart: automatic transition of joint_bridge_node; '': depends on ``simulated``.
+        servo_bus_file, motor_board_file: parameters of the bridges; '': the shipped ones.
+        robot_file: robot file of estimator and controllers; '': the shipped one.
+        plant_file: robot file of the simulation; '': the same.
+        conditions, seed: conditions and seed of the simulation.
+        task: task of reference_node; '': targets from elsewhere.
+        bag: folder of the bag; '': no recording.
+        compression: compression of the bag, 'none' or 'zstd'.
         viewer: whether viewer_node runs.
         clock: 'system', or 'simulated': time on /clock that waits for nodes that are late.
 
@@ -141,11 +143,11 @@ class Wanted:
 @dataclass(frozen=True)
 class Plan:
     """
-    A graph.
+    Nodes of a graph.
 
     Attributes:
         nodes: node name -> parameters.
-        left_out: controller that does not stand by -> why.
+        left_out: omitted standby controller -> reason.
 
     """
 
@@ -158,7 +160,7 @@ def plan(wanted: Wanted) -> Plan:
     List the nodes of a graph.
 
     Raises:
-        ParameterError: the active controller cannot fly, or the clock does not go with the rest.
+        ParameterError: the active controller is unusable, or the clock does not fit the actuators.
 
     """
     if wanted.clock == 'simulated' and (not wanted.simulated or wanted.actuators == 'bridges'):
@@ -170,7 +172,7 @@ def plan(wanted: Wanted) -> Plan:
         wanted.controller, robot_file=wanted.robot_file, policy=wanted.policy,
         allow_other_robot=wanted.allow_other_robot, standby=wanted.standby)
     active = registry.find(wanted.controller).name
-    # Only what these nodes do not know by themselves.
+    # The default of these nodes is the list of standby controllers.
     others = {} if active in registry.standing_by() else {
         'controllers': [active, *registry.standing_by()]}
     packed = {} if wanted.compression == 'none' else {'compression': wanted.compression}
@@ -186,20 +188,20 @@ def plan(wanted: Wanted) -> Plan:
         ('reference_node', wanted.task, {'task': wanted.task, 'seed': wanted.seed}),
         ('viewer_node', wanted.viewer, believed),
         *((name, bridges, bridges.get(name)) for name in BRIDGES))
-    # Copies: ROS reads no parameter file in which two nodes share a list.
+    # Copies: YAML would write a shared list as an alias, which ROS cannot read.
     nodes = {name: deepcopy(values) for name, is_there, values in table if is_there}
     return Plan(in_simulated_time(nodes) if wanted.clock == 'simulated' else nodes, left_out)
 
 
 def in_simulated_time(nodes: Parameters) -> Parameters:
-    """Let sim_node make the time of all others."""
+    """Return the parameters with simulated time, published by sim_node."""
     return {name: {**values, **({'clock': 'simulated'} if name == 'sim_node'
                                 else {'use_sim_time': True})}
             for name, values in nodes.items()}
 
 
 def _bridges(wanted, believed):
-    """Node name -> parameters that the actuators ask for; of the simulator too."""
+    """Parameters of bridges and simulator for the actuators, by node name."""
     if wanted.actuators != 'bridges':
         return {}
     nodes = bridged(Path(wanted.ports), believed) if wanted.simulated else \
@@ -218,23 +220,23 @@ def controller_nodes(active: str, *, robot_file: str = '', policy: str = '',
                      allow_other_robot: bool = False, standby: bool = True
                      ) -> tuple[Parameters, dict[str, str]]:
     """
-    Give the controllers' nodes with their parameters.
+    Return the parameters of the controllers' nodes.
 
-    A policy that cannot fly this robot is left out when it would only stand by, because a node
-    that refuses its parameters ends the process that it shares.
+    A standby policy that is not for this robot is omitted, because a node that refuses its
+    parameters ends the shared process.
 
     Args:
-        active: a name, or where its class is.
-        robot_file: what they believe; empty: the shipped one.
-        policy: file for the controller that `--policy` is for; empty: the shipped one.
-        allow_other_robot: accept a policy that was trained for other robot parameters.
-        standby: whether the others run too.
+        active: a name, or ``package.module:Class``.
+        robot_file: as in :class:`Wanted`; also the following ones.
+        policy: policy file.
+        allow_other_robot: whether a policy for other robot parameters may fly.
+        standby: whether standby controllers run.
 
     Returns:
-        Node name -> parameters, the active one first; controller that does not stand by -> why.
+        Node name -> parameters, the active one first; omitted standby controller -> reason.
 
     Raises:
-        ParameterError: the active controller cannot be built, or its policy is not usable.
+        ParameterError: the active controller cannot be built, or its policy is unusable.
 
     """
     first = registry.find(active)
@@ -261,7 +263,7 @@ def controller_nodes(active: str, *, robot_file: str = '', policy: str = '',
 
 
 def unfit(policy: str, robot_file: str = '', allow_other_robot: bool = False) -> str:
-    """Why a policy cannot fly a robot ('' for the shipped one); '' when it can."""
+    """Return why a policy is unusable for a robot file ('': the shipped one), or ''."""
     try:
         from beetle_omni_ros.control.policy_network import PolicyNetwork
         PolicyNetwork(policy, RobotParameters.load(robot_file or None), allow_other_robot)
@@ -271,23 +273,23 @@ def unfit(policy: str, robot_file: str = '', allow_other_robot: bool = False) ->
 
 
 def executable(node: str) -> str:
-    """Executable that runs a node of this name."""
+    """Return the executable of a node."""
     return node if node in NODES else GENERIC
 
 
 def class_name(name: str) -> str:
-    """Class of an executable: ekf_node -> EkfNode."""
+    """Return the class name of an executable: ekf_node -> EkfNode."""
     return ''.join(part.capitalize() for part in name.split('_'))
 
 
 def arguments(nodes: Parameters, names: Iterable[str]) -> list[str]:
-    """Arguments of `composed` for these nodes: executables, and controllers by reference."""
+    """Return the arguments of `composed`: executables, and references of other controllers."""
     return [name if executable(name) == name else nodes[name].get(
         'controller', name.removesuffix('_node')) for name in names]
 
 
 def processes(nodes: Parameters) -> dict[str, list[str]]:
-    """Process -> its nodes: the bridges, which wait for their ports, have one of their own."""
+    """Return process -> its nodes; the bridges, which block on their ports, have their own."""
     groups = {COMPOSED: [name for name in nodes if name not in BRIDGES],
               BRIDGES_COMPOSED: [name for name in nodes if name in BRIDGES]}
     return {name: names for name, names in groups.items() if names}

@@ -1,4 +1,4 @@
-"""A folder of the user's own for locks and ports, where nobody else can put anything."""
+"""A private folder of the user for locks and ports, not writable for other users."""
 
 import atexit
 import fcntl
@@ -9,20 +9,19 @@ import stat
 import tempfile
 
 NAME = 'beetle_omni'
-ATTEMPTS = 10       # to open what others may be removing
-HOLDER = 20         # characters of a process's number
+ATTEMPTS = 10       # to open a file that another process may be removing
+HOLDER = 20         # most characters of a process id
 
 
 def folder() -> Path:
     """
     Make or find the user's folder: in the runtime folder of the system, else the temporary one.
 
-    The runtime folder is looked for even where nobody tells of it (cron, ssh), so that two
-    processes of a user do not look for each other's locks in two places.
+    The runtime folder is also used if ``XDG_RUNTIME_DIR`` is not set (cron, ssh), so that all
+    processes of a user share one folder.
 
     Raises:
-        OSError: neither can be made, or what stands there is a link, somebody else's, or open
-            to others; one line.
+        OSError: the folder cannot be made, is a link, has another owner, or is open to others.
 
     """
     runtime = Path(os.environ.get('XDG_RUNTIME_DIR') or f'/run/user/{os.getuid()}')
@@ -34,23 +33,23 @@ def folder() -> Path:
 
 
 class HeldError(Exception):
-    """A lock is held by another process; the text is its number, or ''."""
+    """A lock is held by another process; the text is its id, or ''."""
 
 
 class Lock:
     """
-    A lock of this process under a name, until :meth:`close` or the process's end.
+    A named lock of this process, until :meth:`close` or the end of the process.
 
-    Its file goes with it; that of a process that was killed stays until the name is used again.
+    :meth:`close` removes its file. The file of a killed process remains until the name is used
+    again.
 
     Raises:
-        HeldError: another process holds it.
-        OSError: no folder, or the file is a link, special, or somebody else's; one line.
+        HeldError: another process holds the lock.
+        OSError: as :func:`open_lock`.
 
     """
 
     def __init__(self, name: str):
-        """Take the lock at once, or not at all."""
         for _ in range(ATTEMPTS):
             self._file, self._path = open_lock(name), folder() / name
             try:
@@ -69,7 +68,7 @@ class Lock:
         self._file.flush()
 
     def close(self) -> None:
-        """Let go of the lock, and of the folder where it was the last thing in it."""
+        """Release the lock; remove its file, and the folder if it is empty."""
         if not self._file.closed:
             if self._is_in_place():
                 self._path.unlink(missing_ok=True)
@@ -77,7 +76,7 @@ class Lock:
             _leave(self._path.parent)
 
     def _is_in_place(self):
-        """Whether the file that is locked is the one that others would find."""
+        """Whether the locked file is still the one under this name."""
         try:
             return os.path.samestat(os.lstat(self._path), os.fstat(self._file.fileno()))
         except OSError:
@@ -85,7 +84,7 @@ class Lock:
 
 
 def forget(pattern: str) -> None:
-    """Remove the files of locks that nobody holds any more; for names that nobody takes now."""
+    """Remove the files of released locks; only for names that no process takes meanwhile."""
     for path in folder().glob(pattern):
         try:
             Lock(path.name).close()
@@ -95,22 +94,22 @@ def forget(pattern: str) -> None:
 
 def open_lock(name: str):
     """
-    Open a file of :func:`folder` for locking, as it is: nothing is truncated, no link followed.
+    Open a file of :func:`folder` for locking, without truncation and without following links.
 
     Args:
-        name: of the file, without folders.
+        name: file name without folder.
 
     Returns:
         The file, readable and writable, at its beginning.
 
     Raises:
-        OSError: no folder, or the file is a link, special, or somebody else's; one line.
+        OSError: no folder, or the file is a link, special, or of another user.
 
     """
     for left in reversed(range(ATTEMPTS)):
         try:
             return _open(name)
-        except FileNotFoundError:       # who used the folder last has just removed it
+        except FileNotFoundError:       # its last user has just removed the folder
             if not left:
                 raise
 
@@ -119,7 +118,7 @@ def _open(name):
     place = folder()
     parent = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
-        _judge(os.fstat(parent), place)     # the folder that is used, not one of the same name
+        _judge(os.fstat(parent), place)     # of the opened folder: the name may change meanwhile
         number = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o600,
                          dir_fd=parent)
     except FileNotFoundError:
@@ -138,10 +137,10 @@ def _open(name):
 
 def scratch(name: str) -> Path:
     """
-    Make a folder that goes with this process; those of processes that were killed go now.
+    Make a folder that is removed with this process; remove those of killed processes.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: the folder cannot be made.
 
     """
     place = folder()
@@ -160,7 +159,7 @@ def _remove(made):
 
 
 def _leave(place):
-    """Remove the folder where nothing is left in it."""
+    """Remove the folder if it is empty."""
     try:
         place.rmdir()
     except OSError:
@@ -168,7 +167,7 @@ def _leave(place):
 
 
 def _own(path):
-    """Make the folder where it is missing; the checked path."""
+    """Make the folder if it is missing; return the checked path."""
     try:
         path.mkdir(mode=0o700)
     except FileExistsError:
@@ -182,7 +181,7 @@ def _check(path):
 
 
 def _judge(found, path):
-    """Refuse what is no folder, or a folder that others may own or enter."""
+    """Refuse anything but a folder of this user that is closed to others."""
     if not stat.S_ISDIR(found.st_mode):
         raise OSError(f'{path}: expected a folder, found a link or file; remove it')
     if found.st_uid != os.getuid():

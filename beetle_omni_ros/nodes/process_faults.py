@@ -1,4 +1,4 @@
-"""Faults that only the ROS graph shows: processes killed or stopped, strangers on its topics."""
+"""Flights with faults of the ROS graph: killed or stopped processes, foreign publishers."""
 
 from __future__ import annotations
 
@@ -26,16 +26,15 @@ from beetle_omni_ros.sim.faults.listed import FaultList, OutcomeLimits
 
 READY, TAKE_OFF = 300.0, 30.0       # s
 SETTLE = 2.0                        # s in the air before the fault
-LYING = 0.3                         # m of base_link over the floor: it may lie there
+LYING = 0.3                         # m, height of base_link below which it may be on the floor
 OFF = ('disarmed', 'emergency_stop')
 ROBOT = 'sim_node: robot'
 
 
 class Observer(Operator):
-    """An operator who sees the truth and what the actuators are asked for."""
+    """Operator that also observes ground truth and commands."""
 
     def __init__(self, number: int, limits: OutcomeLimits):
-        """Join the domain ``number``."""
         super().__init__(number)
         self._limits = limits
         self.height, self.takeoffs = np.nan, 0
@@ -47,7 +46,7 @@ class Observer(Operator):
         wire.subscribe(self._node, 'command', self._on_asked, qos=SENSOR, read=read_command)
 
     def publisher(self, topic):
-        """Make a publisher that is heard."""
+        """Make a publisher and wait for its first subscription."""
         made = wire.Publisher(self._node, topic, EVENT)
         self.wait(lambda: made.get_subscription_count() > 0, 5.0)
         self.spin(0.3)
@@ -79,13 +78,13 @@ class Observer(Operator):
 @dataclass(frozen=True)
 class ProcessFault:
     """
-    One of them.
+    A fault of the graph.
 
     Attributes:
-        what: happens, in words.
-        expected: outcome, as in the list of faults.
-        strike: does it; returns whether the graph refused it, where that is expected.
-        bridges: whether the actuators are emulated devices behind their bridges.
+        what: description.
+        expected: expected outcome, as in params/faults.yaml.
+        strike: injects the fault; returns whether the graph refused it.
+        bridges: whether the actuators are emulated devices with their bridges.
 
     """
 
@@ -117,7 +116,7 @@ def _pause(node, seconds):
 
 
 def _refused(observer, node, topic, before):
-    """Whether a node has told that it refused messages of a topic since ``before``."""
+    """Whether a node reports more than ``before`` refused messages of a topic."""
     return observer.wait(lambda: _count(observer, node, topic) > before, 5.0)
 
 
@@ -166,9 +165,9 @@ FAULTS = {
                                         _kill('joint_bridge_node'), bridges=True),
     'rotor_bridge_killed': ProcessFault('kill -9 of the rotor bridge: all rotors stop', 'stops',
                                         _kill('rotor_bridge_node'), bridges=True),
-    'second_publisher': ProcessFault('somebody else publishes commands for 1 s', 'refused',
+    'second_publisher': ProcessFault('another node publishes commands for 1 s', 'refused',
                                      _second_publisher),
-    'clock_set': ProcessFault('somebody sets use_sim_time', 'refused', _clock),
+    'clock_set': ProcessFault('use_sim_time is set in flight', 'refused', _clock),
     'target_in_the_ground': ProcessFault('a target at z = -5 m', 'refused', _target(-5.0)),
     'target_of_1970': ProcessFault('a target with a stamp of 1970', 'refused',
                                    _target(1.2, stamp=1.5)),
@@ -177,10 +176,10 @@ FAULTS = {
 
 def chosen(names: list[str] | None) -> list[str]:
     """
-    Names of FAULTS, all by default.
+    Return the names, all of FAULTS by default.
 
     Raises:
-        ParameterError: an unknown one.
+        ParameterError: unknown name.
 
     """
     for name in names or ():
@@ -191,12 +190,12 @@ def chosen(names: list[str] | None) -> list[str]:
 
 def fly_through_ros(name: str, listed: FaultList) -> dict:
     """
-    Fly one of FAULTS in hover, in real time, each node in a process of its own.
+    Hover in real time with one of FAULTS, each node in its own process.
 
     Returns:
-        case, what, expected, outcome, named (what the supervisor told behind its state), states,
-        impact_m_s, stopped_s (from the touchdown until no thrust was asked for), takeoffs,
-        bag_lost and error ('' where the flight could be flown).
+        case, what, expected, outcome, named (faults in the supervisor's states), states,
+        impact_m_s, stopped_s (from the touchdown to the last commanded thrust), takeoffs,
+        bag_lost and error ('' unless the flight failed before the fault).
 
     """
     fault = FAULTS[name]
@@ -227,7 +226,7 @@ def _graph(folder, number, bridges):
 
 
 def _start(graph, observer):
-    """Take off; why that failed, or ''."""
+    """Take off; return why that failed, or ''."""
     bridges = [node for node in graph.nodes if node in BRIDGES]
     if not observer.wait(lambda: observer.ready and ROBOT in observer.diagnostics
                          and not observer.waits_for(bridges), READY):
@@ -243,7 +242,7 @@ def _start(graph, observer):
 
 
 def _watch(graph, observer, fault, listed):
-    """Strike, watch, land; what was seen."""
+    """Inject the fault, observe, land; return the observations."""
     flight = listed.flight
     observer.begin()
     refused = fault.strike(graph, observer)
@@ -253,7 +252,7 @@ def _watch(graph, observer, fault, listed):
         observer.call('land')
     observer.wait(lambda: observer.state in OFF, flight.landing_time if observer.touched is None
                   else 2.0)
-    observer.spin(flight.end_time + 1.0)      # a diagnostic of the simulator is among it
+    observer.spin(flight.end_time + 1.0)      # long enough for a diagnostic of the simulator
     return _judged(observer, asked, refused, listed.limits)
 
 

@@ -1,4 +1,4 @@
-"""Records the flight into a bag, as ``ros2 bag record -s mcap`` does where that is installed."""
+"""ROS node that records a flight into a bag, like ``ros2 bag record -s mcap``."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from beetle_omni_ros.robot.urdf import description
 from beetle_omni_ros.runs.bag import BagError, BagWriter
 from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS
 
-FLUSH_PERIOD = 0.4      # s; a crash loses at most what came after the last flush
-TARGETS = 'target_pose', 'target_trajectory'    # of anybody, however they are published
+FLUSH_PERIOD = 0.4      # s; a crash loses only messages after the last flush
+TARGETS = 'target_pose', 'target_trajectory'    # with any quality of service
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,17 +27,17 @@ class RecorderNodeParameters:
     bag: str = parameter(doc='folder to create for the bag', read_only=True)
     controllers: NAMES = parameter(
         tuple(registry.standing_by()), read_only=True,
-        doc='whose requests are recorded beside the rest: registered names')
-    urdf_file: str = parameter('', doc='robot description, whose frames are recorded; empty: the '
+        doc='registered controllers whose commands are recorded')
+    urdf_file: str = parameter('', doc='robot description for the recorded frames; empty: the '
                                        'shipped one', read_only=True)
     compression: str = parameter('none', choices=COMPRESSIONS, read_only=True,
-                                 doc='of the chunks in the MCAP file')
+                                 doc='compression of the chunks in the MCAP file')
 
 
 class RecorderNode(FlightNode):
-    """Writes every topic of the package as it comes from the wire."""
+    """Writes the messages of every topic of the package into a bag."""
 
-    real_time = True        # the times of arrival in the bag are measurements
+    real_time = True        # the times of receipt in the bag are measurements
 
     def __init__(self):
         super().__init__('recorder_node', RecorderNodeParameters)
@@ -76,12 +76,12 @@ class RecorderNode(FlightNode):
         return write
 
     def waits_for(self):
-        """Whatever comes."""
+        """Return what is recorded where; a recorder needs no particular input."""
         return f'messages, and writes them to {self.parameters.bag}'
 
     def _on_lost(self, event):
         self._lost += event.total_count_change
-        self.get_logger().warning(f'{event.total_count_change} messages lost on the way')
+        self.get_logger().warning(f'{event.total_count_change} messages lost')
 
     def _flush(self):
         try:
@@ -91,7 +91,7 @@ class RecorderNode(FlightNode):
             self._give_up(error)
 
     def _give_up(self, error):
-        # A full disk ends the recording, never the flight that shares the process.
+        # A full disk ends the recording but not the process, which is shared with other nodes.
         if self._failure is None:
             self._failure = str(error)
             self.get_logger().error(f'recording ended: {error}')

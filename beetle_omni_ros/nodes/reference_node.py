@@ -1,4 +1,4 @@
-"""Flies a task: publishes its targets, disturbances and payloads in time."""
+"""ROS node that publishes the targets, disturbances and payloads of a task."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import parameter
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer
 
-PERIOD = 0.02           # s between looks at the task
-IMPULSE_PERIOD = 0.005  # s, the same for tasks with impulses of some 50 ms
-# A trajectory goes out in overlapping windows: one long message would take every reader
-# tenths of a second to unpack, and who joins late hears the next window soon.
+PERIOD = 0.02           # s between updates of the task
+IMPULSE_PERIOD = 0.005  # s, the same for tasks with impulses of 50 ms
+# A trajectory is published in overlapping windows: a reader would need tenths of a second to
+# decode the whole of it, and a node that starts late soon receives the next window.
 WINDOW, WINDOW_PERIOD, WINDOW_SAMPLE = 3.0, 1.5, 0.05   # s
 
 
@@ -28,15 +28,15 @@ class ReferenceNodeParameters:
     """Parameters of reference_node."""
 
     task: str = parameter('hover', doc='name of a task, or a CSV file of poses', read_only=True)
-    seed: int = parameter(0, doc='of random poses', low=0, high=2**31 - 1, read_only=True)
+    seed: int = parameter(0, doc='seed of random poses', low=0, high=2**31 - 1, read_only=True)
 
 
 class ReferenceNode(FlightNode):
     """
-    Plays the task from the moment in which the supervisor reports flying.
+    Publishes the targets of a task, beginning when the supervisor reports 'flying'.
 
-    ``reference/state`` (latched) says 'waiting', 'flying 3/15', 'done',
-    'done: control lost at level 60', or 'aborted' when the flight ended before the task.
+    ``reference/state`` (latched) is 'waiting', 'flying 3/15', 'done',
+    'done: control lost at level 60', or 'aborted' if the flight ended before the task.
     """
 
     def __init__(self):
@@ -60,8 +60,8 @@ class ReferenceNode(FlightNode):
                           clock=self.flight_clock)
 
     def waits_for(self):
-        """The take-off."""
-        return f"supervisor/state to say flying; then flies task '{self._task.name}'"
+        """Return the trigger of the task."""
+        return f"'flying' on supervisor/state; then flies task '{self._task.name}'"
 
     def _set_state(self, state):
         if state != self._state:

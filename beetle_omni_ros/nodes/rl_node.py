@@ -1,4 +1,4 @@
-"""The trained policy as a node."""
+"""ROS node of the trained policy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The motor board as a node: thrusts to the rotors, battery and rotor speeds back."""
+"""ROS node of the motor board: thrusts to the rotors, battery and rotor speeds from it."""
 
 from __future__ import annotations
 
@@ -20,35 +20,34 @@ from beetle_omni_ros.robot.schema import parameter
 
 RPM = math.pi / 30      # [rad/s]
 UNCONFIGURED, INACTIVE = 'not configured', 'not activated'
-POLL_CYCLES = 2         # the board tells its rotors' speeds 100 times a second
+POLL_CYCLES = 2         # the board sends its rotors' speeds 100 times a second
 
 
 @dataclass(frozen=True, kw_only=True)
 class RotorBridgeNodeParameters(MotorBoardParameters):
-    """Parameters of rotor_bridge_node: the driver's own and the robot."""
+    """Parameters of rotor_bridge_node: the driver's parameters, the files, and autostart."""
 
     robot_file: str = parameter(
         '', doc='robot file with the rotor map; empty: the shipped one', read_only=True)
     motor_board_file: str = parameter(
-        '', doc='file to start from; empty: the shipped params/motor_board.yaml', read_only=True)
+        '', doc='motor board file; empty: the shipped params/motor_board.yaml', read_only=True)
     autostart: str = parameter('activate', choices=tuple(AUTOSTART), read_only=True,
-                               doc='transition to make without being asked')
+                               doc='transition at the start')
 
 
 class RotorBridgeNode(LifecycleFlightNode):
     """
     Executes the thrusts of command; publishes battery_state, rotor_states and its own state.
 
-    A lifecycle node: configure looks for the board, activate lets it be armed. Then it arms the
-    motor board when the supervisor takes off, and disarms it when the supervisor does, stops, or
-    when this process ends. rotor_bridge/state (latched) is 'ready', 'waiting: WHY' or
+    A lifecycle node: configure opens the port, activate permits arming. The node arms the motor
+    board when the supervisor takes off. It disarms the board when the supervisor disarms or stops,
+    and when this process ends. rotor_bridge/state (latched) is 'ready', 'waiting: WHY' or
     'lost: WHY'.
     """
 
     real_time = True
 
     def __init__(self):
-        """Begin disarmed, and look for the board."""
         super().__init__('rotor_bridge_node', RotorBridgeNodeParameters,
                          'params/motor_board.yaml', 'motor_board_file')
         given = self.parameters
@@ -60,7 +59,8 @@ class RotorBridgeNode(LifecycleFlightNode):
         self._arming.bar(UNCONFIGURED)
         self._stream = TargetStream(self._period)
         self._command = None
-        self._state, self._absent = '', None    # why the port is away; None: nobody looks for it
+        # _absent: why the port is closed, '' if not yet known; None: open, or not configured.
+        self._state, self._absent = '', None
         self._looked = self._next_try = time.monotonic()
         self._cycle, self._sent = 0, 0.0
         self._states = self.publisher('rotor_bridge/state')
@@ -78,12 +78,12 @@ class RotorBridgeNode(LifecycleFlightNode):
     # --- lifecycle ----------------------------------------------------------------------------
 
     def configure(self):
-        """Look for the board, and keep looking; tell battery and rotors from then on."""
+        """Open the port, now or as soon as it exists; then battery and rotors are published."""
         self._absent, self._next_try = '', time.monotonic()
         self._arming.bar(INACTIVE)
 
     def activate(self):
-        """Let the board be armed, which the supervisor does."""
+        """Permit arming, which the supervisor requests."""
         self._arming.bar('')
 
     def deactivate(self):
@@ -97,13 +97,13 @@ class RotorBridgeNode(LifecycleFlightNode):
         self._board.close()
 
     def changed(self):
-        """Tell the state."""
+        """Publish the state."""
         self._tell()
 
     # --- the stream ---------------------------------------------------------------------------
 
     def waits_for(self):
-        """The board, or what it lacks."""
+        """Return the state of the motor board."""
         self._tell()
         return self._state.replace('waiting:', 'the motor board:')
 
@@ -111,7 +111,7 @@ class RotorBridgeNode(LifecycleFlightNode):
         self._command = command
         if not self._send():
             return
-        self._timer.reset()     # again in a period, unless a newer one comes first
+        self._timer.reset()     # sends this command again after a period without a newer one
         age = self.now() - command.stamp
         if math.isnan(published):
             self._stream.answered(age, 'the stamp of the command', age)
@@ -128,8 +128,8 @@ class RotorBridgeNode(LifecycleFlightNode):
         self._arming.update(now - self._looked)
         self._looked = now
         if now - self._sent < self._period / 2:
-            # A command came just before this expiry was served, which would now count for the
-            # one that its reset had promised.
+            # A command came between this expiry and its callback; its reset of the timer was
+            # too late.
             self._timer.reset()
         else:
             self._send()
@@ -139,7 +139,7 @@ class RotorBridgeNode(LifecycleFlightNode):
         self._tell()
 
     def _open(self, now):
-        """Open the port; once open, the driver itself finds it again."""
+        """Try to open the port; afterwards the driver itself reconnects."""
         if self._absent is None or now < self._next_try:
             return
         self._next_try = now + self.parameters.reconnect_period
@@ -153,7 +153,7 @@ class RotorBridgeNode(LifecycleFlightNode):
             self._absent = None
 
     def _send(self):
-        """Send the newest thrusts while flying; whether they are on their way."""
+        """Send the newest thrusts while flying; return whether they were sent."""
         command = self._command
         if self._arming.phase != FLIES or command is None \
                 or self.now() - command.stamp > self.parameters.stamp_age_limit:
@@ -188,7 +188,7 @@ class RotorBridgeNode(LifecycleFlightNode):
     def _tell(self):
         text = self._arming.text
         if self._absent and text.startswith('waiting'):
-            text = f'waiting: {self._absent}'       # says why the port is away
+            text = f'waiting: {self._absent}'
         if text != self._state:
             if not text.startswith('waiting'):
                 self._log('error' if text.startswith('lost') else 'info', f'motor board: {text}')

@@ -1,4 +1,4 @@
-"""Diagnostics of rotor_bridge_node: targets, the board with its link, the latency, each rotor."""
+"""Diagnostics of rotor_bridge_node: targets, board and link, latency, rotors."""
 
 from __future__ import annotations
 
@@ -16,23 +16,22 @@ from beetle_omni_ros.nodes import health
 
 class TargetStream:
     """
-    Counts of a stream of targets that should have one in every period.
+    Counts of a stream with one target every ``period`` [s].
 
     Attributes:
-        cycles: periods in which a target was to be written.
-        missed: those of them that passed without one.
-        unsent: reason -> targets that could not be sent.
-        latency: from the publication of a command to the last byte of its target, once for each.
-        latency_from: what its beginning is.
-        age: of commands, by their stamp, as the last byte of their target is written: the latency
-            of the whole loop, from the IMU sample on.
+        cycles: periods in which a target was due.
+        missed: periods without a target.
+        unsent: reason -> number of targets that could not be sent.
+        latency: time from the publication of a command to the last byte of its first target.
+        latency_from: event from which the latency counts.
+        age: time from a command's stamp to the last byte of its target: the latency of the whole
+            loop from the IMU sample on.
         command: (4,) normalised commands of the newest target.
-        saturated: (4,) targets of each rotor beyond what the battery can give.
+        saturated: (4,) number of targets of each rotor above the limit of the battery.
 
     """
 
     def __init__(self, period: float):
-        """Expect a target every ``period`` [s]."""
         self._period = period
         self._last: float | None = None
         self.cycles = self.missed = 0
@@ -43,16 +42,16 @@ class TargetStream:
         self.saturated = np.zeros(4, dtype=int)
 
     def rest(self) -> None:
-        """Nothing is to be written until the next target."""
+        """Count no missed period before the next target."""
         self._last = None
 
     def add(self, sent: Sent, now: float) -> None:
-        """Take what became of a target at monotonic time ``now`` [s]."""
+        """Count the result of one target at monotonic time ``now`` [s]."""
         if not sent.sent:
             self.unsent[sent.reason] += 1
             return
         if self._last is not None:
-            # What lies nearer to one period than to two was in time.
+            # A gap nearer to one period than to two was in time.
             cycles = round((now - self._last) / self._period)
             self.cycles += cycles
             self.missed += max(cycles - 1, 0)
@@ -61,14 +60,14 @@ class TargetStream:
         self.saturated += sent.saturated
 
     def answered(self, seconds: float, begin: str, age: float) -> None:
-        """Take the latency [s] of one command, counted from ``begin``, and its age [s]."""
+        """Add the latency [s] of one command since the event ``begin``, and its age [s]."""
         self.latency.add(seconds)
         self.latency_from = begin
         self.age.add(age)
 
 
 class RotorBridgeReport:
-    """Gathers what the board tells and answers when diagnostics are due."""
+    """Sources of the diagnostic statuses of the bridge."""
 
     def __init__(self, reports: health.Health, arming: Arming, stream: TargetStream):
         self._arming, self._stream = arming, stream
@@ -81,7 +80,7 @@ class RotorBridgeReport:
             reports.report(f'rotor{k + 1}', partial(self._rotor_status, k))
 
     def update(self, update: BoardUpdate) -> None:
-        """Take what is new."""
+        """Store the newest data of the board."""
         self._update = update
         self._battery = update.battery or self._battery
         self._rotors = update.rotors or self._rotors
@@ -137,7 +136,7 @@ class RotorBridgeReport:
 
 
 def _link(update):
-    """Both directions of the link and the clocks, flat."""
+    """Counters of both directions of the link, and clock synchronisation."""
     link, received = update.link, update.link.received
     values = {'received': received.messages, 'lost': received.lost, 'bad_crc': received.bad_crc,
               'skipped_bytes': received.skipped_bytes, 'sent': link.sent,

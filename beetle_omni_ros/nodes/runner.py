@@ -1,4 +1,4 @@
-"""Run nodes in one process: start, spin, stop; errors in one line, exit status with meaning."""
+"""Runs nodes in one process: start, spin, stop; errors are one line and an exit status."""
 
 from __future__ import annotations
 
@@ -24,12 +24,11 @@ from beetle_omni_ros.nodes.node import StartError
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
 OK, FAILED, UNUSABLE = 0, 1, 2
-# The events executor of Jazzy dispatches nothing in the calls that take no timeout.
+# s; without a timeout, the events executor of Jazzy dispatches no callbacks.
 FOREVER = 1e8
-# A driver gives a servo 3 ms for its answer, so that no thread may keep the interpreter to itself
-# for the usual 5 ms.
+# A servo has 3 ms to answer, so no thread may keep the interpreter for the default 5 ms.
 THREAD_SWITCH = 0.0005  # s
-REAL_TIME_PRIORITY = 1  # lowest of the real-time ones: above every ordinary process
+REAL_TIME_PRIORITY = 1  # lowest real-time priority, above every ordinary process
 PR_SET_PDEATHSIG = 1    # of linux/prctl.h
 ENDING = (signal.SIGINT, signal.SIGTERM)
 
@@ -55,20 +54,20 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
     Run the nodes on one events executor until a signal or a fatal error.
 
     Args:
-        node_classes: each called without arguments.
+        node_classes: classes that are called without arguments.
         argv: program name and ROS arguments.
-        name: of the process, for messages.
+        name: name of the process in messages.
 
     Returns:
         Exit status: 0 stopped by a signal, 1 failed, 2 unusable parameters.
 
     """
     nodes, status = [], OK
-    signal.signal(signal.SIGTERM, signal.default_int_handler)   # while starting, as Ctrl-C
+    signal.signal(signal.SIGTERM, signal.default_int_handler)   # KeyboardInterrupt during start-up
     end_with_parent()
     try:
         discovery.confine()
-        # Not rclpy's handlers: they end the context under a callback that still publishes.
+        # rclpy's handlers would end the context while a callback still publishes.
         rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
         executor = make_executor()
         for node_class in node_classes:
@@ -77,14 +76,14 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
             nodes.append(node)
             node.introduce()
             executor.add_node(node)
-        # What start-up made lives as long as the process: keep the collector off it, so
-        # that no pause of some 10 ms lands in a control cycle.
+        # Objects of the start-up live as long as the process. Freezing them avoids pauses of the
+        # garbage collector of some 10 ms in a control cycle.
         gc.collect()
         gc.freeze()
         if any(getattr(node, 'real_time', False) for node in nodes):
             sys.setswitchinterval(THREAD_SWITCH)
-        # Alone in its process a node shares the processor as any other: real-time processes
-        # that wait for one another have held up the simulator for a third of a second.
+        # Not for a single node: real-time processes that wait for one another delayed the
+        # simulator by a third of a second.
         if len(nodes) > 1 and any(getattr(node, 'real_time', False) for node in nodes):
             run_before_others()
         executor.spin_until_future_complete(_stop_on_signal(), FOREVER)
@@ -95,7 +94,7 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
     except (StartError, OSError) as error:
         status = _fail(name, error, FAILED)
     finally:
-        # A second signal, forwarded by a launch system, must not cut the clean-up short.
+        # A second signal, forwarded by a launch system, must not interrupt the clean-up.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         for node in reversed(nodes):
@@ -106,28 +105,28 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
 
 def own_arguments(argv: Sequence[str], name: str) -> list[str]:
     """
-    Arguments that are neither for ROS nor for discovery, which is confined here.
+    Return the arguments that are neither for ROS nor for discovery; apply the latter.
 
-    Ends the process when those are unusable.
+    Ends the process if arguments are unusable.
     """
     try:
         _check_parameter_files(argv)
         return discovery.take(remove_ros_args(list(argv))[1:])
     except Exception as error:
-        # rclpy does not export the class of what it raises on bad arguments.
+        # rclpy does not export the class of its error on bad arguments.
         if not isinstance(error, ParameterError) and 'ROSArgs' not in type(error).__name__:
             raise
         sys.exit(_fail(name, error, UNUSABLE))
 
 
 def executable(node_class: type) -> str:
-    """Name of a node's executable, its own or of its class: EkfNode -> ekf_node."""
+    """Return a node class's attribute ``executable``, or its name as one: EkfNode -> ekf_node."""
     return getattr(node_class, 'executable', '') \
         or re.sub(r'(?<=[a-z])(?=[A-Z])', '_', node_class.__name__).lower()
 
 
 def make_executor(context=None):
-    """Make the events executor, or the plain one on a distribution without it."""
+    """Make an events executor, or a single-threaded one if the distribution lacks it."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
@@ -138,10 +137,10 @@ def make_executor(context=None):
 
 def _stop_on_signal() -> Future:
     """
-    Make a future that SIGINT or SIGTERM completes, between two callbacks.
+    Make a future that SIGINT or SIGTERM completes between two callbacks.
 
-    Python runs a signal handler only when the main thread is in Python, which in an idle
-    node may take a second; the wake-up descriptor is written at once.
+    Python runs a signal handler only when the main thread executes Python, in an idle node up to a
+    second later. The wake-up descriptor is written at once.
     """
     stop = Future()
     waiting, written = socket.socketpair()
@@ -160,29 +159,29 @@ def _stop_on_signal() -> Future:
 
 def run_before_others():
     """
-    Give every thread so far real-time priority, where the system allows it.
+    Give all present threads real-time priority, if the system permits it.
 
-    On a busy computer this is what keeps commands in time. Only after the start, which
-    may compile for seconds; Linux itself leaves 5 % to the rest, whatever happens here.
+    This keeps commands in time on a busy computer. It is called after the start-up, which may
+    compile for seconds. Linux reserves 5 % of the processor for other processes.
     """
     try:
         for thread in os.listdir('/proc/self/task'):
             os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(REAL_TIME_PRIORITY))
     except (OSError, AttributeError):
-        pass        # not permitted, or not Linux: as any other process
+        pass        # not permitted, or not Linux
 
 
 def end_with_parent():
-    """Let Linux stop this process when the one that started the graph dies, even by SIGKILL."""
+    """Let Linux send SIGTERM when the process that started the graph ends, even by SIGKILL."""
     parent = os.environ.get('BEETLE_OMNI_PARENT')
     if parent and sys.platform == 'linux':
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != int(parent):     # it was gone already
+        if os.getppid() != int(parent):     # it ended before prctl
             os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _check_parameter_files(argv):
-    """Refuse unusable files by file and line; ROS would answer with a traceback."""
+    """Refuse unusable files by file and line; ROS would print a traceback."""
     for flag, path in zip(argv, argv[1:]):
         if flag == '--params-file':
             load_yaml(path)
@@ -197,12 +196,12 @@ def _fail(name, error, status):
 @contextmanager
 def terminable():
     """
-    Let SIGTERM end what is inside as Ctrl-C does, so that nothing is left behind.
+    Raise KeyboardInterrupt on SIGTERM too, so that the block is cleaned up.
 
-    The first signal counts; those that follow do not cut the cleaning up short.
+    Further signals are ignored, so that they do not interrupt the clean-up.
 
     Raises:
-        KeyboardInterrupt: one of the signals came, whatever a library made of it.
+        KeyboardInterrupt: a signal came, even if a library turned it into another exception.
 
     """
     if threading.current_thread() is not threading.main_thread():
@@ -230,7 +229,7 @@ def terminable():
 
 @contextmanager
 def undisturbed():
-    """Let signals wait: who cleans up has been told already, and a launch system tells twice."""
+    """Ignore signals during a clean-up: a launch system sends them twice."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

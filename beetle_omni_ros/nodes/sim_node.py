@@ -1,4 +1,4 @@
-"""The simulated robot in real time: sensors out, commands in, or devices on serial ports."""
+"""ROS node of the simulated robot, with topics or emulated serial devices as actuators."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
 COMMAND_AGE = 0.1       # s, older commands are not executed
+# Switches of single events, which are reset after they happened.
 EVENTS = {*(f'servo_faults.{name}' for name in SERVO_EVENTS),
           *(f'board_faults.{name}' for name in BOARD_EVENTS)}
 
@@ -43,29 +44,28 @@ class SimNodeParameters:
     """Parameters of sim_node."""
 
     robot_file: str = parameter(
-        '', doc='robot file that is true in the simulation; empty: the shipped one',
-        read_only=True)
+        '', doc='robot file of the simulated robot; empty: the shipped one', read_only=True)
     simulator_file: str = parameter(
         '', doc='simulator file; empty: the shipped one', read_only=True)
     conditions: str = parameter('nominal', choices=('nominal', 'published'), read_only=True,
                                 doc='randomisation of plant and sensors')
-    seed: int = parameter(0, doc='of every random number', low=0, high=2**31 - 1,
+    seed: int = parameter(0, doc='seed of all random numbers', low=0, high=2**31 - 1,
                           read_only=True)
     actuators: str = parameter('direct', choices=('direct', 'emulated'), read_only=True,
                                doc='how commands reach the plant: from the topic, or through '
                                'emulated devices on serial ports')
-    servo_port: str = parameter('', doc="path of the servos' port to make; empty: a temporary one",
-                                read_only=True)
-    board_port: str = parameter('', doc="path of the motor board's port to make; empty: a "
+    servo_port: str = parameter('', doc="path of the emulated servos' port; empty: a temporary "
+                                'one', read_only=True)
+    board_port: str = parameter('', doc="path of the emulated motor board's port; empty: a "
                                 'temporary one', read_only=True)
     servo_bus_file: str = parameter(
         '', doc='ids, signs, zeros and baud rate of the emulated servos; empty: the shipped file',
         read_only=True)
     clock: str = parameter('system', choices=('system', 'simulated'), read_only=True,
-                           doc='real time, or simulated time on /clock that waits for nodes which '
-                           'are late; those need use_sim_time then')
+                           doc='real time, or simulated time on /clock, which waits for late '
+                           'nodes; all other nodes then need use_sim_time')
     payload: float = parameter(0.0, doc='mass attached below the body', unit='kg', low=0, high=2)
-    faults: str = parameter('', doc='faults that are on, as "rotor_stops rotor=2; mocap_lost '
+    faults: str = parameter('', doc='active faults, as "rotor_stops rotor=2; mocap_lost '
                             'duration=3"; docs/faults.md lists the kinds')
     servo_faults: ServoFaultSwitches = group(ServoFaultSwitches, 'faults of the servo bus')
     board_faults: BoardFaultSwitches = group(BoardFaultSwitches, 'faults of the motor board')
@@ -75,8 +75,8 @@ class SimNode(FlightNode):
     """
     Steps the simulator on the steady clock, stamps its readings in ROS time.
 
-    With ``clock`` simulated it makes the time of the others: /clock goes on with each step, and
-    steps wait until estimator and actuator commands have answered what they were sent.
+    With ``clock`` simulated it publishes /clock after each step. Steps then wait until estimator
+    and supervisor have answered the newest samples.
     """
 
     real_time = True
@@ -119,11 +119,11 @@ class SimNode(FlightNode):
         return pacing
 
     def now(self) -> float:
-        """ROS time [s]; where it is simulated, this node makes it."""
+        """Return ROS time [s]; this node is the source of simulated time."""
         return super().now() if self._clock_publisher is None else self._pacing.now
 
     def _take_commands(self):
-        """Let the topic move the plant, and publish what the devices would measure."""
+        """Apply the topic `command` to the plant, and publish the measurements of the devices."""
         self._refuse_faults(self.parameters)
         self._step = self._simulator.step
         self._publish_to['joints'] = self.publisher('joint_states')
@@ -134,7 +134,7 @@ class SimNode(FlightNode):
         self.health.report('latency', self._latency_status)
 
     def _make_devices(self):
-        """Let the bridges' drivers move the plant through serial ports."""
+        """Connect emulated devices to the plant, for the drivers of the bridges."""
         given = self.parameters
         servos = ServoBusParameters.load(given.servo_bus_file or None)
         bus = EmulatedServoBus(
@@ -165,7 +165,7 @@ class SimNode(FlightNode):
             self._devices.close()
 
     def _strike(self, given):
-        """Switch faults of robot and sensors on and off; one that stays goes on."""
+        """Set the active faults of robot and sensors; unchanged ones continue."""
         faults = parse_faults(given.faults)
         for fault in faults:
             if given.actuators == 'emulated' and fault.changes(*DEVICES):
@@ -192,7 +192,7 @@ class SimNode(FlightNode):
 
     @staticmethod
     def _refuse_faults(given):
-        """Refuse faults of devices that are not there."""
+        """Refuse faults of emulated devices if there are none."""
         for group_name, events in (('servo_faults', SERVO_EVENTS), ('board_faults', BOARD_EVENTS)):
             faults = getattr(given, group_name)
             wanted = switched_on(faults) + [name for name in events if getattr(faults, name)]
@@ -201,7 +201,7 @@ class SimNode(FlightNode):
                                      'actuators direct; start with actuators:=emulated')
 
     def _reset_events(self, changed):
-        """Give events that have happened their value of rest, so that they can be set again."""
+        """Reset the parameters of events that have happened, so that they can be set again."""
         happened = [Parameter(one.name, value=type(one.value)()) for one in changed
                     if one.name in EVENTS and one.value]
         if happened:
@@ -221,7 +221,7 @@ class SimNode(FlightNode):
 
     def _publish(self, frame):
         epoch, publish_to = self._pacing.epoch, self._publish_to
-        # What is old already goes first, so that the estimate that the IMU sample triggers has it.
+        # Delayed readings first: the IMU sample triggers the estimate, which should include them.
         if frame.mocap is not None:
             publish_to['mocap'].publish(replace(frame.mocap, stamp=epoch + frame.mocap.stamp))
         if self._devices is None and frame.joints is not None:

@@ -1,4 +1,4 @@
-"""Arming, selection, checks and fallback between the controllers and the actuators."""
+"""ROS node of the supervisor, between the controllers and the actuators."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from beetle_omni_ros.safety.events import ERROR, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import DISARMED, FALLBACK, FLYING, STOPPED, Supervisor
 
-WATCH_PERIOD = 0.01     # s between looks at what is silent
-SENSOR_AGE = 0.2        # s, the descent without estimator uses nothing older
+WATCH_PERIOD = 0.01     # s between checks for silent inputs
+SENSOR_AGE = 0.2        # s, the descent without estimator uses no older sample
 LEVELS = {FALLBACK: health.WARN, STOPPED: health.ERROR}
 
 
 @dataclass(frozen=True, kw_only=True)
 class SupervisorNodeParameters(SupervisorParameters):
-    """Parameters of supervisor_node: the supervisor's own and the robot."""
+    """Parameters of supervisor_node: the supervisor's parameters, controllers and files."""
 
     controllers: NAMES = parameter(
         tuple(registry.standing_by()), read_only=True,
-        doc='those that may be active: registered names, or package.module:Class')
+        doc='controllers that may be active: registered names, or package.module:Class')
     robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
     supervisor_file: str = parameter(
-        '', doc='file to start from; empty: the shipped params/supervisor.yaml', read_only=True)
+        '', doc='supervisor file; empty: the shipped params/supervisor.yaml', read_only=True)
 
 
 class SupervisorNode(FlightNode):
     """
-    Publishes command, the only topic that actuators obey, and supervisor/state (latched).
+    Publishes command, the only topic that actuators execute, and supervisor/state (latched).
 
-    Services ~/arm, ~/disarm, ~/land and ~/emergency_stop; the parameter controller selects
-    the active controller, also in flight.
+    Services ~/arm, ~/disarm, ~/land and ~/emergency_stop; the parameter controller selects the
+    active controller, also in flight.
     """
 
     real_time = True
@@ -80,7 +80,7 @@ class SupervisorNode(FlightNode):
         self._update()
 
     def waits_for(self):
-        """The sensors, the operator."""
+        """Return the missing sensors and the arming."""
         return f'{super().waits_for()}; then for ~/arm'
 
     def _listen(self):
@@ -123,14 +123,14 @@ class SupervisorNode(FlightNode):
             return
         self._supervisor.on_state(State.join(odom, self._joints))
         if self._supervisor.state not in (DISARMED, FLYING):
-            self._update()      # hover answers each estimate, as a controller does
+            self._update()      # the fallback controller answers each estimate
 
     def _on_command(self, name):
         def handle(command):
             supervisor = self._supervisor
             accepted = supervisor.on_command(name, command, self.now())
             if accepted and name == supervisor.active and supervisor.state == FLYING:
-                self._update()      # on with it at once, not at the next look
+                self._update()      # at once, not at the next timer
         return handle
 
     def _on_bridge(self, name):
@@ -142,7 +142,7 @@ class SupervisorNode(FlightNode):
     def _update(self):
         supervisor = self._supervisor
         command = supervisor.update(self.now())
-        # The same command is not repeated: its age tells the actuators that nothing new came.
+        # A command is not repeated: the actuators detect missing commands by the age.
         if command is not None and (command.stamp, supervisor.source) != self._sent:
             self._sent = (command.stamp, supervisor.source)
             self._publisher.publish(command, self._identity)
@@ -178,7 +178,7 @@ class SupervisorNode(FlightNode):
         supervisor = self._supervisor
         told = supervisor.diagnostics()
         for name, at in supervisor.faults.items():
-            told[f'fault.{name}'] = f'{at:.3f}'     # [s]: six digits of a stamp tell nothing
+            told[f'fault.{name}'] = f'{at:.3f}'     # [s]: six digits are too few for a stamp
         level = LEVELS.get(supervisor.state, health.WARN if supervisor.faults else health.OK)
         named = ', '.join(supervisor.faults)
         return level, f'{self._state}; faults: {named}' if named else self._state, told

@@ -1,8 +1,8 @@
 """
-The message of `/tf`, also where ROS is of PyPI, which has no tf2_msgs.
+The message class of `/tf`, also for ROS from PyPI, which has no tf2_msgs.
 
-The wheels hold the generators that make a message package of its definition. What they make is
-compiled once, as the controllers are, and kept in the same cache.
+The wheels contain the generators that make a message package from its definition. The package is
+compiled once and kept in the cache of the compiled controllers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ module tf2_msgs { module msg { struct TFMessage {
   sequence<geometry_msgs::msg::TransformStamped> transforms;
 }; }; };
 """
-# Both kinds of type support in one library; rclpy asks for them by name.
+# Both kinds of type support in one library, which rclpy looks up by name.
 DISPATCH = """#include <string.h>
 #include "rosidl_runtime_c/message_type_support_struct.h"
 #include "tf2_msgs/msg/detail/tf_message__functions.h"
@@ -55,7 +55,7 @@ const Support * HANDLE(rosidl_typesupport_c)(void)
   return &handle;
 }
 """
-# Generators in their order, and their arguments.
+# Generators in order: package, function, further arguments.
 GENERATORS = (('rosidl_generator_type_description', 'generate_type_hash'),
               ('rosidl_generator_c', 'generate_c'),
               ('rosidl_typesupport_fastrtps_c', 'generate_typesupport_fastrtps_c'),
@@ -72,7 +72,7 @@ LIBRARIES = ('geometry_msgs__rosidl_generator_c', 'geometry_msgs__rosidl_generat
 
 
 def transform_message() -> type | None:
-    """Class of `tf2_msgs/msg/TFMessage`, made where it is missing; None where that fails."""
+    """Return the class `tf2_msgs/msg/TFMessage`, built if it is missing; None if that fails."""
     try:
         return import_module('tf2_msgs.msg').TFMessage
     except ImportError:
@@ -87,13 +87,13 @@ def transform_message() -> type | None:
 
 def built() -> Path:
     """
-    Make the package in the cache, if that has not been done before.
+    Build the package in the cache, unless it is there.
 
     Returns:
-        the folder to import it from.
+        The folder to import it from.
 
     Raises:
-        CompilerError: no compiler, no generators, or a failure of theirs.
+        CompilerError: missing compiler or generators, or one of them fails.
 
     """
     from rclpy import __file__ as rclpy
@@ -107,7 +107,7 @@ def built() -> Path:
                 package = Path(build) / 'made' / 'tf2_msgs'
                 _generate(package)
                 _compile(package)
-                os.replace(package.parent, folder)      # atomic: another may make the same
+                os.replace(package.parent, folder)      # atomic: others may build it meanwhile
         except (OSError, ImportError, subprocess.SubprocessError) as error:
             if not folder.is_dir():
                 raise CompilerError(f'tf2_msgs cannot be made ({error})') from None
@@ -123,7 +123,7 @@ def _version():
 
 
 def _generate(package):
-    """Write C, C++ and Python of the message."""
+    """Write C, C++ and Python sources of the message."""
     share = Path(sys.prefix) / 'share'
     (package / 'msg').mkdir(parents=True)
     (package / '__init__.py').touch()
@@ -149,7 +149,7 @@ def _generate(package):
 
 
 def _compile(package):
-    """Make one extension module of all sources."""
+    """Compile all sources into one extension module."""
     import numpy as np
     prefix = Path(sys.prefix)
     include = [prefix / 'include', *(prefix / 'include').iterdir(), package.parent,

@@ -1,4 +1,4 @@
-"""What RViz and Foxglove need: the robot's description, its frames, and drawn forces."""
+"""ROS node for RViz and Foxglove: robot description, frames and markers."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ class ViewerNodeParameters:
     robot_file: str = parameter('', doc='robot file; empty: the shipped one', read_only=True)
     urdf_file: str = parameter('', doc='robot description; empty: the shipped one',
                                read_only=True)
-    links: bool = parameter(True, doc='publish description and frames of the links; false beside '
-                                      'robot_state_publisher', read_only=True)
-    frame_rate: float = parameter(50.0, doc='of the frames', unit='Hz', low=0.5, high=200,
+    links: bool = parameter(True, doc='publish description and frames of the links; false if '
+                                      'robot_state_publisher runs', read_only=True)
+    frame_rate: float = parameter(50.0, doc='rate of the frames', unit='Hz', low=0.5, high=200,
                                   read_only=True)
-    rate: float = parameter(20.0, doc='of the markers', unit='Hz', low=0.5, high=100,
+    rate: float = parameter(20.0, doc='rate of the markers', unit='Hz', low=0.5, high=100,
                             read_only=True)
     newton_per_metre: float = parameter(40.0, doc='thrust that is drawn as one metre',
                                         unit='N/m', low=1, high=1000)
 
 
 class ViewerNode(FlightNode):
-    """Publishes robot_description (latched), tf and markers; reads, never commands."""
+    """Publishes robot_description (latched), tf and markers."""
 
     def __init__(self):
         super().__init__('viewer_node', ViewerNodeParameters, on_change=self._changed)
@@ -70,7 +70,7 @@ class ViewerNode(FlightNode):
         return lambda value: setattr(self, name, value)
 
     def _describe(self, text):
-        """Publish what does not change: the description, and the frames that are fixed."""
+        """Publish the description and the fixed frames, once."""
         tree = joints(text)
         self._moving = [joint for joint in tree if joint.axis is not None]
         self._description = self.create_publisher(String, 'robot_description',
@@ -84,7 +84,7 @@ class ViewerNode(FlightNode):
                            joint.quaternion) for joint in tree if joint.axis is None]))
 
     def _move(self):
-        """Publish the frames that move, where somebody listens."""
+        """Publish the moving frames, if there is a subscription."""
         odom, angles = self._odom, self._joints
         if odom is None or odom.stamp == self._moved or \
                 not self._transforms.get_subscription_count():

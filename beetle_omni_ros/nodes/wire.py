@@ -1,4 +1,4 @@
-"""The table of topics in the terms of rclpy: messages, quality of service, both ends."""
+"""rclpy side of the table of topics: message classes, quality of service, both ends."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from beetle_omni_ros.messages.topics import Qos, topic_of
 
-LOOK_PERIOD = 0.5       # s between looks at what publishers offer
-COPIES = 64             # newest messages among which a copy is looked for
+LOOK_PERIOD = 0.5       # s between checks of the publishers' quality of service
+COPIES = 64             # newest messages that are compared to detect a copy
 TWO_ARGUMENTS = Signature([Parameter(name, Parameter.POSITIONAL_ONLY)
                            for name in ('message', 'info')])
 
 
 @cache
 def message_class(name: str) -> type:
-    """Find the class of a ROS type, 'sensor_msgs/msg/Imu'."""
+    """Return the class of a ROS type such as 'sensor_msgs/msg/Imu'."""
     package, _, message = name.split('/')
     return getattr(import_module(f'{package}.msg'), message)
 
@@ -54,7 +54,7 @@ RCLPY = RclpyKind()
 
 
 def profile(qos: Qos) -> QoSProfile:
-    """Quality of service for rclpy."""
+    """Return the quality of service for rclpy."""
     return QoSProfile(
         depth=qos.depth,
         reliability=ReliabilityPolicy.RELIABLE if qos.reliable else ReliabilityPolicy.BEST_EFFORT,
@@ -66,9 +66,9 @@ def message(topic: str, value: Any, frame: str | None = None) -> Any:
     Make the message of a value.
 
     Args:
-        topic: see :func:`~beetle_omni_ros.messages.topics.topic_of`.
-        value: of that topic.
-        frame: another frame_id than the topic's.
+        topic: name, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
+        value: value of the topic's class.
+        frame: frame_id; default: the topic's.
 
     """
     made = topic_of(topic).write(RCLPY, value)
@@ -82,9 +82,9 @@ class Publisher:
     Publishes the values of one topic.
 
     Args:
-        node: that publishes.
+        node: publishing node.
         topic: relative name.
-        qos: other than the table's.
+        qos: quality of service; default: the table's.
 
     """
 
@@ -98,7 +98,7 @@ class Publisher:
         self._publisher.publish(message(self._topic, value, frame))
 
     def get_subscription_count(self) -> int:
-        """How many hear it."""
+        """Return the number of matched subscriptions."""
         return self._publisher.get_subscription_count()
 
 
@@ -108,11 +108,11 @@ def subscribe(node: Node, topic: str, handle: Callable[[Any], None], *, qos: Qos
     Subscribe a topic without checks of age.
 
     Args:
-        node: that subscribes.
+        node: subscribing node.
         topic: relative name.
-        handle: called with the value.
-        qos: other than what the topic's publisher offers.
-        read: other than the table's ``take``.
+        handle: called with each value.
+        qos: quality of service; default: the table's.
+        read: message -> value; default: the table's ``take``.
 
     """
     entry = topic_of(topic)
@@ -123,14 +123,14 @@ def subscribe(node: Node, topic: str, handle: Callable[[Any], None], *, qos: Qos
 
 def with_publication(callback: Callable) -> Callable:
     """
-    Make a subscription's callback of one that also takes the time of publication.
+    Make a subscription callback that also gets the time of publication.
 
-    rclpy looks at a callback's signature to see whether it wants the message's info. The plain
-    executor then gives two arguments, the events executor of Jazzy one tuple of both.
+    rclpy passes the message's info if the signature has two arguments. The single-threaded
+    executor then passes two arguments, the events executor of Jazzy one tuple of both.
 
     Args:
-        callback: called with (message, publication [s, system time, set by the middleware of the
-            publisher]; nan where the middleware tells none).
+        callback: called with (message, time of publication [s, system time, set by the middleware
+            of the publisher; nan if unknown]).
 
     """
     def take(*given):
@@ -144,29 +144,28 @@ def with_publication(callback: Callable) -> Callable:
 
 class EveryOffer:
     """
-    Hears every publisher of one topic once, and none of them warns.
+    Receives the messages of publishers with any quality of service, each message once.
 
-    A subscription that asks for latched messages is incompatible with a volatile publisher, and
-    one that does not misses what was latched before it came. So there is a volatile one at first,
-    and others follow as soon as a publisher offers what needs them. Both ends are then silent
-    about volatile publishers, which is what `ros2 topic pub` makes.
+    A subscription of latched messages is incompatible with a volatile publisher, such as
+    `ros2 topic pub`; a volatile subscription misses messages latched earlier. So there is a
+    volatile one at first, and others follow as soon as a publisher offers what needs them. This
+    way neither end logs a warning about incompatible quality of service.
 
-    A message that two of them hear is passed on once, by its time of publication.
+    A message that two subscriptions receive is passed on once, by its time of publication.
 
     Args:
-        node: that subscribes, a FlightNode.
+        node: subscribing FlightNode.
         message_type: ROS message class.
         topic: name.
-        callback: called with (message, publication [s, system time, or nan]).
-        depth: of the queues.
-        raw: give the callback bytes.
-        on_lost: called with the event of messages that were lost on the way.
+        callback: called with (message, time of publication [s, system time, or nan]).
+        depth: depth of the queues.
+        raw: whether the callback gets serialized messages.
+        on_lost: called with rclpy's event of lost messages.
 
     """
 
     def __init__(self, node: Node, message_type: type, topic: str, callback: Callable, *,
                  depth: int = 10, raw: bool = False, on_lost: Callable | None = None):
-        """Subscribe, and look for offers from now on."""
         self._node, self._type, self._topic = node, message_type, topic
         self._depth, self._raw, self._on_lost = depth, raw, on_lost
         self._callback = callback
@@ -186,13 +185,13 @@ class EveryOffer:
                 incompatible_qos=lambda event: None, message_lost=self._on_lost))
 
     def _take(self, message, publication):
-        if publication in self._seen:       # nan never is
+        if publication in self._seen:       # never true for nan
             return
         self._seen.append(publication)
         self._callback(message, publication)
 
     def _look(self):
-        """Add what publishers need."""
+        """Add the subscriptions that the present publishers need."""
         for publisher in self._node.get_publishers_info_by_topic(self._topic):
             offer = publisher.qos_profile
             if offer.durability == DurabilityPolicy.TRANSIENT_LOCAL:

@@ -1,1 +1,1 @@
-"""How results become pages: HTML, tables, pictures, and charts that a reader can zoom."""
+"""HTML pages of results: structure, tables, figures and interactive charts."""

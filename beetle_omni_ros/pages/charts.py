@@ -1,8 +1,8 @@
 """
-Charts that a reader can zoom, as data of a page; pages/charts.js draws them.
+Data of interactive charts in a page; pages/charts.js draws them.
 
-Numbers travel as 16-bit integers between the least and the greatest of their series, which is far
-finer than a line is wide. The differences of neighbours are compressed, all series together.
+Numbers are stored as 16-bit integers between minimum and maximum of their series, which is finer
+than the width of a line. Differences of neighbours are compressed, all series together.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ class Series:
     One line of a chart.
 
     Attributes:
-        label: in the legend.
+        label: text in the legend.
         colour: '#rrggbb'.
-        y: (N,) values, NaN where there are none.
-        run: index of the run that it belongs to, or None; its switch hides the line.
+        y: (N,) values, NaN for missing ones.
+        run: index of its run, whose switch hides the line, or None.
         style: 'line', 'dash', 'dot', 'step' or 'points'.
-        band: fill to the series before this one.
+        band: whether to fill the area to the previous series.
 
     """
 
@@ -49,15 +49,15 @@ class Chart:
     Lines over one axis.
 
     Attributes:
-        label: of the vertical axis, with its unit.
-        series: its lines.
-        x: (N,) rising values of the horizontal axis; None: the time of the page.
-        xlabel: of that axis.
-        log: (horizontal, vertical) axis logarithmic.
-        upright: (x, text) vertical marks.
-        level: (y, text) horizontal marks.
-        windows: (from, to, colour) shaded stretches of the horizontal axis.
-        wide: over the whole width of the page, or a part of it.
+        label: label of the vertical axis, with its unit.
+        series: lines of the chart.
+        x: (N,) increasing values of the horizontal axis; None: the time of the page.
+        xlabel: label of the horizontal axis.
+        log: whether the (horizontal, vertical) axis is logarithmic.
+        upright: (x, text) of vertical marks.
+        level: (y, text) of horizontal marks.
+        windows: (from, to, colour) of shaded ranges of the horizontal axis.
+        wide: whether the chart has the full width of the page.
 
     """
 
@@ -72,7 +72,7 @@ class Chart:
     wide: bool = True
 
     def spec(self, numbers: Numbers) -> dict:
-        """Return what the script reads."""
+        """Return the data of the chart for the script; adds its series to ``numbers``."""
         return {
             'label': self.label, 'xlabel': self.xlabel, 'log': self.log, 'level': self.level,
             'upright': self.upright, 'windows': self.windows, 'wide': self.wide,
@@ -82,7 +82,7 @@ class Chart:
 
 
 class Numbers:
-    """All series of a page, as the script reads them."""
+    """All series of a page, encoded for the script."""
 
     def __init__(self):
         self._parts: list[np.ndarray] = []
@@ -90,14 +90,14 @@ class Numbers:
 
     def add(self, values: np.ndarray, log: bool = False) -> dict:
         """
-        Take in a series.
+        Add a series.
 
         Args:
-            values: (N,), NaN where there are none.
-            log: resolve their logarithm evenly; only positive ones are kept.
+            values: (N,) values, NaN for missing ones.
+            log: whether to store logarithms; only positive values are kept.
 
         Returns:
-            where the script finds them.
+            Position and scale of the series for the script.
 
         """
         values = np.asarray(values, dtype=float)
@@ -116,26 +116,26 @@ class Numbers:
         return where
 
     def blob(self) -> str:
-        """All of them, compressed, in base64."""
+        """Return all series, compressed, in base64."""
         data = np.concatenate([*self._parts, np.zeros(0, '<i2')])
         planes = data.view(np.uint8).reshape(-1, 2).T     # high bytes together: mostly equal
         return base64.b64encode(gzip.compress(planes.tobytes(), 9, mtime=0)).decode()
 
 
 def data_block(data: dict, numbers: Numbers) -> str:
-    """What the script of the page reads; nothing in it can end the block."""
+    """Return the HTML of the data for the script; no text in it can end the block."""
     text = json.dumps(data, separators=(',', ':'), allow_nan=False).replace('<', '\\u003c')
     return (f'<script type="application/json" id="data">{text}</script>\n'
             f'<script type="text/plain" id="numbers">{numbers.blob()}</script>\n')
 
 
 def place(identifier: str, wide: bool = True) -> str:
-    """Where a chart goes; the script finds it by its name."""
+    """Return the HTML element that the script fills with a chart."""
     return f'<div class="chart{"" if wide else " part"}" data-chart="{escape(identifier)}"></div>'
 
 
 def scripts() -> str:
-    """Libraries and script of an interactive page, as HTML."""
+    """Return libraries and script of an interactive page as HTML."""
     libraries = ''.join(f'<script>{shipped(f"vendor/{name}.js")}</script>\n'
                         for name in ('uplot', 'three'))
     return (f'<style>{shipped("vendor/uplot.css")}</style>\n{libraries}'

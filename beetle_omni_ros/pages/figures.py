@@ -1,4 +1,4 @@
-"""How figures look, and how they become part of a page."""
+"""Style of figures, and figures as part of a page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COLOURS = ('#1f5fa8', '#d1432f', '#2f8f5b', '#d98a1c', '#7a52a3', '#5b6770')  # 
 PARTS = ('#1f5fa8', '#d98a1c', '#2f8f5b', '#b0447a')  # one for each joint, rotor or axis
 INK, FAINT = '#22272e', '#8a939d'
 WIDTH = 9.6  # [in] of a page-wide figure
-POINTS = 1600  # of a drawn line; more would not be seen
+POINTS = 1600  # of a drawn line; more would not be visible
 
 STYLE: dict[Any, Any] = {
     'font.family': 'sans-serif', 'font.size': 9, 'axes.titlesize': 9.5, 'axes.titleweight': 'bold',
@@ -41,12 +41,12 @@ def panels(rows: int, columns: int = 1, height: float = 1.5, **options):
 
 
 def line(axes: Axes, t: np.ndarray, values: np.ndarray, **style) -> None:
-    """Draw a long series with few points, keeping its extremes."""
+    """Draw a long series with few points, including its extremes."""
     axes.plot(*thinned(t, values), **style)
 
 
 def thinned(t: np.ndarray, values: np.ndarray, points: int = POINTS):
-    """At most ``points`` samples of a series: the lowest and the highest of each stretch."""
+    """Return at most ``points`` samples of a series: minimum and maximum of each bin."""
     if len(t) <= points:
         return t, values
     bins = points // 2
@@ -64,14 +64,14 @@ def thinned(t: np.ndarray, values: np.ndarray, points: int = POINTS):
 
 
 def legend(figure: Figure, axes: Axes) -> None:
-    """One legend above the whole figure."""
+    """Add one legend above the whole figure."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         figure.legend(handles, labels, loc='outside upper right', ncols=min(6, len(labels)))
 
 
 def svg(figure: Figure, alternative: str) -> str:
-    """Figure as an <img> that holds its SVG, so that figures cannot disturb each other."""
+    """Return a figure as an <img> with its SVG, so that styles of figures do not interfere."""
     buffer = BytesIO()
     with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format='svg', metadata={'Date': None, 'Creator': None})

@@ -1,4 +1,4 @@
-"""The HTML of a page: structure and look, free of numbers."""
+"""HTML structure and style of a page."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from beetle_omni_ros.robot.resources import PACKAGE
 
 
 def shipped(name: str) -> str:
-    """Text of a file beside this module."""
+    """Return the text of a file in this folder."""
     return files(f'{PACKAGE}.pages').joinpath(name).read_text(encoding='utf-8')
 
 
 def section(title: str, text: str, content: str) -> str:
-    """One titled box."""
+    """Return the HTML of a box with a title and a text."""
     paragraph = f'<p>{escape(text)}</p>' if text else ''
     return f'<section><h2>{escape(title)}</h2>{paragraph}{content}</section>\n'
 
 
 def verdict_head(word: str, colour: str, sentence: str, picture: str = '') -> str:
-    """Verdict, the sentence that says it, and the one picture that shows it, as HTML."""
+    """Return the HTML of a verdict with one sentence and one picture."""
     return (f'<section class="verdict" style="border-left-color: {colour}">'
             f'<h2>{escape(word)}</h2><p class="said">{escape(sentence)}</p>{picture}</section>\n')
 
@@ -29,14 +29,14 @@ def verdict_head(word: str, colour: str, sentence: str, picture: str = '') -> st
 def page(title: str, subtitle: str, grids: list[Grid], notes: list[str],
          sections: list[str], head: str = '') -> str:
     """
-    Put a page of tables, notes and sections together.
+    Return a page of tables, notes and sections.
 
     Args:
-        title: of the page.
-        subtitle: below it.
+        title: title of the page.
+        subtitle: line below the title.
         grids: tables.
         notes: sentences below the tables.
-        sections: HTML made by :func:`section`.
+        sections: HTML of :func:`section`.
         head: HTML above the tables, such as :func:`verdict_head`.
 
     """
@@ -47,7 +47,7 @@ def page(title: str, subtitle: str, grids: list[Grid], notes: list[str],
 
 
 def frame(title: str, subtitle: str, content: str, css: str = '') -> str:
-    """Return a whole page around ``content``, which is HTML; ``css`` is added to the look."""
+    """Return a page with the HTML ``content`` and additional ``css``."""
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>

@@ -1,4 +1,4 @@
-"""A table: one content, shown in the terminal, as Markdown and as HTML."""
+"""Tables of text for the terminal, as Markdown and as HTML."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from rich.table import Table
 from rich.text import Text
 
 ABSENT = '–'
-LONGEST_TITLE = 78      # that stands on one line of a terminal
+LONGEST_TITLE = 78      # characters that fit on one line of a terminal
 PUBLISHED = ' class="published"'
 LONG = ' class="long"'
-LONGEST_CELL = 45       # characters that stand on one line of a page
+LONGEST_CELL = 45       # characters that fit on one line of a page's cell
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Grid:
 
     Attributes:
         title: one line.
-        header: of the columns.
-        rows: their cells.
-        faint: indices of rows that are not ours but published.
-        faint_columns: indices of such columns.
-        note: what the columns mean, below the title.
+        header: titles of the columns.
+        rows: cells of each row.
+        faint: indices of rows with published results.
+        faint_columns: indices of columns with published results.
+        note: meaning of the columns, below the title.
 
     """
 
@@ -62,14 +62,14 @@ def _rich(grid):
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], numeric: bool = False) -> str:
-    """Rows as GitHub Markdown; ``numeric`` sets all columns but the first to the right."""
+    """Return GitHub Markdown; ``numeric`` aligns all columns but the first to the right."""
     rule = ['---'] + ['---:' if numeric else '---'] * (len(header) - 1)
     return ''.join('| ' + ' | '.join(cell.replace('|', '\\|') for cell in line) + ' |\n'
                    for line in (header, rule, *rows))
 
 
 def html(grid: Grid) -> str:
-    """One table as HTML."""
+    """Return a table as HTML."""
     def cell(tag, text, row, column):
         faint = row in grid.faint or column in grid.faint_columns
         sort = PUBLISHED if faint else LONG if len(text) > LONGEST_CELL else ''

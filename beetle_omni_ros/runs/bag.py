@@ -26,11 +26,10 @@ from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS, JazzyWriter
 
 class BagWriter(Recorder):
     """
-    Writes one bag.
+    Writes one bag; a context manager, or call :meth:`close`.
 
-    Use it as a context manager, or call :meth:`close`. All topics are declared before the
-    first message, because rosbag2 cannot read a chunk in which a declaration follows
-    messages; a topic that turns up later starts a new chunk.
+    Topics are declared before the first message, because rosbag2 cannot read a chunk in which a
+    declaration follows messages. A topic that is declared later starts a new chunk.
     """
 
     keeps_covariances = True
@@ -43,13 +42,12 @@ class BagWriter(Recorder):
 
         Args:
             path: folder to create; it must not exist.
-            meta: what is known of the flight: task, conditions, seed, robot, version.
-            namespace: of the topics, '' or e.g. '/robot1'.
+            meta: metadata of the flight: task, conditions, seed, robot, version.
+            namespace: namespace of the topics, '' or e.g. '/robot1'.
             topics: names to declare, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
-            compression: of the chunks in the file, 'none' or 'zstd'.
-            description: URDF of the robot, whose frames then come into the bag; '' for none.
-            epoch: UNIX time [s] at which the times of the ``write`` calls begin: a flight that
-                begins at 0 s gets a real date.
+            compression: compression of the chunks in the file, 'none' or 'zstd'.
+            description: URDF of the robot, to record its frames; '' for none.
+            epoch: UNIX time of time 0 [s], so that a flight that begins at 0 s gets a real date.
 
         Raises:
             BagError: the folder exists or cannot be made; unknown compression.
@@ -76,12 +74,12 @@ class BagWriter(Recorder):
         return self
 
     def __exit__(self, *exception) -> None:
-        """Close the bag, also after an error, so that what was recorded stays readable."""
+        """Close the bag, also after an error, so that it is readable."""
         self.close()
 
     @property
     def counts(self) -> dict[str, int]:
-        """Messages written so far, by topic."""
+        """Topic -> number of messages written so far."""
         return {topic: self._writer.counts[c.id] for topic, c in self._connections.items()}
 
     def _declare(self, topic: str, msgtype: str, qos: Qos) -> Connection:
@@ -106,13 +104,13 @@ class BagWriter(Recorder):
 
     def write_raw(self, topic: str, msgtype: str, data: bytes | memoryview, t: float) -> None:
         """
-        Write one message as it came from the wire.
+        Write one serialised message.
 
         Args:
             topic: full name.
-            msgtype: ROS type, 'sensor_msgs/msg/Imu'; must be one of Jazzy's common types.
+            msgtype: ROS type such as 'sensor_msgs/msg/Imu'; one of Jazzy's common types.
             data: CDR.
-            t: time of recording [s], since ``epoch``.
+            t: time of recording since ``epoch`` [s].
 
         Raises:
             BagError: unknown type, or the file cannot be written.
@@ -127,7 +125,7 @@ class BagWriter(Recorder):
             ours = ALL.get(topic.removeprefix(self._prefix))
             connection = self._declare(topic, msgtype, ours.qos if ours else EVENT)
         first, self._last_t = self._last_t is None, t
-        if first and self.meta:     # with a time of the flight
+        if first and self.meta:     # now a time of the flight is known
             self._tell_meta()
         try:
             self._writer.write(connection, max(0, nanoseconds(t)) + self._epoch * 1_000_000_000,
@@ -138,7 +136,7 @@ class BagWriter(Recorder):
             self._frames.take(topic, data, t)
 
     def flush(self) -> None:
-        """Hand everything written so far to the operating system: it survives a SIGKILL."""
+        """Pass the written data to the operating system, so that it survives a SIGKILL."""
         if self._writer is None:
             return
         storage = self._writer.storage
@@ -150,7 +148,7 @@ class BagWriter(Recorder):
             raise BagError(f'{self.path}: {error.strerror}') from error
 
     def close(self) -> None:
-        """Finish the bag: index and metadata.yaml. A second call does nothing."""
+        """Write index and metadata.yaml. A second call does nothing."""
         writer, self._writer = self._writer, None
         if writer is None:
             return
@@ -165,7 +163,7 @@ class BagWriter(Recorder):
             raise BagError(f'{self.path}: {error.strerror}') from error
 
     def write_meta(self, meta: dict) -> None:
-        """Add to what is known of the flight; also in the bag itself, for a cut-off one."""
+        """Add metadata; also written as a message, for a bag without metadata.yaml."""
         self.meta.update(meta)
         if self._last_t is not None:
             self._tell_meta()
@@ -176,11 +174,11 @@ class BagWriter(Recorder):
 
 def check_new(path: str | Path, compression: str = 'none') -> None:
     """
-    Refuse a bag that cannot be written, before the flight.
+    Check before a flight that its bag can be written.
 
     Raises:
-        BagError: the folder exists, or its nearest existing parent is no writable folder;
-            unknown compression.
+        BagError: the folder exists, its nearest existing parent is no writable folder, or unknown
+            compression.
 
     """
     if compression not in COMPRESSIONS:
@@ -208,7 +206,7 @@ def _open(path, compression):
 
 def add_meta(path: str | Path, meta: dict) -> None:
     """
-    Add to a finished bag what is known of its flight: task, conditions, seed, robot.
+    Add metadata of the flight to a finished bag: task, conditions, seed, robot.
 
     Raises:
         BagError: the folder has no usable metadata.yaml.

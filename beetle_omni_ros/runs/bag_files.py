@@ -1,4 +1,4 @@
-"""The MCAP files of a rosbag2 folder, read without ROS, also those that a crash cut off."""
+"""Reading of the MCAP files of a rosbag2 folder without ROS, also of truncated files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from beetle_omni_ros.messages.conversions import from_nanoseconds
 
-AT_ONCE = 4096      # messages outside chunks that are handed on together
+AT_ONCE = 4096      # messages outside chunks that are passed on together
 LENGTH = struct.Struct('<Q')
 DECLARED = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
 PREFIX = 9          # bytes of a record before its content: kind and length
@@ -30,7 +30,7 @@ class BagError(ValueError):
 
 
 class RawMessage(NamedTuple):
-    """One message: full topic, ROS type, CDR bytes, time of recording [s]."""
+    """One message: full topic, ROS type, CDR, time of recording [s]."""
 
     topic: str
     type: str
@@ -39,7 +39,7 @@ class RawMessage(NamedTuple):
 
 
 class Messages(NamedTuple):
-    """Messages of one topic, in the order of the file: CDR bytes, (N,) times of recording [s]."""
+    """Messages of one topic in the order of the file: CDR, (N,) times of recording [s]."""
 
     topic: str
     type: str
@@ -48,7 +48,7 @@ class Messages(NamedTuple):
 
 
 class _WholeReads:
-    """A stream whose reads are complete or fail, so that a cut is seen where it is."""
+    """A stream whose reads are complete or raise EOFError, to detect the end of a cut file."""
 
     def __init__(self, stream):
         self._stream = stream
@@ -61,7 +61,7 @@ class _WholeReads:
 
 
 class _Records(StreamReader):
-    """Records of a file, chunks whole; indices of messages, which nobody needs, stay closed."""
+    """Records of a file, without the content of message indices, which is not needed."""
 
     def _read_record(self, opcode, length):
         return None if opcode == Opcode.MESSAGE_INDEX else super()._read_record(opcode, length)
@@ -72,10 +72,10 @@ def bag_files(path: str | Path) -> list[Path]:
     Find the MCAP files of a RUN.
 
     Args:
-        path: a rosbag2 folder, its metadata.yaml or one of its ``.mcap`` files.
+        path: rosbag2 folder, its metadata.yaml or one of its ``.mcap`` files.
 
     Raises:
-        BagError: nothing there that can be read.
+        BagError: no such path, or no MCAP file there.
 
     """
     path = Path(path)
@@ -97,18 +97,18 @@ def bag_files(path: str | Path) -> list[Path]:
 
 
 def _split_number(file):
-    """Order of a split bag: name_2.mcap comes before name_10.mcap."""
+    """Sort key of a split bag: name_2.mcap comes before name_10.mcap."""
     number = file.stem.rpartition('_')[2]
     return (int(number) if number.isdigit() else -1, file.name)
 
 
 def read_messages(path: str | Path, warnings: list[str] | None = None) -> Iterator[RawMessage]:
     """
-    Yield the messages of a bag in the order in which they were recorded, up to a cut.
+    Yield the messages of a bag in the order of recording, up to a truncation.
 
     Args:
         path: folder or file, see :func:`bag_files`.
-        warnings: takes a line for each file that ends early.
+        warnings: list to which a line is added for each truncated or damaged file.
 
     Raises:
         BagError: no such bag, unreadable, or not MCAP.
@@ -125,7 +125,8 @@ def read_together(path: str | Path, warnings: list[str] | None = None
     """
     Yield the messages of a bag by topic, a few seconds at a time; much faster than one by one.
 
-    Args, errors: as :func:`read_messages`. Topics come in the order of their first message.
+    Arguments and errors are as in :func:`read_messages`. Topics are in the order of their first
+    message.
     """
     for part in _parts(path, warnings):
         found, first = np.unique(part.channels, return_index=True)
@@ -158,20 +159,20 @@ def _parts(path, warnings) -> Iterator[_Part]:
             raise BagError(f'{file}: not an MCAP file') from None
         except GeneratorExit:
             raise
-        except Exception as error:  # whatever broken bytes provoke in the library
+        except Exception as error:  # broken bytes raise anything in the library
             kind = 'cut off' if isinstance(error, EOFError) else f'damaged ({error})'
             warnings.append(f'{file.name}: {kind}; read up to there')
 
 
 class _Reader:
-    """Parts of one file."""
+    """Reader of one file."""
 
     def __init__(self):
         self._schemas: dict[int, str] = {}
         self._known: dict[int, tuple[str, str]] = {}
 
     def parts(self, stream) -> Iterator[_Part]:
-        """Yield them, and what was read before an error too."""
+        """Yield the parts, also the messages before an error."""
         loose: list[Message] = []
         try:
             for record in _Records(_WholeReads(stream), emit_chunks=True,

@@ -1,4 +1,4 @@
-"""Flights from bags: into a log, or bit by bit to a recorder."""
+"""Reading of flights from bags: into a log, or incrementally into a recorder."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from beetle_omni_ros.runs.recorder import LogRecorder, Recorder
 
 META_KEY = 'beetle_omni'  # under custom_data of metadata.yaml
 
-# Entries of it by which a flight is judged, and how long they may be.
+# Text entries of the metadata that readers of a log rely on, and their longest length.
 META_TEXTS = ('task', 'conditions', 'robot', 'plant', 'controller', 'guidance', 'version')
 LONGEST_TEXT = 250
 AT_ONCE = 4096      # messages of a series that are read together
@@ -39,10 +39,10 @@ def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
 
     Args:
         path: rosbag2 folder, or one of its files.
-        namespace: of the robot, where the bag holds several.
+        namespace: namespace of the robot, if the bag contains several.
 
     Returns:
-        The flight; what was missing or wrong stands in its ``warnings``.
+        The flight; its ``warnings`` list missing and unusable data.
 
     Raises:
         BagError: no such bag, unreadable, not MCAP, or several robots in it.
@@ -63,18 +63,18 @@ def read_bag(path: str | Path, *, namespace: str | None = None) -> FlightLog:
 def replay(path: str | Path, recorder: Recorder, warnings: list[str], *,
            namespace: str | None = None, leave_out: Container[str] = ()) -> Iterator[np.ndarray]:
     """
-    Pass the messages of a bag on to a recorder, a few seconds at a time.
+    Pass the messages of a bag to a recorder, a few seconds at a time.
 
     Args:
         path: rosbag2 folder, or one of its files.
-        recorder: takes series as values whose fields are arrays, the rest one by one.
-        warnings: takes what was missing or wrong, at the end.
-        namespace: of the robot, where the bag holds several.
-        leave_out: topics without namespace that the recorder does not need; neither does it need
-            what controllers ask for.
+        recorder: recorder that accepts series as values whose fields are arrays; other values
+            come one by one.
+        warnings: list to which missing and unusable data are added at the end.
+        namespace: namespace of the robot, if the bag contains several.
+        leave_out: topics without namespace to skip; commands of controllers are always skipped.
 
     Yields:
-        (N,) times of recording of what the recorder was given [s].
+        (N,) times of recording of the messages so far passed on [s].
 
     Raises:
         BagError: no such bag, unreadable, not MCAP, or several robots in it.
@@ -90,7 +90,7 @@ def replay(path: str | Path, recorder: Recorder, warnings: list[str], *,
 
 
 class _Reading:
-    """Sorts messages by topic and namespace, and counts what cannot be used."""
+    """Sorts messages by topic and namespace, and counts unusable ones."""
 
     def __init__(self, path, namespace, recorder, leave_out=None):
         self.warnings: list[str] = []
@@ -105,8 +105,8 @@ class _Reading:
         self._waiting: dict[str, tuple[list[bytes], list[np.ndarray]]] = {}
 
     def take(self, together: list[Messages]) -> None:
-        """Take messages; those of a series wait until they are many."""
-        # Where a namespace is not yet known, names that leave it open wait for the others.
+        """Read messages; those of a series are collected first, to be read together."""
+        # Ambiguous names last: the other topics may determine the namespace.
         for messages in sorted(together, key=lambda one: is_ambiguous(one.topic)):
             name = self._name(messages.topic)
             if name is None:
@@ -134,11 +134,11 @@ class _Reading:
             value = topic.read(from_bytes(data, topic.type))
             self._recorder.write(name, _stamped(value, received), received)
             self._counts[name] += 1
-        except Exception as error:  # one message that cannot be used must not lose the others
+        except Exception as error:  # an unusable message must not prevent reading the others
             self._refuse(name, str(error) or type(error).__name__)
 
     def take_waiting(self, *names: str) -> None:
-        """Read the messages that wait, of these topics or of all."""
+        """Read the collected messages of these topics, or of all."""
         for name in names or list(self._waiting):
             waiting, times = self._waiting.pop(name)
             rows, value, refused = read_all(topic_of(name), waiting)
@@ -151,10 +151,10 @@ class _Reading:
                 self._refuse(name, reason, count)
 
     def _name(self, topic):
-        """Name without namespace; None where it is not ours, or not known to be."""
+        """Name without namespace; None for a topic that is unknown or still ambiguous."""
         if topic not in self._split:
             if self._namespace is None and is_ambiguous(topic):
-                return None     # until another topic shows in which namespace the robot is
+                return None     # until another topic determines the robot's namespace
             self._split[topic] = self._recognise(topic)
         return self._split[topic]
 
@@ -191,7 +191,7 @@ class _Reading:
 
 
 def _stamped(value, received):
-    """The value; where its stamp is not set, as quick tools leave it, with the time of receipt."""
+    """The value; without a stamp (`ros2 topic pub`), it gets the time of receipt."""
     if isinstance(value, list):
         return [entry if entry.t else replace(entry, t=received) for entry in value]
     if isinstance(value, str) or value.stamp:
@@ -206,7 +206,7 @@ def _rooted(namespace):
 
 
 def _metadata(path, warnings):
-    """Meta data that a finished bag carries; empty where there is none."""
+    """Metadata of a finished bag; empty if there is none."""
     path = Path(path)
     file = (path if path.is_dir() else path.absolute().parent) / 'metadata.yaml'
     if not file.is_file():
@@ -225,7 +225,7 @@ def _metadata(path, warnings):
 
 
 def _usable(key, value):
-    """Whether a value is of the kind that readers of the log count on."""
+    """Whether a value has the type that readers of the log rely on."""
     if value is None:
         return True
     if key == 'seed':

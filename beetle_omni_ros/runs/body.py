@@ -1,4 +1,4 @@
-"""The flown body against its targets: errors in time, windows and intervals."""
+"""Motion of the robot and its errors from the targets, over windows and intervals."""
 
 from __future__ import annotations
 
@@ -10,17 +10,23 @@ from beetle_omni_ros.control.base import PoseTarget, Target, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs.log import FlightLog
 
-# Stamps are whole nanoseconds in a bag and floats in memory, and an absolute time resolves
-# 0.24 us: a sample on a window's edge counts as inside in either.
-EDGE = 1e-5  # [s]
+# [s] tolerance of a window's edges. Stamps are integer nanoseconds in a bag and floats in memory,
+# where UNIX time has a resolution of 0.24 us.
+EDGE = 1e-5
 
 
 @dataclass(frozen=True)
 class Motion:
     """
-    A body in time: t (N,) [s], position (N, 3) [m], quaternion (N, 4), velocity (N, 3).
+    Motion of a body.
 
-    Velocity is in world [m/s], angular_velocity (N, 3) in base_link [rad/s].
+    Attributes:
+        t: (N,) [s].
+        position: (N, 3) in world [m].
+        quaternion: (N, 4) body to world (x, y, z, w).
+        velocity: (N, 3) in world [m/s].
+        angular_velocity: (N, 3) in base_link [rad/s].
+
     """
 
     t: np.ndarray
@@ -30,25 +36,25 @@ class Motion:
     angular_velocity: np.ndarray
 
     def window(self, begin: float, end: float) -> slice:
-        """Samples from ``begin`` to ``end``, both included."""
+        """Slice of the samples from ``begin`` to ``end`` [s], both included."""
         return slice(int(np.searchsorted(self.t, begin - EDGE, side='left')),
                      int(np.searchsorted(self.t, end + EDGE, side='right')))
 
     def covers(self, begin: float, end: float, gap: float = 0.1) -> bool:
-        """Whether there are samples in the window, from edge to edge up to ``gap`` [s]."""
+        """Whether the first and last sample in the window are within ``gap`` [s] of its edges."""
         times = self.t[self.window(begin, end)]
         return len(times) > 0 and times[0] <= begin + gap and times[-1] >= end - gap
 
 
 def motion(log: FlightLog, series: str | None = None) -> Motion:
-    """Take the truth where it was recorded, else the estimate; or the series asked for."""
+    """Return the motion of a series, by default of the truth if recorded, else the estimate."""
     name = series or log.body
     return Motion(*(getattr(log, f'{name}_{channel}') for channel in
                     ('t', 'position', 'quaternion', 'velocity', 'angular_velocity')))
 
 
 def geodesic_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angles [rad] between the rotations of (N, 4) and (N, 4) or (4,) quaternions."""
+    """Angles (N,) [rad] between the rotations of (N, 4) and (N, 4) or (4,) quaternions."""
     bx, by, bz, bw = np.asarray(b).T
     x, y, z, w = rotations.product(-bx, -by, -bz, bw, *np.asarray(a).T)
     return 2 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
@@ -65,10 +71,10 @@ def roll_pitch_yaw(quaternions: np.ndarray) -> np.ndarray:
 
 def errors(body: Motion, target: Target, window: slice = slice(None)):
     """
-    Distance from the target and angle to it.
+    Compute the errors from a target over the samples of a window.
 
     Returns:
-        (n,) position error [m] and (n,) orientation error [deg] of the window's samples.
+        (n,) position error [m] and (n,) orientation error [deg].
 
     """
     if isinstance(target, PoseTarget):
@@ -80,7 +86,7 @@ def errors(body: Motion, target: Target, window: slice = slice(None)):
 
 
 def reference_poses(target: Target, times: np.ndarray):
-    """(n, 3) positions and (n, 4) quaternions of a target at ``times``."""
+    """Return (n, 3) positions and (n, 4) quaternions of a target at ``times`` (n,) [s]."""
     references = [target.at(float(t)) for t in times]
     return (np.array([r.position for r in references]).reshape(-1, 3),
             np.array([r.quaternion for r in references]).reshape(-1, 4))
@@ -88,11 +94,11 @@ def reference_poses(target: Target, times: np.ndarray):
 
 def target_ends(log: FlightLog, last: float) -> list[float]:
     """
-    When each target of a log went out of force.
+    Return the time at which each target of a log ended.
 
     Args:
         log: the flight.
-        last: how long the last pose counts [s]; a trajectory counts to its own end.
+        last: duration of the last target if it is a pose [s].
 
     """
     ends = [target.stamp for target in log.targets[1:]]
@@ -103,13 +109,13 @@ def target_ends(log: FlightLog, last: float) -> list[float]:
 
 
 def hold(times: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Values in force at the times ``at``: the latest sample, the first before it began."""
+    """Return the latest values at the times ``at``; before the first sample, the first one."""
     index = np.searchsorted(times, at + EDGE, side='right') - 1
     return values[np.maximum(index, 0)]
 
 
 def inside(times: np.ndarray, intervals: list[tuple[float, float]]) -> np.ndarray:
-    """Mask of the times that lie in one of the intervals."""
+    """Return a mask of the times that are in one of the intervals."""
     mask = np.zeros(len(times), dtype=bool)
     for begin, end in intervals:
         mask |= (times >= begin - EDGE) & (times <= end + EDGE)

@@ -1,4 +1,4 @@
-"""Charts over time: pose, errors, commands, compute, estimate, battery."""
+"""Charts of a report: pose, errors, commands, compute time, estimate, battery, disturbances."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ from beetle_omni_ros.runs.metrics import (
 from beetle_omni_ros.runs.shown import error_series, Run, target_poses, TimeAxis
 from beetle_omni_ros.runs.tasks import POSE_DURATION
 
-FEW_POSES = 20  # up to so many, the windows of each are shaded
+FEW_POSES = 20          # up to this number, L and U windows are shaded
 MOST_FAULTS = 12        # marked in a chart
 MILLI = 1e3
 TINY = {'m': 1e-4, 'deg': 1e-2}  # floor of logarithmic errors
 L_COLOUR, U_COLOUR = '#eef1f5', '#cfe3d4'
 PERIOD = 10.0           # [ms] of a controller's step
 AXES = ('x [m]', 'y [m]', 'z [m]', 'roll [deg]', 'pitch [deg]', 'yaw [deg]')
-ABSURD, NARROW = 1e6, 1e-9    # [rad, rad/s, N] what no actuator does; ranges not to be divided
-BINS = 60
+ABSURD = 1e6            # [rad, rad/s, N] values that are left out of histograms
+NARROW = 1e-9           # [rad, rad/s, N] range of a histogram below which it is widened
+BINS = 60               # of a histogram
 FEW = 3                 # poses below which no distribution is shown
 SHARES = 200            # points of a distribution
 
 
 def pose(runs: list[Run], axis: TimeAxis) -> list[Chart]:
-    """Position and attitude of every run against its target; angles within a turn of that."""
+    """Plot position and angles of every run and its target; angles within 180 deg of it."""
     wanted = [_wanted(run, axis) for run in runs]
     lines: list[list[Series]] = [[] for _ in AXES]
     tasks: list[object] = []
@@ -53,7 +54,7 @@ def pose(runs: list[Run], axis: TimeAxis) -> list[Chart]:
 
 
 def _wanted(run, axis):
-    """(count, 6) position [m] and angles [deg] asked for at the times of the axis."""
+    """(count, 6) target position [m] and angles [deg] at the times of the axis."""
     t, position, quaternion = target_poses(run)
     if not len(t):
         return np.full((axis.count, 6), np.nan)
@@ -64,7 +65,7 @@ def _wanted(run, axis):
 
 
 def errors_over_time(runs: list[Run], axis: TimeAxis) -> list[Chart]:
-    """Both errors on a logarithmic scale; L and U windows shaded where they are few."""
+    """Plot both errors on a logarithmic scale; L and U windows of few poses are shaded."""
     series = [error_series(run) for run in runs]
     if not any(len(t) for t, _, _ in series):
         return []
@@ -86,7 +87,7 @@ def _windows(stamps):
 
 
 def commands(runs: list[Run], axis: TimeAxis) -> list[Chart]:
-    """Tilt and thrust commands of each run."""
+    """Plot tilt and thrust commands of each run."""
     made = []
     for number, run in enumerate(runs):
         log, name = run.log, f'{run.label}: ' if len(runs) > 1 else ''
@@ -100,7 +101,7 @@ def commands(runs: list[Run], axis: TimeAxis) -> list[Chart]:
 
 
 def compute(runs: list[Run], axis: TimeAxis) -> list[Chart]:
-    """CPU time of the controllers' steps since their start, against the period."""
+    """Plot the CPU time of the controllers' steps since their start, and the period."""
     series = []
     for number, run in enumerate(runs):
         for label, name in _controllers(run):
@@ -117,13 +118,13 @@ def compute(runs: list[Run], axis: TimeAxis) -> list[Chart]:
 
 
 def _controllers(run):
-    """(label, name) of each controller of a run whose compute times are known."""
+    """(label, name) of each controller of a run with compute times."""
     names = [name for name in run.log.controllers() if run.log.compute_history.get(name)]
     return [(run.label if len(names) == 1 else f'{run.label}: {name}', name) for name in names]
 
 
 def estimate(runs: list[Run], axis: TimeAxis) -> list[Chart]:
-    """Error of the estimate, where the truth is known."""
+    """Plot the error of the estimate, if the truth was recorded."""
     places, angles = [], []
     for number, run in enumerate(runs):
         log = run.log
@@ -142,7 +143,7 @@ def estimate(runs: list[Run], axis: TimeAxis) -> list[Chart]:
 
 
 def battery(runs: list[Run], axis: TimeAxis) -> list[Chart]:
-    """Pack voltage and current."""
+    """Plot pack voltage and current."""
     known = [(number, run) for number, run in enumerate(runs) if len(run.log.battery_t)]
     return [Chart(label, [Series(run.label, run.colour, axis.sampled(
         run, run.log.battery_t, sign * getattr(run.log, name)), number) for number, run in known],
@@ -152,7 +153,7 @@ def battery(runs: list[Run], axis: TimeAxis) -> list[Chart]:
 
 
 def payload(runs: list[Run], axis: TimeAxis) -> list[Chart]:
-    """Height while payloads are attached."""
+    """Plot the height error while payloads are attached."""
     known = [(number, run) for number, run in enumerate(runs)
              if run.task and run.task.kind == 'payload' and run.log.targets]
     if not known:
@@ -167,7 +168,7 @@ def payload(runs: list[Run], axis: TimeAxis) -> list[Chart]:
 
 
 def errors_of_a_pose(runs: list[Run]) -> list[Chart]:
-    """Errors in the 8 s of a pose: median and 10 to 90 % band over all poses of a run."""
+    """Plot median and 10 to 90 % band of the errors in the 8 s of a pose, over all poses."""
     grid = np.arange(0.0, POSE_DURATION, 0.02)
     folded = [(number, run, stacks) for number, run in enumerate(runs)
               if (stacks := _folded(run, grid)) is not None]
@@ -200,7 +201,7 @@ def _folded(run, grid):
 
 
 def steady_errors(runs: list[Run]) -> list[Chart]:
-    """Share of the poses whose U error is below a value."""
+    """Plot the cumulative distribution of the poses' U errors."""
     made = []
     for key, limit, title in (('U_position_m', REACHED_POSITION, 'U position error [m]'),
                               ('U_orientation_deg', REACHED_ORIENTATION,
@@ -221,7 +222,7 @@ def steady_errors(runs: list[Run]) -> list[Chart]:
 
 
 def use(runs: list[Run], robot: RobotParameters) -> list[Chart]:
-    """Histograms of what joints and rotors were asked for and gave, with their limits."""
+    """Plot histograms of joint angles, rates, thrusts and joint errors, with their limits."""
     joints, rotors = robot.joints, robot.rotors
     limits = ((-joints.position_limit, joints.position_limit),
               (-joints.velocity_limit, joints.velocity_limit),
@@ -246,7 +247,7 @@ def _used(run):
 
 
 def _histograms(runs, columns, title, limit):
-    """All runs in the same bins, so that their shares compare."""
+    """Histograms of all runs in the same bins."""
     columns = [values[np.abs(values) < ABSURD] for values in columns]
     every = np.concatenate(columns)
     if not every.size:
@@ -263,7 +264,7 @@ def _histograms(runs, columns, title, limit):
 
 
 def disturbance(runs: list[Run]) -> list[Chart]:
-    """Peak errors against the disturbance, for force and torque tasks."""
+    """Plot peak errors over the disturbance level, for force and torque tasks."""
     made = []
     for kind, unit in (('force', 'N'), ('torque', 'N_m')):
         known = [(number, run, label, result[kind]['levels']) for number, run in enumerate(runs)

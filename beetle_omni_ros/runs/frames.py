@@ -1,4 +1,4 @@
-"""Frames in a bag: `/tf`, `/tf_static` and `robot_description`, from what it records."""
+"""`/tf`, `/tf_static` and `robot_description` in a bag, from its odometry and joint states."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 TEXT = 'std_msgs/msg/String'
 PERIOD = 0.02       # [s] between transforms
 STAMP, POSE = struct.Struct('<iI'), struct.Struct('<7d')
-MARK = 1e3          # a number that no frame name holds
+MARK = 1e3          # placeholder of a pose; its bytes occur in no frame name
 
 
 class FrameWriter:
     """
-    Turns `odom` and `joint_states` into transforms, 50 times a second.
+    Converts `odom` and `joint_states` to transforms, 50 times a second.
 
     Args:
         write: called with topic, ROS type, CDR and time [s].
         description: URDF.
-        prefix: of the robot's topics, '/' or e.g. '/robot1/'.
+        prefix: prefix of the robot's topics, '/' or e.g. '/robot1/'.
 
     Raises:
-        ParameterError: the URDF is not usable.
+        ParameterError: unusable URDF.
 
     """
 
@@ -45,13 +45,13 @@ class FrameWriter:
         self._moving = {joint.name: joint for joint in tree if joint.axis is not None}
         self._latest = None     # message of joint_states
         self._due = None
-        # The same message each time but for stamps and poses, so that these alone are written.
+        # Only stamps and poses of the message change, so only these are serialised.
         self._frame = _Template([(WORLD, BODY),
                                  *((joint.parent, joint.child)
                                    for joint in self._moving.values())])
 
     def take(self, topic: str, data: bytes | memoryview, t: float) -> None:
-        """Take a message, recorded at ``t`` [s]; the transforms that are due follow."""
+        """Process a message recorded at ``t`` [s], and write transforms if they are due."""
         try:
             if topic == self._joints:
                 self._latest = data
@@ -59,7 +59,7 @@ class FrameWriter:
                     and (self._due is None or t >= self._due):
                 self._follow(data, t)
         except (LookupError, TypeError, ValueError, SerdeError, struct.error):
-            pass        # of a message that nobody can read, which stands in the bag as it came
+            pass        # an unreadable message is recorded as it is, without transforms
 
     def _follow(self, data, t):
         joints = from_bytes(self._latest, 'sensor_msgs/msg/JointState')
@@ -87,7 +87,7 @@ class FrameWriter:
 
 
 class _Template:
-    """CDR of transforms between given frames, in which stamps and poses are filled in."""
+    """CDR of transforms between given frames, with exchangeable stamps and poses."""
 
     def __init__(self, frames):
         message = BAG.new(TRANSFORMS)
@@ -107,7 +107,7 @@ class _Template:
             self._places.append((header, start))
 
     def filled(self, poses):
-        """CDR with a stamp and seven numbers for each transform."""
+        """Return the CDR with (stamp, seven numbers of the pose) for each transform."""
         for (header, place), (stamp, pose) in zip(self._places, poses, strict=True):
             STAMP.pack_into(self._data, header, stamp.sec, stamp.nanosec)
             POSE.pack_into(self._data, place, *pose)

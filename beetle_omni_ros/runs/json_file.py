@@ -1,4 +1,4 @@
-"""Result files: refused early where they cannot be written, strict JSON where they can."""
+"""Result files in strict JSON."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 def check_writable(path: str | Path, what: str = 'result file') -> None:
     """
-    Refuse a file that cannot be written, before the work that it is to hold.
+    Check that a file can be written, before its content is computed.
 
     Raises:
-        ParameterError: naming the file and the reason.
+        ParameterError: it cannot; names the file and the reason.
 
     """
     path = Path(path)
@@ -33,7 +33,7 @@ def check_writable(path: str | Path, what: str = 'result file') -> None:
 
 def write_json(path: str | Path, results: dict) -> None:
     """
-    Write results as strict JSON: a number that is not finite becomes null.
+    Write results as strict JSON: non-finite numbers become null.
 
     Raises:
         ParameterError: the file cannot be written.

@@ -1,13 +1,13 @@
 """
-The 3D lemniscate: a figure of eight whose height and attitude change along the way.
+The 3D lemniscate: a figure of eight with varying height and attitude.
 
 With the phase phi, one round of which is 2 pi:
     x = A sin(phi),  y = B sin(2 phi) / 2,  z = H + C cos(phi)
     roll = D sin(phi),  pitch = D sin(2 phi),  yaw = phi
-Roll and pitch stay within D = 0.5 rad and yaw runs over [0, 2 pi] in each round, as
-published; the other numbers are ours, chosen to fit a 4 m room. The phase starts and
-ends at rest: its rate rises with a quintic smoothstep over the ramp before the first
-round and falls in the same way after the last, so that all rounds are flown at one speed.
+Roll and pitch are within D = 0.5 rad and yaw runs over [0, 2 pi] in each round, as published. The
+other numbers are chosen for a 4 m room. The phase starts and ends at rest: its rate follows a
+quintic smoothstep over the ramps before the first and after the last round, so all rounds have the
+same speed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SAMPLE_PERIOD = 0.02  # [s] between the samples of the published trajectory
 
 
 def phase(time: float) -> tuple[float, float]:
-    """Phase [rad] and its rate [rad/s] at ``time`` since the start [s]; 0 as round one begins."""
+    """Return phase [rad], 0 at the begin of round one, and rate [rad/s] at ``time`` [s]."""
     rate = 2 * pi / PERIOD
     if time < RAMP:
         return -_ramp_phase(RAMP, rate) + _ramp_phase(max(time, 0.0), rate), \
@@ -56,7 +56,7 @@ def _ramp_phase(time, rate):
 
 
 def sample(time: float) -> Reference:
-    """Pose in world, velocity in world and body rates at ``time`` since the start [s]."""
+    """Return pose and velocity in world and body rates at ``time`` since the start [s]."""
     phi, rate = phase(time)
     position = np.array([LENGTH * sin(phi), WIDTH / 2 * sin(2 * phi), HEIGHT + RISE * cos(phi)])
     velocity = rate * np.array([LENGTH * cos(phi), WIDTH * cos(2 * phi), -RISE * sin(phi)])
@@ -71,7 +71,7 @@ def sample(time: float) -> Reference:
 
 
 def target(start: float) -> TrajectoryTarget:
-    """Make the whole trajectory, beginning at ``start`` [s]."""
+    """Return the whole trajectory, beginning at ``start`` [s]."""
     times = np.linspace(0.0, DURATION, round(DURATION / SAMPLE_PERIOD) + 1)
     samples = [sample(float(t)) for t in times]
     return TrajectoryTarget(

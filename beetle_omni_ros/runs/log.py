@@ -1,8 +1,8 @@
 """
-One flight as plain numpy arrays.
+One flight as numpy arrays.
 
-All times are float seconds on the flight's own clock: ROS time in the graph, from 0 in
-the in-process loop.
+Times are float seconds on the flight's clock: ROS time in the graph, from 0 in the in-process
+loop.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ SERIES = {
     'command': {'received': 0, 'tilt': 4, 'thrust': 4},
     'wrench': {'force': 3, 'torque': 3},
 }
-"""Series -> channel -> width; 0 is a scalar channel. Each has times ``<series>_t``."""
+"""Series -> channel -> width; 0 is a scalar channel. Each series has times ``<series>_t``."""
 
 SERIES_OF = {'ground_truth/odom': 'truth', 'odom': 'odom', 'imu/data_raw': 'imu',
              'mocap/pose': 'mocap', 'joint_states': 'joint', 'battery_state': 'battery',
              'command': 'command', 'disturbance': 'wrench'}
-"""Topic -> series that its values are kept in, channel by channel."""
+"""Topic -> series of its values."""
 
 WIDTHS = {name: 1 + sum(max(1, width) for width in channels.values())
           for name, channels in SERIES.items()}
-"""Series -> numbers in one sample, with its time."""
+"""Series -> count of numbers in one sample, including its time."""
 
-RUN_STATUS = 'run'  # diagnostic status '<node>: run' that carries a flight's meta data
+RUN_STATUS = 'run'  # diagnostic status '<node>: run' with a flight's metadata
 COMPUTE_STATUS = 'compute'  # diagnostic status '<name>_node: compute'
 SUPERVISOR_STATUS, FAULT_KEY = 'supervisor_node: supervisor', 'fault.'
 COMPUTE_KEYS = {'median_ms': 'median', 'p99_ms': 'p99', 'max_ms': 'max',
@@ -49,7 +49,7 @@ def _empty(width):
 
 @dataclass
 class Commands:
-    """Commands in time: t (M,) stamps [s], tilt (M, 4) [rad], thrust (M, 4) [N]."""
+    """Commands: t (M,) stamps [s], received (M,) [s], tilt (M, 4) [rad], thrust (M, 4) [N]."""
 
     t: np.ndarray = _empty(0)
     received: np.ndarray = _empty(0)
@@ -72,20 +72,20 @@ class FlightLog:
         joint_t, joint_position, joint_velocity, joint_effort: (N, 4) [rad], [rad/s], [N m];
             effort is NaN where the message had none.
         battery_t, battery_voltage, battery_current: (N,) [V], [A, negative discharging].
-        command_t, command_received, command_tilt, command_thrust: what the actuators were
-            told: stamp of the estimate answered, time of recording, (M, 4) [rad], (M, 4) [N].
+        command_t, command_received, command_tilt, command_thrust: commands to the actuators:
+            stamp of the answered estimate, time of recording, (M, 4) [rad], (M, 4) [N].
         wrench_t, wrench_force, wrench_torque: external force in world [N] and torque in
             base_link [N m], each valid until the next.
-        requests: controller -> what it asked for, before the supervisor.
+        requests: controller -> its commands, before the supervisor.
         targets: pose and trajectory targets in the order of their stamps.
         state_t, states: (S,) times and names of the supervisor's states.
         compute: controller, or another node's name without '_node' -> median, p99, max [ms],
             deadline_misses, count (cumulative).
         compute_history: the same names -> list of (t, such a dict), one for each report.
-        diagnostics: every status other than the above, in time order.
-        meta: task, conditions, seed, robot, version, as far as known.
-        warnings: what was wrong while reading, one line each.
-        source: the folder or file it was read from, '' in memory.
+        diagnostics: every other status, in the order of time.
+        meta: task, conditions, seed, robot, version, if known.
+        warnings: problems found while reading, one line each.
+        source: folder or file of the bag, '' in memory.
 
     """
 
@@ -132,7 +132,7 @@ class FlightLog:
 
     @property
     def body(self) -> str:
-        """Which series metrics judge by: 'truth' where it was recorded, else 'odom'."""
+        """Series that metrics use: 'truth' if it was recorded, else 'odom'."""
         return 'truth' if len(self.truth_t) else 'odom'
 
     @property
@@ -150,12 +150,12 @@ class FlightLog:
                 and len(times := getattr(self, entry.name))]
 
     def controllers(self) -> list[str]:
-        """Names of the controllers that flew, in the order in which they did."""
+        """Return the names of the controllers that flew, in this order."""
         names = [name for _, name in self.active_controller() if name]
         return list(dict.fromkeys(names))
 
     def named_faults(self) -> dict[str, float]:
-        """Names of the faults that the supervisor told, with when it first did [s]."""
+        """Return the supervisor's fault names -> time of the first report [s], by time."""
         found: dict[str, float] = {}
         for t, state in zip(self.state_t, self.states, strict=True):
             kind, _, fault = state.partition(':')
@@ -171,10 +171,10 @@ class FlightLog:
 
     def active_controller(self) -> list[tuple[float, str | None]]:
         """
-        Who flew when.
+        Return the changes of the active controller.
 
         Returns:
-            (t, name) changes in time order; None where nobody flew a task (on the ground, in
+            (t, name) in the order of time; None while no controller flew (on the ground, during
             take-off and landing). A fallback counts for the controller that it replaced.
 
         """

@@ -1,9 +1,8 @@
 """
-Metrics of one flight, as ``evaluate --json`` and ``fly --json`` hold them.
+Metrics of one flight, as in ``evaluate --json`` and ``fly --json``.
 
-A pose lasts 8 s. U, the mean error over 7.0 to 7.5 s, says how accurate the hover is; L,
-the mean over 1.0 to 7.0 s, how fast it was reached (docs/reference/metrics.md). The same function
-judges a flight in memory and one read back from its bag.
+A pose lasts 8 s. U, the mean error over 7.0 to 7.5 s, measures the accuracy of hovering; L, the
+mean error over 1.0 to 7.0 s, measures how fast the pose is reached (docs/reference/metrics.md).
 """
 
 from __future__ import annotations
@@ -33,24 +32,24 @@ from beetle_omni_ros.runs.tasks import (
     TaskError,
 )
 
-U_WINDOW = (7.0, 7.5)  # [s] after the pose was asked for
+U_WINDOW = (7.0, 7.5)  # [s] after the target
 L_WINDOW = (1.0, 7.0)  # [s]
 REACHED_POSITION = 0.10  # [m]
 REACHED_ORIENTATION = 10.0  # [deg]
-COMMAND_PERIOD = 0.010  # [s] to which changes of the command refer
-CRASH = 'emergency_stop:crash'    # what supervisor/state then says
+COMMAND_PERIOD = 0.010  # [s] for changes of the command
+CRASH = 'emergency_stop:crash'    # supervisor/state after a crash
 POSE_KEYS = ('U_position_m', 'U_orientation_deg', 'L_position_m', 'L_orientation_deg')
 
 
 @dataclass(frozen=True)
 class Flown:
     """
-    The part of a flight that one controller flew.
+    Part of a flight with one controller.
 
     Attributes:
-        name: of the controller.
-        poses: indices into the log's targets, of pose targets that lasted.
-        intervals: (begin, end) of the time that counts [s].
+        name: name of the controller.
+        poses: indices of pose targets in the log's targets that lasted to the end of U.
+        intervals: (begin, end) of the flight towards targets [s].
 
     """
 
@@ -61,15 +60,15 @@ class Flown:
 
 def metrics(log: FlightLog, task: Task | None = None) -> dict:
     """
-    Judge a flight of one controller.
+    Compute the metrics of a flight with one controller.
 
     Args:
         log: the flight.
-        task: what was flown; None takes it from the log's meta data, where it says.
+        task: flown task; None: the task in the log's metadata, if any.
 
     Returns:
-        The dictionary that INTERFACES gives for a controller, with None for what the log
-        does not hold. Lengths in m, angles in deg or rad as the keys say, times in ms.
+        The dictionary of a controller in ``evaluate --json``, with None for unknown values. The
+        keys contain the units.
 
     """
     results = metrics_by_controller(log, task)
@@ -79,16 +78,16 @@ def metrics(log: FlightLog, task: Task | None = None) -> dict:
 
 
 def metrics_by_controller(log: FlightLog, task: Task | None = None) -> dict[str, dict]:
-    """Judge each controller of a flight on what it flew; see :func:`metrics`."""
+    """Compute the metrics of each controller of a flight; see :func:`metrics`."""
     task = task or task_of(log)
     flown = _split(log, task)
-    # A task that one controller flew alone is complete: poses never asked for count as missed.
+    # If one controller flew the whole task, poses after an early end count as missed.
     expected = len(task.poses) if task and len(flown) == 1 else None
     return {part.name: _judge(log, task, part, expected) for part in flown}
 
 
 def task_of(log: FlightLog) -> Task | None:
-    """Rebuild the named task from a log's meta data; None for pose files and free flights."""
+    """Make the named task in a log's metadata; None for pose files and flights without a task."""
     name = str(log.meta.get('task', ''))
     if not name or name.lower().endswith('.csv'):
         return None
@@ -125,7 +124,7 @@ def _split(log, task):
 
 
 def _shares(changes, begin, end):
-    """How long each controller flew between ``begin`` and ``end`` [s]."""
+    """Controller -> its flight time between ``begin`` and ``end`` [s]."""
     shares: dict[str, float] = {}
     for k, (t, name) in enumerate(changes):
         until = changes[k + 1][0] if k + 1 < len(changes) else np.inf
@@ -136,7 +135,7 @@ def _shares(changes, begin, end):
 
 
 def _landing(log, after):
-    """When the robot began to land or was switched off, after ``after`` [s]."""
+    """Time of the first landing or disarming after ``after`` [s]; infinity for none."""
     return next((float(t) for t, state in zip(log.state_t, log.states, strict=True)
                  if t > after and state.partition(':')[0] in ('landing', 'disarmed')), np.inf)
 
@@ -170,7 +169,7 @@ def _judge(log, task, flown, expected):
 
 
 def _guidance(log, controller):
-    """What moved the controller's targets, in its own words; None where nobody said."""
+    """Guidance of the controller, from its diagnostics or the metadata; None if unknown."""
     told = [entry.values['guidance'] for entry in log.diagnostics
             if entry.name.rpartition('/')[2] == f'{controller}_node: controller'
             and 'guidance' in entry.values]
@@ -194,7 +193,7 @@ def _pose(body: Motion, target, task):
 
 
 def _numbers(target, task):
-    """x, y, z [m], roll, pitch, yaw [deg] as the task gives them, where it has this pose."""
+    """x, y, z [m], roll, pitch, yaw [deg]; as in the task if it contains this pose."""
     for pose in task.poses if task else ():
         if np.allclose(pose[:3], target.position, atol=1e-6) and rotations.geodesic_angle(
                 rotations.from_rpy(*np.radians(pose[3:])), target.quaternion) < 1e-6:
@@ -208,7 +207,7 @@ def _reduced(reduce, values):
 
 
 def _crashed(log, body, flown):
-    """Fell to the ground, was stopped in flight, left the numbers, or crashed in its landing."""
+    """Whether the robot hit the ground, had an emergency stop, or has a non-finite position."""
     if any(state == CRASH for state in log.states):
         return True
     for begin, end in flown.intervals:
@@ -222,7 +221,7 @@ def _crashed(log, body, flown):
 
 
 def _lowest(log, body, flown):
-    """How low base_link came, and during which of the flight's poses; {} without a height."""
+    """Lowest height of base_link and the pose during which it occurred; {} without samples."""
     rows = np.flatnonzero(inside(body.t, flown.intervals))
     rows = rows[np.isfinite(body.position[rows, 2])]
     if not len(rows):
@@ -233,7 +232,7 @@ def _lowest(log, body, flown):
 
 
 def _effort(log, intervals, windows):
-    """Joint error |q* - q|, thrust, and how much the command moves while hovering."""
+    """Joint error |q* - q|, thrust, and change of the command while hovering."""
     stamps, first = np.unique(log.command_t, return_index=True)
     tilt, thrust = log.command_tilt[first], log.command_thrust[first]
     joint = inside(log.joint_t, intervals)
@@ -254,7 +253,7 @@ def _effort(log, intervals, windows):
 
 
 def _change_rms(stamps, values, windows):
-    """RMS change of a command in 10 ms over the windows; None without commands."""
+    """RMS change of a command per 10 ms over the windows; None without commands."""
     changes = []
     for begin, end in windows:
         mask = inside(stamps, [(begin, end)])
@@ -278,7 +277,7 @@ def _stillness(body, windows):
 
 
 def _timing(log, intervals):
-    """From the stamp that a command answers to its recording, where these differ."""
+    """Delay from the stamp of the answered estimate to the recording; {} without delays."""
     mask = inside(log.command_t, intervals)
     delay = 1e3 * (log.command_received[mask] - log.command_t[mask])
     if not np.any(delay > 0):
@@ -289,7 +288,7 @@ def _timing(log, intervals):
 
 
 def _estimation(log, intervals):
-    """RMS error of the estimate where the truth is known."""
+    """RMS and largest error of the estimate; {} without truth."""
     times = log.odom_t[inside(log.odom_t, intervals)]
     if not len(times) or not len(log.truth_t):
         return {}
@@ -320,13 +319,13 @@ def _std(values):
 
 def extras(log: FlightLog, body: Motion, task: Task, u_window: tuple[float, float]) -> dict:
     """
-    What a task's kind adds to the metrics; empty for pose tasks.
+    Compute the additional metrics of the task's kind; empty for pose tasks.
 
     Args:
         log: the flight.
-        body: whose motion is judged.
-        task: what was flown; it began with the log's first target.
-        u_window: of a pose [s].
+        body: motion of the robot.
+        task: flown task; it began with the log's first target.
+        u_window: U window of a pose [s].
 
     """
     if not log.targets:
@@ -356,7 +355,7 @@ def _summary(body, target, begin, end):
 
 
 def _tracking(log, body, task, start):
-    """Tracking errors over all rounds and in each; a round that was cut short is None."""
+    """Tracking errors over all rounds and of each; None for an incomplete round."""
     windows = [t for t in log.targets if isinstance(t, TrajectoryTarget)]
     if not windows:
         return {**dict.fromkeys(_summary_keys()), 'rounds': []}
@@ -369,7 +368,7 @@ def _tracking(log, body, task, start):
 
 
 def _joined(windows):
-    """One path of overlapping windows, as the reference node publishes; the newer one counts."""
+    """One trajectory of the overlapping windows of reference_node; newer windows precede."""
     ends = [window.times[0] for window in windows[1:]] + [np.inf]
     kept = [window.times < end for window, end in zip(windows, ends, strict=True)]
     return TrajectoryTarget(*(
@@ -415,7 +414,7 @@ def _lost(body, target, window):
 
 
 def _level_windows(task, start):
-    """(level, begin, end) of each run of segments with one level other than 0."""
+    """(level, begin, end) of consecutive segments with the same level other than 0."""
     windows: list[list[float]] = []
     begin = start
     for segment in task.segments:

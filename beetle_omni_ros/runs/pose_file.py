@@ -1,4 +1,4 @@
-"""Pose files: CSV with one target pose a line, and errors that name the row."""
+"""Pose files: CSV with one target pose a line."""
 
 from __future__ import annotations
 
@@ -16,30 +16,29 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.yaml_file import quoted
 from beetle_omni_ros.runs.target_checks import TargetChecks
 
-START = (0.0, 0.0, 1.0)     # [m] where a task begins after the take-off
+START = (0.0, 0.0, 1.0)     # [m] position after the take-off
 COLUMNS = ('x_m', 'y_m', 'z_m', 'roll_deg', 'pitch_deg', 'yaw_deg')
 
 
 class TaskError(ParameterError):
-    """A task cannot be used; the text names file, row, column and expectation."""
+    """A task is unusable; the text names file, row, column and expectation."""
 
 
 def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
     """
     Read a pose file with the header ``x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg``.
 
-    Blank lines and spaces around fields do not matter; columns may stand in any order.
+    Blank lines and spaces around fields are ignored; columns may be in any order.
 
     Args:
-        path: of the file.
-        reach: largest step from one pose to the next, and from the take-off at world's
-            origin to the first [m].
+        path: CSV file.
+        reach: largest step between poses, and from the take-off to the first pose [m].
 
     Returns:
         (N, 6) x, y, z [m], roll, pitch, yaw [deg].
 
     Raises:
-        TaskError: naming file, row (counted as in an editor), column and expectation.
+        TaskError: unusable file; names file, row (as in an editor), column and expectation.
 
     """
     try:
@@ -64,10 +63,10 @@ def read_poses(path: str | Path, reach: float = np.inf) -> np.ndarray:
 
 def check_steps(poses: np.ndarray, reach: float, where: Callable[[int], str]) -> None:
     """
-    Refuse poses (N, 6) that lie farther from the one before than ``reach`` [m].
+    Check that the steps between poses (N, 6) are at most ``reach`` [m].
 
     Raises:
-        TaskError: names the pose of index k by ``where(k)``.
+        TaskError: a longer step to pose k; the text begins with ``where(k)``.
 
     """
     steps = np.linalg.norm(np.diff(poses[:, :3], axis=0, prepend=[START]), axis=1)
@@ -118,7 +117,7 @@ def _pose(path, line, row, order):
 
 @cache
 def _checks():
-    """Of the shipped robot: a task is for any of its kind."""
+    """Checks with the shipped robot, because a task is for any robot of its kind."""
     return TargetChecks(RobotParameters.load())
 
 

@@ -1,5 +1,5 @@
 """
-Published results of the same tasks, to stand beside ours.
+Published results of the same tasks, for comparison.
 
 Source: Zhang et al., Learning Agile and Robust Omnidirectional Aerial Motion on
 Overactuated Tiltable-Quadrotors: tables of continuous pose reaching in simulation
@@ -48,7 +48,7 @@ WAYPOINTS = {  # real robot; poses in the order of tasks.WAYPOINTS
                                    {'U_position_m': 0.091, 'U_orientation_deg': 4.590}]},
 }
 
-# Where control was lost, as the text says for Gazebo; the levels between are not listed there.
+# Levels at which control was lost in Gazebo, from the text; other levels are not published.
 DISTURBANCE = {
     'NMPC': {'force_N': 100.0, 'torque_N_m': 25.0},
     'RL': {'force_N': 100.0, 'torque_N_m': 15.0},
@@ -67,12 +67,12 @@ LEMNISCATE = {
 
 
 def pose_results(task: str) -> dict[str, dict]:
-    """Published results of a pose task, in the form of our metrics; empty where there are none."""
+    """Return the published results of a pose task in the form of our metrics, if any."""
     if task.startswith('random'):
         return RANDOM_POSES
     return WAYPOINTS if task == 'waypoints' else {}
 
 
 def tracking_results(task: str) -> dict[str, dict]:
-    """Published tracking results of a task."""
+    """Return the published tracking results of a task, if any."""
     return LEMNISCATE if task == 'lemniscate' else {}

@@ -1,8 +1,8 @@
 """
-Collecting a flight while it happens.
+Recording of a flight.
 
-:class:`LogRecorder` and :class:`~beetle_omni_ros.runs.bag.BagWriter` take the same calls, so that
-a loop records into memory, onto disk, or both with :class:`Tee`.
+:class:`LogRecorder` and :class:`~beetle_omni_ros.runs.bag.BagWriter` have the same interface, so
+that a loop records into memory, onto disk, or both with :class:`Tee`.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from beetle_omni_ros.runs.log import (
 
 class Recorder:
     """
-    What takes a flight: :meth:`write` for every topic, and shorter calls for some.
+    Interface of recorders: :meth:`write` for every topic, and shorter calls for some.
 
     Attributes:
-        keeps_covariances: whether those of ``odom`` go anywhere.
+        keeps_covariances: whether the covariances of ``odom`` are recorded.
 
     """
 
@@ -40,32 +40,33 @@ class Recorder:
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
         """
-        Take one value.
+        Record one value.
 
         Args:
-            topic: without namespace, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
-            value: as the table of topics has it for this one.
-            received: time of recording [s]; default: the value's stamp. Text needs it.
+            topic: name without namespace, see
+                :func:`~beetle_omni_ros.messages.topics.topic_of`.
+            value: value of the topic's class.
+            received: time of recording [s]; default: the value's stamp. Required for text.
 
         """
         raise NotImplementedError
 
     def write_meta(self, meta: dict) -> None:
-        """Add to what is known of the flight: task, conditions, seed, robot, version."""
+        """Add metadata of the flight: task, conditions, seed, robot, version."""
         raise NotImplementedError
 
     def write_target(self, target: Target, received=None) -> None:
-        """One pose or trajectory target, in force from its stamp."""
+        """Record a pose or trajectory target, valid from its stamp."""
         self.write('target_pose' if isinstance(target, PoseTarget) else 'target_trajectory',
                    target, received)
 
     def write_compute(self, t, controller: str, **times) -> None:
         """
-        CPU time of one controller's steps since its start; the last report counts.
+        Record the CPU time of a controller's steps since its start.
 
         Args:
             t: time of the report [s].
-            controller: name.
+            controller: name of the controller.
             times: median, p99, max [ms], deadline_misses, count.
 
         """
@@ -74,7 +75,7 @@ class Recorder:
 
     def write_diagnostic(self, t, name: str, values: dict, level: int = 0,
                          message: str = '') -> None:
-        """One status of one node: name 'ekf_node: estimator', values as numbers or text."""
+        """Record one status such as 'ekf_node: estimator', with numbers or text as values."""
         self.write('diagnostics', [Diagnostic(t, name, int(level), message, {
             str(key): str(value) for key, value in values.items()})])
 
@@ -89,7 +90,7 @@ class LogRecorder(Recorder):
         self._states: list[tuple[float, str]] = []
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
-        """Take one value; those of other topics than a log has are left out."""
+        """Record one value; other topics than those of a log are ignored."""
         series = SERIES_OF.get(topic)
         if series:
             self._add(series, self._rows[series], value, received)
@@ -121,7 +122,7 @@ class LogRecorder(Recorder):
         rows.extend(row)
 
     def _add_all(self, series, rows, value, received):
-        """Add a value whose fields are arrays over many messages."""
+        """Add a value whose fields are arrays over several messages."""
         count = len(value.stamp)
         parts = [value.stamp]
         for channel, width in SERIES[series].items():
@@ -130,7 +131,7 @@ class LogRecorder(Recorder):
         rows.frombytes(np.column_stack(parts).astype(float).tobytes())
 
     def write_meta(self, meta: dict) -> None:
-        """Add to what is known of the flight."""
+        """Add metadata of the flight."""
         self._log.meta.update(meta)
 
     def _take(self, entry):
@@ -149,7 +150,7 @@ class LogRecorder(Recorder):
             self._log.diagnostics.append(entry)
 
     def log(self) -> FlightLog:
-        """Build the flight so far, each series sorted by time."""
+        """Return the flight so far, each series sorted by time."""
         log = self._log
         for series, channels in SERIES.items():
             _unpack(log, series + '_', self._rows[series], channels, WIDTHS[series])
@@ -176,7 +177,7 @@ def _unpack(into, prefix, rows, channels, width):
 
 
 def _in_order(targets):
-    """Sort by stamp; a target received again, as latched topics do, is the same target."""
+    """Sort by stamp; of several targets with the same stamp (latched topics), keep one."""
     kept: list[Target] = []
     for target in sorted(targets, key=lambda entry: entry.stamp):
         if kept and target.stamp == kept[-1].stamp and type(target) is type(kept[-1]):
@@ -187,18 +188,18 @@ def _in_order(targets):
 
 
 class Tee(Recorder):
-    """Passes everything on to several recorders."""
+    """Records with several recorders."""
 
     def __init__(self, *recorders: Recorder):
         self._recorders = recorders
         self.keeps_covariances = any(recorder.keeps_covariances for recorder in recorders)
 
     def write(self, topic: str, value: Any, received: float | None = None) -> None:
-        """Let each have it."""
+        """Record one value."""
         for recorder in self._recorders:
             recorder.write(topic, value, received)
 
     def write_meta(self, meta: dict) -> None:
-        """Let each have it."""
+        """Add metadata of the flight."""
         for recorder in self._recorders:
             recorder.write_meta(meta)

@@ -1,4 +1,4 @@
-"""`beetle_omni report`: one self-contained HTML page, several runs side by side."""
+"""`beetle_omni report`: a self-contained HTML page with several runs side by side."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from beetle_omni_ros.runs.metrics import metrics_by_controller, task_of
 from beetle_omni_ros.runs.report_page import make_page
 from beetle_omni_ros.runs.shown import Run
 
-MAX_RUNS = len(COLOURS)  # more could not be told apart
+MAX_RUNS = len(COLOURS)  # each run has its own colour
 
 
 def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None,
@@ -31,8 +31,8 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     Args:
         paths: bags, or folders of bags.
         output: HTML file.
-        json_path: file for the results.
-        console: where to print.
+        json_path: file of the results.
+        console: output of the table.
 
     Returns:
         The results: ``meta`` and one key for each run and controller.
@@ -76,12 +76,12 @@ def _name(path):
 
 def _has_a_pose(log, name):
     if not len(motion(log).t):
-        raise BagError(f'{name}: no pose of the robot in it; expected ground_truth/odom or odom')
+        raise BagError(f'{name}: no pose of the robot; expected ground_truth/odom or odom')
 
 
 def make_runs(logs: list[FlightLog], names: list[str]) -> list[Run]:
     """
-    Judge flights and give each its label and colour; equal names are numbered.
+    Compute the metrics of flights, and give each a label and a colour; equal names are numbered.
 
     Raises:
         BagError: a flight without a pose.
@@ -101,7 +101,7 @@ def make_runs(logs: list[FlightLog], names: list[str]) -> list[Run]:
 
 
 def results_of(runs: list[Run]) -> dict:
-    """Results of all runs in the form of ``evaluate --json``; meta holds what they share."""
+    """Return the results of all runs as in ``evaluate --json``; meta: their common metadata."""
     metas = [run.log.meta for run in runs]
     shared = {key: value for key, value in metas[0].items()
               if all(meta.get(key) == value for meta in metas)} if metas else {}
@@ -112,7 +112,7 @@ def results_of(runs: list[Run]) -> dict:
 
 
 def _runs_in(path: Path) -> list[Path]:
-    """Find the bags of a folder that is none itself, such as `evaluate` makes; else the path."""
+    """Bags in a folder of bags, such as `evaluate` makes; for any other path, the path."""
     if path.is_dir() and not any(path.glob('*.mcap')):
         return sorted({file.parent for file in path.glob('*/*.mcap')}) or [path]
     return [path]

@@ -1,4 +1,4 @@
-"""The page of `beetle_omni report`: the outcome, tables, the flight in 3D, charts, faults."""
+"""The page of `beetle_omni report`: outcome, flight in 3D, tables, charts, faults."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from beetle_omni_ros.runs.shown import Run, target_poses, TimeAxis
 
 MOST_ROWS = 40      # of states, faults and warnings
 DISC_RADIUS = 0.4   # of the distance between neighbouring rotors
-BALL = 0.29         # [m] height of the end-effector where a robot file has none
+BALL = 0.29         # [m] height of the end-effector if the robot file has none
 SPEEDS = (0.1, 0.25, 0.5, 1, 2, 4, 8)
 VIEWS = (('angle', 'Angle'), ('top', 'Top'), ('side', 'Side'), ('front', 'Front'))
 STATE_COLOURS = {'flying': '#9cc7a8', 'takeoff': '#b9cfe6', 'landing': '#f0d29a',
@@ -27,10 +27,10 @@ STATE_COLOURS = {'flying': '#9cc7a8', 'takeoff': '#b9cfe6', 'landing': '#f0d29a'
 
 
 def make_page(runs: list[Run], results: dict) -> str:
-    """Build the page."""
+    """Return the HTML of the page."""
     robot, axis = _robot(runs), TimeAxis.of(runs)
     made: list[tuple[str, str, Callable]] = [
-        ('Errors', 'Distance from the target and angle to it; grey: L window, green: U window.',
+        ('Errors', 'Position and orientation error; grey: L window, green: U window.',
          lambda: charts.errors_over_time(runs, axis)),
         ('Pose', 'Flown pose and target.', lambda: charts.pose(runs, axis)),
         ('Errors of a pose', 'Median and 10 to 90 % band over all poses of a run.',
@@ -39,7 +39,7 @@ def make_page(runs: list[Run], results: dict) -> str:
          lambda: charts.steady_errors(runs)),
         ('Disturbance', 'Largest error at each level.', lambda: charts.disturbance(runs)),
         ('Payload', 'Height while payloads are attached.', lambda: charts.payload(runs, axis)),
-        ('Commands', 'What the actuators were told: joints and rotors 1 to 4.',
+        ('Commands', 'Commands of joints and rotors 1 to 4.',
          lambda: charts.commands(runs, axis)),
         ('Joint and thrust use', 'Share of the flight at each value; dashed: limits.',
          lambda: charts.use(runs, robot)),
@@ -83,7 +83,7 @@ did, with faults. Drag to turn; tap a plot or a strip to go there, drag over a p
 
 
 def _robot(runs):
-    """Dimensions and limits: those of the runs' robot where its file is there."""
+    """Robot parameters of the first run if its file exists, else the shipped ones."""
     file = runs[0].log.meta.get('robot') if runs else None
     try:
         return RobotParameters.load(file if file and Path(file).is_file() else None)
@@ -98,7 +98,7 @@ def _subtitle(meta):
 
 
 def outcome(run: Run) -> str:
-    """How a flight went, in one sentence."""
+    """Return the outcome of a flight in one sentence."""
     said = []
     for label, result in run.results.items():
         name = '' if label == run.label else f'{label.removeprefix(run.label + ": ")}: '
@@ -145,7 +145,7 @@ def _player():
 
 
 def _strip(number, run, axis):
-    """What the supervisor did, along the time of the page, with the faults that it named."""
+    """Strip of the supervisor's states over time, with its faults."""
     length = axis.step * (axis.count - 1) or 1.0
 
     def place(t):
@@ -203,7 +203,7 @@ def _scene(run, axis, numbers):
 
 
 def supervisor_grids(run: Run) -> list[Grid]:
-    """When the supervisor was in which state, and for which controller or fault."""
+    """Return a table of the supervisor's states with times and controllers or faults."""
     rows: list[list[str]] = []
     for t, state in zip(run.log.state_t, run.log.states, strict=True):
         kind, _, what = (shortened(part) for part in state.partition(':'))
@@ -214,7 +214,7 @@ def supervisor_grids(run: Run) -> list[Grid]:
 
 
 def fault_grids(run: Run) -> list[Grid]:
-    """Warnings and errors of the nodes, and the counters of what they rejected."""
+    """Return tables of warnings and errors of the nodes, and of rejected messages."""
     faults: dict[tuple, list] = {}
     last: dict[str, dict] = {}
     for entry in run.log.diagnostics:

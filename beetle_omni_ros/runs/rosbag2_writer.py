@@ -1,4 +1,4 @@
-"""The writer of the library rosbags, made to write what ``ros2 bag record`` of Jazzy writes."""
+"""rosbags' writer, adapted to the format of ``ros2 bag record`` of Jazzy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 
 VERSION = 9     # of metadata.yaml
 DISTRIBUTION = 'jazzy'
-# Chunks inside the MCAP file, which every reader opens; as the preset `zstd_fast` of rosbag2.
+# Compression of the chunks in the MCAP file, which every reader supports; 'zstd' is like the
+# preset `zstd_fast` of rosbag2.
 COMPRESSIONS = ('none', 'zstd')
 
 
@@ -26,10 +27,10 @@ def _from_jazzy(metadata):
 
 class ChunkIndex:
     """
-    Takes the place of the list of index records that the MCAP writer keeps until the end.
+    Replaces the MCAP writer's list of index records by a temporary file.
 
-    A flight of an hour has 9000 chunks, and their records took 4 MB. The file has no name and
-    goes with the process.
+    A flight of an hour has 9000 chunks, whose records need 4 MB of memory. The file has no name
+    and is deleted with the process.
     """
 
     def __init__(self, folder: Path):
@@ -37,12 +38,12 @@ class ChunkIndex:
         self._sizes = array('L')
 
     def append(self, record: BytesIO) -> None:
-        """Take a record, up to its position."""
+        """Store a record."""
         self._file.write(record.getbuffer())
         self._sizes.append(record.tell())
 
     def __iter__(self) -> Iterator[BytesIO]:
-        """Give all records back, each positioned at its end."""
+        """Yield all records, each positioned at its end."""
         self._file.seek(0)
         for size in self._sizes:
             record = BytesIO()
@@ -53,12 +54,12 @@ class ChunkIndex:
         return len(self._sizes)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Delete the file."""
         self._file.close()
 
 
 class JazzyStorage(McapWriter):
-    """MCAP with the hash of each type, and an index that takes no memory."""
+    """MCAP with the hash of each type, and an index outside memory."""
 
     def __init__(self, path: Path, compression: CompressionMode):
         """Create the file in the folder ``path``."""
@@ -84,7 +85,7 @@ class JazzyStorage(McapWriter):
 
 
 class JazzyWriter(Writer):
-    """rosbags' writer with this storage."""
+    """rosbags' writer with :class:`JazzyStorage`."""
 
     STORAGE_PLUGINS: ClassVar = {StoragePlugin.MCAP: JazzyStorage}
 

@@ -1,4 +1,4 @@
-"""The flights of a report, on one time axis."""
+"""The flights of a report on a common time axis."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from beetle_omni_ros.runs.body import EDGE, errors, Motion, motion, reference_po
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.tasks import Task
 
-STEP = 0.01             # [s] of the time axis, or more where the flights are long
-MOST = 12_000           # times of it
-BEFORE = 3.0            # [s] shown before the first target
-STALE = 0.3             # [s] after which a value that was not renewed is not drawn
+STEP = 0.01             # [s] of the time axis, or more for long flights
+MOST = 12_000           # samples of the time axis
+BEFORE = 3.0            # [s] before the first target
+STALE = 0.3             # [s] after which a value without a newer one is not drawn
 TRAJECTORY_STEP = 0.05  # [s] between the drawn poses of a trajectory
 
 
@@ -24,10 +24,10 @@ class Run:
     One flight of a report.
 
     Attributes:
-        label: what it is called on the page.
-        colour: of its lines.
+        label: name on the page.
+        colour: colour of its lines.
         log: the flight.
-        task: what was flown, where the log says.
+        task: flown task, or None if the log does not name it.
         results: label -> metrics, one entry for each controller that flew.
 
     """
@@ -40,18 +40,18 @@ class Run:
 
     @property
     def start(self) -> float:
-        """Time of the first target, from which the plots count [s]."""
+        """Time of the first target [s], which is 0 in the charts."""
         return self.log.targets[0].stamp if self.log.targets else self.log.start
 
     @property
     def pursued(self) -> list[tuple[Target, float]]:
-        """(target, end of its time [s]) of each target; empty where none was recorded."""
+        """(target, its end [s]) of each target; empty if none was recorded."""
         targets = self.log.targets
         return list(zip(targets, [t.stamp for t in targets[1:]] + [self.log.end], strict=False))
 
     @property
     def body(self) -> Motion:
-        """The motion that the metrics judge."""
+        """The motion that the metrics use."""
         return motion(self.log)
 
 
@@ -65,7 +65,7 @@ class TimeAxis:
 
     @classmethod
     def of(cls, runs: list[Run]) -> TimeAxis:
-        """Cover all flights."""
+        """Make an axis that covers all flights."""
         start = max(-BEFORE, min(run.body.t[0] - run.start for run in runs))
         end = max(run.body.t[-1] - run.start for run in runs)
         step = max(STEP, (end - start) / MOST)
@@ -78,15 +78,15 @@ class TimeAxis:
 
     def sampled(self, run: Run, t: np.ndarray, values: np.ndarray) -> np.ndarray:
         """
-        Values of a series of a run in force at the times of the axis.
+        Return the latest values of a series at the times of the axis.
 
         Args:
-            run: whose series it is.
-            t: (N,) on the clock of its flight [s].
-            values: (N, ...).
+            run: run of the series.
+            t: (N,) times on the clock of the flight [s].
+            values: (N, ...) values.
 
         Returns:
-            (count, ...), NaN before the series, after it and where it was not renewed.
+            (count, ...) values, NaN before the series, after it and in its gaps.
 
         """
         if not len(t):
@@ -100,7 +100,7 @@ class TimeAxis:
 
 
 def error_series(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n,) times [s], (n,) position errors [m], (n,) orientation errors [deg]."""
+    """Return (n,) times [s], (n,) position errors [m], (n,) orientation errors [deg]."""
     body, parts = run.body, []
     for target, end in run.pursued:
         window = body.window(target.stamp, end - 1e-3)
@@ -112,7 +112,7 @@ def error_series(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def target_poses(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n,) times since the first target [s] and (n, 3), (n, 4) poses asked for from then on."""
+    """Return (n,) times since the first target [s] and (n, 3), (n, 4) poses of the targets."""
     times, positions, quaternions = [], [], []
     for target, end in run.pursued:
         t = np.array([target.stamp]) if isinstance(target, PoseTarget) else \

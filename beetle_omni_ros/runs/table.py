@@ -1,4 +1,4 @@
-"""Tables of the results of flights."""
+"""Result tables of flights."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from rich.console import Console
 from beetle_omni_ros.pages.table import ABSENT, Grid, print_grids
 from beetle_omni_ros.runs import published
 
-MANY_POSES = 20  # above, only the summary is shown
+MANY_POSES = 20  # above this number, only the summary is shown
 
 ERROR_ROWS = (  # text, path in the metrics, digits
     ('U position, mean [m]', 'mean.U_position_m', 4),
@@ -33,11 +33,11 @@ EFFORT_ROWS = (
 
 def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
     """
-    Tables of a result as INTERFACES lays it out: ``meta`` and one key for each controller.
+    Make the tables of a result.
 
     Args:
-        results: of ``evaluate``, ``fly`` or ``report``; keys other than ``meta`` are labels.
-        with_poses: show every pose; by default where there are no more than 20.
+        results: JSON of ``evaluate``, ``fly`` or ``report``; keys other than ``meta`` are labels.
+        with_poses: whether to show every pose; None: if there are at most 20.
 
     """
     task = str(results.get('meta', {}).get('task', ''))
@@ -60,7 +60,7 @@ def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
 
 
 def _same_poses(judged):
-    """Results in groups that flew the same targets, which alone can stand side by side."""
+    """Groups of results with the same targets, which one table can compare."""
     groups: dict[tuple, dict] = {}
     for name, result in judged.items():
         key = tuple(round(v, 6) for pose in result['poses'] for v in pose['target'])
@@ -69,7 +69,7 @@ def _same_poses(judged):
 
 
 def _summary(judged, task):
-    """One column for each controller and each published result, one row for each metric."""
+    """Table with a column for each controller and published result, a row for each metric."""
     others = published.pose_results(task)
     columns = [*judged.values(), *others.values()]
     rows = [[text, *(_number(_at(column, path), digits) for column in columns)]

@@ -1,4 +1,4 @@
-"""Which targets are flown: one check for messages and for rows of a file."""
+"""Checks of targets, for messages and for rows of a pose file."""
 
 from __future__ import annotations
 
@@ -19,22 +19,24 @@ UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
 
 @dataclass(frozen=True, kw_only=True)
 class TargetLimits:
-    """What a target must keep to; params/targets.yaml says why."""
+    """Limits of a target; params/targets.yaml gives the reasons."""
 
-    half_width: float = parameter(18.0, doc='|x| and |y|', unit='m', low=0.5, high=1000)
-    height: float = parameter(18.0, doc='z', unit='m', low=0.5, high=1000)
-    clearance: float = parameter(0.02, doc='of the lowest point above the floor', unit='m', low=0,
-                                 high=1)
+    half_width: float = parameter(18.0, doc='largest |x| and |y|', unit='m', low=0.5, high=1000)
+    height: float = parameter(18.0, doc='largest z', unit='m', low=0.5, high=1000)
+    clearance: float = parameter(0.02, doc='height of the lowest point above the floor', unit='m',
+                                 low=0, high=1)
     feet: float = parameter(0.16, doc='soles below base_link', unit='m', low=0, high=5)
     feet_spread: float = parameter(0.11, doc='|x| = |y| of a foot', unit='m', low=0, high=5)
-    propeller_radius: float = parameter(0.1143, doc='of a propeller', unit='m', low=0, high=5)
-    ball_radius: float = parameter(0.04, doc='of the end-effector', unit='m', low=0, high=5)
-    speed: float = parameter(10.0, doc='of a trajectory, along each axis', unit='m/s', low=0.1,
-                             high=100)
-    rate: float = parameter(20.0, doc='of a trajectory, about each axis', unit='rad/s', low=0.1,
-                            high=100)
-    oldest: float = parameter(10.0, doc='age of a stamp', unit='s', low=0.1, high=1e5)
-    farthest_ahead: float = parameter(1.0, doc='of a stamp', unit='s', low=0.01, high=1e5)
+    propeller_radius: float = parameter(0.1143, doc='radius of a propeller', unit='m', low=0,
+                                        high=5)
+    ball_radius: float = parameter(0.04, doc='radius of the end-effector', unit='m', low=0, high=5)
+    speed: float = parameter(10.0, doc='largest speed of a trajectory along each axis', unit='m/s',
+                             low=0.1, high=100)
+    rate: float = parameter(20.0, doc='largest rate of a trajectory about each axis', unit='rad/s',
+                            low=0.1, high=100)
+    oldest: float = parameter(10.0, doc='largest age of a stamp', unit='s', low=0.1, high=1e5)
+    farthest_ahead: float = parameter(1.0, doc='largest time of a stamp ahead of the clock',
+                                      unit='s', low=0.01, high=1e5)
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> TargetLimits:
@@ -44,12 +46,12 @@ class TargetLimits:
 
 def out_of_reach(target: Target, position: np.ndarray, reach: float, now: float) -> str:
     """
-    Check how far a target is from the robot; as :meth:`TargetChecks.why_not`.
+    Check the distance of a target from the robot; returns as :meth:`TargetChecks.why_not`.
 
     Args:
-        target: a pose, or a trajectory, of which the present point counts.
-        position: (3,) of the robot in world [m].
-        reach: of the controller that flies [m].
+        target: pose, or trajectory, of which the point at ``now`` is checked.
+        position: (3,) position of the robot in world [m].
+        reach: largest distance for the active controller [m].
         now: present time [s].
 
     """
@@ -63,15 +65,15 @@ class TargetChecks:
     Checks targets of one robot.
 
     Args:
-        robot: its geometry.
-        limits: by default params/targets.yaml.
+        robot: robot parameters, for the geometry.
+        limits: limits; default: params/targets.yaml.
 
     """
 
     def __init__(self, robot: RobotParameters, limits: TargetLimits | None = None):
         self._p = p = limits or TargetLimits.load()
         feet = [(x * p.feet_spread, y * p.feet_spread, -p.feet) for x in (1, -1) for y in (1, -1)]
-        # The joints' axes pass through the rotors' centres and tell where the main body is.
+        # The joints' axes pass through the rotors' centres, which gives the main body's height.
         ball = robot.rotors.positions.mean(axis=0) + [
             0.0, 0.0, robot.parts.end_effector.height - robot.parts.module.joint_height]
         self._points = np.array([*feet, *robot.rotors.positions, ball])
@@ -82,11 +84,11 @@ class TargetChecks:
         Check a target.
 
         Args:
-            target: a pose, or a trajectory, of which every point is checked.
-            now: present time [s]; without it, and for the stamp 0, the stamp is not looked at.
+            target: pose, or trajectory, of which every point is checked.
+            now: present time [s]; if None, or for the stamp 0, the stamp is not checked.
 
         Returns:
-            '' where it may be flown, else what is wrong and what was expected, in one line.
+            '' for a valid target, else error and expectation in one line.
 
         """
         reason = self._stamp(target.stamp, now)
@@ -103,7 +105,7 @@ class TargetChecks:
             self._steps(target)
 
     def why_not_pose(self, position: np.ndarray, quaternion: np.ndarray) -> str:
-        """Check a pose: (3,) in world [m], (4,) xyzw; as :meth:`why_not`."""
+        """Check a pose: (3,) in world [m], (4,) xyzw; returns as :meth:`why_not`."""
         numbers = [*np.asarray(position, dtype=float).tolist(),
                    *np.asarray(quaternion, dtype=float).tolist()]
         if len(numbers) != 7 or not all(map(isfinite, numbers)):
@@ -123,7 +125,7 @@ class TargetChecks:
         return ''
 
     def lowest_height(self, quaternion: np.ndarray) -> float:
-        """Least height of base_link at an attitude (4,) at which nothing touches the floor [m]."""
+        """Return the lowest allowed height of base_link at an attitude (4,) [m]."""
         down = self._points @ rotations.matrix(rotations.normalized(quaternion))[2] - self._radii
         return self._p.clearance - float(down.min())
 
@@ -137,7 +139,7 @@ class TargetChecks:
         return f'point {k + 1}: {name} {worst:.4g} {unit}, expected within +-{most:g} {unit}'
 
     def _steps(self, target):
-        """Whether the way from point to point asks for more than the velocities may."""
+        """Check the mean speeds between points."""
         time = np.maximum(np.diff(target.times), 1e-9)
         away = np.linalg.norm(np.diff(target.positions, axis=0), axis=1)
         same = np.abs(np.sum(target.quaternions[:-1] * target.quaternions[1:], axis=1))

@@ -1,4 +1,4 @@
-"""Tasks: which target, external wrench and payload at which time."""
+"""Tasks: targets, external wrenches and payloads over time."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ TORQUE_IMPULSE = 0.05  # [s]
 FORCE_LEVELS = np.arange(10.0, 101.0, 10.0)  # [N] upwards
 TORQUE_LEVELS = np.arange(2.5, 30.1, 2.5)  # [N m]
 PAYLOADS = (0.0, 0.25, 0.5, 0.75, 1.0)  # [kg]
-LOST_POSITION = 1.5  # [m] from the target: control is lost
-LOST_ORIENTATION = np.radians(90)  # [rad] still, when the next level is due
-GROUND_HEIGHT = 0.25  # [m] of base_link: below, the robot lies on the ground
+LOST_POSITION = 1.5  # [m] position error above which control is lost
+LOST_ORIENTATION = np.radians(90)  # [rad] the same for the orientation, at the end of a level
+GROUND_HEIGHT = 0.25  # [m] height of base_link below which the robot is on the ground
 
 # The poses of the real-world experiment: x, y, z [m], roll, pitch, yaw [deg].
 WAYPOINTS = np.array([[0.0, 0.0, 0.8, 0.0, 0.0, 0.0],
@@ -39,16 +39,15 @@ NAMES = ('waypoints', 'random100', 'lemniscate', 'hover', 'force', 'torque', 'pa
 @dataclass(frozen=True)
 class Segment:
     """
-    A stretch of a task with constant disturbance.
+    Part of a task with constant disturbance.
 
     Attributes:
         duration: [s].
-        target: builds the target to publish at the segment's start from that time;
-            None keeps the one in force.
+        target: start time of the segment [s] -> target to publish; None: the target stays.
         force_world: (3,) external force in world [N].
         torque_body: (3,) external torque in base_link [N m].
         payload: mass attached below the body [kg].
-        level: magnitude of the disturbance that this segment belongs to, 0 for none.
+        level: disturbance level of this segment [N, N m or kg], 0 for none.
 
     """
 
@@ -66,10 +65,10 @@ class Task:
     A named sequence of segments.
 
     Attributes:
-        name: as the user gave it.
+        name: name or file given by the user.
         kind: 'poses', 'trajectory', 'hover', 'force', 'torque' or 'payload'.
-        segments: in their order.
-        poses: (P, 6) the pose targets in their order: x, y, z [m], roll, pitch, yaw [deg].
+        segments: segments in order.
+        poses: (P, 6) pose targets in order: x, y, z [m], roll, pitch, yaw [deg].
         rounds: (start, end) of each round of a trajectory, since the task's start [s].
 
     """
@@ -87,11 +86,11 @@ class Task:
 
     @property
     def duration(self) -> float:
-        """Of the whole task [s]."""
+        """Duration of the whole task [s]."""
         return float(self.ends[-1])
 
     def targets(self, start: float) -> list[Target]:
-        """All targets of a flight of this task that starts at ``start`` [s]."""
+        """Return all targets of a flight of this task that starts at ``start`` [s]."""
         begins = start + np.concatenate([[0.0], self.ends[:-1]])
         return [segment.target(float(begin))
                 for begin, segment in zip(begins, self.segments, strict=True) if segment.target]
@@ -100,16 +99,16 @@ class Task:
 @dataclass(frozen=True)
 class Moment:
     """
-    What a task asks for at one time.
+    State of a task at one time.
 
     Attributes:
-        target: to publish now, or None when nothing changed.
+        target: target to publish now, or None.
         force_world: (3,) external force in world [N].
         torque_body: (3,) external torque in base_link [N m].
         payload: [kg].
-        changed: whether wrench or payload differ from the previous moment.
-        finished: the task is over.
-        lost: control was lost, which ends the task.
+        changed: whether a new segment has begun.
+        finished: whether the task is over.
+        lost: whether control was lost, which ends the task.
 
     """
 
@@ -124,10 +123,10 @@ class Moment:
 
 class TaskPlayer:
     """
-    Plays a task in time; call :meth:`update` at every tick, with the same clock throughout.
+    Plays a task in time, by periodic calls of :meth:`update`.
 
-    Targets are stamped with the time at which they are due, not with the tick at which
-    they are noticed, so that a pose's 8 s are exact.
+    Targets are stamped with the time at which they are due, not with the time of the call, so
+    that the 8 s of a pose are exact.
     """
 
     def __init__(self, task: Task, start: float):
@@ -141,12 +140,12 @@ class TaskPlayer:
     def update(self, now: float, position: np.ndarray | None = None,
                quaternion: np.ndarray | None = None) -> Moment:
         """
-        Ask what holds at ``now``.
+        Return the state of the task at ``now``.
 
         Args:
-            now: [s].
-            position: (3,) of the robot in world, to notice a loss of control.
-            quaternion: (4,) of the robot.
+            now: present time [s].
+            position: (3,) position of the robot in world [m], to detect a loss of control.
+            quaternion: (4,) orientation of the robot.
 
         """
         index = int(np.searchsorted(self._ends, now - self.start + 1e-6, side='right'))
@@ -183,9 +182,9 @@ def control_lost(target: PoseTarget, position: np.ndarray,
     """
     Whether a robot that should hold ``target`` is out of control.
 
-    It is when it is more than 1.5 m away or on the ground. With ``quaternion``, given
-    at the end of a disturbance level, also when it is turned by more than 90 deg: it did
-    not recover before the next level.
+    Control is lost if the robot is more than 1.5 m away or on the ground. With ``quaternion``,
+    given at the end of a disturbance level, control is also lost above an orientation error of
+    90 deg: the robot did not recover before the next level.
     """
     if np.linalg.norm(position - target.position) > LOST_POSITION or position[2] < GROUND_HEIGHT:
         return True
@@ -199,11 +198,11 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
 
     Args:
         name: one of ``NAMES``, ``randomN`` for N random poses, or the path of a CSV file.
-        seed: of the random poses.
-        reach: largest step between two poses of a file [m], of the controller that flies.
+        seed: seed of the random poses.
+        reach: largest step between two poses of a file for the controller [m].
 
     Raises:
-        TaskError: unknown name, or an unusable file: file, row, column and expectation.
+        TaskError: unknown name, or an unusable file.
 
     """
     name = str(name)
@@ -223,14 +222,14 @@ def make_task(name: str | Path, seed: int = 0, reach: float = np.inf) -> Task:
 
 
 def random_poses(count: int, seed: int) -> np.ndarray:
-    """(count, 6) poses: x, y in [-2, 2] m, z in [0.6, 2] m, angles in [-180, 180] deg."""
+    """Return (count, 6) uniform poses: x, y +-2 m, z 0.6 to 2 m, angles +-180 deg."""
     low = [-2.0, -2.0, 0.6, -180.0, -180.0, -180.0]
     high = [2.0, 2.0, 2.0, 180.0, 180.0, 180.0]
     return np.random.default_rng(seed).uniform(low, high, (count, 6))
 
 
 def pose_target(pose: np.ndarray, stamp: float = 0.0) -> PoseTarget:
-    """Target of (6,) x, y, z [m], roll, pitch, yaw [deg]."""
+    """Return the target of (6,) x, y, z [m], roll, pitch, yaw [deg]."""
     return PoseTarget(np.array(pose[:3], dtype=float),
                       rotations.from_rpy(*np.radians(pose[3:])), stamp)
 
@@ -290,16 +289,16 @@ def _lemniscate_task(name):
 def trajectory_task(name: str, times: np.ndarray, positions: np.ndarray,
                     quaternions: np.ndarray) -> Task:
     """
-    Make a task of a trajectory: 8 s at its first pose, then the whole of it.
+    Make a task of a trajectory: 8 s at its first pose, then the trajectory.
 
     Args:
-        name: of the task.
-        times: (N,) increasing, from 0 [s].
+        name: name of the task.
+        times: (N,) increasing times from 0 [s].
         positions: (N, 3) in world [m].
         quaternions: (N, 4) body to world (x, y, z, w).
 
     Raises:
-        TaskError: shapes that do not fit together, or too few samples.
+        TaskError: inconsistent shapes, or too few samples.
 
     """
     times, positions, quaternions = (np.asarray(array, dtype=float)

@@ -1,1 +1,1 @@
-"""The robot in the browser: recorded runs beside each other, or a running graph."""
+"""3D view in the browser: recorded runs over each other, or a running graph."""

@@ -1,4 +1,4 @@
-"""Where the arrows of forces and torques stand, in base_link."""
+"""Geometry of the arrows of forces and torques, in base_link."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 NEWTON_PER_METRE = 40.0         # thrust that is drawn as one metre
-TORQUE_RADIUS = 0.07            # [m] of the arcs that stand for torques
+TORQUE_RADIUS = 0.07            # [m] of the arcs of torques
 TORQUE_HEIGHT = 0.03            # [m] of an arc above its rotor
 RADIAN_PER_NEWTON_METRE = 12.0  # angle of the arc
 LONGEST_ARC = 5.8               # [rad]
@@ -19,10 +19,10 @@ WORLD_NEWTON_PER_METRE = 40.0   # external force that is drawn as one metre
 
 def rotor_frames(robot: RobotParameters, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Place the rotors of a robot.
+    Compute the frames of the rotors.
 
     Args:
-        robot: where they sit.
+        robot: robot parameters.
         tilt: (4,) angles of the tilt joints [rad].
 
     Returns:
@@ -39,12 +39,12 @@ def rotor_frames(robot: RobotParameters, tilt: np.ndarray) -> tuple[np.ndarray, 
 
 def thrust_arrows(robot: RobotParameters, tilt: np.ndarray, thrust: np.ndarray) -> np.ndarray:
     """
-    Begin and end of the thrust of each rotor.
+    Compute begin and end of each rotor's thrust arrow.
 
     Args:
-        robot: where they sit.
+        robot: robot parameters.
         tilt: (4,) angles [rad].
-        thrust: (4,) [N]; NaN draws nothing.
+        thrust: (4,) [N]; NaN: no arrow.
 
     Returns:
         (4, 2, 3) points in base_link [m].
@@ -57,14 +57,14 @@ def thrust_arrows(robot: RobotParameters, tilt: np.ndarray, thrust: np.ndarray) 
 
 def torque_arcs(robot: RobotParameters, tilt: np.ndarray, thrust: np.ndarray) -> np.ndarray:
     """
-    Arcs for the reaction torque of each rotor on the body, -spin ratio f about the rotor's axis.
+    Compute arcs for the reaction torque of each rotor on the body, -spin ratio f about its axis.
 
-    They turn as the torque does; their angle grows with it.
+    The angle of an arc is proportional to the torque and has its direction.
 
     Args:
-        robot: where they sit, how they spin.
+        robot: robot parameters.
         tilt: (4,) angles [rad].
-        thrust: (4,) [N]; NaN draws nothing.
+        thrust: (4,) [N]; NaN: no arc.
 
     Returns:
         (4 * (SEGMENTS + 2), 2, 3) lines in base_link [m].

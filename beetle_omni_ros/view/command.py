@@ -1,4 +1,4 @@
-"""`beetle_omni view RUN...`: play recorded runs in the browser."""
+"""`beetle_omni view RUN...`: playback of recorded runs in the browser."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.view.recording import Recording
 
-FIRST_ROWS = 60.0       # [s] at most until the first of a run is read
+FIRST_ROWS = 60.0       # [s] timeout for the first rows of a run
 
 
 def names(paths: list[Path]) -> list[str]:
-    """Name runs by their folders, and where these are alike by the folders above too."""
+    """Return distinct names of runs: their folders, if necessary with the folders above."""
     parts = [path.absolute().parts for path in paths]
     for depth in range(1, max(map(len, parts)) + 1):
         found = ['/'.join(part[-depth:]) for part in parts]
@@ -31,18 +31,19 @@ def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None =
     Play recorded runs until Ctrl-C.
 
     Args:
-        runs: rosbag2 folders or their files; the first is drawn solid, the others as ghosts.
-        robot: robot file, for where forces act; None: the shipped one.
-        urdf: description; None: the shipped one.
+        runs: rosbag2 folders or their files; the first is drawn solid, the others transparent.
+        robot: robot file, for the positions of forces; None: the shipped one.
+        urdf: robot description; None: the shipped one.
         host: address at which the page is served.
-        port: of it; the next free one is taken.
-        dark: colours to begin with.
-        start: where to begin [s].
-        play: whether it runs at once.
-        console: where to print.
+        port: first port that is tried.
+        dark: whether the page starts with dark colours.
+        start: start of the playback [s].
+        play: whether playback starts at once.
+        console: output of the address.
 
     Raises:
-        BagError, ParameterError: in one line.
+        BagError: unusable run.
+        ParameterError: other unusable input.
 
     """
     console = console or Console()
@@ -52,7 +53,7 @@ def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None =
         for path, name in zip(runs, names(runs), strict=True):
             recordings.append(Recording(path, name))
             stack.callback(recordings[-1].close)
-        from beetle_omni_ros.view.page import Page  # while the first seconds are read
+        from beetle_omni_ros.view.page import Page  # slow import, while the first rows are read
         from beetle_omni_ros.view.playback import Player
         page = Page([recording.name for recording in recordings], model, parameters, host=host,
                     port=port, dark=dark)
@@ -62,11 +63,11 @@ def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None =
         player = Player(page, recordings, start, play)
         player.look()
         player.draw()
-        with suppress(KeyboardInterrupt):       # how a viewer is ended
+        with suppress(KeyboardInterrupt):       # the regular end
             announce(page.url, console)
             player.run()
 
 
 def announce(url: str, console: Console) -> None:
-    """Print where the page is."""
+    """Print the address of the page."""
     console.print(f'{url}  (Ctrl-C ends it)', markup=False, highlight=False, soft_wrap=True)

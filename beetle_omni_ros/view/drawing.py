@@ -1,4 +1,4 @@
-"""One robot in the scene: its links, and what moves them."""
+"""One robot in the 3D scene: links, joints, rotors and arrows."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ TRIANGLE = np.dtype([('normal', '<f4', 3), ('corners', '<f4', (3, 3)), ('attribu
 BLADE = (40, 40, 46)
 BLADE_WIDTH, BLADE_HEIGHT = 0.14, 1.3   # of a disc's radius and height
 SEGMENTS = 24                           # of a cylinder
-EYE_RATE = 9.0      # [rad/s] that a rotor turns at most for the eye: real ones would flicker
+EYE_RATE = 9.0      # [rad/s] highest drawn rotor speed; the real speed would flicker
 
 
 def wxyz(quaternion: np.ndarray) -> np.ndarray:
-    """Quaternion in the order of the viewer."""
+    """Return a quaternion in the order of the viewer."""
     return np.roll(quaternion, 1)
 
 
 class RobotDrawing:
     """
-    A robot that can be placed.
+    A robot in the scene.
 
     Args:
-        scene: of the viser server.
-        name: of its node.
-        model: what it looks like.
-        robot: where forces act.
-        tint: colour and opacity of a ghost; None: as the description says, with arrows.
+        scene: scene of the viser server.
+        name: name of its node in the scene.
+        model: links and shapes.
+        robot: robot parameters, for the positions of forces.
+        tint: colour and opacity of a transparent robot; None: colours of the model, with arrows.
 
     """
 
@@ -72,24 +72,24 @@ class RobotDrawing:
         self._forces = True
 
     def show_forces(self, wanted: bool) -> None:
-        """Show or hide its arrows."""
+        """Show or hide the arrows."""
         self._forces = wanted
         for drawn in (self._arrows, self._arcs):
             if drawn is not None:
                 drawn.visible = wanted
 
     def hide(self) -> None:
-        """Take it out of sight."""
+        """Hide the robot."""
         self._root.visible = False
 
     def show(self, row: np.ndarray, prefix: str = '', passed: float = 0.0) -> None:
         """
-        Place it.
+        Draw the robot at a pose.
 
         Args:
-            row: see :mod:`~beetle_omni_ros.view.frames`.
-            prefix: which pose of the row, see :func:`~beetle_omni_ros.view.frames.pose`.
-            passed: time since the row before, in which the rotors turn [s].
+            row: row of values, see :mod:`~beetle_omni_ros.view.frames`.
+            prefix: pose in the row, see :func:`~beetle_omni_ros.view.frames.pose`.
+            passed: time since the previous row, for the rotation of the rotors [s].
 
         """
         placed = pose(row, prefix)
@@ -111,7 +111,7 @@ class RobotDrawing:
             self._arcs.points = arrows.torque_arcs(self._robot, tilt, thrust)
 
     def _spin(self, thrust, passed):
-        """Turn the rotors by the square root of their thrust, as real ones, but slower."""
+        """Turn the rotors at a speed proportional to the square root of their thrust."""
         rotors = self._robot.rotors
         self._turned += rotors.spin * EYE_RATE * passed * np.sqrt(
             np.clip(thrust / rotors.thrust_max, 0, 1))
@@ -128,7 +128,7 @@ def _add(scene, name, visual, tint):
             'opacity': opacity if opacity < 1 else None}
     if tint is not None:
         look = {'color': tint[0], 'opacity': tint[1] * opacity}
-    # What is transparent throws no shadow, and is seen through from both sides.
+    # Transparent shapes cast no shadow.
     look['cast_shadow'] = look['opacity'] is None
     if visual.shape == 'box':
         scene.add_box(name, dimensions=visual.size, **look, **place)
@@ -144,7 +144,7 @@ def _add(scene, name, visual, tint):
 
 
 def _add_blades(scene, name, disc: Visual, tint):
-    """A propeller in a plain disc, so that it is seen to turn."""
+    """Add a propeller to a rotor disc, so that its rotation is visible."""
     radius, height = disc.size
     colour, opacity = tint or (BLADE, None)
     scene.add_box(name, dimensions=(1.96 * radius, BLADE_WIDTH * radius, BLADE_HEIGHT * height),
@@ -154,7 +154,7 @@ def _add_blades(scene, name, disc: Visual, tint):
 
 @lru_cache
 def _mesh(file):
-    """(N, 3) corners and (M, 3) triangles of them."""
+    """(N, 3) vertices and (M, 3) indices of triangles."""
     try:
         data = file.read_bytes()
         count = int.from_bytes(data[STL_HEADER:STL_HEADER + 4], 'little')
@@ -167,5 +167,5 @@ def _mesh(file):
         if not len(mesh.faces):
             raise ValueError('no triangles')
         return mesh.vertices, mesh.faces
-    except Exception as error:      # whatever a missing or broken file provokes in the library
+    except Exception as error:      # a missing or broken file raises anything in the library
         raise ParameterError(f'{file}: not a usable mesh: {error}') from None

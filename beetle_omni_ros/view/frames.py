@@ -1,4 +1,4 @@
-"""What is shown of one moment, and a run as a table of such moments."""
+"""Rows of displayed values, and a run as a table of rows over time."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ FIELDS = {'t': 1, 'position': 3, 'quaternion': 4, 'estimate_position': 3,
           'estimate_quaternion': 4, 'target_position': 3, 'target_quaternion': 4, 'tilt': 4,
           'tilt_command': 4, 'thrust': 4, 'voltage': 1, 'current': 1, 'force': 3}
 """
-Columns of a row, by name -> width: time [s]; the body in world, true where that is known, else
-estimated; the estimate beside the truth; the target; tilt measured and commanded [rad]; thrust
-commanded [N]; battery [V], [A]; external force in world [N]. NaN where unknown.
+Columns of a row, by name -> width: time [s]; the body in world, true if known, else estimated; the
+estimate if the truth is known; the target; tilt measured and commanded [rad]; thrust commanded
+[N]; battery [V], [A]; external force in world [N]. NaN if unknown.
 """
 
 _ENDS = np.cumsum(list(FIELDS.values()))
@@ -26,7 +26,7 @@ COLUMNS = {name: slice(int(end) - width, int(end))
            for (name, width), end in zip(FIELDS.items(), _ENDS, strict=True)}
 WIDTH = int(_ENDS[-1])
 T = COLUMNS['t'].start
-INPUTS = ': inputs'   # ending of the status in which a node tells what it refused
+INPUTS = ': inputs'   # ending of the name of the status about a node's inputs
 SHOWN = {'ground_truth/odom': {'position': 'position', 'quaternion': 'quaternion'},
          'odom': {'estimate_position': 'position', 'estimate_quaternion': 'quaternion'},
          'joint_states': {'tilt': 'position'},
@@ -34,40 +34,40 @@ SHOWN = {'ground_truth/odom': {'position': 'position', 'quaternion': 'quaternion
          'battery_state': {'voltage': 'voltage', 'current': 'current'},
          'disturbance': {'force': 'force'}}     # topic -> column -> part of its value
 POSED = ('ground_truth/odom', 'odom')
-STEPPED = ('target_position', 'target_quaternion', 'force')   # hold until the next row
+STEPPED = ('target_position', 'target_quaternion', 'force')   # not interpolated
 QUATERNIONS = ('quaternion', 'estimate_quaternion')
 
 
 def known(row: np.ndarray, name: str) -> np.ndarray | None:
-    """Values of one field of a row; None where they are unknown."""
+    """Return the values of one field of a row; None if unknown."""
     values = row[COLUMNS[name]]
     return None if np.isnan(values).any() else values
 
 
 def pose(row: np.ndarray, prefix: str = '') -> tuple[np.ndarray, np.ndarray] | None:
-    """Position [m] and quaternion of the body, 'estimate_' or 'target_'; None where unknown."""
+    """Return position [m] and quaternion of the body, 'estimate_' or 'target_', or None."""
     position, quaternion = (known(row, f'{prefix}{part}') for part in ('position', 'quaternion'))
     return None if position is None or quaternion is None else (position, quaternion)
 
 
 class Sampler(Recorder):
     """
-    Keeps the newest of everything, and gives it as rows and as what was told when.
+    Keeps the newest values of all topics, and samples them into rows.
 
     Attributes:
-        meta: of the run.
-        target: the newest; assigning one takes a refused one back.
-        states: (t, state) of the supervisor, in the order of their arrival.
-        faults: name -> when it was first told [s].
+        meta: metadata of the run.
+        target: newest target; assignment replaces a refused one.
+        states: (t, state) of the supervisor, in the order of receipt.
+        faults: name -> time of the first report [s].
         clock: stamp of the newest pose [s]; NaN before the first.
-        remarks: (status, text) of each warning or error of a node's inputs, as it came.
+        remarks: (status, text) of each warning or error about a node's inputs.
 
     """
 
     def __init__(self):
         self.clock = np.nan
         self.remarks: list[tuple[str, str]] = []
-        self._row = np.full(WIDTH, np.nan)      # newest, truth and estimate each in its place
+        self._row = np.full(WIDTH, np.nan)      # newest values, before _stand_in
         self._series: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []   # since rows()
         self.target: Target | None = None
         self._targets: list[tuple[float, Target | None]] = [(-np.inf, None)]
@@ -79,22 +79,22 @@ class Sampler(Recorder):
 
     @property
     def placed(self) -> bool:
-        """Whether it is known where the robot is."""
+        """Whether a pose of the robot is known."""
         return pose(self._row) is not None or pose(self._row, 'estimate_') is not None
 
     def row(self, t: float) -> np.ndarray:
-        """(WIDTH,) newest values at ``t`` [s]."""
+        """Return the (WIDTH,) newest values at ``t`` [s]."""
         return _table(self._row, np.array([t]), [self.target])[0]
 
     def rows(self, times: np.ndarray) -> np.ndarray:
         """
-        Give the values of each time; those that came for earlier ones are forgotten.
+        Return the newest values at each time, and forget older ones.
 
         Args:
-            times: (N,) increasing [s], later than those of the call before.
+            times: (N,) increasing times [s], later than those of the previous call.
 
         Returns:
-            (N, WIDTH) newest values, by their times of receipt.
+            (N, WIDTH) newest values by the times of receipt.
 
         """
         received = [t for t, _ in self._targets]
@@ -111,9 +111,9 @@ class Sampler(Recorder):
 
     def write(self, topic: str, value: Any, received: float | np.ndarray | None = None) -> None:
         """
-        Take one value, as the table of topics has it; nothing of other topics is shown.
+        Store one value; topics that are not displayed are ignored.
 
-        Those of a series may have fields that are arrays over many messages.
+        Values of a series may have fields that are arrays over several messages.
         """
         if topic not in SHOWN:
             taker = self._TAKERS.get(topic)
@@ -133,7 +133,7 @@ class Sampler(Recorder):
             self.clock = float(np.ravel(value.stamp)[-1])
 
     def write_meta(self, meta: dict) -> None:
-        """Add to what is known of the flight."""
+        """Add metadata of the flight."""
         self.meta.update(meta)
 
     def _take_target(self, target, received):
@@ -162,7 +162,7 @@ class Sampler(Recorder):
 
 
 def _table(row, times, targets):
-    """(N, WIDTH) of one row at times, each with its target."""
+    """(N, WIDTH) copies of one row with times and targets."""
     table = np.tile(row, (len(times), 1))
     table[:, T] = times
     for k, target in enumerate(targets):
@@ -174,7 +174,7 @@ def _table(row, times, targets):
 
 
 def _stand_in(table):
-    """Where no truth is known the estimate stands for it; a force of nothing is no force."""
+    """Replace unknown truth by the estimate, and a force of zero by NaN."""
     unknown = np.isnan(table[:, COLUMNS['position']]).any(axis=1)
     for name in ('position', 'quaternion'):
         table[unknown, COLUMNS[name]] = table[unknown, COLUMNS[f'estimate_{name}']]
@@ -185,10 +185,10 @@ def _stand_in(table):
 
 class Rows:
     """
-    Rows in time, which may grow.
+    Growing table of rows over time.
 
     Args:
-        longest: time that is kept [s].
+        longest: duration that is kept [s].
 
     """
 
@@ -210,7 +210,7 @@ class Rows:
         return self.table[:, T]
 
     def append(self, rows: np.ndarray) -> None:
-        """Add (M, WIDTH) rows; those that do not follow in time are left out."""
+        """Add (M, WIDTH) rows, without those that are not later than the previous one."""
         last = self.times[-1] if len(self) else -np.inf
         rows = rows[np.maximum.accumulate(np.concatenate([[last], rows[:-1, T]])) < rows[:, T]]
         if self._end + len(rows) > len(self._table):
@@ -225,13 +225,10 @@ class Rows:
 
     def at(self, t: float) -> np.ndarray:
         """
-        One row at a time, between the rows around it.
+        Return the row at time ``t`` [s], interpolated between its neighbours.
 
-        Poses, angles and thrusts are interpolated, quaternions as vectors; targets and external
-        forces hold. Outside, the first or last row holds.
-
-        Args:
-            t: [s].
+        Quaternions are interpolated as vectors; targets and external forces are held. Outside the
+        table, the first or last row is returned.
 
         Raises:
             IndexError: there are no rows.
@@ -258,12 +255,12 @@ class Rows:
         return row
 
     def window(self, begin: float, end: float, most: int = 200) -> np.ndarray:
-        """Rows from ``begin`` to ``end`` [s], at most about ``most`` of them, evenly."""
+        """Return about ``most`` or fewer evenly spaced rows from ``begin`` to ``end`` [s]."""
         first, last = np.searchsorted(self.times, [begin, end])
         return self.table[first:last:max(1, int(last - first) // most)]
 
 
 def state_at(states: list[tuple[float, str]], t: float) -> str:
-    """State of the supervisor at ``t`` [s]; '' before the first."""
+    """Return the state of the supervisor at ``t`` [s]; '' before the first."""
     k = bisect_right(states, t, key=lambda entry: entry[0]) - 1
     return states[k][1] if k >= 0 else ''

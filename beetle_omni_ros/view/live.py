@@ -1,4 +1,4 @@
-"""A running graph on the page: what is heard of it, and what the operator asks of it there."""
+"""Display of a running graph, with targets and controller selection by the user."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from beetle_omni_ros.view.frames import pose, Rows, Sampler, T
 from beetle_omni_ros.view.page import moments, Page, Shown
 
 KEPT = 60.0             # [s] of rows
-ANSWER_TIME = 3.0       # [s] in which nodes tell that they refused a target: a diagnostic is 1 s
-JUMP = 1.0              # [s] back in the clock by which a new flight shows
+ANSWER_TIME = 3.0       # [s] to wait for a refusal of a target; diagnostics come every 1 s
+JUMP = 1.0              # [s] step back of the clock that indicates a new flight
 WAITING = 'waiting for odom or ground_truth/odom'
 
 
 class Graph(Protocol):
-    """What the page needs of a running graph."""
+    """Interface of a running graph for the page."""
 
     def take(self, sampler: Sampler) -> None:
-        """Pass on what came since the last call."""
+        """Pass on the messages since the last call."""
 
     def controllers(self) -> list[str]:
-        """Names of the controllers that command, or could."""
+        """Return the names of the controllers in the graph."""
 
     def publish_target(self, target: PoseTarget) -> None:
-        """Ask for a pose."""
+        """Publish a target pose."""
 
     def select(self, controller: str, answer: Callable[[str], None]) -> None:
-        """Ask the supervisor for a controller; ``answer`` takes why not, '' for yes."""
+        """Select a controller; calls ``answer`` with the reason of a refusal, or ''."""
 
 
 class Live:
@@ -45,11 +45,10 @@ class Live:
     Draws a graph as it runs.
 
     Args:
-        page: with one name.
-        graph: what to listen to.
-        robot: for the checks of targets.
-        allow_targets: whether poses dragged on the page become targets, and controllers can be
-            selected there.
+        page: page for one run.
+        graph: graph to display.
+        robot: robot parameters for the checks of targets.
+        allow_targets: whether the page has controls for targets and the controller.
 
     """
 
@@ -60,7 +59,7 @@ class Live:
         self._begin: float | None = None
         self._stop = threading.Event()
         self._asked: tuple[float, PoseTarget | None] | None = None
-        self._wanted: PoseTarget | None = None      # by the page, until the next step takes it
+        self._wanted: PoseTarget | None = None      # set by the page, published by the next step
         self._dragging = False
         self._gizmo = None
         gui = page.server.gui
@@ -89,7 +88,7 @@ class Live:
         self._stop.set()
 
     def step(self, passed: float) -> None:
-        """Take in what came, and draw it; ``passed`` [s] since the step before."""
+        """Process new messages and draw; ``passed`` is the time since the last step [s]."""
         sampler = self._sampler
         self._publish()
         self._graph.take(sampler)
@@ -124,14 +123,14 @@ class Live:
         if self._told.content != text:
             self._told.content = text
 
-    # -- what the operator asks ------------------------------------------------------------
+    # -- controls --------------------------------------------------------------------------
 
     def _place_gizmo(self, placed):
         self._gizmo.visible = True
         if not self._dragging and self._asked is None:
             self._gizmo.position, self._gizmo.wxyz = placed[0], wxyz(placed[1])
 
-    async def _on_gizmo(self, event):   # in the loop, which keeps the order of events
+    async def _on_gizmo(self, event):   # a coroutine: viser then keeps the order of events
         self._dragging = event.phase != 'end'
         position = np.array(event.target.position)
         quaternion = np.roll(np.array(event.target.wxyz), -1)
@@ -142,8 +141,8 @@ class Live:
             self._send(position, quaternion)
 
     def _send(self, position, quaternion):
-        """Ask for a pose, if it can be flown at all; the nodes decide whether it is."""
-        # Stamped by the flight's own clock, so that it is newer than the targets before.
+        """Request a target pose if it is valid; the nodes may still refuse it."""
+        # Stamp by the flight's clock, so that the target is newer than previous ones.
         target = PoseTarget(position, rotations.normalized(quaternion),
                             float(np.nan_to_num(self._sampler.clock)))
         if reason := self._checks.why_not(target, None):
@@ -152,7 +151,7 @@ class Live:
         self._wanted = target
 
     def _publish(self):
-        """In the thread that draws, which alone touches the sampler."""
+        """Publish the requested target; in the drawing thread, which owns the sampler."""
         target, self._wanted = self._wanted, None
         if target is not None:
             self._asked = (time.monotonic(), self._sampler.target)

@@ -1,4 +1,4 @@
-"""The page: scene, panel and plots in the browser, and what the user does there."""
+"""The page in the browser: 3D scene, panel and plots."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from beetle_omni_ros.view.frames import known, pose
 
 RATE = 30.0             # [Hz] of the scene
 PANEL_RATE, PLOT_RATE = 4.0, 4.0
-SHOWN_PLOTS = ('position error [m]', 'thrust command [N]')      # to begin with
+SHOWN_PLOTS = ('position error [m]', 'thrust command [N]')      # at the start
 ESTIMATE = ((70, 140, 250), 0.35)
 GHOST_OPACITY = 0.35
 TARGET_AXES = 0.28      # [m]
@@ -34,18 +34,18 @@ TRAIL_POINTS = 800
 SHADOW_RADIUS, SHADOW_OPACITY = 0.24, 0.15     # of the spot below the robot [m]
 VIEW_FROM, SMALLEST_VIEW = np.array([-0.5, -0.8, 0.36]), 2.0     # [m]
 NARROW, PHONE_DISTANCE, PANEL_SHARE = 0.8, 1.6, 0.35
-SETTLING = 5.0      # [s] in which the page of a newcomer comes to rest
-NUDGE = 1e-6        # [s]
+SETTLING = 5.0      # [s] after a browser connects in which the page is redrawn
+NUDGE = 1e-6        # [s] added to the plots' times so that they change
 ROOM = 3.5          # [m]
-SKY = 4.0           # brightness, in place of reflections
+SKY = 4.0           # brightness of the ambient light, instead of reflections
 FLOOR = 10.0        # [m] to each side, with a line at each metre
-LABEL_HEIGHT, LABEL_STEP = 0.38, 0.1    # [m] above base_link, for each further run
-ESTIMATE_SEEN = 0.01, 1.0   # [m], [deg] by which an estimate is off when it is drawn
+LABEL_HEIGHT, LABEL_STEP = 0.38, 0.1    # [m] above base_link; for each further run
+ESTIMATE_SEEN = 0.01, 1.0   # [m], [deg] error above which the estimate is drawn
 LOCAL = '127.0.0.1'
 
 
 def moments(stop: threading.Event) -> Iterator[tuple[float, float]]:
-    """Yield time and time since the last [s], at RATE until ``stop``; late ones are left out."""
+    """Yield (time, time since the last one) [s] at RATE until ``stop``, without late ones."""
     last = due = time.monotonic()
     while True:
         due = max(due + 1 / RATE, time.monotonic())
@@ -59,13 +59,13 @@ def moments(stop: threading.Event) -> Iterator[tuple[float, float]]:
 @dataclass(frozen=True)
 class Shown:
     """
-    What is known of one run at one moment.
+    Displayed data of one run at one moment.
 
     Attributes:
-        row: see :mod:`~beetle_omni_ros.view.frames`.
+        row: row of values, see :mod:`~beetle_omni_ros.view.frames`.
         window: rows around it, for the plots, on the time base of the first run.
-        state: of the supervisor.
-        faults: named so far -> since when [s].
+        state: state of the supervisor.
+        faults: fault names so far -> time of the first report [s].
 
     """
 
@@ -77,19 +77,19 @@ class Shown:
 
 class Page:
     """
-    A page that a browser opens; it draws what it is given.
+    A page served for browsers.
 
     Args:
-        names: of the runs; the first is drawn as it is, the others as ghosts.
-        model: what the robot looks like.
-        robot: where forces act on it.
-        title: of the folder that holds the controls.
-        host, port: where it is served; a port in use passes on to the next.
-        dark: colours to begin with.
+        names: names of the runs; the first is drawn solid, the others transparent.
+        model: links and shapes of the robot.
+        robot: robot parameters, for the positions of forces.
+        title: title of the folder of the controls.
+        host, port: address; if the port is in use, the next free one is taken.
+        dark: whether the page starts with dark colours.
 
     Attributes:
-        url: for the browser.
-        controls: folder for the controls of whoever draws.
+        url: address for the browser.
+        controls: folder for further controls.
 
     """
 
@@ -97,9 +97,9 @@ class Page:
                  title: str = 'Playback', host: str = LOCAL, port: int = 8080, dark: bool = False):
         self._names, self._robot, self._model, self._title = names, robot, model, title
         try:
-            with socket.socket() as probe:      # where that fails, viser would wait for ever
+            with socket.socket() as probe:      # if bind fails, viser would wait forever
                 probe.bind((host, 0))
-            with contextlib.redirect_stdout(io.StringIO()):     # it prints its own addresses
+            with contextlib.redirect_stdout(io.StringIO()):     # viser prints its own addresses
                 self.server = viser.ViserServer(host, port, label='beetle_omni', verbose=False)
         except (OSError, OverflowError, RuntimeError, UnicodeError) as error:
             raise ParameterError(f'--host {host} --port {port}: cannot be served there '
@@ -115,7 +115,7 @@ class Page:
         @self.server.on_client_connect
         def _(client):
             self._newcomer = time.monotonic()
-            if client.camera.aspect < NARROW:   # a phone, whose lower half is the panel
+            if client.camera.aspect < NARROW:   # a phone, where the panel covers the lower half
                 camera, given = client.camera, self.server.initial_camera
                 away = np.asarray(given.position) - given.look_at
                 centre = given.look_at - [0, 0, PANEL_SHARE * np.linalg.norm(away)]
@@ -126,7 +126,7 @@ class Page:
 
     def _add_scene(self, dark):
         scene = self.server.scene
-        # Shadows, reflections and an infinite floor are most of the cost of a picture.
+        # Shadows, reflections and an infinite floor would dominate the rendering time.
         scene.configure_default_lights(cast_shadow=False)
         scene.configure_environment_map(None)
         scene.add_light_ambient('/sky', intensity=SKY)
@@ -160,20 +160,20 @@ class Page:
                                 thickness_units='screen')
 
     def look_at(self, centre: np.ndarray, size: float) -> None:
-        """Set the camera of those who open the page: at a centre, for a size [m]."""
+        """Set the initial camera, to see a region of ``size`` [m] around ``centre`` (3,) [m]."""
         camera = self.server.initial_camera
         camera.look_at = centre
         camera.position = centre + max(size, SMALLEST_VIEW) * VIEW_FROM
 
     def look_at_room(self) -> None:
-        """Set it for a flight of which nothing is known yet."""
+        """Set the initial camera for a flight without known poses."""
         self.look_at(np.array([0.0, 0.0, 1.0]), ROOM)
 
     def draw_trail(self, k: int, positions: np.ndarray) -> None:
         """Draw the path of a run: (N, 3) in world [m]."""
         if len(positions) < 2:
             return
-        # By the way flown: most of the time is spent at the poses.
+        # Evenly spaced along the path, because most samples are at the hovered poses.
         steps = np.diff(positions, axis=0, prepend=positions[:1])
         flown = np.cumsum(np.linalg.norm(steps, axis=1))
         points = positions[np.searchsorted(flown, np.linspace(0, flown[-1], TRAIL_POINTS))]
@@ -226,16 +226,16 @@ class Page:
             scales={'x': uplot.Scale(time=False, auto=True), 'now': uplot.Scale(range=(0, 1))},
             visible=False, legend=uplot.Legend(show=False), padding=(4, 8, 0, 0))
 
-    # -- what is drawn ---------------------------------------------------------------------
+    # -- drawing ---------------------------------------------------------------------------
 
     def show(self, runs: list[Shown], now: float, passed: float, headline: str) -> None:
         """
         Draw one moment.
 
         Args:
-            runs: one for each name.
+            runs: data of each run.
             now: present time on the time base of the first run [s].
-            passed: time since the moment before, in which rotors turn [s].
+            passed: time since the previous call, for the rotation of the rotors [s].
             headline: first line of the status.
 
         """
@@ -246,7 +246,7 @@ class Page:
                 robot.show(run.row, passed=passed) if wanted else robot.hide()
                 if self._labels:
                     self._place_label(k, pose(run.row) if wanted else None)
-            # Where it coincides with the truth it would only tint the robot.
+            # An estimate at the true pose would only tint the robot.
             if self._show_estimate.value and _differ(*estimate_error(first.row)):
                 self._estimate.show(first.row, 'estimate_')
             else:
@@ -263,7 +263,7 @@ class Page:
     def _draw_plots(self, windows, now):
         if time.monotonic() - self._last_plot > 1 / PLOT_RATE:
             self._last_plot = time.monotonic()
-            # A chart that is opened while time stands still draws no time axis until that changes.
+            # A chart that is opened during a pause draws its time axis only when the data change.
             self._nudge = NUDGE - self._nudge
             for plot, (wanted, handle) in zip(plots.PLOTS, self._plots, strict=True):
                 data = plots.window(plot, windows, now) if wanted.value else None
@@ -273,12 +273,12 @@ class Page:
                     handle.data = data
 
     def refresh(self) -> None:
-        """Let the next moment renew panel and plots too."""
+        """Let the next call of :meth:`show` update panel and plots too."""
         self._last_panel = self._last_plot = -np.inf
 
     @property
     def settling(self) -> bool:
-        """Whether somebody has opened the page just now."""
+        """Whether a browser connected a short time ago."""
         return time.monotonic() < self._newcomer + SETTLING
 
     def _place_label(self, k, placed):
@@ -316,18 +316,18 @@ class Page:
         self._followed = placed[0].copy()
 
     def notify(self, title: str, text: str, colour: str = 'red') -> None:
-        """Show a note to everybody who looks."""
+        """Show a notification in all browsers."""
         for client in self.server.get_clients().values():
             client.add_notification(title, text, color=colour, auto_close_seconds=8.0)
 
     def close(self) -> None:
-        """Serve no more."""
+        """Stop the server."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
 
 def estimate_error(row: np.ndarray) -> tuple[float, float]:
-    """How far the estimate is from the truth [m], [deg]; NaN where one is unknown."""
+    """Return the error of the estimate [m], [deg]; NaN if estimate or truth is unknown."""
     true, estimated = pose(row), pose(row, 'estimate_')
     if true is None or estimated is None:
         return np.nan, np.nan
@@ -340,7 +340,7 @@ def _differ(metres, degrees):
 
 
 def status(run: Shown, headline: str, model: Model, names: list[str]) -> str:
-    """HTML of the status: state, errors, faults, battery and the winding of the joints."""
+    """Return the HTML of the status: state, errors, faults, battery and joint angles."""
     lines = [f'<b>{html.escape(headline)}</b>']
     if len(names) > 1:
         lines.append('<div style="font-size:.85em">' + ' &nbsp; '.join(
@@ -373,7 +373,7 @@ def status(run: Shown, headline: str, model: Model, names: list[str]) -> str:
 
 
 def _winding(row, model):
-    """A bar for each tilt joint: where it is between its limits; its target as a line."""
+    """HTML of a bar for each tilt joint: angle between the limits, and command as a line."""
     tilt, told = known(row, 'tilt'), known(row, 'tilt_command')
     bars = []
     for k, name in enumerate(JOINT_NAMES):

@@ -1,4 +1,4 @@
-"""Recorded runs over each other, with a slider."""
+"""Playback of recorded runs over each other."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ SLIDER_PERIOD = 0.2     # [s] between moves of the slider by the player itself
 
 class Player:
     """
-    Plays recordings on a page; the time is that of the first, from its beginning.
+    Plays recordings on a page.
 
-    The others are laid over it so that their tasks begin together.
+    The time is that of the first recording, from its beginning. The others are shifted so that
+    all tasks begin together.
 
     Args:
-        page: has a name for each recording.
-        recordings: that have at least a first row.
-        start: where to begin [s].
-        play: whether it runs at once.
+        page: page with a name for each recording.
+        recordings: recordings with at least one row each.
+        start: start of the playback [s].
+        play: whether playback starts at once.
 
     """
 
@@ -46,7 +47,7 @@ class Player:
 
     @property
     def length(self) -> float:
-        """Length of what is known of the first run [s], to the slider's hundredth."""
+        """Duration of the first run, as far as it was read, rounded to the slider's step [s]."""
         times = self._runs[0].rows.times
         return round(float(times[-1] - times[0]), 2)
 
@@ -97,7 +98,7 @@ class Player:
         self._page.show(shown, self.time, passed, f'{first.name}: {self.time:.1f} s of {total}')
 
     def _follow(self, playing):
-        """Let the slider and the paths follow what is played, and what was read."""
+        """Update the slider by the playback, and slider range and paths by newly read data."""
         if self.length > self._slider.max:
             self._slider.max = self.length
         if playing:
@@ -109,7 +110,7 @@ class Player:
                 self._page.draw_trail(k, run.rows.table[:, COLUMNS['position']])
 
     def look(self) -> None:
-        """Set the first camera so that the flight, as far as it is known, is in sight."""
+        """Set the initial camera so that the flight, as far as it was read, is visible."""
         positions = np.concatenate([run.rows.table[:, COLUMNS['position']]
                                     for run in self._runs])
         low, high = positions.min(axis=0), positions.max(axis=0) + [0, 0, 0.3]

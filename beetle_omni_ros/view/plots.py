@@ -1,4 +1,4 @@
-"""The plots beside the scene: what they show, and the window around the present moment."""
+"""The plots beside the scene, and their data in a window around the present time."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Plot:
     One plot.
 
     Attributes:
-        title: with its unit.
-        labels: of its series.
+        title: title with unit.
+        labels: labels of its series.
         values: rows (N, WIDTH) -> (N, len(labels)).
-        compares: one series for each run; otherwise of the first run alone.
+        compares: whether it shows all runs; otherwise the first run only.
 
     """
 
@@ -37,7 +37,7 @@ class Plot:
 
 
 def colour(run: int) -> str:
-    """Colour of a run, as HTML has it."""
+    """Return the HTML colour of a run."""
     return '#{:02x}{:02x}{:02x}'.format(*RUN_COLOURS[run % len(RUN_COLOURS)])
 
 
@@ -68,17 +68,17 @@ PLOTS = (
 
 def window(plot: Plot, runs: list[np.ndarray], now: float) -> tuple[np.ndarray, ...] | None:
     """
-    Series of a plot around the present.
+    Return the series of a plot around the present time.
 
     Args:
-        plot: which.
-        runs: rows (N, WIDTH) of each run, the first one's time base for all.
+        plot: plot to draw.
+        runs: rows (N, WIDTH) of each run, on the time base of the first.
         now: present time [s].
 
     Returns:
-        Times, the series one after the other, and one that is a vertical line at ``now``, from 0
-        to 1 on a scale of its own; all of one length and, but for the last, without NaN, at which
-        the plotting library stops. None where nothing is known.
+        Times, the series, and a vertical line at ``now`` from 0 to 1 on its own scale. All have
+        equal length. The series contain no NaN, at which the plotting library would stop. None
+        without data.
 
     """
     series = [plot.values(rows) for rows in (runs if plot.compares else runs[:1])]
@@ -97,6 +97,6 @@ def window(plot: Plot, runs: list[np.ndarray], now: float) -> tuple[np.ndarray, 
 
 
 def _over(times, own, values):
-    """Values at other times, those that are missing from their neighbours; None without any."""
+    """Values interpolated at other times, without NaN; None without values."""
     there = np.isfinite(values)
     return np.interp(times, own[there], values[there]) if there.any() else None

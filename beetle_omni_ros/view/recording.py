@@ -1,4 +1,4 @@
-"""A recorded run, read by a process of its own while its first seconds are shown already."""
+"""A recorded run, read by a separate process while its first seconds are already displayed."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from beetle_omni_ros.runs.bag_files import bag_files, BagError
 from beetle_omni_ros.view.frames import COLUMNS, Rows, Sampler
 
 STEP = 0.02         # [s] between rows
-GAP = 1.0           # [s] without any message that is not filled with rows
-PART = 1000         # rows that are handed on at a time; the first ones come as soon as read
+GAP = 1.0           # [s] without any message in which no rows are made
+PART = 1000         # rows that are passed on together, after a shorter first part
 SKIPPED = ('imu/data_raw', 'mocap/pose', 'rotor_states')
 
 
 @dataclass
 class Part:
     """
-    What is new of a run.
+    New data of a run.
 
     Attributes:
-        rows: (N, WIDTH), see :mod:`~beetle_omni_ros.view.frames`.
+        rows: (N, WIDTH) rows, see :mod:`~beetle_omni_ros.view.frames`.
         states: (t, state) of the supervisor so far.
-        faults: name -> when first told [s].
-        meta: of the run; filled at the end.
-        warnings: what was missing or wrong; filled at the end.
-        error: why it cannot be read, '' otherwise.
+        faults: name -> time of the first report [s].
+        meta: metadata of the run, in the last part.
+        warnings: missing and unusable data, in the last part.
+        error: why the bag is unreadable, or ''.
 
     """
 
@@ -48,13 +48,13 @@ class Part:
 
 def parts(path: str | Path) -> Iterator[Part]:
     """
-    Read a bag in parts, the first one a short one: what stands in the first chunk of the file.
+    Read a bag in parts; the first one is short, the first chunk of the file.
 
     Raises:
-        BagError: it cannot be read, or tells nowhere where the robot is.
+        BagError: the bag is unreadable, or contains no pose of the robot.
 
     """
-    from beetle_omni_ros.runs.bag_reader import replay  # the page does without its 0.1 s
+    from beetle_omni_ros.runs.bag_reader import replay  # 0.1 s, not needed by the page
     sampler, warnings, size = Sampler(), [], 0
     tables, due = [], None
     for times in replay(path, sampler, warnings, leave_out=SKIPPED):
@@ -84,16 +84,16 @@ class Recording:
     A run that is being read.
 
     Attributes:
-        name: for labels.
-        rows: what is known of it so far.
+        name: name for labels.
+        rows: rows so far.
         states, faults, meta, warnings: as in :class:`Part`, so far.
-        done: whether all of it is known.
+        done: whether the whole run was read.
 
     """
 
     def __init__(self, path: str | Path, name: str | None = None):
         """
-        Begin to read.
+        Start reading.
 
         Raises:
             BagError: no such bag.
@@ -117,10 +117,10 @@ class Recording:
 
     def wait(self, timeout: float | None = None, whole: bool = False) -> None:
         """
-        Wait for the first seconds, or for the whole.
+        Wait for the first rows, or for the whole run.
 
         Raises:
-            BagError: it cannot be read.
+            BagError: the bag is unreadable.
 
         """
         with self._changed:
@@ -129,12 +129,12 @@ class Recording:
             raise BagError(self._error)
 
     def origin(self) -> float:
-        """When its task began, as far as is known, else when it began itself [s]."""
+        """Return the time of the first state 'flying', else of the first row [s]."""
         flying = (t for t, state in self.states if state.startswith('flying'))
         return next(flying, float(self.rows.times[0]))
 
     def close(self) -> None:
-        """Read no further."""
+        """Stop reading."""
         self._process.kill()
         self._process.wait()
 
@@ -166,10 +166,10 @@ def main(path: str) -> None:
     except BagError as error:
         pickle.dump(Part(error=str(error)), output)
     except (BrokenPipeError, KeyboardInterrupt):
-        os._exit(1)     # nobody listens; the interpreter would complain about its output
+        os._exit(1)     # the reader has ended; a regular exit would report the closed output
 
 
 if __name__ == '__main__':
-    # As an import sees it: what is pickled is of this module, not of __main__.
+    # Import again: pickled classes must belong to this module, not to __main__.
     from beetle_omni_ros.view import recording
     recording.main(sys.argv[1])
