@@ -88,7 +88,7 @@ class Board:
         self._parser.feed(frame)
         self._watch.tick(now, True)
         if rng.random() < 0.1:
-            self._asked = self._watch.time_question().ts1
+            self._asked = self._watch.timesync_request().ts1
             self._watch.take()
 
 

@@ -31,7 +31,7 @@ ALLOWED = {
     'drive': ('robot',),
     'view': ('robot', 'control.base', 'runs', 'messages'),
     'nodes': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'drivers', 'drive',
-              'messages', 'view', 'bringup.heard'),
+              'messages', 'view', 'bringup.graph'),
     'train': ('robot', 'control.observation', 'control.onnx_runtime', 'control.policy_file',
               'control.policy_checksum', 'runs.json_file'),
     'cli': ('robot', 'control', 'estimation', 'sim', 'safety', 'runs', 'evaluation', 'comparison',

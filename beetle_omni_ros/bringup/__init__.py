@@ -1,1 +1,1 @@
-"""Bring-up of the real robot: look at everything, touch nothing, say what to do."""
+"""Bring-up checks of the real robot. They move nothing and change no setting."""

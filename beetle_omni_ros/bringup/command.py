@@ -1,4 +1,4 @@
-"""`beetle_omni check`: look at ports, servos, motor board and topics; a table of what to do."""
+"""`beetle_omni check`: checks ports, servos, motor board and topics, and prints remedies."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.text import Text
 from beetle_omni_ros import __version__
 from beetle_omni_ros.bringup.board import check_board
 from beetle_omni_ros.bringup.finding import FAIL, Finding, missing_library, OK, WARN
-from beetle_omni_ros.bringup.heard import Heard
+from beetle_omni_ros.bringup.graph import BRIDGES, ObservedGraph
 from beetle_omni_ros.bringup.limits import CheckLimits
 from beetle_omni_ros.bringup.servos import check_servos
 from beetle_omni_ros.bringup.topics import check_topics
@@ -27,19 +27,19 @@ SERVOS, BOARD, ROS = PARTS = ('servos', 'board', 'ros')
 STYLES = {OK: 'green', WARN: 'yellow', FAIL: 'bold red'}
 
 
-def run_check(*, listen: Callable[[float], Heard], servo_port: str | None = None,
+def run_check(*, listen: Callable[[float], ObservedGraph], servo_port: str | None = None,
               board_port: str | None = None, servo_bus: Path | None = None,
               motor_board: Path | None = None, robot: Path | None = None, seconds: float = 3.0,
               skip: tuple[str, ...] = (), json_path: Path | None = None,
               console: Console | None = None) -> int:
     """
-    Look at everything and print a table; nothing moves, nothing is set.
+    Check everything and print a table.
 
-    Arguments are the options of `beetle_omni check`. ``listen`` is called with seconds, returns
-    what ROS said and raises ModuleNotFoundError without ROS.
+    The arguments are the options of `beetle_omni check`. ``listen`` observes the ROS graph for a
+    number of seconds; it raises ModuleNotFoundError without ROS.
 
     Returns:
-        exit status: 0 nothing failed, 1 something did.
+        exit status: 0 if nothing failed, else 1.
 
     Raises:
         ParameterError: unusable input, in one line.
@@ -52,21 +52,24 @@ def run_check(*, listen: Callable[[float], Heard], servo_port: str | None = None
         check_writable(json_path)
     console, limits = console or Console(), CheckLimits.load()
     bus, link = ServoBusParameters.load(servo_bus), MotorBoardParameters.load(motor_board)
-    believed = RobotParameters.load(robot)
-    bus, link = _on(bus, servo_port), _on(link, board_port)
+    robot_parameters = RobotParameters.load(robot)
+    bus = replace(bus, port=servo_port or bus.port)
+    link = replace(link, port=board_port or link.port)
     found: dict[str, list[Finding]] = {part: [] for part in PARTS if part not in skip}
-    heard = None
+    graph = None
     if ROS in found:
         with console.status(f'listening to ROS for {seconds:g} s'):
-            heard = _listen(listen, seconds, found[ROS])
+            graph = _observed(listen, seconds, found[ROS])
     if SERVOS in found:
-        with console.status(f'looking at the servos on {bus.port}'):
-            found[SERVOS] = check_servos(bus, believed.joints, limits, heard)
+        with console.status(f'checking the servos on {bus.port}'):
+            found[SERVOS] = check_servos(bus, robot_parameters.joints, limits, graph)
     if BOARD in found:
         with console.status(f'listening to the motor board on {link.port}'):
-            found[BOARD] = check_board(link, believed, limits, seconds, heard)
-    if heard:
-        found[ROS] = check_topics(heard, limits, believed.gravity, _told(found))
+            found[BOARD] = check_board(link, robot_parameters, limits, seconds, graph)
+    if graph:
+        items = [finding.item for rows in found.values() for finding in rows]
+        reported = frozenset(bridge for bridge in BRIDGES if f'{bridge} state' in items)
+        found[ROS] = check_topics(graph, limits, robot_parameters.gravity, reported)
     _print(console, found, skip)
     if json_path:
         write_json(json_path, results(found, servo_port=bus.port, board_port=link.port,
@@ -75,18 +78,14 @@ def run_check(*, listen: Callable[[float], Heard], servo_port: str | None = None
 
 
 def results(found: dict[str, list[Finding]], **meta) -> dict:
-    """Findings as JSON has them: ``ok``, ``findings`` in order, ``meta``."""
+    """Content of the JSON file: ``ok``, ``findings`` in order, ``meta``."""
     rows = [finding.as_dict(part) for part, findings in found.items() for finding in findings]
     return {'ok': all(row['level'] != FAIL for row in rows), 'findings': rows,
             'meta': {'version': __version__, **meta}}
 
 
-def _on(parameters, port):
-    return replace(parameters, port=port) if port else parameters
-
-
-def _listen(listen, seconds, findings):
-    """Listen; without ROS, or where it does not start, a finding and None."""
+def _observed(listen, seconds, findings):
+    """Observe the graph; None, with a finding appended, if ROS is missing or does not start."""
     try:
         return listen(seconds)
     except ModuleNotFoundError as error:
@@ -95,15 +94,8 @@ def _listen(listen, seconds, findings):
                                 f'{finding.remedy}, or --skip ros'))
     except (OSError, RuntimeError) as error:
         findings.append(Finding('ROS', FAIL, f"does not start: {' '.join(str(error).split())}",
-                                'RMW_IMPLEMENTATION, network; or --skip ros'))
+                                'check RMW_IMPLEMENTATION and network; or --skip ros'))
     return None
-
-
-def _told(found):
-    """Bridges whose reports stand in the table already."""
-    items = [finding.item for rows in found.values() for finding in rows]
-    return frozenset(bridge for bridge in ('joint_bridge', 'rotor_bridge')
-                     if f'{bridge} state' in items)
 
 
 def _print(console, found, skip):
@@ -118,6 +110,6 @@ def _print(console, found, skip):
     console.print(table)
     levels = [finding.level for rows in found.values() for finding in rows]
     failed, warned = levels.count(FAIL), levels.count(WARN)
-    skipped = f"; not looked at: {', '.join(skip)}" if skip else ''
+    skipped = f"; not checked: {', '.join(skip)}" if skip else ''
     console.print(f'{failed} failed, {warned} warnings, {levels.count(OK)} ok{skipped}',
                   highlight=False, style=STYLES[FAIL if failed else WARN if warned else OK])

@@ -1,14 +1,13 @@
-"""One thing looked at: how it is, and what to do about it."""
+"""Findings: what a check found about one item, and the remedy."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 
-from beetle_omni_ros.bringup.heard import BRIDGES, Heard
+from beetle_omni_ros.bringup.graph import BRIDGES, ObservedGraph
 
 OK, WARN, FAIL = 'ok', 'warn', 'fail'
-LEVELS = (OK, WARN, FAIL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,11 +16,11 @@ class Finding:
     One row of the result.
 
     Attributes:
-        item: what was looked at; stable, for scripts.
-        level: 'ok', 'warn' (flies, but look at it) or 'fail'.
-        found: in words and numbers with units.
-        remedy: what to do; '' where all is well.
-        values: numbers behind ``found``, the unit in the key's ending.
+        item: name of the checked item, stable for scripts.
+        level: 'ok', 'warn' (the robot can fly, but look at the item) or 'fail'.
+        found: description with numbers and units.
+        remedy: what to do; '' for level 'ok'.
+        values: numbers behind ``found``; each key ends with the unit.
 
     """
 
@@ -36,61 +35,55 @@ class Finding:
         return {'part': part, **asdict(self), 'values': dict(self.values)}
 
 
-def worst(levels: Iterable[str]) -> str:
-    """Return the worst of some levels; 'ok' of none."""
-    return max(levels, key=LEVELS.index, default=OK)
-
-
 def graded(item: str, found: str, value: float, remedy: str, *, warn: float, fail: float,
            values: Mapping | None = None) -> Finding:
-    """Judge a number that is better the smaller it is: above ``warn``, above ``fail``."""
+    """Finding about ``value``: 'warn' above ``warn``, 'fail' above ``fail`` or for NaN."""
     level = FAIL if not value <= fail else WARN if value > warn else OK
     return Finding(item, level, found, '' if level == OK else remedy, values or {})
 
 
 def missing_library(item: str, error: ModuleNotFoundError, extra: str) -> Finding:
-    """Say which extra of pip brings a library that is not installed."""
+    """Finding about an item that needs a library of the pip extra ``extra``."""
     module = (error.name or '').partition('.')[0]
-    return Finding(item, FAIL, f"not looked at: the module '{module}' is not installed",
+    return Finding(item, FAIL, f"not checked: the module '{module}' is not installed",
                    f"pip install 'beetle_omni_ros[{extra}]'")
 
 
-OF_DIAGNOSTICS = {0: OK, 1: WARN}       # errors and stale ones fail
-FAULTS = {'joint_bridge': 'docs/reference/hardware_faults.md: what happens when',
-          'rotor_bridge': 'docs/reference/firmware.md: outcome of faults'}
-UNUSED = ('node', 'inputs', 'compute')  # of every node; the topics themselves are judged
+DIAGNOSTIC_LEVELS = {0: OK, 1: WARN}        # error and stale are failures
+FAULT_PAGES = {'joint_bridge': 'docs/reference/hardware_faults.md: what happens when',
+               'rotor_bridge': 'docs/reference/firmware.md: outcome of faults'}
+UNUSED = ('node', 'inputs', 'compute')      # statuses of every node; check_topics covers them
 
 
-def bridge_findings(port: Finding, bridge: str, heard: Heard | None) -> list[Finding]:
+def bridge_findings(port: Finding, bridge: str, graph: ObservedGraph | None) -> list[Finding]:
     """
-    Findings about a device whose port cannot be opened here.
+    Findings about a device whose port cannot be opened.
 
     Args:
         port: the failed finding about the port.
-        bridge: 'joint_bridge' or 'rotor_bridge'.
-        heard: None where nobody listened.
+        bridge: 'joint_bridge' or 'rotor_bridge', the node that opens this port in flight.
+        graph: the observed ROS graph, or None.
 
     """
     busy = bool(port.values.get('holders')) or 'another process' in port.found
-    if not (busy and heard and heard.runs(bridge)):
+    if not (busy and graph and graph.runs(bridge)):
         return [port]
     port = replace(port, level=OK, remedy='', found=f'{port.found}; not opened, judged by '
-                   f'what {bridge}_node reports of {BRIDGES[bridge]}')
-    return [port, *reported(bridge, heard)]
+                   f'what {bridge}_node reports about {BRIDGES[bridge]}')
+    return [port, *reported(bridge, graph)]
 
 
-def reported(bridge: str, heard: Heard) -> list[Finding]:
+def reported(bridge: str, graph: ObservedGraph) -> list[Finding]:
     """State and diagnostics of a running bridge as findings."""
-    findings = [_of_state(bridge, heard.states.get(bridge))]
-    for name, status in heard.of_bridge(bridge).items():
+    findings = [_of_state(bridge, graph.states.get(bridge))]
+    for name, status in graph.of_bridge(bridge).items():
         if name in UNUSED:
             continue
-        level = OF_DIAGNOSTICS.get(status.level, FAIL)
+        level = DIAGNOSTIC_LEVELS.get(status.level, FAIL)
         findings.append(Finding(f'{bridge} {name}', level, status.message or 'no message',
-                                '' if level == OK else FAULTS[bridge],
-                                status.values))
+                                '' if level == OK else FAULT_PAGES[bridge], status.values))
     if len(findings) == 1:
-        findings.append(Finding(f'{bridge} diagnostics', WARN, f'none within {heard.seconds:g} s',
+        findings.append(Finding(f'{bridge} diagnostics', WARN, f'none within {graph.seconds:g} s',
                                 'listen longer: --seconds 5'))
     return findings
 
@@ -98,10 +91,10 @@ def reported(bridge: str, heard: Heard) -> list[Finding]:
 def _of_state(bridge, state):
     item = f'{bridge} state'
     if state is None:
-        return Finding(item, WARN, f'no {bridge}/state', 'a bridge of another version?')
+        return Finding(item, WARN, f'no {bridge}/state', 'check the version of the bridge')
     if state == 'ready':
         return Finding(item, OK, state)
     if state.startswith('waiting'):
-        return Finding(item, WARN, state, f'configure and activate {bridge}_node, or cure '
-                       'what it waits for')
-    return Finding(item, FAIL, state, 'cure it, then disarm and arm again')
+        return Finding(item, WARN, state, f'configure and activate {bridge}_node, or remove '
+                       'the stated cause')
+    return Finding(item, FAIL, state, 'remove the cause, then disarm and arm again')

@@ -1,73 +1,92 @@
-"""What `beetle_omni check` calls well; read from params/check.yaml."""
+"""Limits of `beetle_omni check`; read from params/check.yaml."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.schema import parameter
 
+_share = partial(parameter, low=0, high=1)
+_supply = partial(parameter, unit='V', low=0, high=60)
+
+
+def _rate(topic, low, high):
+    return parameter(doc=f'nominal rate of {topic}', unit='Hz', low=low, high=high)
+
+
+def _age(topic, result):
+    return parameter(doc=f'age of the freshest message of {topic}; {result} above', unit='s',
+                     low=0, high=10)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ServoLimits:
-    """Of each servo and of the bus."""
+    """Limits for each servo and for the bus."""
 
-    supply_fail_low: float = parameter(doc='fails below', unit='V', low=0, high=60)
-    supply_low: float = parameter(doc='warns below', unit='V', low=0, high=60)
-    supply_high: float = parameter(doc='fails above', unit='V', low=0, high=60)
-    temperature_high: float = parameter(doc='warns above', unit='C', low=0, high=150)
-    answer_loss: float = parameter(doc='share of missing answers, warns above', low=0, high=1)
-    answer_loss_fail: float = parameter(doc='fails above', low=0, high=1)
+    supply_fail_low: float = _supply(doc='supply voltage of a servo; failure below')
+    supply_low: float = _supply(doc='supply voltage of a servo; warning below')
+    supply_high: float = _supply(doc='supply voltage of a servo; failure above')
+    temperature_high: float = parameter(doc='temperature of a servo; warning above', unit='C',
+                                        low=0, high=150)
+    answer_loss: float = _share(doc='share of missing answers; warning above')
+    answer_loss_fail: float = _share(doc='share of missing answers; failure above')
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatteryLimits:
-    """Of each cell, at rest."""
+    """Voltage limits of a cell at rest."""
 
-    cell_fail_low: float = parameter(doc='fails below', unit='V', low=0, high=5)
-    cell_low: float = parameter(doc='warns below', unit='V', low=0, high=5)
-    cell_high: float = parameter(doc='fails above', unit='V', low=0, high=6)
+    cell_fail_low: float = parameter(doc='cell voltage; failure below', unit='V', low=0, high=5)
+    cell_low: float = parameter(doc='cell voltage; warning below', unit='V', low=0, high=5)
+    cell_high: float = parameter(doc='cell voltage; failure above', unit='V', low=0, high=6)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LinkLimits:
-    """Of serial ports."""
+    """Limits for serial ports."""
 
-    loss: float = parameter(doc='share of packets, warns above', low=0, high=1)
-    loss_fail: float = parameter(doc='fails above', low=0, high=1)
-    latency_timer: int = parameter(doc='fails above', unit='ms', low=1, high=255)
+    loss: float = _share(doc='share of lost or corrupt packets; warning above')
+    loss_fail: float = _share(doc='share of lost or corrupt packets; failure above')
+    latency_timer: int = parameter(doc='latency timer of an FTDI adapter; failure above',
+                                   unit='ms', low=1, high=255)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TopicLimits:
-    """Rates and ages of ROS topics; ages are those of the freshest message."""
+    """Limits for the rates and ages of ROS topics."""
 
-    mocap_rate: float = parameter(doc='wanted', unit='Hz', low=1, high=2000)
-    imu_rate: float = parameter(doc='wanted', unit='Hz', low=1, high=8000)
-    joint_rate: float = parameter(doc='wanted', unit='Hz', low=1, high=2000)
-    battery_rate: float = parameter(doc='wanted', unit='Hz', low=0.1, high=1000)
-    rate_low: float = parameter(doc='share of the rate, warns below', low=0, high=1)
-    rate_fail: float = parameter(doc='fails below', low=0, high=1)
-    rate_high: float = parameter(doc='warns above', low=1, high=100)
-    ahead: float = parameter(doc='stamps in the future fail beyond', unit='s', low=0, high=10)
-    mocap_age: float = parameter(doc='warns above', unit='s', low=0, high=10)
-    mocap_age_fail: float = parameter(doc='fails above', unit='s', low=0, high=10)
-    imu_age: float = parameter(doc='warns above', unit='s', low=0, high=10)
-    imu_age_fail: float = parameter(doc='fails above', unit='s', low=0, high=10)
-    joint_age: float = parameter(doc='warns above', unit='s', low=0, high=10)
-    joint_age_fail: float = parameter(doc='fails above', unit='s', low=0, high=10)
-    battery_age: float = parameter(doc='warns above', unit='s', low=0, high=10)
-    battery_age_fail: float = parameter(doc='fails above', unit='s', low=0, high=10)
-    gap: float = parameter(doc='between two messages, warns above', unit='s', low=0, high=10)
-    gravity_tolerance: float = parameter(doc='mean specific force at rest, warns beyond',
-                                         unit='m/s^2', low=0, high=10)
+    mocap_rate: float = _rate('mocap/pose', 1, 2000)
+    imu_rate: float = _rate('imu/data_raw', 1, 8000)
+    joint_rate: float = _rate('joint_states', 1, 2000)
+    battery_rate: float = _rate('battery_state', 0.1, 1000)
+    rate_low: float = _share(doc='share of the nominal rate; warning below')
+    rate_fail: float = _share(doc='share of the nominal rate; failure below')
+    rate_high: float = parameter(doc='multiple of the nominal rate; warning above', low=1,
+                                 high=100)
+    ahead: float = parameter(doc='lead of a stamp over the clock of this computer; failure above',
+                             unit='s', low=0, high=10)
+    mocap_age: float = _age('mocap/pose', 'warning')
+    mocap_age_fail: float = _age('mocap/pose', 'failure')
+    imu_age: float = _age('imu/data_raw', 'warning')
+    imu_age_fail: float = _age('imu/data_raw', 'failure')
+    joint_age: float = _age('joint_states', 'warning')
+    joint_age_fail: float = _age('joint_states', 'failure')
+    battery_age: float = _age('battery_state', 'warning')
+    battery_age_fail: float = _age('battery_state', 'failure')
+    gap: float = parameter(doc='pause between two messages; warning above', unit='s', low=0,
+                           high=10)
+    gravity_tolerance: float = parameter(
+        doc='difference between mean specific force at rest and gravity; warning above',
+        unit='m/s^2', low=0, high=10)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckLimits:
-    """All of them."""
+    """All limits of params/check.yaml."""
 
     servos: ServoLimits = parameter(doc='servos')
     battery: BatteryLimits = parameter(doc='battery')

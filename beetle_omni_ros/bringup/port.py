@@ -1,4 +1,4 @@
-"""A serial port before anybody opens it: is it there, may we, who has it, how slow is it."""
+"""Check of a serial port: existence, permission, processes that use it, latency timer."""
 
 from __future__ import annotations
 
@@ -17,26 +17,27 @@ USB_DEPTH = 6           # folders from a tty up to its USB device
 
 def port_finding(item: str, path: str, sys_root: Path = SYS, proc_root: Path = PROC) -> Finding:
     """
-    Look at a port without opening it.
+    Check a port without opening it.
 
     Args:
-        item: name of the finding.
-        path: as in the parameters; may be a link.
-        sys_root: of sysfs.
-        proc_root: of procfs.
+        item: item of the finding.
+        path: path of the port or of a link to it.
+        sys_root: root of sysfs.
+        proc_root: root of procfs.
 
     Returns:
-        'ok', or 'fail' with what to do; ``values['holders']`` counts processes that have it open.
+        'ok' or 'fail'; ``values['holders']`` is the number of processes that have it open.
 
     """
     try:
         status = os.stat(path)
     except PermissionError:
-        return Finding(item, FAIL, f'{path}: no permission for its folder', 'ask its owner')
+        return Finding(item, FAIL, f'{path}: no permission for its folder',
+                       'ask the owner of the folder')
     except OSError:
         if os.path.islink(path):
-            return Finding(item, FAIL, f'{path}: the link leads to {os.readlink(path)}, which is '
-                           'not there', 'plug the adapter in again')
+            return Finding(item, FAIL, f'{path}: the link leads to {os.readlink(path)}, which '
+                           'does not exist', 'plug the adapter in again')
         return _absent(item, path, sys_root)
     if not stat.S_ISCHR(status.st_mode):
         return Finding(item, FAIL, f'{path}: no serial port',
@@ -57,23 +58,22 @@ def port_finding(item: str, path: str, sys_root: Path = SYS, proc_root: Path = P
 def _absent(item, path, sys_root):
     ports = usb_ports(sys_root)
     if ports:
-        there = '; '.join(f'{device}: {product}' for device, product in ports.items())
-        remedy = (f'is it one of these? {there}. A udev rule gives it its name: '
-                  'docs/how-to/hardware.md')
+        present = '; '.join(f'{device}: {product}' for device, product in ports.items())
+        remedy = (f'name one of the present ports ({present}), or give it this name by the udev '
+                  'rule of docs/how-to/hardware.md')
     else:
-        remedy = 'no USB serial port is there at all: plug the adapter in, look at `dmesg`'
+        remedy = 'no USB serial port is present: plug the adapter in, check `dmesg`'
     return Finding(item, FAIL, f'{path}: no such port', remedy)
 
 
 def _forbidden(item, path, status):
-    """Say which group may use the port, and how to get into it."""
     user, group = _name(pwd.getpwuid, os.geteuid()), _name(grp.getgrgid, status.st_gid)
     found = f'{path}: no permission for {user} ({stat.filemode(status.st_mode)}, group {group})'
     wanted = stat.S_IRGRP | stat.S_IWGRP
     if status.st_mode & wanted != wanted or group == 'root':
         remedy = 'install the udev rule of docs/how-to/hardware.md: GROUP="dialout", MODE="0660"'
     elif user in _members(group):
-        remedy = f'{user} has joined group {group}, not yet this session: log out and in again'
+        remedy = f'{user} is in group {group}, this session is not yet: log out and in again'
     else:
         remedy = f'sudo usermod -aG {group} {user}, then log out and in again'
     return Finding(item, FAIL, found, remedy)
@@ -95,15 +95,15 @@ def _members(group):
 
 def _free(holding):
     if any('ModemManager' in command for _, command in holding):
-        return 'sudo systemctl disable --now ModemManager: it takes every new port for a modem'
-    return 'stop that process, or look at the bridges through ROS (source ROS, same ROS_DOMAIN_ID)'
+        return 'sudo systemctl disable --now ModemManager: it opens every new port as a modem'
+    return 'stop that process, or check the bridges through ROS (source ROS, same ROS_DOMAIN_ID)'
 
 
 def holders(path: str, proc_root: Path = PROC) -> list[tuple[int, str]]:
     """
-    Other processes that have a port open, as far as this user may see them.
+    Other processes of this user that have a port open: (process ID, command line).
 
-    The process at the other end of a pseudo-terminal is the device and does not count.
+    The process at the other end of a pseudo-terminal is the device and is left out.
     """
     device, found = os.stat(path).st_rdev, []
     for folder in sorted(proc_root.glob('[0-9]*')):
@@ -153,13 +153,13 @@ def _command(folder):
 
 def latency_finding(item: str, path: str, limit: int, sys_root: Path = SYS) -> Finding:
     """
-    Look at the latency timer of a USB adapter; ask while the driver has the port open.
+    Check the latency timer of a USB adapter while the driver has the port open.
 
     Args:
-        item: name of the finding.
-        path: of the port.
-        limit: [ms] that is well.
-        sys_root: of sysfs.
+        item: item of the finding.
+        path: path of the port.
+        limit: largest accepted value [ms].
+        sys_root: root of sysfs.
 
     """
     name = Path(os.path.realpath(path)).name
@@ -172,18 +172,18 @@ def latency_finding(item: str, path: str, limit: int, sys_root: Path = SYS) -> F
     if timer <= limit:
         return Finding(item, OK, f'{timer} ms', values=values)
     return Finding(item, FAIL, f'{timer} ms: each answer waits for it', f'echo {limit} | sudo tee '
-                   f'{file}, and for good the udev rule of docs/how-to/hardware.md', values)
+                   f'{file}; permanently: the udev rule of docs/how-to/hardware.md', values)
 
 
 def usb_ports(sys_root: Path = SYS) -> dict[str, str]:
-    """Device -> maker, product and serial number of the USB serial ports of this computer."""
+    """USB serial ports of this computer: device -> maker, product and serial number."""
     names = sorted(path.name for kind in ('ttyUSB*', 'ttyACM*')
                    for path in (sys_root / 'class' / 'tty').glob(kind))
     return {f'/dev/{name}': usb_product(name, sys_root) or 'unknown' for name in names}
 
 
 def usb_product(device: str, sys_root: Path = SYS) -> str:
-    """Describe the USB device behind a tty; '' where there is none."""
+    """Maker, product and serial number of the USB device of a tty; '' if there is none."""
     folder = Path(os.path.realpath(sys_root / 'class' / 'tty' / Path(device).name / 'device'))
     for _ in range(USB_DEPTH):
         if (folder / 'idVendor').is_file():

@@ -1,8 +1,7 @@
-"""Bring-up of the servo bus: only pings and reads, so that nothing moves and nothing is set."""
+"""Check of the servo bus by pings and reads only: nothing moves and no setting changes."""
 
 from __future__ import annotations
 
-from pathlib import Path
 import time
 
 from beetle_omni_ros.bringup.finding import (
@@ -14,40 +13,37 @@ from beetle_omni_ros.bringup.finding import (
     OK,
     WARN,
 )
-from beetle_omni_ros.bringup.heard import Heard
+from beetle_omni_ros.bringup.graph import ObservedGraph
 from beetle_omni_ros.bringup.limits import CheckLimits, ServoLimits
-from beetle_omni_ros.bringup.port import latency_finding, port_finding, PROC, SYS
+from beetle_omni_ros.bringup.port import latency_finding, port_finding
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
-from beetle_omni_ros.drivers.servo_turns import certain_limit, settle
+from beetle_omni_ros.drivers.servo_turns import settle, unambiguous_limit
 from beetle_omni_ros.robot.parameters import JointParameters
 
-PORT, BUS, BRIDGE = 'servo port', 'servo bus', 'joint_bridge'
-ROUNDS = 50             # reads of each servo, to see how quick and how sure the answers are
-OTHER_IDS = range(21)   # looked for at every baud rate when a servo is missing
+BUS, BRIDGE = 'servo bus', 'joint_bridge'
+ROUNDS = 50             # reads of each servo to measure answer time and loss
+OTHER_IDS = range(21)   # searched at every baud rate if a servo is missing
 
 
 def check_servos(parameters: ServoBusParameters, joints: JointParameters, limits: CheckLimits,
-                 heard: Heard | None = None, sys_root: Path = SYS,
-                 proc_root: Path = PROC) -> list[Finding]:
+                 graph: ObservedGraph | None = None) -> list[Finding]:
     """
-    Look at the bus and its servos.
+    Check the bus and its servos.
 
     Args:
-        parameters: of the bus.
-        joints: for the travel of the tilts.
-        limits: of what is well.
-        heard: what ROS says, for the case that a bridge has the port; None: not listened.
-        sys_root: of sysfs.
-        proc_root: of procfs.
+        parameters: parameters of the bus.
+        joints: joint parameters, for the travel of the tilts.
+        limits: limits of all checks.
+        graph: the observed ROS graph, used if a bridge has the port open.
 
     Returns:
-        findings; the list ends early where nothing behind the fault can be looked at.
+        findings; a failure that prevents the further checks ends the list.
 
     """
-    port = port_finding(PORT, parameters.port, sys_root, proc_root)
+    port = port_finding('servo port', parameters.port)
     if port.level != OK:
-        return bridge_findings(port, BRIDGE, heard)
+        return bridge_findings(port, BRIDGE, graph)
     try:
         from beetle_omni_ros.drivers.servo_link import ServoLink
         from beetle_omni_ros.drivers.servo_port import PortLost
@@ -57,11 +53,11 @@ def check_servos(parameters: ServoBusParameters, joints: JointParameters, limits
     try:
         link.open()
         latency = latency_finding('servo port latency timer', parameters.port,
-                                  limits.link.latency_timer, sys_root)
+                                  limits.link.latency_timer)
         return [port, latency, *_of_bus(link, parameters, joints, limits.servos)]
     except PortLost as error:
         return [port, Finding(BUS, FAIL, f'{parameters.port}: {error}',
-                              'look at cable and adapter: docs/how-to/hardware.md')]
+                              'check cable and adapter: docs/how-to/hardware.md')]
     finally:
         link.close()
 
@@ -71,24 +67,24 @@ def _of_bus(link, parameters, joints, limits):
     from beetle_omni_ros.drivers.servo_state import make_servos
     servos = make_servos(parameters)
     with link.patient():
-        looks = [examine(link, servo) for servo in servos]
-        torques = [_torque(link, servo) if look.model is not None else None
-                   for servo, look in zip(servos, looks, strict=True)]
-    present = [servo for servo, look in zip(servos, looks, strict=True) if look.model is not None]
-    answers = [_answers(link, present, limits)] if present else []
-    strangers = []
+        states = [examine(link, servo) for servo in servos]
+        torques = [_torque(link, servo) if state.model is not None else None
+                   for servo, state in zip(servos, states, strict=True)]
+    present = [servo for servo, state in zip(servos, states, strict=True)
+               if state.model is not None]
+    findings = [_answers(link, present, limits)] if present else []
+    misplaced = []
     if len(present) < len(servos):
-        strangers = _strangers(link, parameters)
-        if not present and not strangers:
-            return [Finding(BUS, FAIL, 'no servo answers, at no baud rate',
-                            "look at the servos' supply (their LEDs blink once when it comes on) "
-                            'and at the data cable')]
-    findings = [*answers]
-    for k, (servo, look) in enumerate(zip(servos, looks, strict=True)):
-        findings.append(_of_servo(look, parameters, strangers))
-        if look.position is not None:
-            findings += _troubles(look, torques[k], limits)
-            findings += _turn(servo, look, parameters, joints, k)
+        misplaced = _misplaced(link, parameters)
+        if not present and not misplaced:
+            return [Finding(BUS, FAIL, 'no servo answers at any baud rate',
+                            "check the servos' supply (their LEDs blink once at power-up) "
+                            'and the data cable')]
+    for k, (servo, state) in enumerate(zip(servos, states, strict=True)):
+        findings.append(_of_servo(state, parameters, misplaced))
+        if state.position is not None:
+            findings += _of_health(state, torques[k], limits)
+            findings += _of_turn(servo, state, parameters, joints, k)
     return findings
 
 
@@ -100,96 +96,95 @@ def _torque(link, servo):
         return None
 
 
-def _of_servo(look, parameters, strangers):
-    """The servo itself: does it answer, is it the right one, is it healthy."""
-    values = {'id': look.identifier, 'model': look.model, 'firmware': look.firmware,
-              'baud_rate': look.baud_rate, 'supply_V': look.voltage,
-              'temperature_C': look.temperature, 'position_rad': look.position}
+def _of_servo(state, parameters, misplaced):
+    """Finding whether a servo answers, has the right model and reports no error."""
+    values = {'id': state.identifier, 'model': state.model, 'firmware': state.firmware,
+              'baud_rate': state.baud_rate, 'supply_V': state.voltage,
+              'temperature_C': state.temperature, 'position_rad': state.position}
     facts = ''
-    if look.position is not None:
-        facts = (f'id {look.identifier}, model {look.model}, firmware {look.firmware}, '
-                 f'{look.voltage:.1f} V, {look.temperature:.0f} C, {look.position:+.2f} rad')
-    if look.ok:
-        return Finding(look.name, OK, facts, values=values)
-    found = f'id {look.identifier} {look.problem}' if not facts else f'{look.problem}; {facts}'
-    remedy = look.remedy
-    if look.model is None:
-        remedy = _where_it_may_be(look.identifier, parameters, strangers) or \
-            'look at its connector, and at those before it in the chain'
-    return Finding(look.name, FAIL, found, remedy, values)
+    if state.position is not None:
+        facts = (f'id {state.identifier}, model {state.model}, firmware {state.firmware}, '
+                 f'{state.voltage:.1f} V, {state.temperature:.0f} C, {state.position:+.2f} rad')
+    if state.ok:
+        return Finding(state.name, OK, facts, values=values)
+    found = f'{state.problem}; {facts}' if facts else f'id {state.identifier} {state.problem}'
+    remedy = state.remedy
+    if state.model is None:
+        remedy = _remedy_of_missing(state.identifier, parameters, misplaced)
+    return Finding(state.name, FAIL, found, remedy, values)
 
 
-def _strangers(link, parameters):
-    """Look for (baud rate, ID, model) of servos that are not where they should be."""
+def _misplaced(link, parameters):
+    """Find (baud rate, ID, model) of servos with an unexpected ID or baud rate."""
     from beetle_omni_ros.drivers.servo_setup import scan
     link.close()
     expected = {(parameters.baud_rate, int(name)) for name in parameters.ids}
     return [found for found in scan(parameters, OTHER_IDS) if found[:2] not in expected]
 
 
-def _where_it_may_be(identifier, parameters, strangers):
-    """Explain what was found in place of a missing servo; '' nothing."""
-    for baud_rate, other, _ in strangers:
+def _remedy_of_missing(identifier, parameters, misplaced):
+    for baud_rate, other, _ in misplaced:
         if other == identifier:
             return (f'id {other} answers at {baud_rate} bit/s: set Baud Rate(8) to code '
                     f'{registers.BAUD_CODES[parameters.baud_rate]}, '
                     f'{parameters.baud_rate} bit/s, with DYNAMIXEL Wizard')
-    others = [f'id {other} at {baud_rate} bit/s' for baud_rate, other, _ in strangers]
+    others = [f'id {other} at {baud_rate} bit/s' for baud_rate, other, _ in misplaced]
     if others:
-        return (f"{', '.join(others)} answers, which nobody expects: is it this one? Set id "
-                f'{identifier} and {parameters.baud_rate} bit/s with DYNAMIXEL Wizard, that '
-                'servo alone on the bus')
-    return ''
+        return (f"unexpected answer of {', '.join(others)}; if this is the servo, set id "
+                f'{identifier} and {parameters.baud_rate} bit/s with DYNAMIXEL Wizard, with '
+                'that servo alone on the bus')
+    return 'check its connector, and those before it in the chain'
 
 
-def _troubles(look, torque, limits: ServoLimits):
-    """What is not as it should be with a servo that answers."""
-    name, findings = look.name, []
-    if look.firmware < registers.FIRST_FAST_FIRMWARE:
+def _of_health(state, torque, limits: ServoLimits):
+    """Findings about firmware, supply, temperature and torque; empty without a problem."""
+    name, findings = state.name, []
+    if state.firmware < registers.FIRST_FAST_FIRMWARE:
         findings.append(Finding(
-            f'{name} firmware', WARN, f'{look.firmware}, before '
+            f'{name} firmware', WARN, f'{state.firmware}, before '
             f'{registers.FIRST_FAST_FIRMWARE}: no fast sync read, feedback of all servos takes '
-            'longer', 'update it with DYNAMIXEL Wizard', {'firmware': look.firmware}))
-    supply = {'supply_V': look.voltage}
-    if not limits.supply_fail_low <= look.voltage <= limits.supply_high:
+            'longer', 'update it with DYNAMIXEL Wizard', {'firmware': state.firmware}))
+    supply = {'supply_V': state.voltage}
+    if not limits.supply_fail_low <= state.voltage <= limits.supply_high:
         findings.append(Finding(
-            f'{name} supply', FAIL, f'{look.voltage:.1f} V, allowed are '
+            f'{name} supply', FAIL, f'{state.voltage:.1f} V, allowed are '
             f'{limits.supply_fail_low:g} to {limits.supply_high:g} V',
             'set the regulator to 11.1 to 12 V', supply))
-    elif look.voltage < limits.supply_low:
+    elif state.voltage < limits.supply_low:
         findings.append(Finding(
-            f'{name} supply', WARN, f'{look.voltage:.1f} V: slower and weaker than identified',
-            'set the regulator to 11.1 to 12 V; drop over a thin cable?', supply))
-    if look.temperature > limits.temperature_high:
+            f'{name} supply', WARN, f'{state.voltage:.1f} V: slower and weaker than identified',
+            'set the regulator to 11.1 to 12 V; check the drop over thin cables', supply))
+    if state.temperature > limits.temperature_high:
         findings.append(Finding(
-            f'{name} temperature', WARN, f'{look.temperature:.0f} C', 'let it cool; does it '
-            'push against something?', {'temperature_C': look.temperature}))
+            f'{name} temperature', WARN, f'{state.temperature:.0f} C', 'let it cool; check what '
+            'blocks the joint', {'temperature_C': state.temperature}))
     if torque:
         findings.append(Finding(
-            f'{name} torque', WARN, 'its torque is on, although no driver has the port',
-            'a program left it so: switch it off with the joint bridge, or cut its supply'))
+            f'{name} torque', WARN, 'its torque is on, although no driver has the port open',
+            'a program left it on: switch it off with the joint bridge, or cut its supply'))
     return findings
 
 
-def _turn(servo, look, parameters, joints, k):
-    """Whether the joint's angle is certain, as the driver will ask before it gives torque."""
-    servo.position = look.position
+def _of_turn(servo, state, parameters, joints, k):
+    """Finding if the turn of the joint is ambiguous, by the rule of the driver."""
+    servo.position = state.position
     confirmed = [parameters.confirmed_tilts[k]] if parameters.confirm_tilts else None
     doubts = settle([servo], joints.position_limit, confirmed)
     if doubts:
-        limit = certain_limit(joints.position_limit)
-        return [Finding(f'{look.name} turn', FAIL, f'ambiguous: {doubts}', 'turn it by hand to '
+        limit = unambiguous_limit(joints.position_limit)
+        return [Finding(f'{state.name} turn', FAIL, f'ambiguous: {doubts}', 'turn it by hand to '
                         f'within +-{limit:.2f} rad, cables untwisted; or set confirmed_tilts and '
-                        'confirm_tilts: docs/how-to/hardware.md', {'position_rad': look.position})]
+                        'confirm_tilts: docs/how-to/hardware.md',
+                        {'position_rad': state.position})]
     if confirmed:
-        return [Finding(f'{look.name} turn', WARN, f'taken as {servo.position:+.2f} rad because '
+        return [Finding(f'{state.name} turn', WARN, f'taken as {servo.position:+.2f} rad because '
                         'confirm_tilts is set', 'reset confirm_tilts once it is parked',
                         {'position_rad': servo.position})]
     return []
 
 
 def _answers(link, servos, limits: ServoLimits):
-    """Ask as the loop does; how many answers are missing, and how long do they take."""
+    """Finding about the loss and the duration of answers to single reads."""
     from beetle_omni_ros.drivers.servo_link import ServoBusError
     asked, missing, times = 0, 0, []
     for _ in range(ROUNDS):
@@ -206,8 +201,8 @@ def _answers(link, servos, limits: ServoLimits):
     slowest = 1e3 * times[-1] if times else float('nan')
     found = (f'{asked - missing} of {asked} reads answered, {median:.1f} ms each (median), '
              f'longest {slowest:.1f} ms, at {link.baud_rate} bit/s')
-    return graded(BUS, found, missing / asked, 'latency timer, connectors, ground, ends of the '
-                  'chain, two servos with one id; a busy computer', warn=limits.answer_loss,
-                  fail=limits.answer_loss_fail,
+    return graded(BUS, found, missing / asked, 'check latency timer, connectors, ground, ends '
+                  'of the chain, two servos with one id, the load of the computer',
+                  warn=limits.answer_loss, fail=limits.answer_loss_fail,
                   values={'asked': asked, 'missing': missing, 'median_ms': median,
                           'longest_ms': slowest, 'baud_rate': link.baud_rate})

@@ -1,1 +1,1 @@
-"""Bytes to hardware: the servo bus and the motor board."""
+"""Drivers of the servo bus and of the motor board, without ROS."""

@@ -1,9 +1,10 @@
 """
-Offset between two clocks from request and answer, with a bound on its error.
+Offset between two clocks from requests and answers, with an error bound.
 
-The other clock was read between sending and receiving, so each exchange bounds the offset from
-both sides. The bounds of all exchanges are intersected, each widened by what the clocks can have
-drifted since; the middle is the estimate, half the width its largest error, whatever the delays.
+The remote clock is read between the request and the answer, so each exchange gives a lower and an
+upper bound of the offset. Bounds of earlier exchanges are widened by the largest possible drift,
+and all bounds are intersected. The estimate is the centre of this interval, and its error is at
+most half the width, for any delays.
 """
 
 from __future__ import annotations
@@ -16,38 +17,38 @@ class ClockOffset:
     Offset of a remote clock, remote minus local [s].
 
     Attributes:
-        exchanges: number of answers taken.
-        jumps: how often an answer contradicted all before it: the remote clock was set anew.
+        exchanges: number of answers used.
+        jumps: number of answers outside the interval, because the remote clock was set.
 
     """
 
     def __init__(self, drift: float):
-        """Take clocks to run apart by at most ``drift`` [s/s]."""
+        """``drift``: bound of the relative drift of the clocks [s/s]."""
         self._drift = drift
         self.exchanges = self.jumps = 0
         self.restart()
 
     def restart(self) -> None:
-        """Know nothing."""
-        # One tuple, replaced as a whole: other threads read it.
+        """Forget all exchanges."""
+        # Other threads read this tuple, so it is only replaced as a whole.
         self._bounds = -math.inf, math.inf, 0.0
 
     @property
     def known(self) -> bool:
-        """Whether there was an answer since the restart."""
+        """Whether an answer arrived since the restart."""
         return math.isfinite(self._bounds[0])
 
     def add(self, sent: float, remote: float, received: float) -> bool:
         """
-        Take one exchange.
+        Use one exchange.
 
         Args:
             sent: local time of the request [s].
-            remote: the remote time that the answer tells [s].
+            remote: remote time in the answer [s].
             received: local time of the answer [s].
 
         Returns:
-            whether it contradicted what was known; then it alone counts.
+            whether it contradicts the earlier exchanges, which are then forgotten.
 
         """
         if received < sent:
@@ -66,11 +67,11 @@ class ClockOffset:
         return jumped
 
     def offset(self) -> float:
-        """Remote minus local [s]; nan while unknown."""
+        """Remote minus local clock [s]; NaN while unknown."""
         low, high, _ = self._bounds
         return 0.5 * (low + high) if math.isfinite(low) else math.nan
 
     def uncertainty(self, now: float) -> float:
-        """Bound of the error [s] at local time ``now``; inf while unknown."""
+        """Bound of the offset's error [s] at local time ``now``; inf while unknown."""
         low, high, at = self._bounds
         return 0.5 * (high - low) + self._drift * max(0.0, now - at)

@@ -1,9 +1,9 @@
 """
-The MAVLink 2 dialect of the motor board: pymavlink's ``common`` and the ESC messages it lacks.
+The MAVLink 2 dialect of the motor board: pymavlink's ``common`` with two more ESC messages.
 
-ESC_INFO and ESC_STATUS stand in MAVLink's common.xml and in the C headers that firmware is built
-with, but not in the dialects that pymavlink is released with (2.4.41 and 2.4.50 looked at). They
-are declared here as common.xml declares them; a release that has them is left as it is.
+MAVLink's common.xml and its C headers contain ESC_INFO and ESC_STATUS, the dialects of pymavlink
+2.4.41 and 2.4.50 do not. Here they are declared as in common.xml. The declaration of a pymavlink
+release that contains them has priority.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import struct
 
 from pymavlink.dialects.v20 import common
 
-# Message id -> name and fields (type, name, array length or 0) in the order of common.xml.
+# Message ID -> name and fields (type, name, array length or 0) in the order of common.xml.
 ESC_MESSAGES = {
     290: ('ESC_INFO', (
         ('uint8_t', 'index', 0), ('uint64_t', 'time_usec', 0), ('uint16_t', 'counter', 0),
@@ -28,7 +28,7 @@ CODES = {'uint8_t': 'B', 'int16_t': 'h', 'uint16_t': 'H', 'int32_t': 'i', 'uint3
 
 
 def crc_extra(name: str, fields) -> int:
-    """Seed of a message's checksum: a digest of its name and of its ``fields`` in wire order."""
+    """Checksum seed of a message, from its name and its ``fields`` in wire order."""
     crc = common.x25crc()
     crc.accumulate(f'{name} '.encode())
     for kind, field, length in fields:
@@ -40,7 +40,7 @@ def crc_extra(name: str, fields) -> int:
 
 def message_class(number: int, name: str, fields) -> type:
     """Build a message class of the form that pymavlink generates."""
-    # On the wire large types come first; Python's sort keeps the order among equals.
+    # Wire order: larger types first, otherwise as declared (Python's sort is stable).
     wire = sorted(fields, key=lambda field: -struct.calcsize(CODES[field[0]]))
     names = [field for _, field, _ in fields]
     unpacker = struct.Struct('<' + ''.join(
@@ -74,7 +74,7 @@ def message_class(number: int, name: str, fields) -> type:
 for _number, (_name, _fields) in ESC_MESSAGES.items():
     common.mavlink_map.setdefault(_number, message_class(_number, _name, _fields))
 MESSAGES = common.mavlink_map
-common.MAVLINK_IGNORE_CRC = 0   # no setting in the environment may let broken packets through
+common.MAVLINK_IGNORE_CRC = 0   # the environment must not switch the checksum off
 EscInfo, EscStatus = MESSAGES[290], MESSAGES[291]
 
 __all__ = ['common', 'crc_extra', 'EscInfo', 'EscStatus', 'MESSAGES', 'message_class']

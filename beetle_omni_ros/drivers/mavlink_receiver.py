@@ -1,8 +1,9 @@
 """
-Bytes to MAVLink 2 messages: framing that recovers at once, and the counts of what went wrong.
+Parses a byte stream into MAVLink 2 messages and counts errors.
 
-pymavlink decodes and checks each frame. Its own framing is not used: after a bad checksum it
-drops as many bytes as the broken header announced, up to 280, and the good messages in them.
+pymavlink decodes and checks each frame. Its own framing is not used, because after a bad checksum
+it drops the length announced by the corrupt header, up to 280 bytes with the valid messages in
+them.
 """
 
 from __future__ import annotations
@@ -18,37 +19,30 @@ SEQUENCE = 256
 
 @dataclass
 class ReceiveCounts:
-    """What arrived since the start."""
+    """Counts since the start."""
 
     messages: int = 0
     bytes: int = 0
     lost: int = 0           # gaps in the sender's sequence numbers
-    bad_crc: int = 0        # frames with a good header and a wrong checksum
-    skipped_bytes: int = 0  # belonging to no good frame
-    foreign: int = 0        # good frames of another sender
+    bad_crc: int = 0        # frames with a valid header and a wrong checksum
+    skipped_bytes: int = 0  # bytes outside valid frames
+    foreign: int = 0        # valid frames of another sender
 
 
 class MavlinkReceiver:
     """
     Splits a byte stream into the messages of one sender.
 
-    Attributes:
-        counts: see :class:`ReceiveCounts`.
+    Args:
+        system: system ID of the sender.
+        component: component ID of the sender.
+        restarts: whether a message is the first one after a restart of the sender, so that its
+            number begins a new sequence.
 
     """
 
     def __init__(self, system: int, component: int,
                  restarts: Callable[[common.MAVLink_message], bool] = lambda message: False):
-        """
-        Start with an empty buffer.
-
-        Args:
-            system: id that a frame must bear.
-            component: likewise.
-            restarts: tells whether a message says that the sender has just restarted, so that
-                its number begins a new sequence.
-
-        """
         self._sender, self._restarts = (system, component), restarts
         self._buffer = bytearray()
         self._decoder = common.MAVLink(None)
@@ -56,12 +50,12 @@ class MavlinkReceiver:
         self.counts = ReceiveCounts()
 
     def restart(self) -> None:
-        """Forget a broken-off frame and the sequence: the sender or the cable is a new one."""
+        """Forget an incomplete frame and the sequence number."""
         self._buffer.clear()
         self._sequence = None
 
     def feed(self, data: bytes) -> list:
-        """Take bytes as they come; return the messages completed by them."""
+        """Parse further bytes; return the messages that they complete."""
         buffer, found = self._buffer, []
         buffer += data
         self.counts.bytes += len(data)
@@ -72,7 +66,7 @@ class MavlinkReceiver:
             start = end if marker < 0 else marker
             if end - start < HEADER:
                 break
-            # Flags are those of signed frames, which the firmware contract excludes.
+            # Incompatibility flags mark signed frames, which the firmware contract excludes.
             number = int.from_bytes(buffer[start + 7:start + 10], 'little')
             if buffer[start + 2] or number not in MESSAGES:
                 message, size = None, 1
@@ -82,7 +76,7 @@ class MavlinkReceiver:
                     break
                 message = self._decode(buffer[start:start + size])
             if message is None:
-                # The marker was data, or the header is broken: look on right behind it.
+                # The marker was data, or the header is corrupt: continue behind the marker.
                 self.counts.skipped_bytes += 1
                 start += 1
                 continue
@@ -100,7 +94,7 @@ class MavlinkReceiver:
             return None
 
     def _from_sender(self, message):
-        """Count a good frame; tell whether it is the sender's."""
+        """Count a valid frame; return whether it is of the sender."""
         if (message.get_srcSystem(), message.get_srcComponent()) != self._sender:
             self.counts.foreign += 1
             return False

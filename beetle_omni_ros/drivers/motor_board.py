@@ -1,4 +1,4 @@
-"""The motor board: thrusts out, battery and rotor states in, arming, link health."""
+"""Driver of the motor board: thrust targets, battery and rotor states, arming, link health."""
 
 from __future__ import annotations
 
@@ -21,30 +21,32 @@ from beetle_omni_ros.drivers.motor_board_messages import (
     CONTRACT_VERSION,
     heartbeat,
     LinkStatistics,
+    NO_HOST_HEARTBEAT,
     RESULTS,
-    UNHEARD,
 )
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.motor_board_watch import BoardWatch, restarted
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.thrust_map import ThrustMap
 
-CORRECTION = 50_000     # [us] a larger step back of the board's clock is a restart
-GOODBYES = 3            # disarm commands written at once on closing, besides those with an answer
+CORRECTION = 50_000     # [us] a larger backward step of the board's clock is a restart
+CLOSING_COMMANDS = 3    # disarm commands sent at once on closing
+NOTHING = np.zeros(4)
+NOT_SATURATED = np.zeros(4, dtype=bool)
 
 
 class ArmCommand:
     """
-    One arm or disarm command on its way.
+    One arm or disarm command, repeated until the board acknowledges it.
 
     Attributes:
-        arm: what was asked.
-        result: None until it has ended.
+        arm: True to arm, False to disarm.
+        result: result of the command, None while it is pending.
 
     """
 
     def __init__(self, arm: bool, parameters: MotorBoardParameters, send: Callable, now: float):
-        """Send it for the first time at ``now`` [s]; ``send`` takes a message."""
+        """Send it for the first time at ``now`` [s] by ``send(message)``."""
         self.arm = arm
         self.result: CommandResult | None = None
         self._parameters, self._send = parameters, send
@@ -54,7 +56,7 @@ class ArmCommand:
         self.tick(now)
 
     def tick(self, now: float) -> None:
-        """Send it again, or give up, when an acknowledgement is overdue."""
+        """Send it again, or fail, if the acknowledgement is overdue."""
         if self.result or now < self._next:
             return
         if self._attempts >= self._parameters.acknowledge_attempts:
@@ -68,7 +70,7 @@ class ArmCommand:
         self._attempts += 1
 
     def acknowledge(self, message, now: float) -> bool:
-        """Take a COMMAND_ACK, or ignore one to another question; tell whether it is done."""
+        """Handle a COMMAND_ACK; return whether it accepts this command."""
         if message.command != common.MAV_CMD_COMPONENT_ARM_DISARM \
                 or bool(message.result_param2 & 1) != self.arm:
             return False
@@ -76,30 +78,30 @@ class ArmCommand:
             self.end(now, True)
             return True
         text = RESULTS.get(message.result, f'result {message.result}')
-        why = ', '.join(conditions_of(message.result_param2 >> 8 & 0xFF))
-        self.end(now, False, f'{text} by the board: {why or "no reason given"}')
+        reason = ', '.join(conditions_of(message.result_param2 >> 8 & 0xFF))
+        self.end(now, False, f'{text} by the board: {reason or "no reason given"}')
         return False
 
     def end(self, now: float, accepted: bool, reason: str = '') -> None:
-        """End with a result, unless it has one."""
+        """Set the result, if it is pending."""
         if self.result is None:
             self.result = CommandResult(accepted, reason, self._attempts, now - self._begin)
             self._done.set()
 
     def wait(self, timeout: float) -> bool:
-        """Wait for the end at most ``timeout`` [s]; tell whether it came."""
+        """Wait for the result at most ``timeout`` [s]; return whether there is one."""
         return self._done.wait(timeout)
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
     """
-    What became of one set of thrusts.
+    Result of sending one thrust target.
 
     Attributes:
-        sent: whether the target is on its way.
-        reason: why not, or ''.
-        saturated: (4,) thrusts that the battery cannot give; the largest possible were sent.
+        sent: whether the target was sent.
+        reason: reason why it was not sent, or ''.
+        saturated: (4,) whether the battery limits the thrust; the largest one was sent then.
         command: (4,) normalised commands, 0 to 1.
 
     """
@@ -110,29 +112,22 @@ class Sent:
     command: np.ndarray
 
 
-NOTHING = np.zeros(4)
-NOT_SATURATED = np.zeros(4, dtype=bool)
-
-
 class MotorBoard:
     """
-    Driver of the motor board on a serial port; docs/reference/firmware.md describes the other end.
+    Driver of the motor board on a serial port; docs/reference/firmware.md describes the board.
 
-    A thread reads, sends heartbeats and reconnects. :meth:`send` and :meth:`poll` never wait.
-    Rotors stop 100 ms after the last target whatever happens to this process.
+    A thread reads, sends heartbeats and reconnects. :meth:`send` and :meth:`poll` do not wait.
+    The board stops the rotors 100 ms after the last target, also if this process fails.
+
+    Args:
+        parameters: parameters of the link; default: params/motor_board.yaml.
+        robot: robot with the rotor map and the battery; default: params/robot.yaml.
+        clock: clock of all stamps, those given to :meth:`send` and those returned [s].
+
     """
 
     def __init__(self, parameters: MotorBoardParameters | None = None,
                  robot: RobotParameters | None = None, clock: Callable[[], float] = time.time):
-        """
-        Prepare; nothing is opened.
-
-        Args:
-            parameters: by default params/motor_board.yaml.
-            robot: whose rotor map and battery to use; by default params/robot.yaml.
-            clock: the clock [s] of the stamps given to :meth:`send` and found in what is told.
-
-        """
         self.parameters = parameters or MotorBoardParameters.load()
         robot = robot or RobotParameters.load()
         self.thrust_map = ThrustMap(robot.rotors)
@@ -147,10 +142,10 @@ class MotorBoard:
 
     def open(self) -> None:
         """
-        Open the port and begin to talk; :meth:`wait_ready` waits for the board.
+        Open the port and start the thread; :meth:`wait_ready` waits for the board.
 
         Raises:
-            SerialPortError: the port cannot be opened; the text says what to do.
+            SerialPortError: the port cannot be opened.
 
         """
         if self._link.opened:
@@ -159,11 +154,11 @@ class MotorBoard:
         atexit.register(self.close)
 
     def close(self) -> None:
-        """Disarm, wait shortly for the acknowledgement, give the port back."""
+        """Disarm, wait shortly for the acknowledgement, close the port."""
         atexit.unregister(self.close)
         if not self._link.opened:
             return
-        for _ in range(GOODBYES):
+        for _ in range(CLOSING_COMMANDS):
             command = self._start(False)
         command.wait(self.parameters.acknowledge_timeout * self.parameters.acknowledge_attempts)
         self._link.close()
@@ -177,17 +172,17 @@ class MotorBoard:
 
     @property
     def status(self) -> BoardStatus | None:
-        """The board's last heartbeat, or None."""
+        """Last heartbeat of the board, or None."""
         return self._watch.status
 
     @property
     def connected(self) -> bool:
-        """Whether the port is there, so that targets can be sent."""
+        """Whether the port is open, so that targets can be sent."""
         return self._link.connected
 
     @property
     def ready(self) -> str:
-        """What is missing for arming on this side; '' when nothing is."""
+        """Reason why this side cannot arm the board; '' if it can."""
         status, now = self._watch.status, time.monotonic()
         if not self._link.connected:
             return f'{self.parameters.port}: port is away'
@@ -198,7 +193,7 @@ class MotorBoard:
         if status.contract != CONTRACT_VERSION:
             return (f'firmware follows contract {status.contract}, '
                     f'this driver {CONTRACT_VERSION}')
-        if UNHEARD in status.conditions:
+        if NO_HOST_HEARTBEAT in status.conditions:
             return 'the board does not hear our heartbeat'
         if self._watch.voltage is None:
             return 'battery voltage unknown'
@@ -214,7 +209,7 @@ class MotorBoard:
         return missing
 
     def start_arm(self) -> ArmCommand:
-        """Begin to arm without waiting; the returned command gets a result."""
+        """Start to arm without waiting; the returned command gets the result."""
         missing = self.ready
         if missing:
             command = ArmCommand(True, self.parameters, lambda _: None, time.monotonic())
@@ -224,11 +219,11 @@ class MotorBoard:
         return self._start(True)
 
     def start_disarm(self) -> ArmCommand:
-        """Begin to disarm without waiting; the returned command gets a result."""
+        """Start to disarm without waiting; the returned command gets the result."""
         return self._start(False)
 
     def arm(self) -> CommandResult:
-        """Arm and wait for the answer, half a second at most; refused unless all is well."""
+        """Arm and wait for the answer, half a second at most; needs :attr:`ready` to be ''."""
         return self._finished(self.start_arm())
 
     def disarm(self) -> CommandResult:
@@ -237,17 +232,17 @@ class MotorBoard:
 
     @property
     def armed(self) -> bool:
-        """Whether the board said so in its last heartbeat, and is heard."""
+        """Whether the board is armed by its last heartbeat, and not silent."""
         status = self._watch.status
         return bool(status and status.armed and not self._watch.silent(time.monotonic()))
 
     def send(self, thrust: np.ndarray, stamp: float) -> Sent:
         """
-        Send thrust targets; returns at once. From one thread only.
+        Send thrust targets without waiting. Only one thread may call this.
 
         Args:
-            thrust: (4,) [N]; negative counts as zero, zero stops the rotor.
-            stamp: time of the state that they answer [s, the clock of the constructor].
+            thrust: (4,) thrust targets [N]; zero and negative values stop the rotor.
+            stamp: time of the state estimate that they answer [s].
 
         """
         try:
@@ -263,7 +258,7 @@ class MotorBoard:
             return _not_sent('stale stamp' if age > 0 else 'stamp in the future')
         if not self._watch.clock.known:
             return _not_sent("offset of the board's clock unknown")
-        # Without a measurement the highest voltage: it gives the least duty.
+        # Without a measurement use the highest voltage, which gives the smallest duty.
         voltage = self._watch.voltage or self.thrust_map.voltages[-1]
         command = self.thrust_map.command(thrust, voltage)
         message = common.MAVLink_set_actuator_control_target_message(
@@ -274,7 +269,7 @@ class MotorBoard:
         return Sent(sent, reason, self.thrust_map.saturated(thrust, voltage), command)
 
     def poll(self) -> BoardUpdate:
-        """Return what is new since the last call."""
+        """Return measurements and events since the last call, and the present state."""
         with self._lock:
             news = self._watch.take()
         link = self._link
@@ -287,16 +282,16 @@ class MotorBoard:
 
     def _board_stamp(self, stamp, age):
         """
-        Board's clock [us] at a stamp; it rises as the stamps do, and repeats as they do.
+        Board's clock [us] at a stamp; equal stamps give equal values, rising stamps rising ones.
 
-        It is found by the age, so that a step of the host's clock spoils no more than one.
+        It is computed from the age, so that a step of the host's clock affects one target only.
         """
         last_stamp, last = self._last_stamp
         if stamp == last_stamp:
             return last
         micros = max(0, round(1e6 * (time.monotonic() - age + self._watch.clock.offset())))
         if stamp > last_stamp and last - CORRECTION < micros <= last:
-            micros = last + 1       # the offset was corrected by more than the stamps are apart
+            micros = last + 1   # the offset was corrected by more than the time between stamps
         self._last_stamp = stamp, micros
         return micros
 
@@ -309,8 +304,8 @@ class MotorBoard:
             return self._command
 
     def _finished(self, command):
-        patience = self.parameters.acknowledge_timeout * (self.parameters.acknowledge_attempts + 2)
-        if not command.wait(patience):
+        timeout = self.parameters.acknowledge_timeout * (self.parameters.acknowledge_attempts + 2)
+        if not command.wait(timeout):
             command.end(time.monotonic(), False, 'the thread of the link does not run')
         return command.result
 
@@ -337,9 +332,9 @@ class MotorBoard:
             self._next_heartbeat = now + 1 / self.parameters.heartbeat_rate
             self._link.send(heartbeat())
         if now >= self._next_timesync:
-            hurry = 1 if self._watch.clock.known else 4
-            self._next_timesync = now + 1 / (hurry * self.parameters.timesync_rate)
-            self._link.send(self._watch.time_question())
+            factor = 1 if self._watch.clock.known else 4
+            self._next_timesync = now + 1 / (factor * self.parameters.timesync_rate)
+            self._link.send(self._watch.timesync_request())
 
 
 def _not_sent(reason):

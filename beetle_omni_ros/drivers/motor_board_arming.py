@@ -1,4 +1,4 @@
-"""When the motor board is armed and disarmed, and what is said of it: the bridge's rule."""
+"""Arms and disarms the motor board by the state of the supervisor."""
 
 from __future__ import annotations
 
@@ -8,42 +8,41 @@ from beetle_omni_ros.drivers.motor_board_messages import BLOCKS_ARMING
 DISARMED = 'disarmed'
 RESTING = (DISARMED, 'emergency_stop')      # states of the supervisor without thrust
 RESTS, ARMS, FLIES, LOST = 'rests', 'arms', 'flies', 'lost'
-# A board that seems gone is given this long [s], in steps of at most STEP [s]: after a pause of
-# this process itself what the board has said meanwhile is read first.
+# A board that is not ready is tolerated for this long [s], counted in steps of at most STEP [s]:
+# after a pause of this process the waiting messages of the board are read first.
 PATIENCE, STEP = 0.05, 0.01
 
 
 class Arming:
     """
-    Keeps the board armed while the supervisor flies, and only then.
+    Keeps the board armed while the supervisor flies.
 
-    It arms once, when the supervisor leaves 'disarmed'. A board that is lost afterwards is
-    disarmed and left alone until the supervisor has been 'disarmed' again. One that is merely not
-    heard, while targets can be sent, goes on: its rotors carry the robot to the ground.
+    It arms once, when the supervisor leaves 'disarmed'. A board that is lost later is disarmed,
+    and not armed before the supervisor has been 'disarmed' again. A board that is only silent,
+    while targets can be sent, remains armed, because its rotors carry the robot to the ground.
 
     Attributes:
-        phase: 'rests', 'arms', 'flies' or 'lost'; targets are for 'flies' alone.
+        phase: 'rests', 'arms', 'flies' or 'lost'; targets are sent only in 'flies'.
 
     """
 
     def __init__(self, board: MotorBoard):
-        """Begin at rest, whatever the board was left in."""
         self._board = board
         self._command: ArmCommand | None = None
         self._supervisor = ''
-        self._lost = self._deaf = self._barred = ''
-        self._gone = 0.0
-        self._disarm = False        # whether the board has yet to confirm it
+        self._lost = self._silent = self._inhibited = ''
+        self._missing_for = 0.0
+        self._disarm = False        # whether a confirmation of disarming is pending
         self.phase = RESTS
 
-    def bar(self, why: str) -> None:
-        """Keep the board disarmed for a reason, also in flight; '' lets it be armed again."""
-        self._barred = why
-        if why and self.phase in (ARMS, FLIES):
-            self._lose(why)
+    def inhibit(self, reason: str) -> None:
+        """Keep the board disarmed for a reason, also in flight; '' ends this."""
+        self._inhibited = reason
+        if reason and self.phase in (ARMS, FLIES):
+            self._set_lost(reason)
 
     def follow(self, state: str) -> None:
-        """Take the supervisor's ``state``, perhaps with a fault's name, and act on it at once."""
+        """Act on the state of the supervisor, 'STATE' or 'STATE: FAULT'."""
         state = state.partition(':')[0]
         before, self._supervisor = self._supervisor, state
         if state in RESTING:
@@ -52,29 +51,29 @@ class Arming:
             if before != state:
                 self._start_disarm()
         elif before in RESTING or not before:
-            if before == DISARMED and not self._barred:
-                self.phase, self._disarm, self._gone = ARMS, False, 0.0
+            if before == DISARMED and not self._inhibited:
+                self.phase, self._disarm, self._missing_for = ARMS, False, 0.0
                 self._command = self._board.start_arm()
-                self._look_at_answer(0.0)
+                self._check_answer(0.0)
             else:
-                self._lose(self._barred or 'the supervisor was not disarmed before')
+                self._set_lost(self._inhibited or 'the supervisor was not disarmed before')
 
     def update(self, elapsed: float) -> None:
-        """Look at the board; ``elapsed`` [s] since the last look."""
+        """Check the board, ``elapsed`` [s] after the last call."""
         status, elapsed = self._board.status, min(elapsed, STEP)
         if self.phase == ARMS:
-            self._look_at_answer(elapsed)
+            self._check_answer(elapsed)
         elif self.phase == FLIES:
             missing = self._board.ready
-            self._gone = self._gone + elapsed if missing else 0.0
+            self._missing_for = self._missing_for + elapsed if missing else 0.0
             if status is None or not status.armed:
-                self._lose(_ending(status))
-            elif self._gone < PATIENCE:
-                self._deaf = self._deaf and missing
+                self._set_lost(_disarm_cause(status))
+            elif self._missing_for < PATIENCE:
+                self._silent = self._silent and missing
             elif self._board.connected:
-                self._deaf = missing
+                self._silent = missing
             else:
-                self._lose(missing)
+                self._set_lost(missing)
         else:
             answer = self._command and self._command.result
             if answer:
@@ -83,45 +82,45 @@ class Arming:
                 self._start_disarm()
 
     def end(self) -> None:
-        """The bridge stops."""
+        """Enter 'lost' because the bridge stops."""
         self.phase = LOST
         self._lost = 'the bridge has stopped'
 
     @property
     def text(self) -> str:
-        """What the supervisor needs to know: 'ready', 'waiting:', 'silent:' or 'lost: WHY'."""
+        """State for the supervisor: 'ready', or 'waiting', 'silent' or 'lost' with ': REASON'."""
         if self.phase == LOST:
             return f'lost: {self._lost}'
-        if self.phase == FLIES and self._deaf:
-            return f'silent: {self._deaf}'
+        if self.phase == FLIES and self._silent:
+            return f'silent: {self._silent}'
         missing = self.missing if self.phase == RESTS else ''
         return f'waiting: {missing}' if missing else 'ready'
 
     @property
     def missing(self) -> str:
-        """What would keep the board from arming now, on either side; '' when nothing."""
-        if self._barred:
-            return self._barred
+        """Reason on either side that prevents arming now; '' if there is none."""
+        if self._inhibited:
+            return self._inhibited
         missing = self._board.ready or self._disarm and 'disarming is not confirmed yet'
         blocking = missing or ', '.join(text for text in self._board.status.conditions
                                         if text in BLOCKS_ARMING)
         return blocking or ('' if self._supervisor else 'nothing heard of the supervisor')
 
-    def _look_at_answer(self, elapsed):
+    def _check_answer(self, elapsed):
         answer, status = self._command.result, self._board.status
         if answer is None:
             return
         if not answer.accepted:
-            self._lose(f'not armed: {answer.reason}')
+            self._set_lost(f'not armed: {answer.reason}')
         elif status.armed:
-            self.phase, self._gone, self._deaf = FLIES, 0.0, ''
+            self.phase, self._missing_for, self._silent = FLIES, 0.0, ''
         else:
-            self._gone += elapsed       # the link's thread is just about to note it
-            if self._gone >= PATIENCE:
-                self._lose(_ending(status))
+            self._missing_for += elapsed       # the link's thread has not set the status yet
+            if self._missing_for >= PATIENCE:
+                self._set_lost(_disarm_cause(status))
 
-    def _lose(self, why):
-        self.phase, self._lost = LOST, why
+    def _set_lost(self, reason):
+        self.phase, self._lost = LOST, reason
         self._start_disarm()
 
     def _start_disarm(self):
@@ -129,8 +128,8 @@ class Arming:
         self._command = self._board.start_disarm()
 
 
-def _ending(status):
-    """Why an armed board is not armed any more."""
+def _disarm_cause(status):
+    """Reason why an armed board is not armed any more."""
     if status is None or status.state == 'boot' or status.stop_reason in ('none',
                                                                         'watchdog reset'):
         return 'restarted' + (' (watchdog reset)' if status and status.stop_reason != 'none'

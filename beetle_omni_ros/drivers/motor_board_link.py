@@ -1,4 +1,4 @@
-"""The thread that serves the motor board's port: reads, keeps time, reconnects."""
+"""Serves the port of the motor board in a thread: reading, timing, reconnecting."""
 
 from __future__ import annotations
 
@@ -13,36 +13,30 @@ from beetle_omni_ros.drivers.mavlink_receiver import MavlinkReceiver
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.serial_port import SerialPort, SerialPortError
 
-TICK = 0.01             # [s] longest sleep of the thread; what it times is ten times slower
+TICK = 0.01             # [s] longest sleep of the thread, a tenth of its shortest period
 
 
 class BoardLink:
     """
-    One serial port with MAVLink on it.
+    MAVLink on one serial port. The callbacks run one at a time in the thread of the link.
 
-    The callbacks run in the thread of the link, one after the other.
+    Args:
+        parameters: parameters of the link.
+        on_message: called with (message, arrival [s, monotonic]).
+        on_tick: called with the monotonic time [s], at least each :data:`TICK`.
+        on_connection: called with (True, '') or (False, reason) when the port opens or fails.
+        restarts: whether a message is the first one after a restart of the board.
 
     Attributes:
-        receiver: counts what arrives.
-        sent: frames handed to the port.
-        dropped: frames that found its buffer full.
-        connections: times the port was opened.
+        receiver: parser with the counts of received messages.
+        sent: number of frames written to the port.
+        dropped: number of frames dropped because the output buffer was full.
+        connections: number of times the port was opened.
 
     """
 
     def __init__(self, parameters: MotorBoardParameters, on_message: Callable,
                  on_tick: Callable, on_connection: Callable, restarts: Callable):
-        """
-        Prepare; :meth:`open` starts.
-
-        Args:
-            parameters: of the link.
-            on_message: called with (message, arrival [s, monotonic]).
-            on_tick: called with the monotonic time [s], at least each :data:`TICK`.
-            on_connection: called with True, or False and a text, when the port comes or goes.
-            restarts: tells of a message whether the board has just restarted.
-
-        """
         self._parameters = parameters
         self._on_message, self._on_tick = on_message, on_tick
         self._on_connection = on_connection
@@ -70,7 +64,7 @@ class BoardLink:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the thread and give the port back."""
+        """Stop the thread and close the port."""
         if self._thread is None:
             return
         self._stop.set()
@@ -92,7 +86,7 @@ class BoardLink:
 
     @property
     def opened(self) -> bool:
-        """Whether there is something to close."""
+        """Whether the thread runs, also while the port is lost."""
         return self._thread is not None
 
     def send(self, message) -> bool:
@@ -100,7 +94,7 @@ class BoardLink:
         Pack and write a message without waiting.
 
         Returns:
-            whether all or the beginning of it is on its way; False if the port is away or full.
+            whether it was written, at least in part; False if the port is lost or its buffer full.
 
         """
         with self._write_lock:
@@ -110,9 +104,9 @@ class BoardLink:
             try:
                 taken = self._port.write(frame)
             except SerialPortError:
-                return False            # the thread finds out by itself and reconnects
+                return False            # the thread detects the error itself and reconnects
             if taken:
-                # A frame that was never sent must not look like a lost one.
+                # A dropped frame must not leave a gap, which the board would count as lost.
                 self._packer.seq = (self._packer.seq + 1) % 256
                 self.sent += 1
             else:
@@ -146,7 +140,7 @@ class BoardLink:
             self._on_tick(time.monotonic())
 
     def _reconnect(self, retry):
-        """Try to open the port once in a while; return when to try next."""
+        """Try to open the port if it is time; return the time of the next attempt."""
         now = time.monotonic()
         if now < retry:
             select.select([self._wake_read], [], [], min(TICK, retry - now))
@@ -159,7 +153,7 @@ class BoardLink:
         return 0.0
 
     def _serve(self):
-        """Wait for bytes, at most one tick, and handle them."""
+        """Wait at most one tick for bytes and handle them."""
         port = self._port
         writers = [port] if port.waiting else []
         readable, writable, _ = select.select([port, self._wake_read], writers, [], TICK)

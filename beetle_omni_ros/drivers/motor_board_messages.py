@@ -1,4 +1,4 @@
-"""What the motor board tells, as dataclasses, and how it stands in MAVLink's fields."""
+"""Messages of the motor board as dataclasses, converted from MAVLink."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ CONTRACT_VERSION = 1
 STATES = {0: 'boot', 1: 'disarmed', 2: 'armed', 3: 'running'}
 STOP_REASONS = {0: 'none', 1: 'asked by the host', 2: 'heartbeat of the host lost',
                 3: 'no target for too long', 4: 'watchdog reset'}
-UNHEARD, THROTTLE = 'no heartbeat of the host', 'throttle not low'
-CONDITIONS = {1: 'booting', 2: UNHEARD, 4: THROTTLE,
+NO_HOST_HEARTBEAT, THROTTLE = 'no heartbeat of the host', 'throttle not low'
+CONDITIONS = {1: 'booting', 2: NO_HOST_HEARTBEAT, 4: THROTTLE,
               8: 'battery low', 16: 'ESC failure', 32: 'targets timed out', 64: 'saturated'}
 BLOCKS_ARMING = tuple(text for bit, text in CONDITIONS.items() if bit <= 16)
 RESULTS = {0: 'accepted', 1: 'refused', 2: 'denied', 3: 'unsupported', 4: 'failed'}
@@ -28,7 +28,7 @@ UNKNOWN_TEMPERATURE, UNKNOWN_CELL, UNKNOWN_CURRENT = 32767, 65535, -1
 
 @dataclass(frozen=True, slots=True)
 class BoardStatus:
-    """A heartbeat of the board: its state, why it last disarmed, what holds at present."""
+    """A heartbeat: state, reason of the last disarming, present conditions, contract version."""
 
     stamp: float
     state: str
@@ -49,12 +49,12 @@ class RotorStates:
 
     Attributes:
         stamp: host time of the measurement [s].
-        rpm: (4,) [1/min]; nan where the ESC is offline, as in all of these.
+        rpm: (4,) rotor speeds [1/min]; this and the next two are NaN if the ESC is offline.
         voltage: (4,) [V].
         current: (4,) [A].
-        temperature: (4,) [C], of the last ESC_INFO; nan unknown.
-        failures: four tuples of what the ESC reports.
-        error_count: (4,) since the board's start.
+        temperature: (4,) [C] of the last ESC_INFO; NaN if unknown.
+        failures: for each ESC a tuple of its reported failures.
+        error_count: (4,) errors since the start of the board.
 
     """
 
@@ -69,7 +69,7 @@ class RotorStates:
 
 @dataclass(frozen=True, slots=True)
 class BoardReception:
-    """What the board says of the packets that it got, since its start."""
+    """Counts of the board since its start: packets, refused targets, target timeouts."""
 
     lost: int
     bad_crc: int
@@ -79,25 +79,25 @@ class BoardReception:
 
 @dataclass(frozen=True, slots=True)
 class LinkStatistics:
-    """Both directions of the link; ``board`` is None until the board has told."""
+    """Both directions of the link; ``board`` is None before the board's first report."""
 
     received: ReceiveCounts
     board: BoardReception | None
     sent: int
-    dropped: int            # frames that found the output buffer full
-    connections: int        # times the port was opened
+    dropped: int            # frames dropped because the output buffer was full
+    connections: int        # number of times the port was opened
 
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
     """
-    How an arm or disarm command ended.
+    Result of an arm or disarm command.
 
     Attributes:
-        accepted: whether the board acknowledged it.
-        reason: '' or one line that says why not.
-        attempts: times it was sent.
-        duration: until the acknowledgement or the end of patience [s].
+        accepted: whether the board accepted it.
+        reason: '' or the reason of the refusal, in one line.
+        attempts: number of times it was sent.
+        duration: time until the acknowledgement or the timeout [s].
 
     """
 
@@ -110,16 +110,16 @@ class CommandResult:
 @dataclass(frozen=True, slots=True)
 class BoardUpdate:
     """
-    What is new since the last poll, and the state of the link.
+    Measurements and events since the last poll, and the present state.
 
     Attributes:
-        battery: the newest, or None.
-        rotors: the newest, or None.
-        status: the newest of all time, or None.
-        events: (level, text) with level 'info', 'warning' or 'error', in order.
-        link: counts.
-        clock_offset: board's clock minus monotonic clock [s], nan unknown.
-        clock_uncertainty: bound of its error [s], inf unknown.
+        battery: newest reading since the last poll, or None.
+        rotors: newest telemetry since the last poll, or None.
+        status: last heartbeat, or None before the first.
+        events: (level, text) with level 'info', 'warning' or 'error', oldest first.
+        link: counts of the link.
+        clock_offset: board's clock minus monotonic clock [s]; NaN if unknown.
+        clock_uncertainty: bound of the offset's error [s]; inf if unknown.
 
     """
 
@@ -133,7 +133,7 @@ class BoardUpdate:
 
 
 def status_of(message, stamp: float) -> BoardStatus:
-    """HEARTBEAT to :class:`BoardStatus`."""
+    """Convert HEARTBEAT."""
     mode = message.custom_mode
     state, reason = mode & 0xFF, mode >> 8 & 0xFF
     return BoardStatus(stamp, STATES.get(state, f'state {state}'),
@@ -147,17 +147,17 @@ def conditions_of(bits: int) -> tuple[str, ...]:
 
 
 def battery_of(message, stamp: float) -> BatteryReading | None:
-    """BATTERY_STATUS to :class:`BatteryReading`; None if it holds no voltage."""
+    """Convert BATTERY_STATUS; None if it contains no voltage."""
     cells = [cell for cell in message.voltages if cell != UNKNOWN_CELL]
     if not cells:
         return None
     current = message.current_battery
     return BatteryReading(stamp, sum(cells) / 1000,
-                   math.nan if current == UNKNOWN_CURRENT else -current / 100)
+                          math.nan if current == UNKNOWN_CURRENT else -current / 100)
 
 
 def rotors_of(message, info, stamp: float) -> RotorStates:
-    """ESC_STATUS with the last ESC_INFO (None: none yet) to :class:`RotorStates`."""
+    """Convert ESC_STATUS and the last ESC_INFO, or None before the first."""
     if info is None:
         online, temperature = np.ones(4, dtype=bool), np.full(4, np.nan)
         failures, errors = ((),) * 4, np.zeros(4, dtype=int)
@@ -177,7 +177,7 @@ def rotors_of(message, info, stamp: float) -> RotorStates:
 
 
 def heartbeat() -> common.MAVLink_message:
-    """Our heartbeat."""
+    """Heartbeat of this computer."""
     return common.MAVLink_heartbeat_message(
         common.MAV_TYPE_ONBOARD_CONTROLLER, common.MAV_AUTOPILOT_INVALID, 0, 0,
         common.MAV_STATE_ACTIVE, 3)

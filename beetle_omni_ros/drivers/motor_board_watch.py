@@ -1,4 +1,4 @@
-"""What is known of the motor board, put together from its messages, and what changed."""
+"""State of the motor board from its messages, and events about changes."""
 
 from __future__ import annotations
 
@@ -24,25 +24,29 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.readings import BatteryReading
 
 EVENTS_KEPT = 200
-QUESTIONS_KEPT = 50     # of TIMESYNC; an answer later than these is of no use
+REQUESTS_KEPT = 50      # TIMESYNC requests; later answers are ignored
 SEVERE = ('ESC failure', 'targets timed out')
 
 
 class BoardWatch:
     """
-    The newest of everything, and events about what changed.
+    Newest state and measurements of the board, and events about changes.
+
+    Args:
+        parameters: parameters of the link.
+        robot: robot with the number of battery cells.
+        clock: clock of all stamps [s].
 
     Attributes:
         status: last heartbeat, or None.
         voltage: filtered pack voltage [V] for the thrust map, or None.
-        reception: what the board says of our packets, or None.
+        reception: counts of the board about received packets, or None.
         clock: offset of the board's clock against the monotonic clock.
 
     """
 
     def __init__(self, parameters: MotorBoardParameters, robot: RobotParameters,
                  clock: Callable[[], float]):
-        """Know nothing; ``clock`` [s] is the one of all stamps."""
         self._parameters, self._host_clock, self._cells = parameters, clock, robot.battery.cells
         self.clock = ClockOffset(parameters.clock_drift)
         self.status: BoardStatus | None = None
@@ -52,8 +56,8 @@ class BoardWatch:
         self._battery: BatteryReading | None = None
         self._rotors: RotorStates | None = None
         self._events: deque = deque(maxlen=EVENTS_KEPT)
-        self._asked: deque = deque(maxlen=QUESTIONS_KEPT)
-        self._heard = self._opened = -math.inf
+        self._requests: deque = deque(maxlen=REQUESTS_KEPT)
+        self._received_at = self._opened = -math.inf
         self._battery_at = -math.inf
         self._was_silent = self._was_uncertain = self._was_implausible = False
         self._handlers = {
@@ -63,66 +67,66 @@ class BoardWatch:
             common.MAVLINK_MSG_ID_SYS_STATUS: self._on_reception,
             EscInfo.id: self._on_info, EscStatus.id: self._on_rotors}
 
-    def time_question(self) -> common.MAVLink_message:
-        """TIMESYNC that asks for the board's clock; to be sent at once."""
-        self._asked.append(time.monotonic_ns())
-        return common.MAVLink_timesync_message(0, self._asked[-1])
+    def timesync_request(self) -> common.MAVLink_message:
+        """TIMESYNC request for the board's clock, to be sent at once."""
+        self._requests.append(time.monotonic_ns())
+        return common.MAVLink_timesync_message(0, self._requests[-1])
 
     def message(self, message, now: float) -> None:
-        """Take a message of the board that arrived at ``now`` [s, monotonic]."""
-        self._heard = now
+        """Handle a message of the board that arrived at ``now`` [s, monotonic]."""
+        self._received_at = now
         handler = self._handlers.get(message.get_msgId())
         if handler:
             handler(message, now)
 
     def silent(self, now: float) -> bool:
-        """Whether the board was not heard for too long."""
-        return now - self._heard > self._parameters.silence
+        """Whether no message arrived for too long."""
+        return now - self._received_at > self._parameters.silence
 
     def tick(self, now: float, connected: bool) -> None:
-        """Notice silence and a poor clock."""
-        # A port that has just come back is given the same time to be heard.
-        silent = math.isfinite(self._heard) and \
-            now - max(self._heard, self._opened) > self._parameters.silence
+        """Update the events about silence and the clock's uncertainty."""
+        # After a reconnection the board has the same time for its first message.
+        silent = math.isfinite(self._received_at) and \
+            now - max(self._received_at, self._opened) > self._parameters.silence
         if silent != self._was_silent and connected:
             self._was_silent = silent
-            self._say('error' if silent else 'info',
+            self._event('error' if silent else 'info',
                       f'nothing heard for {self._parameters.silence:g} s' if silent
                       else 'heard again')
         uncertainty = self.clock.uncertainty(now)
         uncertain = self.clock.known and uncertainty > self._parameters.clock_uncertainty_limit
         if uncertain != self._was_uncertain:
             self._was_uncertain = uncertain
-            self._say('warning' if uncertain else 'info',
+            self._event('warning' if uncertain else 'info',
                       f'offset of its clock known to {1e3 * uncertainty:.1f} ms')
 
     def acknowledged(self, arm: bool) -> None:
-        """Note that the board has armed or disarmed as asked, before its heartbeat says so."""
+        """Update the status after an acknowledged command, before the next heartbeat."""
         if self.status is not None and self.status.armed != arm:
-            # What keeps it from arming again comes with the heartbeat that follows.
+            # The next heartbeat contains the conditions that prevent arming again.
             self.status = replace(self.status, stamp=self._host_clock(),
                                   state='armed' if arm else 'disarmed',
                                   conditions=self.status.conditions if arm else (THROTTLE,))
-            self._say('info', self.status.state)
+            self._event('info', self.status.state)
 
     def connection(self, connected: bool, text: str) -> None:
-        """Note that the port came or went."""
+        """Record that the port was opened, or lost with the reason ``text``."""
         self._opened = time.monotonic()
-        self._say('info' if connected else 'error',
+        self._event('info' if connected else 'error',
                   'port opened again' if connected else text)
 
     def take(self) -> dict:
-        """Hand out what is new: ``battery``, ``rotors``, ``events``."""
+        """Return what is new since the last call: ``battery``, ``rotors``, ``events``."""
         news = {'battery': self._battery, 'rotors': self._rotors, 'events': tuple(self._events)}
         self._battery = self._rotors = None
         self._events.clear()
         return news
 
-    def _say(self, level, text):
+    def _event(self, level, text):
         self._events.append((level, f'motor board: {text}'))
 
     def _stamp(self, message, now):
-        """Host time of a measurement; of its arrival while the board's clock is unknown."""
+        """Host time of a measurement, or of its arrival while the board's clock is unknown."""
         measured = now
         if self.clock.known:
             measured = min(now, message.time_usec / 1e6 - self.clock.offset())
@@ -136,25 +140,25 @@ class BoardWatch:
             self._info = None
             if old is not None and old.state != 'boot':
                 level = 'error' if old.armed else 'warning'
-                self._say(level, f'restarted ({new.stop_reason})')
+                self._event(level, f'restarted ({new.stop_reason})')
             return
         if old is None:
-            self._say('info', f'found, {new.state}, contract {new.contract}')
+            self._event('info', f'found, {new.state}, contract {new.contract}')
             return
         if old.armed != new.armed:
             asked = new.stop_reason == 'asked by the host'
-            self._say('info' if new.armed or asked else 'error',
+            self._event('info' if new.armed or asked else 'error',
                       'armed' if new.armed else f'disarmed ({new.stop_reason})')
         for condition in new.conditions if new.armed else ():
             if condition not in old.conditions:
-                self._say('error' if condition in SEVERE else 'warning', condition)
+                self._event('error' if condition in SEVERE else 'warning', condition)
 
     def _on_timesync(self, message, now):
-        if not message.tc1 or message.ts1 not in self._asked:
+        if not message.tc1 or message.ts1 not in self._requests:
             return
-        self._asked.remove(message.ts1)
+        self._requests.remove(message.ts1)
         if self.clock.add(message.ts1 / 1e9, message.tc1 / 1e9, now) and self.status is not None:
-            self._say('warning', 'its clock was set anew: restarted?')
+            self._event('warning', 'its clock was set anew: restarted?')
 
     def _on_battery(self, message, now):
         battery = battery_of(message, self._host_clock())
@@ -162,7 +166,7 @@ class BoardWatch:
         plausible = battery is not None and low <= battery.voltage / self._cells <= high
         if plausible == self._was_implausible:
             self._was_implausible = not plausible
-            self._say('info' if plausible else 'warning',
+            self._event('info' if plausible else 'warning',
                       'battery voltage plausible again' if plausible else
                       f'battery voltage {battery.voltage if battery else math.nan:.1f} V not '
                       'believed, the last good one is used')
@@ -187,7 +191,7 @@ class BoardWatch:
             before = old is None or bool(old.info >> k & 1)
             online = bool(message.info >> k & 1)
             if online != before:
-                self._say('info' if online else 'error',
+                self._event('info' if online else 'error',
                           f"ESC of rotor {k + 1} {'online again' if online else 'offline'}")
 
     def _on_rotors(self, message, now):
@@ -195,6 +199,6 @@ class BoardWatch:
 
 
 def restarted(message) -> bool:
-    """Whether a message is the heartbeat that a board sends first after its start."""
+    """Whether a message is the first heartbeat after a start of the board."""
     return message.get_msgId() == common.MAVLINK_MSG_ID_HEARTBEAT \
         and message.custom_mode & 0xFF == 0

@@ -1,8 +1,8 @@
 """
-A serial port that never blocks.
+A serial port whose calls do not block.
 
-pyserial opens and configures the port; reading and writing go to its descriptor, because
-pyserial's write waits in a busy loop for room in a full output buffer, also without a time limit.
+pyserial opens and configures the port. Reading and writing use its descriptor, because pyserial's
+write waits in a busy loop, without a time limit, if the output buffer is full.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import serial
 
 
 class SerialPortError(OSError):
-    """The port cannot be used; one line with its name and what to do."""
+    """The port cannot be used; the message has its name and a remedy."""
 
 
 ADVICE = {
-    2: 'no such device: is it plugged in and powered, is the name right?',
+    2: 'no such device: check plug, power and name',
     13: "no permission: add the user to the group 'dialout' or install the udev rule",
     11: 'in use by another process', 16: 'in use by another process',
 }
@@ -30,17 +30,17 @@ class SerialPort:
     One open port, locked against other processes.
 
     Attributes:
-        name: its path.
-        dropped: writes refused because the output buffer was full.
+        name: path of the port.
+        dropped: number of frames dropped because the output buffer was full.
 
     """
 
     def __init__(self, name: str, baud: int):
         """
-        Open ``name`` at ``baud`` [bit/s]; what waits in its buffers is thrown away.
+        Open ``name`` at ``baud`` [bit/s] and empty its buffers.
 
         Raises:
-            SerialPortError: it is absent, taken, not permitted, or no serial port.
+            SerialPortError: it is absent, in use, not permitted, or no serial port.
 
         """
         self.name = name
@@ -54,7 +54,7 @@ class SerialPort:
         try:
             self._serial.set_low_latency_mode(True)
         except (OSError, ValueError, AttributeError, NotImplementedError):
-            pass        # pseudo-terminals and USB CDC have no such setting, nor the need
+            pass        # pseudo-terminals and USB CDC do not need this setting
         os.set_blocking(self._serial.fileno(), False)
         self._rest = b''
 
@@ -64,7 +64,7 @@ class SerialPort:
 
     def read(self) -> bytes:
         """
-        Return what has arrived, perhaps nothing.
+        Return the received bytes, also if there are none.
 
         Raises:
             SerialPortError: the device is gone.
@@ -77,15 +77,15 @@ class SerialPort:
         except (OSError, serial.SerialException) as error:
             raise self._gone(error) from None
         if not data and select.select([self.fileno()], [], [], 0)[0]:
-            # Readable and yet empty is how a tty tells that its other end hung up.
+            # A tty whose other end is closed is readable and empty.
             raise SerialPortError(f'{self.name}: device is gone (end of file)')
         return data
 
     def write(self, frame: bytes) -> bool:
         """
-        Hand a frame to the driver's buffer as a whole, or drop it if there is no room.
+        Write a frame, or drop it if the output buffer is full.
 
-        A frame that fits in part is completed before anything else is written.
+        A frame that fits only in part is completed before the next frame.
 
         Raises:
             SerialPortError: the device is gone.
@@ -102,14 +102,14 @@ class SerialPort:
         return True
 
     def flush(self) -> bool:
-        """Go on with a frame written in part; tell whether it is complete."""
+        """Continue a partly written frame; return whether it is complete."""
         if self._rest:
             self._rest = self._rest[self._write(self._rest):]
         return not self._rest
 
     @property
     def waiting(self) -> bool:
-        """Whether part of a frame waits for room."""
+        """Whether part of a frame is not written yet."""
         return bool(self._rest)
 
     def _write(self, data):
@@ -125,7 +125,7 @@ class SerialPort:
         return SerialPortError(f'{self.name}: device is gone ({text})')
 
     def close(self) -> None:
-        """Give the port back; what is still unsent is dropped, or closing would wait for it."""
+        """Close the port and drop unsent bytes, for which closing would wait."""
         try:
             self._serial.reset_output_buffer()
         except (OSError, termios.error):

@@ -1,4 +1,4 @@
-"""The servo bus as the joint bridge uses it: goals out, angles in, nothing stalls."""
+"""Driver of the servo bus for the joint bridge: tilt goals, feedback, health."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ import numpy as np
 
 from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.servo_guard import Guard
-from beetle_omni_ros.drivers.servo_keeper import ServoKeeper
 from beetle_omni_ros.drivers.servo_link import LinkStatistics, ServoBusError, ServoLink
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.drivers.servo_port import PortLost
 from beetle_omni_ros.drivers.servo_setup import (
     configure,
+    enable_torque,
     examine,
     locate,
-    power,
     ServoFinding,
 )
 from beetle_omni_ros.drivers.servo_state import (
@@ -28,28 +27,29 @@ from beetle_omni_ros.drivers.servo_state import (
     ServoHealth,
     ServoReadings,
 )
-from beetle_omni_ros.drivers.servo_turns import certain_limit, settle
+from beetle_omni_ros.drivers.servo_turns import settle, unambiguous_limit
+from beetle_omni_ros.drivers.servo_upkeep import ServoUpkeep
 from beetle_omni_ros.robot.parameters import JointParameters
 
 
 class ServoBus:
     """
-    Four tilt servos. For one thread; between :meth:`open` and :meth:`close`.
+    Four tilt servos. Only one thread may use it, between :meth:`open` and :meth:`close`.
 
     A loop of 200 Hz calls :meth:`write_goals`, :meth:`read` and :meth:`poll_health` in each tick.
-    None of them raises when the cable is out or servos are silent: they say so in what they
-    return, take at most one reply time together, and go on by themselves when things are back.
+    If the cable is unplugged or servos are silent, they raise nothing and report it in their
+    results. Together they then take at most one reply time. They recover without further calls.
 
     Args:
-        parameters: of the bus.
-        joints: for the travel of the tilts.
-        clock: stamps of readings [s].
+        parameters: parameters of the bus.
+        joints: joint parameters, for the travel of the tilts.
+        clock: clock of the stamps of readings [s].
 
     Attributes:
         parameters: may be replaced while torque is off.
-        enabled: whether torque is wanted.
-        clipped: goals beyond the travel that were cut off.
-        rejected: goals that were no numbers.
+        enabled: whether the servos should have torque.
+        clipped: number of goals limited to the travel.
+        rejected: number of goals that are not four finite numbers.
 
     """
 
@@ -62,7 +62,7 @@ class ServoBus:
         self._clock = clock
         self._link = ServoLink(parameters.port, parameters.baud_rate, parameters.timing.reply)
         self._servos = make_servos(parameters)
-        self._keeper = ServoKeeper(self._link, parameters, self._servos)
+        self._upkeep = ServoUpkeep(self._link, parameters, self._servos)
         self._guard: Guard | None = None
 
     # --- lifecycle ----------------------------------------------------------------------------
@@ -72,7 +72,7 @@ class ServoBus:
         Open the port.
 
         Raises:
-            ServoBusError: it cannot be opened; one line with what helps.
+            ServoBusError: it cannot be opened.
 
         """
         try:
@@ -81,46 +81,46 @@ class ServoBus:
             raise ServoBusError(f'{self._link.where()}: {error}') from None
 
     def close(self):
-        """Take the torque off and close the port; safe to call at any time, more than once."""
+        """Switch the torque off and close the port; may be called at any time, repeatedly."""
         self.disable()
         if self._guard is not None:
-            self._guard.release()
+            self._guard.trigger()
             self._guard = None
         self._link.close()
 
     def check(self) -> list[ServoFinding]:
-        """Look at each servo without changing anything."""
+        """Examine each servo without changing anything."""
         try:
             with self._link.patient():
                 return [examine(self._link, servo) for servo in self._servos]
         except PortLost as error:
-            self._keeper.lost()
+            self._upkeep.port_lost()
             return [ServoFinding(servo.name, servo.identifier, problem=f'{self._link.where()}: '
                                  f'{error}', remedy='plug the adapter in') for servo in
                     self._servos]
 
     def configure(self):
         """
-        Take the torque off, make all settings ours and read the angles once.
+        Switch the torque off, write all settings and read the angles.
 
         Raises:
-            ServoBusError: one line that names each servo that is missing or wrong.
+            ServoBusError: servos are missing or wrong; the message names all of them.
 
         """
         self._call(self.disable)
         self._link.fast = False
         self._link.fast = self._call(configure, self._link, self.parameters, self._servos)
         for servo in self._servos:
-            servo.silent, servo.resting, servo.misses, servo.recoveries = False, False, 0, 0
+            servo.silent, servo.kept_off, servo.misses, servo.recoveries = False, False, 0, 0
             servo.torque, servo.error, servo.watchdog_expired = False, 0, False
         self._call(locate, self._link, self.parameters, self._servos)
 
     def enable(self):
         """
-        Turn the torque on where the servos stand.
+        Switch the torque on with the present angles as goals.
 
         Raises:
-            ServoBusError: an angle is ambiguous, or a servo is silent or shut down; no servo has
+            ServoBusError: an angle is ambiguous, or a servo is silent or shut down. No servo has
                 torque then.
 
         """
@@ -130,7 +130,7 @@ class ServoBus:
         if doubts:
             raise ServoBusError(
                 f'{self._link.where()}: no torque, the turn is lost: {doubts}; turn it by hand '
-                f'to within +-{certain_limit(self.travel):.2f} rad, or look where it is and set '
+                f'to within +-{unambiguous_limit(self.travel):.2f} rad, or measure it and set '
                 'confirmed_tilts and confirm_tilts')
         try:
             if self.parameters.guard and self._guard is None:
@@ -138,8 +138,8 @@ class ServoBus:
                     registers.TORQUE_ENABLE, {servo.identifier: 0 for servo in self._servos})
                 self._guard = Guard(self.parameters.port, self.parameters.baud_rate, packet)
             for servo in self._servos:
-                self._call(power, self._link, self.parameters, servo)
-                self._keeper.spoke()
+                self._call(enable_torque, self._link, self.parameters, servo)
+                self._upkeep.packet_sent()
         except ServoBusError:
             self.enabled = True
             self.disable()
@@ -148,21 +148,21 @@ class ServoBus:
 
     def disable(self) -> bool:
         """
-        Take the torque off all servos.
+        Switch the torque of all servos off.
 
         Returns:
             whether every servo has confirmed it.
 
         """
         was_enabled, self.enabled = self.enabled, False
-        self._keeper.drop_recoveries()
+        self._upkeep.drop_recoveries()
         if not self._link.is_open:
             return not was_enabled
         try:
             with self._link.patient():
-                confirmed = self._cut()
+                confirmed = self._torque_off()
         except PortLost as error:
-            self._keeper.lost(error)
+            self._upkeep.port_lost(error)
             return False
         if self._guard is not None and confirmed:
             self._guard.dismiss()
@@ -171,7 +171,7 @@ class ServoBus:
 
     def reboot(self, identifier: int):
         """
-        Restart a servo; :meth:`poll_health` carries it out, step by step, in some 0.5 s.
+        Start the restart of a servo; calls of :meth:`poll_health` finish it in about 0.5 s.
 
         Raises:
             ServoBusError: no servo has this ID.
@@ -179,7 +179,7 @@ class ServoBus:
         """
         for servo in self._servos:
             if servo.identifier == identifier:
-                self._keeper.recover(servo, forced=True)
+                self._upkeep.recover(servo, forced=True)
                 return
         raise ServoBusError(f'{self._link.where(identifier)}: no such servo; ids are '
                             f'{[servo.identifier for servo in self._servos]}')
@@ -191,10 +191,10 @@ class ServoBus:
         Send tilt targets to all servos with one packet.
 
         Args:
-            tilt: (4,) [rad]; beyond the travel they are cut off.
+            tilt: (4,) tilt targets [rad], limited to the travel.
 
         Returns:
-            whether the packet went out; False without torque, port, or numbers.
+            whether the packet was sent; False without torque, port or finite numbers.
 
         """
         tilt = np.asarray(tilt, dtype=float)
@@ -206,18 +206,18 @@ class ServoBus:
         legal = np.clip(tilt, -self.travel, self.travel)
         self.clipped += int(np.any(legal != tilt))
         try:
-            self._keeper.feed_watchdog()
+            self._upkeep.feed_watchdog()
             sent = self._link.sync_write(registers.GOAL_POSITION, {
                 servo.identifier: servo.counts(angle)
                 for servo, angle in zip(self._servos, legal, strict=True)})
         except PortLost as error:
-            self._keeper.lost(error)
+            self._upkeep.port_lost(error)
             return False
-        self._keeper.spoke()
+        self._upkeep.packet_sent()
         return sent
 
     def read(self) -> ServoReadings:
-        """Read current, velocity and position of all servos that are not known to be silent."""
+        """Read current, velocity and position of all servos except silent ones."""
         stamp = self._clock()
         asked = sorted((servo for servo in self._servos if not servo.silent),
                        key=lambda servo: servo.misses)
@@ -226,46 +226,46 @@ class ServoBus:
             try:
                 answers = self._link.sync_read(FEEDBACK, FEEDBACK_SIZE,
                                                [servo.identifier for servo in asked])
-                self._keeper.spoke()
+                self._upkeep.packet_sent()
             except PortLost as error:
-                self._keeper.lost(error)
+                self._upkeep.port_lost(error)
         if self._link.is_open:
-            answered = self._keeper.take(asked, answers, self.enabled)
+            answered = self._upkeep.handle_feedback(asked, answers, self.enabled)
         else:
             answered = set()
-            self._keeper.reconnect(self.enabled)
+            self._upkeep.reconnect(self.enabled)
         return readings(self._servos, stamp, answered, self.parameters.torque_per_current)
 
     def upkeep(self):
         """
-        Do at most one transaction beside goals and feedback.
+        Do at most one transaction besides goals and feedback.
 
-        That is: a step in bringing a servo back, a look for a silent one, or reading torque,
-        hardware error, watchdog, voltage and temperature of all.
+        It is a step of a servo's recovery, a ping of a silent servo, or a read of torque, hardware
+        error, watchdog, voltage and temperature of all servos.
         """
         try:
-            self._keeper.step(self.enabled)
+            self._upkeep.step(self.enabled)
         except PortLost as error:
-            self._keeper.lost(error)
+            self._upkeep.port_lost(error)
 
     def health(self) -> list[ServoHealth]:
-        """What is known about each servo, without a transaction."""
-        return self._keeper.report(self.enabled)
+        """Last known health of each servo, without a transaction."""
+        return self._upkeep.report(self.enabled)
 
     def poll_health(self) -> list[ServoHealth]:
-        """Do :meth:`upkeep`, then report the :meth:`health`."""
+        """Do :meth:`upkeep` and return :meth:`health`."""
         self.upkeep()
         return self.health()
 
     @property
     def obeying(self) -> np.ndarray:
-        """(4,) bool: connected, answering, and with torque, as far as known."""
+        """(4,) bool: whether a servo is connected, answers and has torque, as last known."""
         return np.array([self._link.is_open and not servo.silent and servo.torque is True
                          for servo in self._servos])
 
     def take_events(self) -> list[str]:
-        """Lines for the log since the last call."""
-        return self._keeper.take_events()
+        """Return the lines for the log since the last call."""
+        return self._upkeep.take_events()
 
     @property
     def connected(self) -> bool:
@@ -274,13 +274,13 @@ class ServoBus:
 
     @property
     def statistics(self) -> LinkStatistics:
-        """Transactions, missing and corrupt answers, refusals, connections."""
+        """Counts of the link."""
         return self._link.statistics
 
     # --- inside -------------------------------------------------------------------------------
 
-    def _cut(self):
-        """Take the torque off: all at once, then each with its confirmation."""
+    def _torque_off(self):
+        """Switch the torque off by one packet, then for each servo with confirmation."""
         self._link.sync_write(registers.TORQUE_ENABLE,
                               {servo.identifier: 0 for servo in self._servos})
         confirmed = True
@@ -290,7 +290,7 @@ class ServoBus:
                 servo.torque = False
             except ServoBusError as error:
                 confirmed = False
-                self._keeper.say(f'torque off is not confirmed: {error}')
+                self._upkeep.log(f'torque off is not confirmed: {error}')
         return confirmed
 
     def _call(self, function, *arguments):
@@ -298,5 +298,5 @@ class ServoBus:
             with self._link.patient():
                 return function(*arguments)
         except PortLost as error:
-            self._keeper.lost(error)
+            self._upkeep.port_lost(error)
             raise ServoBusError(f'{self._link.where()}: {error}') from None

@@ -1,10 +1,10 @@
 """
-Cuts the servos' torque when the process that drives them was killed.
+Switches the servos' torque off if the process of their driver was killed.
 
-Runs as a process of its own, holds no port and uses no time; :class:`Guard` starts it. Its
-standard input is a pipe from the driver: a byte means that all is well and it may go; the pipe's
-end without one means that the driver died with torque on. The servos' own watchdog would only
-stop them.
+:class:`Guard` starts this module as a separate process, which sleeps and has no port open. Its
+standard input is a pipe from the driver. A byte ends it without action. The end of the pipe
+without a byte means that the driver died with torque on. The servos' own watchdog would only stop
+them.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ import time
 
 import serial
 
-PATIENCE = 2.0      # [s] for a port that is busy or away at that moment
-REPEATS = 3         # nobody acknowledges a broadcast
-PAUSE = 0.02        # [s] between them
+OPEN_TIMEOUT = 2.0  # [s] for a port that is busy or unplugged
+REPEATS = 3         # a broadcast has no acknowledgement
+PAUSE = 0.02        # [s] between repetitions
 
 
 class Guard:
     """
-    The helper process of one bus.
+    The guard process of one bus.
 
     Args:
-        port: serial port.
-        baud_rate: [bit/s].
-        packet: bytes that take the torque off all servos.
+        port: path of the serial port.
+        baud_rate: baud rate of the bus [bit/s].
+        packet: packet that switches the torque of all servos off.
 
     """
 
@@ -37,14 +37,14 @@ class Guard:
             [sys.executable, __file__, port, str(baud_rate), packet.hex()],
             stdin=subprocess.PIPE, start_new_session=True)
 
-    def release(self):
-        """Let it act now: the driver could not make sure that the torque is off."""
+    def trigger(self):
+        """Let it switch the torque off now, because the driver has no confirmation."""
         if self._process is not None:
             self._process.stdin.close()
             self._process = None
 
     def dismiss(self):
-        """All servos are without torque: let it end."""
+        """End it without action, because the torque of all servos is off."""
         if self._process is None:
             return
         try:
@@ -57,13 +57,13 @@ class Guard:
         self._process = None
 
 
-def cut(port: str, baud_rate: int, packet: bytes):
+def send_torque_off(port: str, baud_rate: int, packet: bytes):
     """Send ``packet`` as soon as the port can be opened."""
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + OPEN_TIMEOUT
     while time.monotonic() < end:
         try:
             with serial.Serial(port, baud_rate, timeout=0, write_timeout=0.1) as line:
-                # An unfinished packet of the dead driver ends here: the servos find the header.
+                # The header of this packet also ends an incomplete packet of the driver.
                 for _ in range(REPEATS):
                     line.write(packet)
                     line.flush()
@@ -74,10 +74,10 @@ def cut(port: str, baud_rate: int, packet: bytes):
 
 
 def main():
-    """Wait for the driver's end."""
+    """Wait for the end of the pipe."""
     port, baud_rate, packet = sys.argv[1:4]
     if not os.read(0, 1):
-        cut(port, int(baud_rate), bytes.fromhex(packet))
+        send_torque_off(port, int(baud_rate), bytes.fromhex(packet))
 
 
 if __name__ == '__main__':

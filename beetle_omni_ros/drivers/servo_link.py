@@ -1,4 +1,4 @@
-"""Transactions with servos through dynamixel_sdk: one call, one exchange of packets, checked."""
+"""Transactions with servos by dynamixel_sdk: each call exchanges packets and checks them."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from beetle_omni_ros.drivers.servo_port import PortLost, ServoPort
 from beetle_omni_ros.drivers.servo_registers import Register
 
 BROADCAST = 0xFE
-PATIENCE = 0.02     # [s] for an answer, outside the loop
-STATUS_SIZE = 11    # [B] an answer without data
-FIRST_BLOCK = 8     # [B] before the first servo's error byte in the answer to a fast sync read
+RELAXED_REPLY_TIME = 0.02   # [s] time limit of an answer outside the loop
+STATUS_SIZE = 11            # [B] of an answer without data
+FIRST_BLOCK = 8             # [B] before the first error byte in the answer to a fast sync read
 
 
 class ServoBusError(RuntimeError):
-    """The bus or a servo does not do what was asked; one line with port and ID."""
+    """The bus or a servo failed; one line with port and ID."""
 
 
 class NoAnswer(ServoBusError):
-    """A servo did not answer, or not with a sound packet."""
+    """A servo did not answer, or its answer was corrupt."""
 
 
 class Refused(ServoBusError):
@@ -30,23 +30,23 @@ class Refused(ServoBusError):
 
 
 class _Recorder:
-    """A port that keeps what the SDK writes."""
+    """A port that stores the packet written by the SDK."""
 
     is_using = False
     sent = b''
 
     def clearPort(self):
-        """Nothing to drop."""
+        """Do nothing."""
 
     def writePort(self, packet):
-        """Keep the packet."""
+        """Store the packet."""
         self.sent = packet
         return len(packet)
 
 
 @dataclass
 class LinkStatistics:
-    """Counts since the link was made."""
+    """Counts since the creation of the link."""
 
     transactions: int = 0
     unanswered: int = 0
@@ -59,13 +59,18 @@ class ServoLink:
     """
     The bus at one baud rate.
 
+    Args:
+        path: path of the serial port.
+        baud_rate: baud rate [bit/s].
+        reply_time: time limit of an answer, without its time on the wire [s].
+
     Attributes:
-        fast: whether to use fast sync read; every servo must have firmware 46 or later.
-        alerts: IDs whose last answer had the alert bit: a hardware error.
-        late: whether the last transaction ran into its time limit.
+        fast: whether to use fast sync read, which needs firmware 46 or later in every servo.
+        alerts: IDs whose last answer had the alert bit of a hardware error.
+        late: whether an answer of the last transaction was missing or corrupt.
 
     Raises:
-        PortLost: from any call, when the port is gone; open it again.
+        PortLost: by any call, if the port is lost; open it again.
 
     """
 
@@ -80,11 +85,11 @@ class ServoLink:
 
     @property
     def is_open(self) -> bool:
-        """Whether the port is open, as far as known."""
+        """Whether the port is open; True until a call notices its loss."""
         return self._port is not None
 
     def open(self):
-        """Open the port; raises PortLost with what helps."""
+        """Open the port; raises PortLost if it cannot be opened."""
         self.close()
         port = ServoPort(self.path, self.baud_rate, self.reply_time)
         port.openPort()
@@ -93,13 +98,13 @@ class ServoLink:
 
     @contextmanager
     def patient(self):
-        """Wait longer for answers, where no loop is kept waiting."""
-        self.reply_time, brisk = max(self.reply_time, PATIENCE), self.reply_time
+        """Context with a longer time limit for answers, for use outside the loop."""
+        self.reply_time, usual = max(self.reply_time, RELAXED_REPLY_TIME), self.reply_time
         self._set_reply_time()
         try:
             yield
         finally:
-            self.reply_time = brisk
+            self.reply_time = usual
             self._set_reply_time()
 
     def _set_reply_time(self):
@@ -121,7 +126,7 @@ class ServoLink:
     def ping(self, identifier: int) -> int:
         """Model number of a servo."""
         model, result, error = self._handler.ping(self._open_port(), identifier)
-        self._judge(identifier, result, error, 'ping')
+        self._check(identifier, result, error, 'ping')
         return model
 
     def read(self, identifier: int, register: Register) -> int:
@@ -131,11 +136,11 @@ class ServoLink:
         error, data = 0, b''
         if result == COMM_SUCCESS:
             error, data, result = self._status(port, identifier, register.size)
-        self._judge(identifier, result, error, f'read {register.name}({register.address})')
+        self._check(identifier, result, error, f'read {register.name}({register.address})')
         return register.decoded(data)
 
     def write(self, identifier: int, register: Register, value: int, attempts: int = 3):
-        """Write a register; repeated where the answer is missing, as writing twice is harmless."""
+        """Write a register, and repeat it if there is no answer."""
         what = f'write {value} to {register.name}({register.address})'
         for attempt in range(attempts):
             port = self._open_port()
@@ -146,20 +151,20 @@ class ServoLink:
                 port.setPacketTimeout(STATUS_SIZE)
                 error, _, result = self._status(port, identifier, 0)
             try:
-                return self._judge(identifier, result, error, what)
+                return self._check(identifier, result, error, what)
             except NoAnswer:
                 if attempt == attempts - 1:
                     raise
 
     def reboot(self, identifier: int):
-        """Restart a servo; it is away for some 0.3 s then."""
+        """Restart a servo, which does not answer for about 0.3 s."""
         result, error = self._handler.reboot(self._open_port(), identifier)
-        self._judge(identifier, result, error, 'reboot')
+        self._check(identifier, result, error, 'reboot')
 
     # --- several servos -----------------------------------------------------------------------
 
     def sync_write(self, register: Register, values: dict[int, int]) -> bool:
-        """Write one register of several servos with one packet; tells whether it went out."""
+        """Write one register of several servos by one packet; return whether it was sent."""
         parameters = []
         for identifier, value in values.items():
             parameters.append(identifier)
@@ -170,7 +175,7 @@ class ServoLink:
         return result == COMM_SUCCESS
 
     def packet_of_sync_write(self, register: Register, values: dict[int, int]) -> bytes:
-        """Return the bytes that :meth:`sync_write` would send."""
+        """Packet that :meth:`sync_write` would send."""
         recorder = _Recorder()
         held, self._port = self._port, recorder
         try:
@@ -184,11 +189,11 @@ class ServoLink:
         """
         Read the same registers of several servos.
 
-        Servos answer in the order given, each after the one before: behind a silent one, the
-        others may be silent too. What was sound is returned.
+        Each servo answers after the previous one in the list, so servos behind a silent one may
+        not answer.
 
         Returns:
-            ID -> (error number, data), of those that answered.
+            ID -> (error number, data) of each valid answer.
 
         """
         port = self._open_port()
@@ -209,7 +214,7 @@ class ServoLink:
         answers = {}
         for identifier in identifiers:
             error, data, result = self._status(port, identifier, length)
-            self._count(result)
+            self._count_errors(result)
             if result == COMM_SUCCESS:
                 answers[identifier] = (error, data)
         return answers
@@ -218,8 +223,8 @@ class ServoLink:
         """
         Receive the answer of one servo: error byte, data, the SDK's result.
 
-        An answer does not say to what; one of another length is a late one to something else.
-        The SDK's own readRx would take its CRC for data.
+        An answer does not contain its address. An answer of another length is a late one of
+        another transaction, whose CRC the SDK's readRx would return as data.
         """
         while True:
             packet, result = self._handler.rxPacket(port, False)
@@ -236,10 +241,10 @@ class ServoLink:
             packet, result = self._handler.rxPacket(port, True)
             ours = len(packet) >= FIRST_BLOCK and packet[4] == BROADCAST \
                 and packet[5] | packet[6] << 8 == expected
-            # A late answer to something else may come first.
+            # A late answer of another transaction may come first.
             if ours or result != COMM_SUCCESS:
                 break
-        self._count(result)
+        self._count_errors(result)
         if not ours:
             return {}
         answers, checked, crc = {}, 0, 0
@@ -248,7 +253,7 @@ class ServoLink:
             if end > len(packet) or packet[end - step + 1] != identifier:
                 break
             if result != COMM_SUCCESS:
-                # Each block ends with the CRC of all before: the sound part can be used.
+                # Each block ends with the CRC of everything before, so the valid part is usable.
                 crc = self._handler.updateCRC(crc, packet[checked:end - 2], end - 2 - checked)
                 if crc != packet[end - 2] | packet[end - 1] << 8:
                     break
@@ -256,14 +261,14 @@ class ServoLink:
             answers[identifier] = (packet[end - step], bytes(packet[end - step + 2:end - 2]))
         return answers
 
-    # --- judgement ----------------------------------------------------------------------------
+    # --- results ------------------------------------------------------------------------------
 
     def _open_port(self):
         if self._port is None:
             raise PortLost('not open')
         return self._port
 
-    def _count(self, result):
+    def _count_errors(self, result):
         if result == COMM_RX_TIMEOUT:
             self.statistics.unanswered += 1
             self.late = True
@@ -277,10 +282,10 @@ class ServoLink:
         else:
             self.alerts.discard(identifier)
 
-    def _judge(self, identifier, result, error, what):
+    def _check(self, identifier, result, error, what):
         self.statistics.transactions += 1
         self.late = False
-        self._count(result)
+        self._count_errors(result)
         if result != COMM_SUCCESS:
             text = self._handler.getTxRxResult(result).removeprefix('[TxRxResult] ')
             raise NoAnswer(f'{self.where(identifier)}: {what}: {text}')

@@ -1,4 +1,4 @@
-"""The servo bus at 200 Hz in a thread of its own; goals go out as soon as they come."""
+"""The 200 Hz loop of the servo bus in a thread; new goals are written at once."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ import numpy as np
 from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_state import ServoHealth, ServoReadings
 
-READ_AFTER = 0.001  # [s] cycles begin so long after goals came: these find the bus free
-SLEW = 0.01         # most that a period is stretched for that
-GAIN = 0.1          # of the phase error in each cycle: single late goals hardly count
-CAME = 0.1          # [s] goals older than this tell no phase
+READ_AFTER = 0.001  # [s] start of a cycle after the arrival of goals, which find the bus free
+SLEW = 0.01         # largest relative change of a period by the phase control
+GAIN = 0.1          # of the phase control in each cycle, small against single late goals
+GOALS_KEPT = 0.1    # [s] older goals do not control the phase
 PERIOD = 0.005      # [s]
-STOP_TIMEOUT = 5.0  # [s] for the thread to end; a cycle takes at most 0.02 s
-EVENTS_KEPT = 200   # lines for the log that wait to be taken
+STOP_TIMEOUT = 5.0  # [s] until the thread has ended; a cycle takes at most 0.02 s
+EVENTS_KEPT = 200   # lines for the log
 
 
 class ServoPace:
     """
-    Times of the cycles on a steady clock.
+    Times of the cycles on a monotonic clock.
 
-    A cycle that starts late is made up for by the next; a period that passes without any is
-    missed. Goals come at a multiple of the period or of two; the phase glides to where they do
-    not meet a transaction.
+    A late cycle does not delay the next one, and a period without a cycle is missed. Goals arrive
+    once in one or several periods. The phase of the cycles is controlled so that goals do not
+    arrive during a transaction.
 
     Args:
-        period: of the cycles [s].
+        period: period of the cycles [s].
 
     Attributes:
-        missed: periods that passed without a cycle.
+        missed: number of periods without a cycle.
 
     """
 
@@ -46,23 +46,23 @@ class ServoPace:
         self._goals = float('-inf')
 
     def start(self, now: float):
-        """Let the next cycle be due at ``now`` [s]."""
+        """Set the next cycle to ``now`` [s]."""
         self._due = now
 
     def wait(self, now: float) -> float:
-        """Time left until the next cycle is due [s]."""
+        """Time until the next cycle [s]."""
         return max(0.0, self._due - now)
 
-    def goals_came(self, now: float):
-        """Note goals that came at ``now`` [s]."""
+    def goals_arrived(self, now: float):
+        """Record goals that arrived at ``now`` [s]."""
         self._goals = now
 
     def begin(self, now: float):
-        """Begin a cycle at ``now`` [s]; the next one becomes due."""
+        """Start a cycle at ``now`` [s] and set the time of the next one."""
         passed = int(max(0.0, now - self._due) / self._period)
         self.missed += passed
         self._due += (passed + 1) * self._period
-        if now - self._goals < CAME:
+        if now - self._goals < GOALS_KEPT:
             period = self._period
             late = (self._due - self._goals - READ_AFTER + period / 2) % period - period / 2
             limit = SLEW * period
@@ -71,7 +71,7 @@ class ServoPace:
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """Tilt targets (4,) [rad], when they were published [s], until when they count [steady s]."""
+    """Tilt targets (4,) [rad], publication time [s], expiry on the monotonic clock [s]."""
 
     tilt: np.ndarray
     published: float
@@ -82,22 +82,22 @@ class ServoLoop:
     """
     Runs a bus: goals, feedback and upkeep in each cycle.
 
-    Never two transactions at a time: whoever has goals writes them where the bus is free, and
-    leaves them to the one who uses it otherwise, who writes them after its present transaction.
+    A lock allows one transaction at a time. :meth:`offer` writes goals in the caller's thread if
+    the bus is free. Otherwise the thread that holds the bus writes them after its transaction.
 
     Args:
-        bus: configured; nobody else calls it while the loop runs, save in :meth:`exclusive`.
-        on_readings: called in the thread with the readings and (4,) bool: valid, and obeying
-            where torque is on.
-        on_written: called with ``Goal.published`` as soon as its last byte was written.
-        clock: steady time [s].
+        bus: configured bus; while the loop runs, other threads use it in :meth:`exclusive` only.
+        on_readings: called in the thread with the readings and (4,) bool: whether a reading is
+            valid and, with torque on, the servo obeys.
+        on_written: called with ``Goal.published`` after the goals were written.
+        clock: monotonic time [s].
 
     Attributes:
-        cycles: run so far.
-        written: packets of goals sent, repetitions included.
-        stale: goals that were too old when the bus was free.
-        incomplete: cycles in which a servo gave no valid reading.
-        failure: what ended the thread, '' while all is well; torque is off then.
+        cycles: number of cycles.
+        written: number of packets with goals, repetitions included.
+        stale: number of goals that had expired when the bus was free.
+        incomplete: number of cycles without a valid reading of each servo.
+        failure: error that ended the thread, or ''; torque is off then.
 
     """
 
@@ -112,58 +112,58 @@ class ServoLoop:
         self._lock = Lock()
         self._goal: Goal | None = None
         self._fresh = self._wrote = self._stopping = False
-        self._obeyed = [clock()] * 4
+        self._last_obeying = [clock()] * 4
         self._events: deque[str] = deque(maxlen=EVENTS_KEPT)
         self._thread = Thread(target=self._run, name='servo bus', daemon=True)
 
     # --- from other threads -------------------------------------------------------------------
 
     def start(self):
-        """Begin."""
+        """Start the thread."""
         self._pace.start(self._clock())
         self._thread.start()
 
     def stop(self):
-        """End after the present cycle; the bus is the caller's then."""
+        """End the thread after the present cycle; then the caller may use the bus."""
         self._stopping = True
         if self._thread.is_alive():
             self._thread.join(STOP_TIMEOUT)
 
     def offer(self, goal: Goal):
-        """Write goals now, or as soon as the present transaction is over; the newest count."""
-        self._pace.goals_came(self._clock())
+        """Write goals now, or after the present transaction; newer goals replace older ones."""
+        self._pace.goals_arrived(self._clock())
         self._goal = goal
         self._fresh = True
-        self._hand_over()
+        self._write_pending()
 
     @contextmanager
     def exclusive(self):
-        """Keep the bus to oneself for longer; the time does not count as missed cycles."""
+        """Context with the bus for the caller alone; its time does not count as missed cycles."""
         with self._lock:
             try:
                 yield self._bus
             finally:
                 now = self._clock()
-                self._obeyed = [now] * len(self._obeyed)
+                self._last_obeying = [now] * len(self._last_obeying)
                 self._pace.start(now)
-        self._hand_over()
+        self._write_pending()
 
     @property
     def missed(self) -> int:
-        """Periods that passed without a cycle."""
+        """Number of periods without a cycle."""
         return self._pace.missed
 
     def health(self) -> list[ServoHealth]:
-        """What is known about each servo."""
+        """Last known health of each servo."""
         with self._lock:
             return self._bus.health()
 
     def lost(self, patience: float) -> str:
-        """Say which servos have not obeyed for so long [s], and why; '' when all do."""
+        """Servos that have not obeyed for ``patience`` [s], with reasons; '' if there is none."""
         if self.failure:
             return self.failure
         limit = self._clock() - patience
-        gone = [k for k, seen in enumerate(self._obeyed) if seen < limit]
+        gone = [k for k, seen in enumerate(self._last_obeying) if seen < limit]
         if not gone:
             return ''
         if not self._bus.connected:
@@ -173,7 +173,7 @@ class ServoLoop:
                          for k in gone)
 
     def take_events(self) -> list[str]:
-        """Lines for the log since the last call."""
+        """Return the lines for the log since the last call."""
         events = []
         while self._events:
             events.append(self._events.popleft())
@@ -188,15 +188,15 @@ class ServoLoop:
                 with self._lock:
                     if not self._stopping:
                         self._cycle()
-                self._hand_over()
-        except Exception as error:  # a mistake in the code must not leave torque on
+                self._write_pending()
+        except Exception as error:  # also after a programming error torque must go off
             self.failure = f'the bus thread ended: {type(error).__name__}: {error}'
             self._events.append(self.failure)
             with self._lock:
                 self._bus.close()
 
     def _cycle(self):
-        """Goals, feedback, upkeep; the bus is ours."""
+        """Goals, feedback and upkeep, with the lock held."""
         self._pace.begin(self._clock())
         self.cycles += 1
         self._write()
@@ -212,13 +212,13 @@ class ServoLoop:
         self._events.extend(self._bus.take_events())
         now = self._clock()
         if obeying.all():
-            self._obeyed = [now] * len(self._obeyed)
+            self._last_obeying = [now] * len(self._last_obeying)
         else:
-            self._obeyed = [now if obeys else seen
-                            for obeys, seen in zip(obeying, self._obeyed, strict=True)]
+            self._last_obeying = [now if obeys else seen
+                            for obeys, seen in zip(obeying, self._last_obeying, strict=True)]
 
-    def _hand_over(self):
-        """Write what came while the bus was busy; whoever has the bus now does it otherwise."""
+    def _write_pending(self):
+        """Write new goals if the bus is free; otherwise the holder of the lock does it later."""
         while self._fresh and self._lock.acquire(blocking=False):
             try:
                 self._write_fresh()
@@ -226,7 +226,7 @@ class ServoLoop:
                 self._lock.release()
 
     def _write(self):
-        """Write new goals, or the last ones again where a whole period brought none."""
+        """Write new goals, or repeat the last ones if a whole period brought none."""
         if self._fresh:
             self._write_fresh()
         elif self._goal is not None and not self._wrote and self._clock() <= self._goal.expires:

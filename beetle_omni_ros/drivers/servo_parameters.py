@@ -1,4 +1,4 @@
-"""What describes the servo bus; read from params/servo_bus.yaml."""
+"""Parameters of the servo bus; read from params/servo_bus.yaml."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 
 @dataclass(frozen=True, kw_only=True)
 class ServoGains:
-    """Gains of the servo's own position controller, in its table's numbers."""
+    """Gains of the servo's position controller, in units of its control table."""
 
     proportional: int = parameter(900, doc='Position P Gain', low=0, high=16383)
     integral: int = parameter(0, doc='Position I Gain', low=0, high=16383)
@@ -26,24 +26,24 @@ class ServoGains:
 
 @dataclass(frozen=True, kw_only=True)
 class ServoTiming:
-    """How long the driver waits for what."""
+    """Periods and time limits of the driver."""
 
-    reply: float = parameter(0.003, doc='wait for an answer, beside its time on the wire',
+    reply: float = parameter(0.003, doc='time limit of an answer, without its time on the wire',
                              unit='s', low=0.0002, high=0.1)
-    silent_after: int = parameter(10, doc='missed answers in a row until a servo is left out',
-                                  low=1, high=100)
-    probe_first: float = parameter(0.1, doc='first look whether a silent servo is back',
-                                   unit='s', low=0.005, high=10)
-    probe_longest: float = parameter(2.0, doc='waits between looks double up to this', unit='s',
-                                     low=0.005, high=60)
-    health: float = parameter(0.1, doc='all health registers are read once in this time',
+    silent_after: int = parameter(10, doc='consecutive missing answers after which a servo is '
+                                  'silent and only pinged', low=1, high=100)
+    probe_first: float = parameter(0.1, doc='time until a silent servo is pinged first', unit='s',
+                                   low=0.005, high=10)
+    probe_longest: float = parameter(2.0, doc='largest time between two pings of a silent servo, '
+                                     'to which the time doubles', unit='s', low=0.005, high=60)
+    health: float = parameter(0.1, doc='period in which all health registers are read once',
                               unit='s', low=0.02, high=10)
-    reconnect: float = parameter(0.2, doc='between attempts to open a lost port', unit='s',
-                                 low=0.01, high=10)
-    watchdog: float = parameter(0.1, doc='silence of the bus that stops the servos', unit='s',
-                                low=0.02, high=2.54)
-    reboot: float = parameter(2.0, doc='a servo must be back after a reboot', unit='s', low=0.1,
-                              high=10)
+    reconnect: float = parameter(0.2, doc='time between attempts to open a lost port',
+                                 unit='s', low=0.01, high=10)
+    watchdog: float = parameter(0.1, doc='silence of the bus after which the servos stop',
+                                unit='s', low=0.02, high=2.54)
+    reboot: float = parameter(2.0, doc='time limit of the first answer after a reboot', unit='s',
+                              low=0.1, high=10)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,10 +51,11 @@ class ServoBusParameters:
     """Four servos on one serial port, in the order of gimbal1 to gimbal4."""
 
     port: str = parameter(doc='serial port', read_only=True)
-    baud_rate: int = parameter(1_000_000, doc='that the servos are set to', unit='bit/s',
+    baud_rate: int = parameter(1_000_000, doc='baud rate of the servos', unit='bit/s',
                                low=9600, high=4_000_000, read_only=True)
-    ids: np.ndarray = parameter(doc='of each servo', shape=(4,), low=0, high=252, read_only=True)
-    signs: np.ndarray = parameter(doc='+1 or -1: counts rise with the tilt or fall', shape=(4,),
+    ids: np.ndarray = parameter(doc='ID of each servo', shape=(4,), low=0, high=252,
+                                read_only=True)
+    signs: np.ndarray = parameter(doc='+1 or -1: counts rise or fall with the tilt', shape=(4,),
                                   low=-1, high=1, read_only=True)
     zeros: np.ndarray = parameter(doc='reading at zero tilt', unit='counts', shape=(4,), low=0,
                                   high=4095, read_only=True)
@@ -63,23 +64,24 @@ class ServoBusParameters:
     current_limit: float = parameter(
         0.91, doc='largest current; in current_based_position the torque cap', unit='A',
         low=0.02, high=0.91, read_only=True)
-    torque_per_current: float = parameter(doc='of effort in joint_states', unit='N m/A', low=0,
-                                          high=100)
+    torque_per_current: float = parameter(doc='torque in joint_states for each ampere',
+                                          unit='N m/A', low=0, high=100)
     gains: ServoGains = group(ServoGains, 'position controller')
-    timing: ServoTiming = group(ServoTiming, 'waits')
+    timing: ServoTiming = group(ServoTiming, 'periods and time limits')
     reboot_after_overload: bool = parameter(
         True, doc='restart a servo that shut down while torque was on (not when overheated)')
-    recoveries: int = parameter(3, doc='such restarts of one servo until it stays off', low=0,
+    recoveries: int = parameter(3, doc='restarts of one servo after which it stays off', low=0,
                                 high=1000)
-    guard: bool = parameter(True, doc='a helper process cuts torque should this one be killed',
-                            read_only=True)
-    confirm_tilts: bool = parameter(False, doc='confirmed_tilts tells the turn where it is open')
+    guard: bool = parameter(True, doc='a second process switches the torque off if the driver is '
+                            'killed', read_only=True)
+    confirm_tilts: bool = parameter(False, doc='use confirmed_tilts if the turn of a joint is '
+                                     'ambiguous')
     confirmed_tilts: np.ndarray = parameter(
-        [0, 0, 0, 0], doc='true tilts as seen by the operator, to half a turn', unit='rad',
+        [0, 0, 0, 0], doc='tilts measured by the operator, correct to half a turn', unit='rad',
         shape=(4,), low=-10, high=10)
 
     def __post_init__(self):
-        """Refuse what no bus can have."""
+        """Check IDs, zeros, signs and baud rate."""
         for name in ('ids', 'zeros'):
             values = getattr(self, name)
             if np.any(values != np.round(values)):

@@ -1,4 +1,4 @@
-"""The SDK's port, without its busy waiting, wall clock and endless writes."""
+"""The port of the DYNAMIXEL SDK, without its busy waits, wall clock and blocking writes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import time
 from dynamixel_sdk import port_handler
 import serial
 
-# [ms] The SDK's default of 16 makes one missing answer cost 34 ms. The adapter must agree:
-# docs/how-to/hardware.md.
+# [ms] With the SDK's default of 16 a missing answer takes 34 ms. The adapter must be set
+# accordingly: docs/how-to/hardware.md.
 port_handler.LATENCY_TIMER = 1
 
 
 class PortLost(OSError):
-    """The serial port does not exist, cannot be opened, or went away."""
+    """The serial port does not exist, cannot be opened, or was unplugged."""
 
 
 class ServoPort(port_handler.PortHandler):
@@ -24,9 +24,9 @@ class ServoPort(port_handler.PortHandler):
     A serial port for the SDK's packet handler.
 
     Args:
-        path: of the device.
-        baud_rate: [bit/s].
-        reply_time: wait for an answer beside its time on the wire [s].
+        path: path of the device.
+        baud_rate: baud rate [bit/s].
+        reply_time: time limit of an answer without its time on the wire [s].
 
     """
 
@@ -37,7 +37,7 @@ class ServoPort(port_handler.PortHandler):
         self.unsent = 0
 
     def setupPort(self, cflag_baud):
-        """Open for this process alone; ask the kernel's driver for low latency."""
+        """Open the port exclusively and set low latency."""
         if self.is_open:
             self.closePort()
         try:
@@ -53,7 +53,7 @@ class ServoPort(port_handler.PortHandler):
         return True
 
     def closePort(self):
-        """Close; never fails."""
+        """Close the port; raises nothing."""
         if self.ser is not None:
             try:
                 self.ser.close()
@@ -62,20 +62,17 @@ class ServoPort(port_handler.PortHandler):
         self.is_open = False
 
     def clearPort(self):
-        """Drop what has arrived."""
+        """Drop received bytes."""
         try:
             termios.tcflush(self.ser.fd, termios.TCIFLUSH)
         except (OSError, termios.error, TypeError) as error:
             raise PortLost(reason(error)) from None
 
     def readPort(self, length):
-        """Wait for bytes, at most until the packet's time is up."""
-        patience = (self.packet_timeout - self.getTimeSinceStart()) / 1000
+        """Wait for bytes, at most until the packet's time limit."""
+        remaining = (self.packet_timeout - self.getTimeSinceStart()) / 1000
         try:
-            if patience <= 0:
-                ready, _, _ = select.select([self.ser.fd], [], [], 0)
-            else:
-                ready, _, _ = select.select([self.ser.fd], [], [], patience)
+            ready, _, _ = select.select([self.ser.fd], [], [], max(0.0, remaining))
             data = os.read(self.ser.fd, length) if ready else b''
         except BlockingIOError:
             return b''
@@ -86,7 +83,7 @@ class ServoPort(port_handler.PortHandler):
         return data
 
     def writePort(self, packet):
-        """Write at once or not at all: a full buffer means that nobody takes the bytes."""
+        """Write without waiting, also if the buffer is full."""
         self.unsent = len(packet)
         try:
             return os.write(self.ser.fd, bytes(packet))
@@ -96,24 +93,24 @@ class ServoPort(port_handler.PortHandler):
             raise PortLost(reason(error)) from None
 
     def getCurrentTime(self):
-        """Milliseconds of a clock that nobody sets."""
+        """Milliseconds of the monotonic clock."""
         return time.monotonic() * 1000
 
     def setPacketTimeout(self, packet_length):
-        """Allow for both packets' time on the wire and one reply time."""
+        """Set the time limit: both packets' time on the wire and one reply time."""
         self.packet_start_time = self.getCurrentTime()
         self.packet_timeout = self.tx_time_per_byte * (self.unsent + packet_length) \
             + self.reply_time * 1000
 
 
 def reason(error: Exception) -> str:
-    """Say in a few words what is wrong with a port and what helps."""
+    """Describe a port's error and its remedy."""
     number = getattr(error, 'errno', None)
     if number is None and error.args and isinstance(error.args[0], int):
         number = error.args[0]
     if isinstance(error, serial.SerialException) and 'exclusively lock' in str(error):
         return 'used by another process; stop that one'
-    hints = {2: 'no such port; is the adapter plugged in, is the udev rule installed?',
+    hints = {2: 'no such port; check the adapter and the udev rule',
              13: 'no permission; add the user to group dialout and log in again',
              16: 'used by another process; stop that one',
              5: 'unplugged', 6: 'unplugged', 19: 'unplugged'}

@@ -1,8 +1,8 @@
 """
-How a servo is brought back while the others go on: one transaction for each step.
+Recovery of a servo while the others continue, with one transaction in each step.
 
-A restarted servo has lost gains, watchdog, torque and turn count. :func:`recovery` is a generator;
-the bus lets it do one step in a tick, so that none is missed.
+A restarted servo has lost gains, watchdog, torque and turn count. :func:`recovery` is a generator,
+which the bus advances by one step in a tick, so that no tick is late.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ from beetle_omni_ros.drivers.servo_setup import volatile_settings, watchdog_coun
 from beetle_omni_ros.drivers.servo_state import Servo
 from beetle_omni_ros.drivers.servo_turns import nearest_turns
 
-FIRST_LOOK = 0.2    # [s] a servo does not answer earlier after a reboot
-NEXT_LOOK = 0.02    # [s]
+FIRST_PING = 0.2    # [s] after a reboot; a servo does not answer earlier
+PING_PERIOD = 0.02  # [s]
 
 
 def recovery(link: ServoLink, parameters: ServoBusParameters, servo: Servo, enabled: bool,
-             forced: bool, clock: Callable[[], float], say: Callable[[str], None]
+             forced: bool, clock: Callable[[], float], log: Callable[[str], None]
              ) -> Iterator[None]:
     """
-    Find out what happened to a servo and bring it back.
+    Read the state of a servo and recover it.
 
     Args:
         link: the bus.
-        parameters: the settings to restore.
-        servo: the driver's memory of it; turns and torque are updated.
-        enabled: whether it should have torque in the end.
-        forced: restart it in any case.
-        clock: steady time [s].
-        say: takes a line for the log.
+        parameters: settings to restore.
+        servo: state of the servo; turns and torque are updated.
+        enabled: whether it has torque at the end.
+        forced: whether to restart it in any case.
+        clock: monotonic time [s].
+        log: adds a line to the log.
 
     Yields:
-        after each transaction, or while waiting.
+        after each transaction, and while waiting.
 
     Raises:
-        ServoBusError, PortLost: given up; the bus may start anew.
+        ServoBusError, PortLost: the recovery failed; another one may be started.
 
     """
     where = f'{servo.name} ({link.where(servo.identifier)})'
@@ -52,14 +52,14 @@ def recovery(link: ServoLink, parameters: ServoBusParameters, servo: Servo, enab
     if (servo.error and not servo.torque) or forced:
         if not forced and not _may_restart(parameters, servo, enabled):
             causes = ', '.join(registers.hardware_errors(servo.error))
-            say(f'{where}: shut down ({causes}); it stays off until it is rebooted')
-            servo.resting = True
+            log(f'{where}: shut down ({causes}); it stays off until it is rebooted')
+            servo.kept_off = True
             return
         servo.recoveries += 1
-        servo.resting = False
-        say(f'{where}: restarting it')
+        servo.kept_off = False
+        log(f'{where}: restarting it')
         link.reboot(servo.identifier)
-        servo.silent = True  # the others need not wait for it
+        servo.silent = True  # so that reads of the others do not wait for it
         yield from _boot(link, parameters, servo, clock)
         servo.error = link.read(servo.identifier, registers.HARDWARE_ERROR)
         yield
@@ -74,9 +74,9 @@ def recovery(link: ServoLink, parameters: ServoBusParameters, servo: Servo, enab
     servo.torque = False
     if not enabled:
         servo.turns_known = False
-        say(f'{where}: is back, without torque')
+        log(f'{where}: is back, without torque')
         return
-    # The goals of the running loop reach it too, in the frame of the new turn count.
+    # The goals of the running loop also use the new turn count.
     link.write(servo.identifier, registers.GOAL_POSITION, counts, attempts=1)
     yield
     link.write(servo.identifier, registers.WATCHDOG, watchdog_counts(parameters), attempts=1)
@@ -84,7 +84,7 @@ def recovery(link: ServoLink, parameters: ServoBusParameters, servo: Servo, enab
     link.write(servo.identifier, registers.TORQUE_ENABLE, 1, attempts=1)
     servo.torque = True
     servo.watchdog_expired = False
-    say(f'{where}: had restarted, is back at {servo.position:+.2f} rad')
+    log(f'{where}: had restarted, is back at {servo.position:+.2f} rad')
 
 
 def _may_restart(parameters, servo, enabled):
@@ -94,12 +94,12 @@ def _may_restart(parameters, servo, enabled):
 
 
 def _boot(link, parameters, servo, clock):
-    """Wait until it answers again."""
+    """Wait until the servo answers again."""
     start = last = clock()
-    while clock() - start < FIRST_LOOK:
+    while clock() - start < FIRST_PING:
         yield
     while True:
-        if clock() - last >= NEXT_LOOK:
+        if clock() - last >= PING_PERIOD:
             last = clock()
             try:
                 link.ping(servo.identifier)

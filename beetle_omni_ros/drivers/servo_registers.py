@@ -1,8 +1,8 @@
 """
-Control table of the XC330-T181-T as data, with units and the meaning of codes.
+Control table of the XC330-T181-T: registers, units and codes.
 
 Source: emanual.robotis.com/docs/en/dxl/x/xc330-t181 (addresses, sizes, units), .../dxl/protocol2
-(errors). Indirect addressing (168 on) is left out: its place differs between firmware versions.
+(errors). Indirect addresses (168 on) are left out, because they depend on the firmware version.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from math import pi
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """A value in the servo: first address, size [B], whether in two's complement."""
+    """A register: first address, size [B], whether it is in two's complement."""
 
     name: str
     address: int
@@ -22,15 +22,15 @@ class Register:
 
     @property
     def permanent(self) -> bool:
-        """Whether it is kept without power; then it is writable only with torque off."""
+        """Whether it is in EEPROM, kept without power and writable only with torque off."""
         return self.address < 64
 
     def encoded(self, value: int) -> list[int]:
-        """Bytes of a value, as the SDK takes them."""
+        """Bytes of a value, in the form of the SDK."""
         return list(int(value).to_bytes(self.size, 'little', signed=self.signed))
 
     def decoded(self, data) -> int:
-        """Value of bytes; the SDK itself knows no sign."""
+        """Value of bytes; the SDK has no signed values."""
         return int.from_bytes(bytes(data), 'little', signed=self.signed)
 
 
@@ -97,7 +97,7 @@ FIRST_FAST_FIRMWARE = 46    # fast sync read and startup configuration exist fro
 COUNTS_PER_TURN = 4096
 POSITION_UNIT = 2 * pi / COUNTS_PER_TURN  # [rad]
 VELOCITY_UNIT = 0.229 * 2 * pi / 60       # [rad/s] 0.229 rev/min
-CURRENT_UNIT = 0.001        # [A] "about 1 mA", at the supply input
+CURRENT_UNIT = 0.001        # [A] "about 1 mA" in the manual, at the supply input
 VOLTAGE_UNIT = 0.1          # [V]
 WATCHDOG_UNIT = 0.02        # [s]
 WATCHDOG_EXPIRED = 255      # -1 in one byte
@@ -116,7 +116,7 @@ HARDWARE_ERRORS = {
 # Error number of a status packet; bit 7 is the alert that HARDWARE_ERROR explains.
 ALERT = 0x80
 PACKET_ERRORS = {
-    1: 'could not execute it', 2: 'does not know the instruction', 3: 'received a bad CRC',
+    1: 'could not execute it', 2: 'unknown instruction', 3: 'received a bad CRC',
     4: 'value out of range', 5: 'wrong data length', 6: 'value beyond a limit register',
     7: 'no access (unknown or read-only register, or EEPROM while torque is on)'}
 

@@ -1,4 +1,4 @@
-"""Bring-up of the bus: who is there, is it the right servo, and are its settings ours."""
+"""Search, examination and configuration of servos."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from beetle_omni_ros.drivers.servo_port import PortLost
 from beetle_omni_ros.drivers.servo_registers import Register
 from beetle_omni_ros.drivers.servo_turns import TURN
 
-# A servo that has restarted since it was configured has its default of 1200 here. The register
-# acts in velocity mode alone.
+# A value that only a configured servo has: a restart sets the register to its default, 1200. The
+# register has an effect only in velocity mode.
 MARK = (registers.VELOCITY_I, 1201)
 
 
 @dataclass(frozen=True, slots=True)
 class ServoFinding:
     """
-    What :func:`check` found about one servo.
+    State of one servo; None for values that could not be read.
 
     Attributes:
-        problem: '' when it is fit for use.
-        remedy: what to do about the problem.
+        problem: problem that prevents its use, or ''.
+        remedy: remedy of the problem, or ''.
 
     """
 
@@ -42,12 +42,12 @@ class ServoFinding:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there is no problem."""
         return not self.problem
 
 
 def permanent_settings(parameters: ServoBusParameters) -> list[tuple[Register, int]]:
-    """Settings that the servo keeps without power, the mode first: it resets the gains."""
+    """EEPROM settings; the mode is first, because it resets the gains."""
     amperes = round(parameters.current_limit / registers.CURRENT_UNIT)
     return [(registers.OPERATING_MODE, registers.MODE_CODES[parameters.mode]),
             (registers.DRIVE_MODE, 0), (registers.HOMING_OFFSET, 0),
@@ -55,7 +55,7 @@ def permanent_settings(parameters: ServoBusParameters) -> list[tuple[Register, i
 
 
 def volatile_settings(parameters: ServoBusParameters) -> list[tuple[Register, int]]:
-    """Settings that a restart of the servo loses; torque and watchdog come later."""
+    """RAM settings, lost by a restart, except torque and watchdog."""
     gains = parameters.gains
     settings = [MARK, (registers.STATUS_LEVEL, 2),
                 (registers.POSITION_P, gains.proportional),
@@ -71,24 +71,24 @@ def volatile_settings(parameters: ServoBusParameters) -> list[tuple[Register, in
 
 
 def watchdog_counts(parameters: ServoBusParameters) -> int:
-    """Bus Watchdog (98) for the wanted time."""
+    """Value of Bus Watchdog (98) for the watchdog time in the parameters."""
     return max(1, min(127, round(parameters.timing.watchdog / registers.WATCHDOG_UNIT)))
 
 
 def is_marked(link: ServoLink, identifier: int) -> bool:
-    """Tell whether a servo still runs as it was configured: then it has counted every turn."""
+    """Whether a servo has not restarted since it was configured, so that its turns are valid."""
     register, value = MARK
     return retried(link.read, identifier, register) == value
 
 
 def examine(link: ServoLink, servo) -> ServoFinding:
-    """Look at one servo without changing it."""
+    """Read the state of one servo without changing it."""
     place = {'name': servo.name, 'identifier': servo.identifier}
     try:
         model = retried(link.ping, servo.identifier)
     except NoAnswer:
         return ServoFinding(**place, problem='does not answer',
-                            remedy='check power, cable and id; is another baud rate set?')
+                            remedy='check power, cable, id and baud rate')
     except Refused as error:
         return ServoFinding(**place, problem=str(error), remedy='reboot it')
     wanted = (registers.FIRMWARE, registers.INPUT_VOLTAGE, registers.TEMPERATURE,
@@ -98,7 +98,7 @@ def examine(link: ServoLink, servo) -> ServoFinding:
             retried(link.read, servo.identifier, register) for register in wanted)
     except ServoBusError as error:
         return ServoFinding(**place, model=model, problem=str(error),
-                            remedy='check its cable; more than one servo with this id?')
+                            remedy='check its cable, and whether two servos have this id')
     place |= {'model': model, 'firmware': firmware, 'baud_rate': link.baud_rate,
               'voltage': voltage * registers.VOLTAGE_UNIT, 'temperature': float(temperature),
               'position': servo.angle(position), 'errors': registers.hardware_errors(error)}
@@ -109,20 +109,20 @@ def examine(link: ServoLink, servo) -> ServoFinding:
         return ServoFinding(**place, problem=', '.join(registers.hardware_errors(error)),
                             remedy='remove the cause, then reboot the servo')
     if shadow <= 252:
-        return ServoFinding(**place, problem=f'also listens to id {shadow}',
+        return ServoFinding(**place, problem=f'also has the secondary id {shadow}',
                             remedy='set Secondary(Shadow) ID(12) to 255')
     return ServoFinding(**place)
 
 
 def configure(link: ServoLink, parameters: ServoBusParameters, servos) -> bool:
     """
-    Take the torque off and make every setting ours; EEPROM is written only where it differs.
+    Switch the torque off and write all settings, EEPROM only where it differs.
 
     Returns:
-        whether all can do fast sync read.
+        whether all servos support fast sync read.
 
     Raises:
-        ServoBusError: one line for all servos that are missing, wrong or refuse.
+        ServoBusError: servos are missing or wrong, or refuse a setting; the message names all.
 
     """
     problems, firmware = [], []
@@ -162,7 +162,7 @@ def _apply(link, parameters, identifier, firmware):
 
 
 def locate(link: ServoLink, parameters: ServoBusParameters, servos):
-    """Read where the servos are; restarted ones get their settings and lose their turns."""
+    """Read all positions; restarted servos get their RAM settings and have unknown turns."""
     for servo in servos:
         if not is_marked(link, servo.identifier):
             servo.turns_known = False
@@ -173,8 +173,8 @@ def locate(link: ServoLink, parameters: ServoBusParameters, servos):
         servo.position = servo.angle(counts) + TURN * servo.turns
 
 
-def power(link: ServoLink, parameters: ServoBusParameters, servo):
-    """Give a servo torque at its place; its watchdog runs from then on."""
+def enable_torque(link: ServoLink, parameters: ServoBusParameters, servo):
+    """Switch the torque on with the present position as goal, and start the watchdog."""
     for register, value in ((registers.WATCHDOG, 0),
                             (registers.GOAL_POSITION, servo.counts(servo.position)),
                             (registers.WATCHDOG, watchdog_counts(parameters)),
@@ -186,14 +186,14 @@ def power(link: ServoLink, parameters: ServoBusParameters, servo):
 def scan(parameters: ServoBusParameters,
          others: Iterable[int] = (1,)) -> list[tuple[int, int, int]]:
     """
-    Look for servos at every baud rate that the port can do.
+    Search servos at every baud rate of the port.
 
     Args:
-        parameters: of the bus; its ids are looked for.
-        others: further ids; by default a new servo's.
+        parameters: parameters of the bus; its IDs are searched.
+        others: further IDs to search; by default that of a new servo.
 
     Returns:
-        (baud rate, ID, model) of each that answers.
+        (baud rate, ID, model) of each servo that answers.
 
     Raises:
         PortLost: the port cannot be opened.
@@ -205,7 +205,7 @@ def scan(parameters: ServoBusParameters,
         try:
             link.open()
         except PortLost as error:
-            failure = error     # not every adapter can do every rate
+            failure = error     # some adapters lack some baud rates
             continue
         opened = True
         try:
@@ -222,7 +222,7 @@ def scan(parameters: ServoBusParameters,
 
 
 def retried(call, *arguments, attempts: int = 3):
-    """Repeat a read whose answer went missing."""
+    """Call a read, and repeat it if there is no answer."""
     for attempt in range(attempts):
         try:
             return call(*arguments)

@@ -1,4 +1,4 @@
-"""What the driver knows about each servo, and what it hands out."""
+"""State of each servo, feedback and health."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from beetle_omni_ros.drivers import servo_registers as registers
 from beetle_omni_ros.drivers.servo_turns import nearest_turns, TURN
 from beetle_omni_ros.robot.parameters import JOINT_NAMES
 
-# Current, velocity and position are neighbours: one read.
+# Current, velocity and position have consecutive addresses.
 FEEDBACK = registers.PRESENT_CURRENT.address
 FEEDBACK_SIZE = 10
 _FEEDBACK = struct.Struct('<hii')
-FOLLOWED = 0.2  # [s] half a turn takes longer: 12 rad/s is the servo's fastest
+TRACKED = 0.2   # [s] half a turn takes longer at the servo's largest speed, 12 rad/s
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,12 +24,12 @@ class ServoReadings:
     Feedback of the four servos.
 
     Attributes:
-        stamp: when they were asked, by the bus's clock [s].
-        position: (4,) tilt [rad], unwrapped; the last known where not valid, NaN before the first.
+        stamp: time of the request on the bus's clock [s].
+        position: (4,) tilt [rad], unwrapped; the last reading if not valid, NaN before the first.
         velocity: (4,) [rad/s].
-        current: (4,) [A], in the sense of the tilt.
-        effort: (4,) rough torque [N m].
-        valid: (4,) bool: read in this call.
+        current: (4,) [A], with the sign of the tilt.
+        effort: (4,) torque estimated from the current [N m].
+        valid: (4,) bool: whether a servo was read in this call.
 
     """
 
@@ -44,19 +44,19 @@ class ServoReadings:
 @dataclass(frozen=True, slots=True)
 class ServoHealth:
     """
-    What is known about one servo.
+    Last known health of one servo.
 
     Attributes:
-        name: of the joint.
-        identifier: on the bus.
+        name: name of the joint.
+        identifier: ID on the bus.
         responding: whether it answers.
-        torque: whether its motor is powered; None before the first look.
+        torque: whether its motor is powered; None if unknown.
         errors: hardware errors in words.
         watchdog_expired: whether the bus watchdog has stopped it.
-        recovering: whether the driver is bringing it back.
-        voltage: at its input [V], NaN before the first look.
-        temperature: [deg C], NaN before the first look.
-        message: what is wrong and what helps; '' when all is well.
+        recovering: whether its recovery is running.
+        voltage: input voltage [V], NaN if unknown.
+        temperature: [deg C], NaN if unknown.
+        message: problem and remedy; '' without a problem.
 
     """
 
@@ -75,15 +75,15 @@ class ServoHealth:
 @dataclass(slots=True)
 class Servo:
     """
-    The driver's memory of one servo.
+    State of one servo in the driver.
 
     Attributes:
         turns: turns to add to its reading.
         turns_known: whether ``turns`` is certain.
-        misses: answers missed in a row.
-        next_probe: when to look for it again while silent [s].
-        resting: it has shut down and is left alone until it is rebooted.
-        taken: time of the last feedback [s].
+        misses: consecutive missing answers.
+        next_probe: time of the next ping while it is silent [s].
+        kept_off: whether it has shut down and stays off until it is rebooted.
+        updated: time of the last feedback [s].
 
     """
 
@@ -106,8 +106,8 @@ class Servo:
     voltage: float = float('nan')
     temperature: float = float('nan')
     recoveries: int = 0
-    resting: bool = False
-    taken: float = float('-inf')
+    kept_off: bool = False
+    updated: float = float('-inf')
 
     def angle(self, counts: int) -> float:
         """Tilt of a reading without added turns [rad]."""
@@ -117,17 +117,17 @@ class Servo:
         """Goal for a tilt [rad], in the servo's present frame."""
         return round(self.zero + self.sign * (tilt - TURN * self.turns) / registers.POSITION_UNIT)
 
-    def take(self, data: bytes, now: float, powered: bool) -> bool:
+    def update(self, data: bytes, now: float, powered: bool) -> bool:
         """
-        Take ten bytes of feedback.
+        Update position, velocity and current from feedback.
 
         Args:
-            data: from the registers.
-            now: steady time [s].
-            powered: whether it has torque, so that no hand moves it between two readings.
+            data: ten bytes of the feedback registers.
+            now: monotonic time [s].
+            powered: whether it has torque, so that it cannot be turned by hand.
 
         Returns:
-            whether the turn count jumped: the servo has restarted since the last feedback.
+            whether the turn count jumped because the servo has restarted.
 
         """
         current, velocity, counts = _FEEDBACK.unpack(data)
@@ -135,18 +135,18 @@ class Servo:
         self.velocity = self.sign * velocity * registers.VELOCITY_UNIT
         angle = self.angle(counts)
         jumped = False
-        if powered or now - self.taken < FOLLOWED:
-            # No servo turns half a turn between two readings. After a pause without torque the
-            # servo's own count holds.
+        if powered or now - self.updated < TRACKED:
+            # A servo cannot move by half a turn between two readings. After a pause without
+            # torque the servo's own count is used.
             turns = nearest_turns(angle, self.position)
             jumped = turns != self.turns
             self.turns = turns
         self.position = angle + TURN * self.turns
-        self.taken, self.misses = now, 0
+        self.updated, self.misses = now, 0
         return jumped
 
     def describe(self, recovering: bool, enabled: bool, where: str) -> ServoHealth:
-        """Build the report for diagnostics."""
+        """Health of the servo, for diagnostics."""
         errors = registers.hardware_errors(self.error)
         message = ''
         if self.silent:
@@ -166,7 +166,7 @@ class Servo:
 
 def readings(servos: list[Servo], stamp: float, answered: set[int],
              torque_per_current: float) -> ServoReadings:
-    """Hand out what the servos last said; ``answered`` are the IDs that did so just now."""
+    """Last feedback of the servos; ``answered`` are the IDs of valid ones."""
     current = np.array([servo.current for servo in servos])
     return ServoReadings(
         stamp, np.array([servo.position for servo in servos]),
@@ -175,6 +175,6 @@ def readings(servos: list[Servo], stamp: float, answered: set[int],
 
 
 def make_servos(parameters) -> list[Servo]:
-    """Build one memory for each joint."""
+    """Initial state of the servo of each joint."""
     return [Servo(name, int(identifier), int(sign), int(zero)) for name, identifier, sign, zero
             in zip(JOINT_NAMES, parameters.ids, parameters.signs, parameters.zeros, strict=True)]

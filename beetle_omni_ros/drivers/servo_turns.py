@@ -1,9 +1,9 @@
 """
-The lost turn count: which angle a reading stands for.
+Ambiguity of the joint angle after the loss of a servo's turn count.
 
-A servo counts turns only while it has power. After power-up or reboot its position is within
-one turn, so that each angle beyond +-(2 pi - travel) has a twin one turn away that the joint can
-reach as well: with +-3.96 rad of travel, readings beyond +-2.32 rad (0.74 pi) are ambiguous.
+A servo counts turns only while it has power. After power-up or reboot its position is within one
+turn. An angle beyond +-(2 pi - travel) then has a second solution, one turn away, within the
+travel. With a travel of +-3.96 rad, readings beyond +-2.32 rad (0.74 pi) are ambiguous.
 """
 
 from __future__ import annotations
@@ -15,32 +15,32 @@ TURN = 2 * pi
 
 
 def candidates(angle: float, travel: float) -> list[float]:
-    """All angles within +-``travel`` [rad] that differ from ``angle`` by whole turns, rising."""
+    """Angles within +-``travel`` [rad] that differ from ``angle`` by whole turns, ascending."""
     first, last = ceil((-travel - angle) / TURN), floor((travel - angle) / TURN)
     return [angle + TURN * turn for turn in range(first, last + 1)]
 
 
 def nearest_turns(angle: float, reference: float) -> int:
-    """How many whole turns to add to ``angle`` [rad] to come nearest to ``reference``."""
+    """Number of whole turns that brings ``angle`` [rad] nearest to ``reference``."""
     return round((reference - angle) / TURN)
 
 
-def certain_limit(travel: float) -> float:
-    """Angle up to which a reading within one turn has one meaning [rad]."""
+def unambiguous_limit(travel: float) -> float:
+    """Angle up to which a reading within one turn is unambiguous [rad]."""
     return TURN - travel if travel > pi else travel
 
 
 def settle(servos: Sequence, travel: float, confirmed: Sequence[float] | None) -> str:
     """
-    Make sure of the turn count of each servo that has none.
+    Determine the unknown turn counts of servos.
 
     Args:
-        servos: with ``position`` [rad] and ``turns``, which are set with ``turns_known``.
-        travel: of the joints to each side [rad].
-        confirmed: true angles to half a turn as the operator sees them [rad], or None.
+        servos: servos whose ``position`` [rad], ``turns`` and ``turns_known`` are updated.
+        travel: travel of the joints to each side [rad].
+        confirmed: angles measured by the operator, correct to half a turn [rad], or None.
 
     Returns:
-        '' or, for the operator, which servos are in doubt.
+        '' or a message about the ambiguous servos.
 
     """
     doubts = []

@@ -10,7 +10,7 @@ import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.signals import SignalHandlerOptions
 
-from beetle_omni_ros.bringup.heard import BRIDGES, Heard, Status, Stream
+from beetle_omni_ros.bringup.graph import BRIDGES, ObservedGraph, Status, Stream
 from beetle_omni_ros.messages.conversions import seconds as seconds_of
 from beetle_omni_ros.messages.topics import LOG, TOPICS
 from beetle_omni_ros.messages.values import MessageError
@@ -23,7 +23,7 @@ STREAMS = {'mocap/pose': 'position', 'imu/data_raw': 'specific_force',
            'joint_states': 'position', 'battery_state': 'voltage'}
 
 
-def listen(seconds: float, namespace: str = '', discovery: str | None = None) -> Heard:
+def listen(seconds: float, namespace: str = '', discovery: str | None = None) -> ObservedGraph:
     """
     Join the graph and record its messages.
 
@@ -41,18 +41,19 @@ def listen(seconds: float, namespace: str = '', discovery: str | None = None) ->
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = _node(context, namespace)
-        heard = Heard(context.get_domain_id(), seconds, {topic: Stream() for topic in STREAMS})
-        _subscribe(node, heard)
+        graph = ObservedGraph(context.get_domain_id(), seconds,
+                              {topic: Stream() for topic in STREAMS})
+        _subscribe(node, graph)
         executor = runner.make_executor(context)
         executor.add_node(node)
         deadline = time.monotonic() + seconds
         while (left := deadline - time.monotonic()) > 0:
             executor.spin_once(timeout_sec=left)
-        _look_at_publishers(node, heard)
+        _look_at_publishers(node, graph)
         node.destroy_node()
     finally:
         context.try_shutdown()
-    return heard
+    return graph
 
 
 def _node(context, namespace):
@@ -62,15 +63,15 @@ def _node(context, namespace):
         raise ParameterError(f"namespace '{namespace}': {str(error).splitlines()[0]}") from None
 
 
-def _subscribe(node, heard):
+def _subscribe(node, graph):
     for topic, part in STREAMS.items():
         node.create_subscription(
             wire.message_class(TOPICS[topic].type), topic,
-            partial(_take, node, heard.streams[topic], TOPICS[topic].take, part),
+            partial(_take, node, graph.streams[topic], TOPICS[topic].take, part),
             wire.profile(LOG))
     for bridge in BRIDGES:
-        wire.subscribe(node, f'{bridge}/state', partial(heard.states.__setitem__, bridge))
-    wire.subscribe(node, 'diagnostics', partial(_take_diagnostics, heard))
+        wire.subscribe(node, f'{bridge}/state', partial(graph.states.__setitem__, bridge))
+    wire.subscribe(node, 'diagnostics', partial(_take_diagnostics, graph))
 
 
 def _take(node, stream, take, part, message):
@@ -78,22 +79,22 @@ def _take(node, stream, take, part, message):
     stream.arrivals.append(time.monotonic())
     stream.ages.append(now - seconds_of(message.header.stamp))
     try:
-        stream.sizes.append(float(np.linalg.norm(getattr(take(message), part))))
+        stream.norms.append(float(np.linalg.norm(getattr(take(message), part))))
     except MessageError as error:
         stream.refused[str(error)] += 1
 
 
-def _take_diagnostics(heard, statuses):
+def _take_diagnostics(graph, statuses):
     for status in statuses:
-        heard.diagnostics[status.name] = Status(status.level, status.message, status.values)
+        graph.diagnostics[status.name] = Status(status.level, status.message, status.values)
 
 
-def _look_at_publishers(node, heard):
+def _look_at_publishers(node, graph):
     """Record the publishers of the topics, and other message types under their names."""
     for topic in STREAMS:
         wanted = TOPICS[topic].type
         for publisher in node.get_publishers_info_by_topic(topic):
             if publisher.topic_type == wanted:
-                heard.streams[topic].publishers.append(publisher.node_name)
-            elif publisher.topic_type not in heard.streams[topic].other_types:
-                heard.streams[topic].other_types.append(publisher.topic_type)
+                graph.streams[topic].publishers.append(publisher.node_name)
+            elif publisher.topic_type not in graph.streams[topic].other_types:
+                graph.streams[topic].other_types.append(publisher.topic_type)

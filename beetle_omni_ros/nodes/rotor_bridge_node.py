@@ -56,7 +56,7 @@ class RotorBridgeNode(LifecycleFlightNode):
         self._period = 1 / given.target_rate
         self._board = MotorBoard(given, robot, clock=self.now)
         self._arming = Arming(self._board)
-        self._arming.bar(UNCONFIGURED)
+        self._arming.inhibit(UNCONFIGURED)
         self._stream = TargetStream(self._period)
         self._command = None
         # _absent: why the port is closed, '' if not yet known; None: open, or not configured.
@@ -80,19 +80,19 @@ class RotorBridgeNode(LifecycleFlightNode):
     def configure(self):
         """Open the port, now or as soon as it exists; then battery and rotors are published."""
         self._absent, self._next_try = '', time.monotonic()
-        self._arming.bar(INACTIVE)
+        self._arming.inhibit(INACTIVE)
 
     def activate(self):
         """Permit arming, which the supervisor requests."""
-        self._arming.bar('')
+        self._arming.inhibit('')
 
     def deactivate(self):
         """Disarm, also in flight."""
-        self._arming.bar(INACTIVE)
+        self._arming.inhibit(INACTIVE)
 
     def release(self):
         """Disarm and close the port."""
-        self._arming.bar(UNCONFIGURED)
+        self._arming.inhibit(UNCONFIGURED)
         self._absent = None
         self._board.close()
 

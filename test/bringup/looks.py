@@ -45,13 +45,13 @@ def levels(found, *, without='ok'):
     return {item: finding.level for item, finding in found.items() if finding.level != without}
 
 
-def servos(port, heard=None, places=None, **changes):
-    """Look at a bus; item -> finding. ``places``: sys_root, proc_root."""
+def servos(port, graph=None, **changes):
+    """Check a bus; item -> finding."""
     parameters = replace(ServoBusParameters.load(), port=port, timing=PATIENT, **changes)
-    return named(check_servos(parameters, ROBOT.joints, LIMITS, heard, **(places or {})))
+    return named(check_servos(parameters, ROBOT.joints, LIMITS, graph))
 
 
-def board(port, heard=None, seconds=1.2, places=None, **changes):
-    """Look at a motor board; item -> finding."""
+def board(port, graph=None, seconds=1.2, **changes):
+    """Check a motor board; item -> finding."""
     parameters = replace(MotorBoardParameters.load(), port=port, **changes)
-    return named(check_board(parameters, ROBOT, LIMITS, seconds, heard, **(places or {})))
+    return named(check_board(parameters, ROBOT, LIMITS, seconds, graph))

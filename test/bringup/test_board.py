@@ -74,7 +74,7 @@ def test_losses_are_told_each_way(emulated):
 def test_a_firmware_of_another_contract_is_refused(emulated, monkeypatch):
     monkeypatch.setattr(motor_board_messages, 'CONTRACT_VERSION', 2)
     found = board_with(emulated, {'board firmware': 'fail'})
-    assert 'contract 1, this driver speaks 2' in found['board firmware'].found
+    assert 'contract 1, this driver uses 2' in found['board firmware'].found
 
 
 def test_other_numbers_of_the_computer_are_noticed(emulated):

@@ -15,7 +15,7 @@ from servo_bench import JOINTS
 from beetle_omni_ros import cli
 from beetle_omni_ros.bringup import servos
 from beetle_omni_ros.bringup.command import run_check
-from beetle_omni_ros.bringup.heard import Heard, Status
+from beetle_omni_ros.bringup.graph import ObservedGraph, Status
 from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 from beetle_omni_ros.sim.emulated.servo_bus import EmulatedServoBus
 
@@ -58,7 +58,7 @@ def test_a_good_robot_ends_with_status_0(robot, tmp_path, capsys):
     assert set(result['findings'][0]) == {'part', 'item', 'level', 'found', 'remedy', 'values'}
     assert result['meta']['skipped'] == ['ros']
     out = capsys.readouterr().out
-    assert 'gimbal4' in out and 'not looked at: ros' in out and '0 failed' in out
+    assert 'gimbal4' in out and 'not checked: ros' in out and '0 failed' in out
 
 
 @pytest.mark.real_time
@@ -92,7 +92,7 @@ def test_without_ros_the_rest_is_looked_at(robot, tmp_path, monkeypatch):
 @pytest.mark.real_time
 def test_a_port_that_the_bridge_has_is_not_opened(robot, tmp_path):
     bus, _, _ = robot
-    heard = Heard(0, 1.0, {}, {'joint_bridge': 'ready'},
+    graph = ObservedGraph(0, 1.0, {}, {'joint_bridge': 'ready'},
                   {'joint_bridge_node: gimbal2': Status(2, 'overload', {})})
     path, told = tmp_path / 'result.json', []
     bus.network.handle = lambda packet, *_: told.append(packet) or []
@@ -101,7 +101,7 @@ def test_a_port_that_the_bridge_has_is_not_opened(robot, tmp_path):
                               stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
         bridge.stdout.readline()
-        status = run_check(listen=lambda _: heard, servo_port=bus.port, skip=('board',),
+        status = run_check(listen=lambda _: graph, servo_port=bus.port, skip=('board',),
                            json_path=path)
     finally:
         bridge.communicate()

@@ -51,7 +51,7 @@ def test_an_absent_port_names_those_that_are_there(tmp_path, sys_root):
     assert finding.level == 'fail' and '/dev/beetle_servos: no such port' in finding.found
     assert '/dev/ttyUSB0: FTDI USB <-> Serial (0403:6014, serial FT4THV5O)' in finding.remedy
     finding = port_finding('port', '/dev/beetle_servos', tmp_path / 'empty')
-    assert 'no USB serial port is there' in finding.remedy
+    assert 'no USB serial port is present' in finding.remedy
 
 
 def test_a_link_to_nothing_and_a_file_are_no_ports(tmp_path):

@@ -1,11 +1,11 @@
-"""What was heard of ROS is judged: rates, ages, clocks, units, twins, bridges."""
+"""Observations of ROS are judged: rates, ages, clocks, units, twins, bridges."""
 
 from looks import levels, LIMITS, named, ROBOT
 import numpy as np
 import pytest
 
 from beetle_omni_ros.bringup.finding import bridge_findings, Finding
-from beetle_omni_ros.bringup.heard import Heard, Status, Stream
+from beetle_omni_ros.bringup.graph import ObservedGraph, Status, Stream
 from beetle_omni_ros.bringup.topics import check_topics
 
 
@@ -14,19 +14,19 @@ def stream(rate, age, jitter=0.001, size=9.81, seconds=3.0, seed=0):
     rng = np.random.default_rng(seed)
     arrivals = 100.0 + np.arange(0, seconds, 1 / rate)
     return Stream(arrivals=list(arrivals), ages=list(age + jitter * rng.random(len(arrivals))),
-                  sizes=list(size + 0.01 * rng.normal(size=len(arrivals))), publishers=['driver'])
+                  norms=list(size + 0.01 * rng.normal(size=len(arrivals))), publishers=['driver'])
 
 
-def heard(**streams):
+def graph(**streams):
     """Both sensors as they should be, or replaced by name."""
     made = {'mocap': stream(100, 0.010), 'imu': stream(200, 0.001)} | streams
     names = {'mocap': 'mocap/pose', 'imu': 'imu/data_raw', 'joints': 'joint_states',
              'battery': 'battery_state'}
-    return Heard(5, 3.0, {names[key]: value for key, value in made.items()})
+    return ObservedGraph(5, 3.0, {names[key]: value for key, value in made.items()})
 
 
 def judged(**streams):
-    return named(check_topics(heard(**streams), LIMITS, ROBOT.gravity))
+    return named(check_topics(graph(**streams), LIMITS, ROBOT.gravity))
 
 
 def test_good_sensors_without_bridges_are_well():
@@ -91,7 +91,7 @@ def test_units_twins_frozen_and_broken_messages_are_told():
     twins.publishers = ['sim_node', 'vrpn']
     assert levels(judged(mocap=twins)) == {'mocap/pose publishers': 'fail'}
     frozen = stream(100, 0.01)
-    frozen.sizes = [1.0] * len(frozen.sizes)
+    frozen.norms = [1.0] * len(frozen.norms)
     assert levels(judged(mocap=frozen)) == {'mocap/pose content': 'fail'}
     broken = stream(200, 0.001)
     broken.refused['specific force is not finite'] = 7
@@ -100,8 +100,8 @@ def test_units_twins_frozen_and_broken_messages_are_told():
 
 
 def running(state='ready', level=0):
-    """What is heard of the joint bridge and of its topic."""
-    made = heard(joints=stream(200, 0.002))
+    """Observations of the joint bridge and of its topic."""
+    made = graph(joints=stream(200, 0.002))
     made.states['joint_bridge'] = state
     made.diagnostics = {
         'joint_bridge_node: gimbal1': Status(level, 'overload', {'voltage': '11.9'}),
@@ -128,7 +128,7 @@ def test_a_port_that_a_bridge_has_is_left_to_it():
     assert 'joint_bridge_node reports' in port.found
     told = named(check_topics(running(), LIMITS, ROBOT.gravity, frozenset({'joint_bridge'})))
     assert 'joint_bridge state' not in told
-    for nobody in (None, heard()):
+    for nobody in (None, graph()):
         assert bridge_findings(busy, 'joint_bridge', nobody) == [busy]
     absent = Finding('servo port', 'fail', 'p: no such port', 'plug it in')
     assert bridge_findings(absent, 'joint_bridge', running()) == [absent]

@@ -49,7 +49,7 @@ def test_good_frames_with_any_content_do_no_harm(payloads):
 
 def test_only_answers_to_questions_asked_count_and_once():
     board = watch()
-    question = board.time_question()
+    question = board.timesync_request()
     now = time.monotonic()
     board.message(received(emulated.TIMESYNC, (5 * 10**9, question.ts1 + 1)), now)
     assert not board.clock.known

@@ -103,7 +103,7 @@ def test_a_lasting_overload_leaves_the_servo_off_with_a_reason_and_the_service_b
         emulated.faults.overload = {2}
         _, reports = until(lambda _, reports: not reports[1].recovering
                            and 'shut down (overload)' in reports[1].message
-                           and bus._servos[1].resting, bus, GOAL)
+                           and bus._servos[1].kept_off, bus, GOAL)
         assert 'reboot' in reports[1].message
         assert bus._servos[1].recoveries == 2
         assert not emulated.torque_enabled[1] and emulated.torque_enabled[[0, 2, 3]].all()

@@ -192,7 +192,7 @@ def run(pace, now, cycles, goals=None, late=lambda k: 0.0):
     for k in range(cycles):
         due = now + pace.wait(now)
         while goals and goals[0] <= due:
-            pace.goals_came(goals.pop(0))
+            pace.goals_arrived(goals.pop(0))
         now = due + late(k)
         pace.begin(now)
         began.append(now)

@@ -10,7 +10,7 @@ import pytest
 from servo_bench import arrived, bench, COUNT, JOINTS, running, until
 
 from beetle_omni_ros.drivers.servo_link import ServoBusError
-from beetle_omni_ros.drivers.servo_turns import candidates, certain_limit, nearest_turns
+from beetle_omni_ros.drivers.servo_turns import candidates, nearest_turns, unambiguous_limit
 
 TRAVEL = JOINTS.position_limit
 
@@ -28,7 +28,7 @@ def test_the_true_angle_is_always_among_the_candidates(angle):
     options = candidates(reading, TRAVEL)
     assert any(option == pytest.approx(angle, abs=1e-9) for option in options)
     assert all(abs(option) <= TRAVEL for option in options)
-    assert (len(options) == 1) == (abs(reading) < certain_limit(TRAVEL))
+    assert (len(options) == 1) == (abs(reading) < unambiguous_limit(TRAVEL))
 
 
 @given(st.floats(-4, 4), st.integers(-2, 2), st.floats(-3, 3))

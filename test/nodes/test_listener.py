@@ -89,20 +89,20 @@ class Drivers:
 def test_what_real_publishers_send_is_heard_and_judged(ros_domain):
     with Drivers(ros_domain):
         for _ in range(5):      # discovery takes its time on a busy machine
-            heard = listen(3.0)
-            if heard.streams['imu/data_raw'].rate and heard.of_bridge('joint_bridge'):
+            graph = listen(3.0)
+            if graph.streams['imu/data_raw'].rate and graph.of_bridge('joint_bridge'):
                 break
-    assert heard.domain == ros_domain
-    imu, mocap = heard.streams['imu/data_raw'], heard.streams['mocap/pose']
+    assert graph.domain == ros_domain
+    imu, mocap = graph.streams['imu/data_raw'], graph.streams['mocap/pose']
     assert imu.rate == pytest.approx(2 * mocap.rate, rel=0.1)
     assert -0.05 <= imu.freshest < 0 <= 0.008 <= mocap.freshest
-    assert np.mean(imu.sizes) == pytest.approx(9.81, abs=0.05)
+    assert np.mean(imu.norms) == pytest.approx(9.81, abs=0.05)
     assert sorted(mocap.publishers) == ['sim_node', 'vrpn'] and imu.publishers == ['vrpn']
-    assert heard.streams['battery_state'].other_types == ['std_msgs/msg/String']
-    assert heard.streams['joint_states'].refused.total() > 1
-    assert heard.states == {'joint_bridge': 'ready'}
+    assert graph.streams['battery_state'].other_types == ['std_msgs/msg/String']
+    assert graph.streams['joint_states'].refused.total() > 1
+    assert graph.states == {'joint_bridge': 'ready'}
     found = {finding.item: finding for finding in check_topics(
-        heard, CheckLimits.load(), RobotParameters.load().gravity)}
+        graph, CheckLimits.load(), RobotParameters.load().gravity)}
     assert {item for item, finding in found.items() if finding.level == 'fail'} >= {
         'imu/data_raw age', 'mocap/pose publishers', 'joint_states content',
         'joint_bridge gimbal2'}
@@ -110,8 +110,8 @@ def test_what_real_publishers_send_is_heard_and_judged(ros_domain):
 
 
 def test_an_empty_graph_and_a_namespace(ros_domain):
-    heard = listen(0.2, 'robot1')
-    assert not heard.runs('joint_bridge') and not heard.streams['mocap/pose'].arrivals
+    graph = listen(0.2, 'robot1')
+    assert not graph.runs('joint_bridge') and not graph.streams['mocap/pose'].arrivals
     with Drivers(ros_domain):
         assert not listen(1.0, 'robot1').streams['imu/data_raw'].arrivals
 

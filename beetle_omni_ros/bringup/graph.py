@@ -1,4 +1,4 @@
-"""What was heard of the ROS graph while listening for some seconds; needs no ROS itself."""
+"""Messages and publishers observed in the ROS graph for some seconds; does not need ROS."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from statistics import median
 
-# Bridge -> device whose port it has.
+# Bridge -> device whose port it opens.
 BRIDGES = {'joint_bridge': 'the servo bus', 'rotor_bridge': 'the motor board'}
 
 
@@ -16,26 +16,25 @@ class Stream:
     Messages of one topic.
 
     Attributes:
-        arrivals: steady times [s].
+        arrivals: arrival times on a monotonic clock [s].
         ages: clock of this computer minus stamp, at arrival [s].
-        sizes: a number for each message that a living sensor never repeats for long: the norm
-            of what was measured.
-        refused: reason -> messages that cannot be used.
-        publishers: names of the nodes that publish it.
-        other_types: types under which others publish it, which nobody here understands.
+        norms: norm of the measured vector of each message, equal only if a sensor is frozen.
+        refused: reason -> number of unusable messages.
+        publishers: names of the publishing nodes.
+        other_types: other message types under which the topic is published.
 
     """
 
     arrivals: list[float] = field(default_factory=list)
     ages: list[float] = field(default_factory=list)
-    sizes: list[float] = field(default_factory=list)
+    norms: list[float] = field(default_factory=list)
     refused: Counter = field(default_factory=Counter)
     publishers: list[str] = field(default_factory=list)
     other_types: list[str] = field(default_factory=list)
 
     @property
     def rate(self) -> float:
-        """Messages a second from the first to the last arrival; 0 with fewer than two."""
+        """Mean rate between first and last arrival [Hz]; 0 with fewer than two messages."""
         if len(self.arrivals) < 2 or self.arrivals[-1] <= self.arrivals[0]:
             return 0.0
         return (len(self.arrivals) - 1) / (self.arrivals[-1] - self.arrivals[0])
@@ -47,7 +46,7 @@ class Stream:
 
     @property
     def freshest(self) -> float:
-        """Smallest age [s]: what is left of it is latency, or clocks that do not agree."""
+        """Smallest age [s]: the latency plus the offset between the clocks."""
         return min(self.ages)
 
     @property
@@ -57,13 +56,13 @@ class Stream:
 
     @property
     def frozen(self) -> bool:
-        """Whether several messages came and all said the same."""
-        return len(self.sizes) > 2 and len(set(self.sizes)) == 1
+        """Whether more than two messages arrived and all have the same norm."""
+        return len(self.norms) > 2 and len(set(self.norms)) == 1
 
 
 @dataclass(frozen=True)
 class Status:
-    """A diagnostic status: level 0 well, 1 warning, 2 error, 3 stale."""
+    """A diagnostic status; ``level`` is 0 (ok), 1 (warning), 2 (error) or 3 (stale)."""
 
     level: int
     message: str
@@ -71,16 +70,16 @@ class Status:
 
 
 @dataclass
-class Heard:
+class ObservedGraph:
     """
-    All that was heard.
+    Everything observed during one check.
 
     Attributes:
         domain: ROS domain.
-        seconds: for how long.
+        seconds: duration of the observation [s].
         streams: topic -> its messages.
-        states: bridge ('joint_bridge', 'rotor_bridge') -> what its latched state says.
-        diagnostics: name of a status -> the newest.
+        states: bridge ('joint_bridge', 'rotor_bridge') -> its latched state.
+        diagnostics: name of a status -> the newest one.
 
     """
 
@@ -91,11 +90,11 @@ class Heard:
     diagnostics: dict[str, Status] = field(default_factory=dict)
 
     def of_bridge(self, bridge: str) -> dict[str, Status]:
-        """Diagnostics of a bridge's node: what comes after 'NODE: ' -> status."""
+        """Diagnostics of a bridge's node: name without the prefix 'NODE: ' -> status."""
         start = f'{bridge}_node: '
         return {name.removeprefix(start): status for name, status in self.diagnostics.items()
                 if name.startswith(start)}
 
     def runs(self, bridge: str) -> bool:
-        """Whether a bridge was heard."""
+        """Whether a state or a diagnostic of the bridge arrived."""
         return bridge in self.states or bool(self.of_bridge(bridge))
