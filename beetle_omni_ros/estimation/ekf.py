@@ -1,11 +1,10 @@
 """
 Error-state EKF: IMU prediction and MoCap correction at capture time.
 
-The guard decides what may enter, a track carries one hypothesis of the motion, and the
-filter here decides which hypothesis is believed: the first one, or a new one after a long
-dropout or a persistent jump, is a candidate until enough poses agree with it and the IMU.
-Agreement of the IMU with gravity is part of that: an IMU with wrong axes or units predicts
-a motion that the poses contradict.
+The guard checks the inputs, a track is one hypothesis of the motion, and the filter here selects
+the valid hypothesis. The first track, or a new one after a long dropout or a persistent jump, is a
+candidate until enough poses agree with it and the IMU. This includes agreement of the IMU with
+gravity: an IMU with wrong axes or units predicts a motion that the poses contradict.
 """
 
 from collections import Counter, deque
@@ -14,7 +13,7 @@ from math import sqrt
 import numpy as np
 
 from beetle_omni_ros.estimation.guard import InputGuard
-from beetle_omni_ros.estimation.model import ErrorStateModel, MEASURED
+from beetle_omni_ros.estimation.model import ErrorStateModel, MEASUREMENTS
 from beetle_omni_ros.estimation.mounting import Mounting
 from beetle_omni_ros.estimation.noise import NoiseMonitor
 from beetle_omni_ros.estimation.parameters import EkfParameters
@@ -27,8 +26,8 @@ from beetle_omni_ros.robot.rotations import geodesic_angle
 
 __all__ = ['EkfParameters', 'ErrorStateEkf', 'Estimate', 'ImuReading', 'PoseReading']
 
-ALIGNED = 0.8   # cosine between residuals of one cause; of noise in six dimensions 3 % reach it
-SURE = 5.0      # standard deviations of the attitude
+ALIGNED = 0.8   # least cosine between residuals of one cause; 3 % of random pairs in 6-D reach it
+SURE = 5.0      # standard deviations of the attitude that noise does not reach
 
 
 class ErrorStateEkf:
@@ -36,11 +35,11 @@ class ErrorStateEkf:
 
     def __init__(self, parameters: EkfParameters, gravity: float):
         """
-        Begin without a state.
+        Construct the filter without a state.
 
         Args:
             parameters: noise, extrinsics, gates and times.
-            gravity: magnitude, along world -z [m/s^2].
+            gravity: magnitude along world -z [m/s^2].
 
         """
         self._parameters = parameters
@@ -49,28 +48,28 @@ class ErrorStateEkf:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything, as before the first sample."""
+        """Return to the state before the first sample."""
         self._guard = InputGuard(self._parameters)
         self._noise = NoiseMonitor(self._parameters.mocap)
         self._noise_scale = self._noise.scale
         self._model.scale_noise(*self._noise_scale)
-        self._readings: deque = deque()  # (stamp, force, rate, shaken), base_link axes
-        self._early: deque = deque()     # poses that wait for the IMU to reach their capture
+        self._readings: deque = deque()  # (stamp, force, rate, after_impact), base_link axes
+        self._early: deque = deque()     # poses captured after the newest IMU sample
         self._track: Track | None = None
         self._candidate: Track | None = None
         self._estimate: Estimate | None = None
-        self._good_pose: tuple | None = None    # the last one used: stamp, position, quaternion
+        self._good_pose: tuple | None = None    # last used one: stamp, position, quaternion
         self._contradictions, self._doubt_until = 0, -np.inf
-        self._residual = np.zeros(MEASURED)     # of the last refused pose, in deviations
+        self._residual = np.zeros(MEASUREMENTS)     # of the last refused pose, in deviations
 
     @property
     def rejected(self) -> Counter:
-        """Reason -> how many inputs were refused for it since :meth:`reset`."""
+        """Reason -> number of inputs refused for it since :meth:`reset`."""
         return self._guard.rejected
 
     @property
     def status(self) -> str:
-        """'uninitialised', 'tracking', 'dead_reckoning' or 'lost', at the newest IMU sample."""
+        """'uninitialised', 'tracking', 'dead_reckoning' or 'lost' at the newest IMU sample."""
         if self._track is None:
             return 'uninitialised'
         limits = self._parameters.status
@@ -85,24 +84,24 @@ class ErrorStateEkf:
 
     @property
     def estimate(self) -> Estimate | None:
-        """The state at the newest IMU sample; None while uninitialised."""
+        """State at the newest IMU sample; None while uninitialised."""
         if self._estimate is None and self._track is not None:
             self._estimate = self._mounting.estimate(self._track.newest, self._readings)
         return self._estimate
 
     def imu(self, sample: ImuReading) -> bool:
         """
-        Predict to the sample's stamp.
+        Predict to the stamp of a sample.
 
         Returns:
-            False when it was refused; the reason is counted in ``rejected``.
+            False if it was refused; ``rejected`` counts the reason.
 
         """
         checked = self._guard.reading(sample)
         if checked is None:
             return False
         stamp = checked[0]
-        reading = (stamp, *self._mounting.aligned(*checked[1:3]), self._guard.shaken)
+        reading = (stamp, *self._mounting.aligned(*checked[1:3]), self._guard.after_impact)
         self._estimate = None
         if self._guard.clock_jumped:
             self._restart(reading)
@@ -122,10 +121,10 @@ class ErrorStateEkf:
         """
         Correct the state at the capture time of a MoCap pose.
 
-        A pose slightly ahead of the newest IMU sample waits for the IMU.
+        A pose slightly ahead of the newest IMU sample is applied when the IMU has reached it.
 
         Returns:
-            False when it was refused; the reason is counted in ``rejected``.
+            False if it was refused; ``rejected`` counts the reason.
 
         """
         checked = self._guard.pose(sample, self._readings[0][0] if self._readings else 0.0)
@@ -139,12 +138,12 @@ class ErrorStateEkf:
         return self._apply(stamp, *checked[1:])
 
     def _time_offset(self) -> float:
-        """What brings a pose's stamp to the IMU's clock, as the leading track estimates it."""
-        leader = self._track if self._believed or self._candidate is None else self._candidate
+        """Offset from a pose's stamp to the IMU's clock, estimated by the leading track."""
+        leader = self._track if self._valid or self._candidate is None else self._candidate
         return leader.newest.time_offset if leader is not None else 0.0
 
     @property
-    def _believed(self) -> bool:
+    def _valid(self) -> bool:
         return self.status in ('tracking', 'dead_reckoning')
 
     def _apply(self, stamp, position, quaternion) -> bool:
@@ -152,31 +151,31 @@ class ErrorStateEkf:
         if self._noise.scale != self._noise_scale:
             self._noise_scale = self._noise.scale
             self._model.scale_noise(*self._noise_scale)
-        track = self._track if self._believed else None
+        track = self._track if self._valid else None
         if track is not None:
             if track.correct(stamp, position, quaternion) \
-                    or self._doubt(track, stamp, position, quaternion):
+                    or self._corrected_with_doubt(track, stamp, position, quaternion):
                 self._candidate, self._contradictions = None, 0
                 self._good_pose = stamp, position, quaternion
                 return True
             self.rejected['outlier'] += 1
-        agrees = self._consider(track, stamp, position, quaternion)
+        agrees = self._update_candidate(track, stamp, position, quaternion)
         if not agrees and track is None:
             self.rejected['inconsistent_start'] += 1
         return agrees and track is None
 
-    def _doubt(self, track: Track, stamp, position, quaternion) -> bool:
+    def _corrected_with_doubt(self, track: Track, stamp, position, quaternion) -> bool:
         """
-        Use a refused pose, where poses contradict the IMU and not each other.
+        Use a refused pose if the poses contradict the IMU but not each other.
 
-        They go on smoothly from the last good one, and their residuals point the same way: those
-        of poses that are merely noisy do not.
+        Such poses continue smoothly from the last good one, and their residuals have the same
+        direction. The residuals of poses that are only noisy do not.
         """
         before, self._residual = self._residual, self._model.whitened_residual
         lengths = float(np.linalg.norm(before) * np.linalg.norm(self._residual))
         aligned = float(before @ self._residual) > ALIGNED * lengths
-        goes_on = self._goes_on(track, stamp, position, quaternion)
-        self._contradictions = 0 if not goes_on else self._contradictions + 1 if aligned else 1
+        smooth = self._continues_smoothly(track, stamp, position, quaternion)
+        self._contradictions = 0 if not smooth else self._contradictions + 1 if aligned else 1
         if not aligned:
             return False
         needed = 1 if stamp < self._doubt_until else self._parameters.doubt.poses
@@ -185,10 +184,10 @@ class ErrorStateEkf:
         self._doubt_until = stamp + self._parameters.doubt.time
         self.rejected['imu_contradicts'] += 1
         since = stamp - self._good_pose[0] if self._good_pose is not None else 0.0
-        return track.correct(stamp, position, quaternion, doubtful=since)
+        return track.correct(stamp, position, quaternion, doubt_span=since)
 
-    def _goes_on(self, track: Track, stamp, position, quaternion) -> bool:
-        """Whether a pose goes on smoothly from the last good one."""
+    def _continues_smoothly(self, track: Track, stamp, position, quaternion) -> bool:
+        """Whether a pose continues smoothly from the last good one."""
         if self._good_pose is None:
             return False
         before, from_position, from_quaternion = self._good_pose
@@ -205,18 +204,18 @@ class ErrorStateEkf:
         return float(np.linalg.norm(step)) < limits.distance + limits.speed * dt \
             and geodesic_angle(turned, now) < limits.angle + limits.rate * dt
 
-    def _consider(self, believed: Track | None, stamp, position, quaternion) -> bool:
+    def _update_candidate(self, valid: Track | None, stamp, position, quaternion) -> bool:
         """
-        Let a candidate follow poses that the track cannot use, and believe it in time.
+        Update the candidate with a pose that the track cannot use, and accept it if confirmed.
 
         Args:
-            believed: the track, or None while it is not believed.
-            stamp: of the pose [s].
+            valid: the track, or None while it is not valid.
+            stamp: time of the pose [s].
             position: (3,) of the marker body in world [m].
             quaternion: (4,) marker body to world.
 
         Returns:
-            False when the pose contradicts the candidate, which then starts anew from it.
+            False if the pose contradicts the candidate, which then restarts from this pose.
 
         """
         candidate = self._candidate
@@ -225,26 +224,26 @@ class ErrorStateEkf:
             agrees = candidate.correct(stamp, position, quaternion)
             if agrees:
                 limits = self._parameters.status
-                needed = limits.start_poses if believed is None else limits.jump_poses
+                needed = limits.start_poses if valid is None else limits.jump_poses
                 if candidate.fixes >= needed:
-                    if believed is not None and self._turned_at_once(believed, candidate):
+                    if valid is not None and self._attitude_jumped(valid, candidate):
                         self.rejected['attitude_jump'] += 1
                         return True
                     self._track, self._candidate = candidate, None
                 return True
-        # What was known of the biases helps once; if it contradicts the poses, start without.
+        # The known biases are used once; if they contradict the poses, start without them.
         known = self._track.newest if agrees and self._track is not None else None
         self._candidate = self._started(stamp, position, quaternion, known)
         return agrees
 
-    def _turned_at_once(self, track: Track, candidate: Track) -> bool:
-        """Whether the candidate's attitude is one that the gyroscope rules out."""
+    def _attitude_jumped(self, track: Track, candidate: Track) -> bool:
+        """Whether the gyroscope rules out the candidate's attitude."""
         deviation = sqrt(np.trace(track.newest.covariance[ATTITUDE, ATTITUDE]))
         return geodesic_angle(track.newest.quaternion, candidate.newest.quaternion) \
             > self._parameters.status.jump_attitude + SURE * deviation
 
     def _started(self, stamp, position, quaternion, known) -> Track:
-        """Start a track at a pose, with the biases of ``known``, and bring it up to now."""
+        """Start a track at a pose, with the biases of ``known``, and predict it to now."""
         later = [reading for reading in self._readings if reading[0] > stamp + SAME_INSTANT]
         before = self._readings[len(self._readings) - len(later) - 1]
         force, rate = interpolate(stamp, before, later[0]) if later else (before[1], before[2])
@@ -257,12 +256,12 @@ class ErrorStateEkf:
         return track
 
     def _restart(self, reading) -> None:
-        """Go on after a jump of the clock: what happened meanwhile is unknown."""
+        """Continue after a jump of the clock by an unknown time."""
         self._readings.clear()
         self._readings.append(reading)
         self._early.clear()
         self._candidate = None
         if self._track is not None:
-            first = self._model.forget(self._track.newest, *reading[:3])
+            first = self._model.after_clock_jump(self._track.newest, *reading[:3])
             self._track = Track(self._model, first, self._parameters.mocap.delay_limit)
             self._track.last_fix = -np.inf

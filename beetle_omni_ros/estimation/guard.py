@@ -1,4 +1,4 @@
-"""What may enter the filter: finite, plausible, new and in time."""
+"""Checks of the filter's inputs: finite, plausible, new and in time."""
 
 from collections import Counter
 from math import inf, isfinite, sqrt
@@ -13,12 +13,12 @@ Checked = tuple[float, np.ndarray, np.ndarray]   # stamp and two vectors of a sa
 
 class InputGuard:
     """
-    Checks every sample before it can touch the state.
+    Checks of every sample before it changes the state.
 
     Attributes:
         rejected: reason -> count.
-        clock_jumped: whether the reading just accepted begins a new time line.
-        shaken: whether readings just before it were beyond the sensor's range, as in an impact.
+        clock_jumped: whether the reading just accepted starts a new time line.
+        after_impact: whether readings just before it were beyond the sensor's range.
 
     """
 
@@ -26,7 +26,7 @@ class InputGuard:
         self._imu, self._mocap = parameters.imu, parameters.mocap
         self.rejected: Counter = Counter()
         self.clock_jumped = False
-        self.shaken = False
+        self.after_impact = False
         self._out_of_range = False
         self._last_reading: float | None = None
         self._last_pose = -inf
@@ -35,14 +35,14 @@ class InputGuard:
         self._same_pose = self._same_reading = 0
         self._pose_moved = self._moved = False
         self._spikes = SpikeFilter(self._imu.impact_change, self._imu.spike_change)
-        self._refused: list[float] = []  # stamps refused in a row, each shortly after the last
+        self._refused: list[float] = []  # consecutive refused stamps at regular distances
 
     def reading(self, sample) -> Checked | None:
         """
         Check an IMU sample.
 
         Returns:
-            (stamp, specific force, angular rate) in copies, or None when it is refused.
+            (stamp, specific force, angular rate) in copies, or None if it is refused.
 
         """
         stamp = float(sample.stamp)
@@ -58,23 +58,23 @@ class InputGuard:
         if self._last_reading is not None:
             step = stamp - self._last_reading
             if not 0 < step <= self._imu.gap_limit:
-                if not self._new_time_line(stamp):
+                if not self._starts_time_line(stamp):
                     return self._refuse('duplicate' if step == 0 else
                                         'backwards' if step < 0 else 'forward_gap')
                 self.clock_jumped = True
                 self._last_pose = -inf
                 self._spikes.reset()
-        if self._repeats((*force.tolist(), *rate.tolist())):
+        if self._reading_frozen((*force.tolist(), *rate.tolist())):
             return self._refuse('frozen')
         if not self._spikes.passes(force, rate):
             return self._refuse('spike')
         self._last_reading = stamp
         self._refused.clear()
-        self.shaken, self._out_of_range = self._out_of_range or self._spikes.lasted, False
+        self.after_impact, self._out_of_range = self._out_of_range or self._spikes.lasted, False
         return stamp, force, rate
 
-    def _repeats(self, values) -> bool:
-        """Whether readings have long stayed the same to the last digit, while the MoCap moved."""
+    def _reading_frozen(self, values) -> bool:
+        """Whether readings have long been equal to the last digit while the MoCap moved."""
         same = values == self._reading_values
         self._moved |= self._reading_values is not None and not same
         self._reading_values = values
@@ -82,8 +82,8 @@ class InputGuard:
         self._pose_moved &= same
         return self._same_reading >= self._imu.frozen_samples and self._pose_moved
 
-    def _new_time_line(self, stamp) -> bool:
-        """Whether refused stamps have gone on so consistently that the clock itself jumped."""
+    def _starts_time_line(self, stamp) -> bool:
+        """Whether enough consecutive refused stamps are consistent, after a jump of the clock."""
         refused = self._refused
         if refused and not 0 < stamp - refused[-1] <= self._imu.gap_limit:
             refused.clear()
@@ -96,10 +96,10 @@ class InputGuard:
 
         Args:
             sample: stamp, position and quaternion.
-            oldest: stamp of the oldest IMU reading kept [s].
+            oldest: stamp of the oldest stored IMU reading [s].
 
         Returns:
-            (stamp on the IMU's clock, position, unit quaternion), or None when it is refused.
+            (stamp on the IMU's clock, position, unit quaternion), or None if it is refused.
 
         """
         stamp = float(sample.stamp) + self._mocap.time_offset
@@ -121,12 +121,12 @@ class InputGuard:
         if stamp > self._last_reading + self._imu.gap_limit:
             return self._refuse('future')
         self._last_pose = stamp
-        if self._frozen((*position.tolist(), *quaternion.tolist())):
+        if self._pose_frozen((*position.tolist(), *quaternion.tolist())):
             return self._refuse('frozen')
         return stamp, position, quaternion / norm
 
-    def _frozen(self, values) -> bool:
-        """Whether the pose has long stayed the same to the last digit, while the IMU moved."""
+    def _pose_frozen(self, values) -> bool:
+        """Whether poses have long been equal to the last digit while the IMU moved."""
         same = values == self._pose_values
         self._pose_moved |= self._pose_values is not None and not same
         self._pose_values = values
@@ -135,7 +135,7 @@ class InputGuard:
         return self._same_pose >= self._mocap.frozen_poses
 
     def _refuse(self, reason: str) -> Checked | None:
-        """Count a refusal; return what the caller returns then."""
+        """Count a refusal; return the result of the caller."""
         self.rejected[reason] += 1
         return None
 
@@ -147,5 +147,5 @@ def _finite(stamp, *vectors) -> bool:
 
 
 def _squared_norm(vector) -> float:
-    """Sum of squares in plain floats: huge values become infinite without a warning."""
+    """Sum of squares in plain floats, which become infinite without a warning."""
     return sum(number * number for number in vector.tolist())

@@ -1,9 +1,9 @@
 """
-The error-state model: what filterpy's Kalman filter is fed with at each step.
+The error-state model: inputs of filterpy's Kalman filter at each step.
 
-filterpy keeps the error state and does its covariance and gain algebra; around it stands
-only what is particular to a rigid body: propagation and residual on SO(3), and the
-injection of the estimated error into the state.
+filterpy keeps the error state and computes its covariance and gain. This module adds the parts of
+a rigid body: propagation and residual on SO(3), and the injection of the estimated error into the
+state.
 """
 
 from dataclasses import replace
@@ -30,36 +30,36 @@ from beetle_omni_ros.estimation.samples import (
 )
 from beetle_omni_ros.robot import rotations
 
-MEASURED = 6  # position in world, rotation vector in base_link
+MEASUREMENTS = 6  # position in world, rotation vector in base_link
 
 
 class ErrorStateModel:
     """
-    Prediction and correction of one node; holds constants and buffers, no state.
+    Prediction and correction of one node; contains constants and buffers, no state.
 
     Attributes:
-        marker_to_base: (4,) quaternion of base_link's axes seen from the marker body.
+        marker_to_base: (4,) quaternion from base_link's axes to those of the marker body.
 
     """
 
     def __init__(self, parameters: EkfParameters, gravity: float):
         """
-        Prepare the constant matrices.
+        Compute the constant matrices.
 
         Args:
             parameters: noise and extrinsics.
-            gravity: magnitude, along world -z [m/s^2].
+            gravity: magnitude along world -z [m/s^2].
 
         """
         imu, mocap = parameters.imu, parameters.mocap
         self.gravity = gravity
         self.parameters = parameters
-        self.filter = KalmanFilter(dim_x=STATES, dim_z=MEASURED)
+        self.filter = KalmanFilter(dim_x=STATES, dim_z=MEASUREMENTS)
         self._no_error = np.zeros(STATES)
         self._transition = identity()
         self._process = _process_noise(parameters)
         self._period = 1 / imu.rate
-        # an unseen reading was at the limit of the sensor's range or beyond, in any direction
+        # a missing reading was at the limit of the sensor's range or beyond, in any direction
         self._shock = np.zeros(STATES)
         self._shock[VELOCITY] = imu.specific_force_limit ** 2
         self._shock[ATTITUDE] = imu.angular_velocity_limit ** 2
@@ -70,7 +70,7 @@ class ErrorStateModel:
         variance[ACCELEROMETER_BIAS] = doubt.accelerometer_bias_std ** 2
         self._doubt = np.diag(variance)
 
-        # the marker body, as seen from the navigated point (the IMU), in base_link axes
+        # vector from the navigated point (the IMU) to the marker body, in base_link axes
         self._lever = mocap.position - imu.position
         self._has_lever = bool(np.any(self._lever))
         self.marker_to_base = rotations.conjugate(rotations.exp(mocap.rotation))
@@ -79,24 +79,24 @@ class ErrorStateModel:
         self._claimed_noise = (mocap.position_noise ** 2, mocap.orientation_noise ** 2)
         self.scale_noise(1.0, 1.0)
         # quantile of the chi-square distribution
-        self.gate = float(2 * gammaincinv(MEASURED / 2, mocap.gate_probability))
+        self.gate = float(2 * gammaincinv(MEASUREMENTS / 2, mocap.gate_probability))
 
     def scale_noise(self, position: float, orientation: float) -> None:
-        """Take the MoCap's variances as these multiples of the parameters' ones."""
+        """Set the MoCap's variances to these multiples of the parameters' values."""
         self.filter.R = np.diag([position * self._claimed_noise[0]] * 3
                                 + [orientation * self._claimed_noise[1]] * 3)
 
     def start(self, stamp, force, rate, position, quaternion, biases: Node | None) -> Node:
         """
-        Make the first node from one pose, at unknown velocity and as if its time were exact.
+        Make the first node from one pose, at unknown velocity and with an exact time.
 
         Args:
             stamp: capture time of the pose [s].
-            force: (3,) specific force then, base_link axes [m/s^2].
-            rate: (3,) angular rate then, base_link axes [rad/s].
+            force: (3,) specific force at that time, base_link axes [m/s^2].
+            rate: (3,) angular rate at that time, base_link axes [rad/s].
             position: (3,) of the marker body in world [m].
             quaternion: (4,) marker body to world, unit.
-            biases: a node whose biases and time offset are kept with their covariance, or None.
+            biases: node whose biases and time offset are kept with their covariance, or None.
 
         """
         first = self.parameters.initial
@@ -120,15 +120,15 @@ class ErrorStateModel:
         return Node(stamp, force, rate, position - rotation @ self._lever, np.zeros(3), attitude,
                     rotation, *known, covariance=covariance)
 
-    def doubt_time(self, node: Node, deviation: float) -> None:
+    def add_time_uncertainty(self, node: Node, deviation: float) -> None:
         """
-        Make the time offset uncertain, in a node that was found as if it were exact.
+        Make the time offset uncertain in a node that was estimated with an exact offset.
 
-        With another offset the same poses would have given the states of another moment: their
-        errors are the offset's error times how they change.
+        With another offset the same poses would have given the state of another instant. The
+        errors of the states are therefore the error of the offset times their rates.
 
         Args:
-            node: its velocity must be known; its covariance is replaced.
+            node: node with known velocity; its covariance is replaced.
             deviation: standard deviation of the offset [s].
 
         """
@@ -142,10 +142,10 @@ class ErrorStateModel:
 
     def doubt(self, node: Node, span: float) -> Node:
         """
-        The node with velocity, attitude and biases as uncertain as the parameters say.
+        Add the uncertainty of the parameters ``doubt`` to position, velocity, attitude and biases.
 
-        A gyroscope bias that was wrong for ``span`` [s] has turned the attitude by span times
-        itself. Both errors are therefore correlated, and a pose corrects the rate at once.
+        A gyroscope bias that was wrong for ``span`` [s] has turned the attitude by ``span`` times
+        its error. Both errors are therefore correlated, and a pose corrects the rate at once.
         """
         covariance = node.covariance + self._doubt
         change = np.zeros((STATES, 3))
@@ -153,8 +153,9 @@ class ErrorStateModel:
         covariance += self.parameters.doubt.gyroscope_bias_std ** 2 * change @ change.T
         return replace(node, covariance=covariance)
 
-    def forget(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray) -> Node:
-        """Move a state across an unknown lapse of time: only the biases are still worth much."""
+    def after_clock_jump(self, node: Node, stamp: float, force: np.ndarray,
+                         rate: np.ndarray) -> Node:
+        """Move a state across an unknown time; only the biases remain known."""
         limits = self.parameters
         covariance = node.covariance.copy()
         covariance[0:9, :] = covariance[:, 0:9] = 0.0
@@ -166,11 +167,11 @@ class ErrorStateModel:
                     covariance=covariance)
 
     def predict(self, node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
-                shaken: bool = False) -> Node:
-        """Carry ``node`` and its covariance to the next IMU reading."""
+                after_impact: bool = False) -> Node:
+        """Predict ``node`` and its covariance to the next IMU reading."""
         after = propagate(node, stamp, force, rate, self.gravity)
         dt = stamp - node.stamp
-        # What happened during missing samples is interpolated: its error grows with each.
+        # Missing samples are interpolated, and the error grows with each of them.
         missing = max(1.0, dt / self._period)
         kalman = self.filter
         kalman.x = self._no_error
@@ -179,33 +180,33 @@ class ErrorStateModel:
                        Q=self._process * (dt * missing ** 3))
         after.covariance = kalman.P
         change = force - node.force
-        jolt = float(change @ change)
-        if shaken or jolt > self._impact:
-            self._doubt_impulse(after, dt, jolt, shaken)
+        squared_change = float(change @ change)
+        if after_impact or squared_change > self._impact:
+            self._add_impulse_uncertainty(after, dt, squared_change, after_impact)
         return after
 
-    def _doubt_impulse(self, node, dt, jolt, shaken) -> None:
-        """Take the velocity, and after unseen readings the attitude, as shaken over a step."""
-        node.shaken = shaken
-        density = self._shock.copy() if shaken else np.zeros(STATES)
-        density[VELOCITY] += jolt
+    def _add_impulse_uncertainty(self, node, dt, squared_change, after_impact) -> None:
+        """Add the uncertainty of an impulse, after missing readings also to the attitude."""
+        node.after_impact = after_impact
+        density = self._shock.copy() if after_impact else np.zeros(STATES)
+        density[VELOCITY] += squared_change
         node.covariance = node.covariance + np.diag(density * dt ** 2)
 
     def correct(self, prior: Node, position: np.ndarray, quaternion: np.ndarray) -> Node | None:
         """
-        Update a node with the pose that was captured then.
+        Correct a node with a pose that was captured at its stamp.
 
         Args:
-            prior: the predicted node.
+            prior: predicted node.
             position: (3,) of the marker body in world [m].
             quaternion: (4,) marker body to world, unit, either sign.
 
         Returns:
-            The corrected node, or None when the pose fails the chi-square gate.
+            The corrected node, or None if the pose fails the chi-square gate.
 
         """
         kalman = self.filter
-        residual = np.empty(MEASURED)
+        residual = np.empty(MEASUREMENTS)
         residual[:3] = position - prior.position
         residual[3:] = rotations.log(rotations.multiply(
             rotations.conjugate(prior.quaternion),
@@ -229,10 +230,10 @@ class ErrorStateModel:
 
     def _linearise_time(self, prior) -> None:
         """
-        Write the columns of the time offset: what moves is seen displaced by motion x offset.
+        Set the columns of the time offset: a moving pose is displaced by motion times offset.
 
-        At rest they are zero: there, the estimated velocity and rate are mostly noise, which is
-        correlated with the residual and would pass for an offset.
+        At rest they are zero. The estimated velocity and rate are then mostly noise, which is
+        correlated with the residual and would bias the offset.
         """
         least, jacobian = self.parameters.time_offset, self.filter.H
         rate = prior.rate - prior.gyroscope_bias
@@ -243,12 +244,12 @@ class ErrorStateModel:
         jacobian[3:6, TIME_OFFSET] = rate if rate @ rate > least.rate ** 2 else 0.0
 
     def _inject(self, prior: Node, error: np.ndarray, covariance: np.ndarray) -> Node:
-        """Move the estimated error into the state; the error that remains has mean zero."""
+        """Add the estimated error to the state; the remaining error has mean zero."""
         turn = error[ATTITUDE]
         quaternion = rotations.normalized(
             rotations.multiply(prior.quaternion, rotations.exp(turn.tolist())))
-        # The attitude error that remains counts from the corrected attitude: right Jacobian of
-        # SO(3), first order.
+        # The remaining attitude error refers to the corrected attitude: right Jacobian of SO(3),
+        # first order.
         shift = -0.5 * rotations.skew(turn.tolist())
         covariance[ATTITUDE, :] += shift @ covariance[ATTITUDE, :]
         covariance[:, ATTITUDE] += covariance[:, ATTITUDE] @ shift.T
@@ -259,7 +260,7 @@ class ErrorStateModel:
                     prior.accelerometer_bias + error[ACCELEROMETER_BIAS],
                     prior.gyroscope_bias + error[GYROSCOPE_BIAS],
                     min(limit, max(-limit, prior.time_offset + float(error[TIME_OFFSET]))),
-                    prior.shaken, 0.5 * (covariance + covariance.T))
+                    prior.after_impact, 0.5 * (covariance + covariance.T))
 
 
 def _process_noise(parameters: EkfParameters) -> np.ndarray:

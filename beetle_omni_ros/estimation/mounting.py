@@ -1,7 +1,7 @@
 """
-From the filter's state to the estimate that everybody else means.
+Conversion of the filter's state to the estimate of base_link.
 
-The filter navigates the IMU's point at the IMU's stamps; others ask for base_link now.
+The filter estimates the motion of the IMU at the IMU's stamps, the estimate that of base_link now.
 """
 
 from collections.abc import Sequence
@@ -23,20 +23,20 @@ from beetle_omni_ros.estimation.samples import (
 )
 from beetle_omni_ros.robot import rotations
 
-SIGNIFICANT = 4.0  # standard deviations by which a time offset must differ from chance
+SIGNIFICANT = 4.0  # standard deviations of a significant time offset
 
 
 class Mounting:
-    """The IMU's rotation and lever arm in base_link, and its known biases."""
+    """Rotation and lever arm of the IMU in base_link, and its known biases."""
 
     def __init__(self, imu: ImuParameters, gravity: float, trend_samples: int = 1):
         """
-        Take rotation, position and noise from the IMU's parameters.
+        Copy rotation, position and noise from the IMU's parameters.
 
         Args:
-            imu: the IMU.
+            imu: parameters of the IMU.
             gravity: [m/s^2].
-            trend_samples: readings through which the trend of a late rate is laid.
+            trend_samples: number of readings in the trend of a delayed rate.
 
         """
         self._trend_samples = trend_samples
@@ -49,24 +49,24 @@ class Mounting:
         self._rate_noise = imu.gyroscope_noise ** 2
 
     def aligned(self, force: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Specific force and rate (3,) without their known biases, in base_link axes."""
+        """Specific force and rate (3,) minus their known biases, in base_link axes."""
         if self._biased:
             force, rate = force - self._force_bias, rate - self._rate_bias
         return (force, rate) if self._axes is None else (self._axes @ force, self._axes @ rate)
 
     def estimate(self, node: Node, readings: Sequence = ()) -> Estimate:
         """
-        Express a node as base_link's state at its stamp, with its covariance.
+        Convert a node to the state of base_link at its stamp, with its covariance.
 
         Args:
             node: newest state of the filter.
-            readings: (stamp, specific force, rate, shaken) of the IMU up to the node's.
+            readings: IMU readings (stamp, specific force, rate, after impact) up to the node's.
 
         """
-        age, then = node.time_offset, node
+        age, delayed = node.time_offset, node
         late = age > SIGNIFICANT * sqrt(node.covariance[TIME_OFFSET, TIME_OFFSET])
         if late:
-            node = self._aged(then, age, self.trend(readings))
+            node = self._extrapolated(delayed, age, self.trend(readings))
         rate = node.rate - node.gyroscope_bias
         position, velocity = node.position, node.velocity
         if self._arm is not None:
@@ -74,7 +74,7 @@ class Mounting:
             velocity = velocity - node.rotation @ np.cross(rate, self._arm)
 
         def covariance():
-            found = self._aged_covariance(then, node, age) if late else node.covariance
+            found = self._extrapolated_covariance(delayed, node, age) if late else node.covariance
             found = found[:ERROR_STATES, :ERROR_STATES]
             return found if self._arm is None else \
                 self._covariance_at_base(node, rate, found, self._arm)
@@ -83,7 +83,7 @@ class Mounting:
                         node.accelerometer_bias, node.gyroscope_bias, covariance)
 
     def trend(self, readings) -> np.ndarray:
-        """(3,) angular acceleration [rad/s^2]: least squares line through the last readings."""
+        """(3,) angular acceleration [rad/s^2], by least squares through the last readings."""
         count = self._trend_samples
         last = [readings[i] for i in range(max(0, len(readings) - count), len(readings))]
         if len(last) < max(count, 2) or any(reading[3] for reading in last):
@@ -92,14 +92,14 @@ class Mounting:
         times -= times.mean()
         return times @ np.array([reading[2] for reading in last]) / (times @ times)
 
-    def _aged(self, node, age, trend) -> Node:
+    def _extrapolated(self, node, age, trend) -> Node:
         """
-        Carry a state over the latency that the IMU hides in its stamps.
+        Extrapolate a state over the latency in the IMU's stamps.
 
-        A stamp can be late, because it was put on arrival, but not early: IMU stamps later than
-        the MoCap's mean that the reading is old, the reverse that the MoCap's stamps are late
-        and the reading is fresh. The acceleration is held over the few milliseconds, and the
-        rate goes on changing as it did: held for 25 ms, a swing of 2 Hz would look 18 deg late.
+        A stamp on arrival can be late but not early. IMU stamps later than the MoCap's therefore
+        mean a delayed reading. In the opposite case the MoCap's stamps are late and the reading is
+        not delayed. The acceleration is constant over these few milliseconds, and the rate
+        continues its trend. Without the trend, 25 ms are a phase lag of 18 deg at 2 Hz.
         """
         rate = node.rate - node.gyroscope_bias + 0.5 * age * trend
         acceleration = (node.rotation @ (node.force - node.accelerometer_bias) - self._gravity)
@@ -110,10 +110,10 @@ class Mounting:
             velocity=node.velocity + age * acceleration, quaternion=quaternion,
             rotation=rotations.matrix(quaternion))
 
-    def _aged_covariance(self, before, after, age) -> np.ndarray:
-        """(16, 16) covariance of ``after``, which is ``before`` carried on by :meth:`_aged`."""
+    def _extrapolated_covariance(self, before, after, age) -> np.ndarray:
+        """(16, 16) covariance of ``after``, the extrapolation of ``before``."""
         acceleration = before.rotation @ (before.force - before.accelerometer_bias) - self._gravity
-        # the mean rate, which half of the trend is in
+        # the mean rate, which includes half of the trend
         rate = 0.5 * (before.rate + after.rate) - before.gyroscope_bias
         jacobian = np.eye(STATES)
         jacobian[POSITION, VELOCITY] = age * np.eye(3)
@@ -128,10 +128,10 @@ class Mounting:
 
     def _covariance_at_base(self, node, rate, covariance, lever: np.ndarray) -> np.ndarray:
         """
-        Move a state's covariance (15, 15) from the IMU to base_link's origin.
+        Transform a state's covariance (15, 15) from the IMU to base_link's origin.
 
-        With arm r, rate w: p = p_imu - R r and v = v_imu - R (w x r). The noise of the rate
-        sample itself enters the velocity through the arm.
+        With arm r and rate w, p = p_imu - R r and v = v_imu - R (w x r). The noise of the rate
+        sample affects the velocity through the arm.
         """
         swing = np.cross(rate, lever)
         arm = node.rotation @ rotations.skew(lever)

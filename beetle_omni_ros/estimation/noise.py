@@ -1,4 +1,4 @@
-"""How noisy the MoCap really is, seen from its poses alone."""
+"""Measurement of the MoCap's noise from its poses alone."""
 
 from bisect import bisect_left, insort
 from collections import deque
@@ -11,10 +11,10 @@ from beetle_omni_ros.robot import rotations
 POSES = 4        # a third difference needs four
 GAIN = 20.0      # variance of the third difference of white noise: 1 + 9 + 9 + 1
 MEDIAN = 2.366   # of the chi-square distribution with 3 degrees of freedom
-WINDOW = 200     # differences of which the median is taken
-ENOUGH = 20      # differences before it says anything
-TRUSTED = 2.0    # excess of variance that chance hardly gives
-EVEN = 0.1       # relative difference of intervals still taken as even
+WINDOW = 200     # differences in a median
+MIN_COUNT = 20   # differences before the first result
+SIGNIFICANT = 2.0    # excess of variance that is unlikely by chance
+EVEN = 0.1       # largest relative difference of equal intervals
 
 
 class RunningMedian:
@@ -25,7 +25,7 @@ class RunningMedian:
         self._sorted: list[float] = []
 
     def add(self, value: float) -> None:
-        """Take a value; forget the oldest when the window is full."""
+        """Add a value; remove the oldest if the window is full."""
         self._recent.append(value)
         insort(self._sorted, value)
         if len(self._recent) > WINDOW:
@@ -33,23 +33,23 @@ class RunningMedian:
 
     @property
     def value(self) -> float:
-        """The median; 0 before there are enough values."""
+        """The median; 0 with fewer than ``MIN_COUNT`` values."""
         count = len(self._sorted)
-        return self._sorted[count // 2] if count >= ENOUGH else 0.0
+        return self._sorted[count // 2] if count >= MIN_COUNT else 0.0
 
 
 class NoiseMonitor:
     """
-    Compares the noise of position and orientation with what the parameters claim.
+    Compares the noise of position and orientation with the parameters' values.
 
-    The third difference of evenly spaced poses removes smooth motion and keeps noise. It needs
-    no filter state, so it works before the first fix and cannot argue with the gate; its median
-    over a window does not care for jumps and outliers, even when one pose in ten is wrong.
+    The third difference of evenly spaced poses removes smooth motion and keeps noise. It needs no
+    filter state. It is therefore available before the first fix and independent of the gate. Its
+    median over a window is robust against jumps and outliers, even one wrong pose in ten.
     """
 
     def __init__(self, mocap: MocapParameters):
-        self._claims = [MEDIAN * GAIN * mocap.position_noise ** 2,
-                        MEDIAN * GAIN * mocap.orientation_noise ** 2]
+        self._nominal = [MEDIAN * GAIN * mocap.position_noise ** 2,
+                         MEDIAN * GAIN * mocap.orientation_noise ** 2]
         self._limit = mocap.noise_scale_limit ** 2
         self._last: tuple | None = None
         self._moves: deque = deque(maxlen=POSES - 1)  # (translation, rotation vector, interval)
@@ -57,12 +57,13 @@ class NoiseMonitor:
 
     @property
     def scale(self) -> tuple[float, ...]:
-        """Factors >= 1 on the claimed variances of position and orientation."""
-        ratios = [median.value / claim for median, claim in zip(self._medians, self._claims)]
-        return tuple(min(ratio, self._limit) if ratio > TRUSTED else 1.0 for ratio in ratios)
+        """Factors >= 1 on the nominal variances of position and orientation."""
+        ratios = [median.value / nominal
+                  for median, nominal in zip(self._medians, self._nominal)]
+        return tuple(min(ratio, self._limit) if ratio > SIGNIFICANT else 1.0 for ratio in ratios)
 
     def add(self, stamp: float, position: np.ndarray, quaternion: np.ndarray) -> None:
-        """Take one pose: stamp [s], (3,) [m], (4,) unit."""
+        """Add one pose: stamp [s], (3,) [m], (4,) unit."""
         last, self._last = self._last, (stamp, position, quaternion)
         if last is None:
             return

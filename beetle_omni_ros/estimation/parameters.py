@@ -15,7 +15,7 @@ from beetle_omni_ros.robot.schema import group, parameter
 
 @dataclass(frozen=True, kw_only=True)
 class ImuParameters:
-    """The IMU: noise, mounting and what it can plausibly say."""
+    """Noise, mounting and plausible range of the IMU."""
 
     rate: float = parameter(
         200.0, doc='nominal sample rate', unit='Hz', low=20, high=4000)
@@ -30,9 +30,9 @@ class ImuParameters:
     gyroscope_bias_walk: float = parameter(
         0.0001, doc='random walk of the gyroscope bias', unit='rad/s/sqrt(s)', low=0, high=1)
     position: np.ndarray = parameter(
-        [0.0, 0.0, 0.0], doc='of the IMU in base_link', unit='m', shape=(3,), low=-5, high=5)
+        [0.0, 0.0, 0.0], doc='position in base_link', unit='m', shape=(3,), low=-5, high=5)
     rotation: np.ndarray = parameter(
-        [0.0, 0.0, 0.0], doc="rotation vector of the IMU's axes seen from base_link", unit='rad',
+        [0.0, 0.0, 0.0], doc='rotation vector from IMU axes to base_link axes', unit='rad',
         shape=(3,), low=-3.2, high=3.2)
     accelerometer_bias: np.ndarray = parameter(
         [0.0, 0.0, 0.0], doc='known part of the bias, in the axes of the IMU', unit='m/s^2',
@@ -45,24 +45,24 @@ class ImuParameters:
     angular_velocity_limit: float = parameter(
         40.0, doc='larger readings are refused', unit='rad/s', low=1, high=200)
     impact_change: float = parameter(
-        30.0, doc='a larger change of the specific force between two samples is an impact, '
-        'whose impulse is unknown', unit='m/s^2', low=1, high=2000)
+        30.0, doc='change of the specific force between two samples that counts as an impact of '
+        'unknown impulse', unit='m/s^2', low=1, high=2000)
     spike_change: float = parameter(
-        3.0, doc='a lone reading whose angular rate changes by more, or whose specific force '
-        'changes by more than an impact, is refused', unit='rad/s', low=0.1, high=200)
+        3.0, doc='change of the angular rate above which a single reading is refused; that of the '
+        'specific force is impact_change', unit='rad/s', low=0.1, high=200)
     frozen_samples: int = parameter(
-        10, doc='samples that repeat the one before to the last digit while the MoCap moves, from '
-        'which they are refused', low=2, high=10000)
+        10, doc='number of equal samples from which they are refused while the MoCap moves',
+        low=2, high=10000)
     gap_limit: float = parameter(
-        0.1, doc='longest time between two samples that is bridged', unit='s', low=0.001, high=1)
+        0.1, doc='longest bridged time between two samples', unit='s', low=0.001, high=1)
     resync_samples: int = parameter(
-        20, doc='refused stamps in a row, consistent with each other, after which they are '
-        'believed and the state is lost', low=2, high=10000)
+        20, doc='number of refused consistent stamps in a row after which they are accepted and '
+        'the state is lost', low=2, high=10000)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MocapParameters:
-    """The MoCap: noise, the marker body's place on the robot, delay and gating."""
+    """Noise, mounting, delay and gating of the MoCap."""
 
     position_noise: float = parameter(
         0.001, doc='standard deviation of a position, each axis', unit='m', low=1e-6, high=1)
@@ -70,35 +70,36 @@ class MocapParameters:
         0.0017453292519943296, doc='standard deviation of an orientation, each axis', unit='rad',
         low=1e-6, high=1)
     position: np.ndarray = parameter(
-        [0.0, 0.0, 0.0], doc='of the marker body in base_link', unit='m', shape=(3,), low=-5,
+        [0.0, 0.0, 0.0], doc='position of the marker body in base_link', unit='m', shape=(3,),
+        low=-5,
         high=5)
     rotation: np.ndarray = parameter(
-        [0.0, 0.0, 0.0], doc="rotation vector of the marker body's axes seen from base_link",
+        [0.0, 0.0, 0.0], doc="rotation vector from the marker body's axes to base_link axes",
         unit='rad', shape=(3,), low=-3.2, high=3.2)
     time_offset: float = parameter(
-        0.0, doc='added to its stamps to bring them to the clock of the IMU', unit='s', low=-1,
+        0.0, doc='added to the stamps to convert them to the clock of the IMU', unit='s', low=-1,
         high=1)
     delay_limit: float = parameter(
-        0.2, doc='oldest capture that is still used, behind the newest IMU sample', unit='s',
+        0.2, doc='largest age of a pose against the newest IMU sample', unit='s',
         low=0.005, high=2)
     noise_scale_limit: float = parameter(
-        20.0, doc='largest factor on both noises when the poses are seen to be noisier; 1 keeps '
-        'them as given', low=1, high=1000)
+        20.0, doc='largest factor on both noises from their measurement; 1 switches it off',
+        low=1, high=1000)
     gate_probability: float = parameter(
-        0.99999, doc='share of good poses that passes the chi-square gate', low=0.5,
+        0.99999, doc='fraction of good poses that passes the chi-square gate', low=0.5,
         high=0.9999999999)
     quaternion_tolerance: float = parameter(
         0.01, doc='largest deviation of the norm of a quaternion from 1', low=1e-6, high=0.5)
     position_limit: float = parameter(
         100.0, doc='larger coordinates are refused', unit='m', low=0.1, high=1e5)
     frozen_poses: int = parameter(
-        5, doc='poses that repeat the one before to the last digit while the IMU moves, from '
-        'which they are refused', low=1, high=1000)
+        5, doc='number of equal poses from which they are refused while the IMU moves', low=1,
+        high=1000)
 
 
 @dataclass(frozen=True, kw_only=True)
 class InitialParameters:
-    """How wrong the first state may be."""
+    """Uncertainty of the first state."""
 
     velocity_std: float = parameter(
         5.0, doc='standard deviation of the velocity', unit='m/s', low=0.01, high=100)
@@ -107,7 +108,7 @@ class InitialParameters:
     gyroscope_bias_std: float = parameter(
         0.05, doc='standard deviation of the gyroscope bias', unit='rad/s', low=1e-6, high=1)
     time_offset: float = parameter(
-        0.0, doc='by how much the stamps of the IMU are later than those of the MoCap', unit='s',
+        0.0, doc='stamps of the IMU minus stamps of the MoCap at one instant', unit='s',
         low=-0.2, high=0.2)
     time_offset_std: float = parameter(
         0.01, doc='standard deviation of the offset between the clocks; 0 if there is none',
@@ -116,76 +117,81 @@ class InitialParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class TimeOffsetParameters:
-    """What remains between the clocks of IMU and MoCap, estimated in flight."""
+    """Offset between the clocks of IMU and MoCap, estimated in flight."""
 
     limit: float = parameter(
-        0.05, doc='largest offset that is estimated', unit='s', low=0, high=0.2)
+        0.05, doc='largest estimated offset', unit='s', low=0, high=0.2)
     walk: float = parameter(
         0.00001, doc='random walk', unit='s/sqrt(s)', low=0, high=1)
     speed: float = parameter(
-        0.1, doc='slower motion says nothing about it', unit='m/s', low=0.001, high=10)
+        0.1, doc='speed below which it is not estimated', unit='m/s', low=0.001, high=10)
     rate: float = parameter(
-        0.2, doc='slower rotation says nothing about it', unit='rad/s', low=0.001, high=10)
+        0.2, doc='rotation below which it is not estimated', unit='rad/s', low=0.001, high=10)
     trend_samples: int = parameter(
-        3, doc='readings through which the trend is laid that carries a late rate on; 1 holds it',
+        3, doc='number of readings in the trend that extrapolates a delayed rate; 1: constant',
         low=1, high=100)
 
 
 @dataclass(frozen=True, kw_only=True)
 class StatusParameters:
-    """When the estimate is good, and how a lost one comes back."""
+    """Limits of the status, and recovery of a lost state."""
 
     dead_reckoning_after: float = parameter(
-        0.1, doc='time without an accepted pose', unit='s', low=0.01, high=10)
+        0.1, doc='time without an accepted pose until dead_reckoning', unit='s', low=0.01,
+        high=10)
     lost_after: float = parameter(
-        20.0, doc='time without an accepted pose', unit='s', low=0.02, high=600)
+        20.0, doc='time without an accepted pose until lost', unit='s', low=0.02, high=600)
     lost_position_std: float = parameter(
-        5.0, doc='standard deviation of the position, each axis', unit='m', low=0.001, high=100)
+        5.0, doc='standard deviation of the position, each axis, above which the state is lost',
+        unit='m', low=0.001, high=100)
     start_poses: int = parameter(
         20, doc='consecutive poses that must agree with the IMU before the first fix and when '
         'lost', low=2, high=10000)
     jump_poses: int = parameter(
         100, doc='consecutive poses that must agree with the IMU and with each other before a '
-        'persistent jump is believed', low=2, high=10000)
+        'persistent jump is accepted', low=2, high=10000)
     jump_attitude: float = parameter(
-        0.35, doc='a jump of the attitude beyond is not believed, for the gyroscope rules it out',
+        0.35, doc='largest accepted jump of the attitude; the gyroscope rules out larger ones',
         unit='rad', low=0.01, high=4)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DoubtParameters:
-    """What becomes uncertain when the IMU contradicts poses that follow each other smoothly."""
+    """Uncertainty that is added if the IMU contradicts poses that are smooth in themselves."""
 
     poses: int = parameter(
         3, doc='consecutive poses that must contradict', low=1, high=1000)
     time: float = parameter(
-        1.0, doc='for which a single pose suffices after that', unit='s', low=0, high=100)
+        1.0, doc='duration after that in which a single pose suffices', unit='s', low=0, high=100)
     distance: float = parameter(
-        0.05, doc='a longer step from the last good pose is a jump of the MoCap', unit='m',
+        0.05, doc='step from the last good pose above which the MoCap has jumped', unit='m',
         low=0.001, high=10)
     angle: float = parameter(
-        0.05, doc='likewise a larger turn', unit='rad', low=0.001, high=3)
+        0.05, doc='rotation from the last good pose above which the MoCap has jumped', unit='rad',
+        low=0.001, high=3)
     speed: float = parameter(
-        2.0, doc='error of the velocity by which that step may be longer for each second',
+        2.0, doc='increase of distance for each second since the last good pose',
         unit='m/s', low=0, high=100)
     rate: float = parameter(
-        8.0, doc='error of the angular rate by which that turn may be larger for each second',
+        8.0, doc='increase of angle for each second since the last good pose',
         unit='rad/s', low=0, high=100)
     position_std: float = parameter(
-        0.05, doc='then added to the deviation of the position', unit='m', low=1e-4, high=10)
+        0.05, doc='added standard deviation of the position', unit='m', low=1e-4, high=10)
     velocity_std: float = parameter(
-        0.5, doc='then added to the deviation of the velocity', unit='m/s', low=0.001, high=100)
+        0.5, doc='added standard deviation of the velocity', unit='m/s', low=0.001, high=100)
     attitude_std: float = parameter(
-        0.01, doc='then added to that of the attitude', unit='rad', low=0.001, high=3)
+        0.01, doc='added standard deviation of the attitude', unit='rad', low=0.001, high=3)
     accelerometer_bias_std: float = parameter(
-        1.0, doc='then added to that of the accelerometer bias', unit='m/s^2', low=1e-6, high=100)
+        1.0, doc='added standard deviation of the accelerometer bias', unit='m/s^2', low=1e-6,
+        high=100)
     gyroscope_bias_std: float = parameter(
-        3.0, doc='then added to that of the gyroscope bias', unit='rad/s', low=1e-6, high=100)
+        3.0, doc='added standard deviation of the gyroscope bias', unit='rad/s', low=1e-6,
+        high=100)
 
 
 @dataclass(frozen=True, kw_only=True)
 class EkfParameters:
-    """Everything that :class:`~beetle_omni_ros.estimation.ekf.ErrorStateEkf` can be told."""
+    """Parameters of :class:`~beetle_omni_ros.estimation.ekf.ErrorStateEkf`."""
 
     imu: ImuParameters = group(ImuParameters)
     mocap: MocapParameters = group(MocapParameters)
@@ -195,7 +201,7 @@ class EkfParameters:
     status: StatusParameters = group(StatusParameters)
 
     def __post_init__(self):
-        """Refuse times that contradict each other."""
+        """Check the times against each other."""
         if self.status.lost_after <= self.status.dead_reckoning_after:
             raise schema.ParameterError(
                 f'status.lost_after ({self.status.lost_after:g} s) must be above '
@@ -207,10 +213,11 @@ class EkfParameters:
 
     def of_robot(self, robot: RobotParameters):
         """
-        Parameters with what the robot file's effects say of IMU and MoCap.
+        Combine the parameters with the sensor effects of a robot file.
 
-        Mountings replace those given here; biases and delays add to them. A late MoCap is early
-        by its stamps; a late IMU is carried on to now, as a latency that is found in flight.
+        Mountings of the effects replace those of the parameters; biases and delays are added. A
+        delay of the MoCap is subtracted from its time offset. A delay of the IMU is extrapolated,
+        as a latency that is estimated in flight.
         """
         e, imu, mocap = robot.sensors, self.imu, self.mocap
 
@@ -233,7 +240,7 @@ class EkfParameters:
         Read a parameter file; without a path, the shipped one.
 
         Raises:
-            ParameterError: naming file, key and what was expected.
+            ParameterError: names file, key and expected value.
 
         """
         return schema.load(cls, path if path else share_path('params/ekf.yaml'))

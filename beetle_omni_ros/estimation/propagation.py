@@ -1,11 +1,10 @@
 """
 Strapdown propagation between two IMU samples, and its exact linearisation.
 
-The samples are taken as values of a signal that is linear in between. Attitude takes the
-mean rate and the first commutator (Magnus) term, so that coning motion does not drift;
-velocity and position take the trapezoidal rule in world, which needs no midpoint.
-The navigated point is the IMU itself: its accelerometer then needs no correction by an
-angular acceleration, which nobody measures.
+The measured signals are linear between two samples. The attitude uses the mean rate and the first
+commutator (Magnus) term, so that coning motion does not drift. Velocity and position use the
+trapezoidal rule in world, which needs no midpoint. The navigated point is the IMU. Its
+accelerometer then needs no correction by the angular acceleration, which is not measured.
 """
 
 from dataclasses import dataclass, field
@@ -22,7 +21,7 @@ from beetle_omni_ros.estimation.samples import (
 )
 from beetle_omni_ros.robot import rotations
 
-# Behind the 15 error states that leave the estimator, the offset between the sensors' clocks.
+# The offset between the sensors' clocks follows the 15 error states of the estimate.
 TIME_OFFSET = ERROR_STATES
 STATES = ERROR_STATES + 1
 UNKNOWN = np.full((STATES, STATES), np.nan)
@@ -31,21 +30,21 @@ UNKNOWN = np.full((STATES, STATES), np.nan)
 @dataclass(slots=True, eq=False)
 class Node:
     """
-    One instant of the history: the IMU reading and the state there; never changed in place.
+    IMU reading and state at one instant of the history; never changed in place.
 
     Attributes:
         stamp: [s].
-        force: (3,) specific force as measured, base_link axes [m/s^2].
-        rate: (3,) angular rate as measured, base_link axes [rad/s].
+        force: (3,) measured specific force, base_link axes [m/s^2].
+        rate: (3,) measured angular rate, base_link axes [rad/s].
         position: (3,) of the IMU in world [m].
         velocity: (3,) of the IMU in world [m/s].
         quaternion: (4,) base_link to world.
-        rotation: (3, 3) the same.
+        rotation: (3, 3) matrix of ``quaternion``.
         accelerometer_bias: (3,) base_link axes [m/s^2].
         gyroscope_bias: (3,) base_link axes [rad/s].
-        time_offset: by how much the stamps of the IMU are later than those of the MoCap [s].
-        shaken: whether readings just before were beyond the sensor's range.
-        covariance: (16, 16) of the error states and the time offset; NaN until it is propagated.
+        time_offset: stamps of the IMU minus stamps of the MoCap at one instant [s].
+        after_impact: whether readings just before were beyond the sensor's range.
+        covariance: (16, 16) of the error states and the time offset; NaN before its prediction.
 
     """
 
@@ -59,21 +58,21 @@ class Node:
     accelerometer_bias: np.ndarray
     gyroscope_bias: np.ndarray
     time_offset: float
-    shaken: bool = False
+    after_impact: bool = False
     covariance: np.ndarray = field(default_factory=lambda: UNKNOWN)
 
 
 def propagate(node: Node, stamp: float, force: np.ndarray, rate: np.ndarray,
               gravity: float) -> Node:
     """
-    Carry the state, without its covariance, to the next IMU reading.
+    Propagate the state, without its covariance, to the next IMU reading.
 
     Args:
-        node: where to start.
-        stamp: of the next reading [s].
-        force: (3,) its specific force, base_link axes [m/s^2].
-        rate: (3,) its angular rate, base_link axes [rad/s].
-        gravity: magnitude, along world -z [m/s^2].
+        node: initial state.
+        stamp: stamp of the next reading [s].
+        force: (3,) specific force of the next reading, base_link axes [m/s^2].
+        rate: (3,) angular rate of the next reading, base_link axes [rad/s].
+        gravity: magnitude along world -z [m/s^2].
 
     """
     dt = stamp - node.stamp
@@ -106,9 +105,9 @@ def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
     Linearise :func:`propagate`: error after = ``out`` @ error before.
 
     Args:
-        before: where the step started.
-        after: what :func:`propagate` made of it.
-        out: (16, 16) buffer; holds the identity wherever no block is written.
+        before: initial node of the step.
+        after: result of :func:`propagate`.
+        out: (16, 16) buffer, identity in all unwritten blocks.
 
     """
     dt = after.stamp - before.stamp
@@ -118,7 +117,7 @@ def transition(before: Node, after: Node, out: np.ndarray) -> np.ndarray:
     back = r1.T @ r0
     out[0, 3] = out[1, 4] = out[2, 5] = dt
     out[ATTITUDE, ATTITUDE] = back
-    # the right Jacobian of SO(3) over the step, to second order: the mean of both ends
+    # right Jacobian of SO(3) over the step, to second order: mean of both ends
     drift = (-0.5 * dt) * back
     drift[0, 0] -= 0.5 * dt
     drift[1, 1] -= 0.5 * dt

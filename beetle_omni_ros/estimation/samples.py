@@ -1,4 +1,4 @@
-"""What comes out of the estimator, and the order of its error states."""
+"""Output of the estimator, and the order of its error states."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,8 +8,8 @@ import numpy as np
 
 from beetle_omni_ros.robot import rotations
 
-# The 15 error states, in this order everywhere: position and velocity of base_link in world,
-# attitude as rotation vector in base_link (R_true = R exp(theta)), then the two biases.
+# The 15 error states: position and velocity of base_link in world, attitude as rotation vector
+# in base_link (R_true = R exp(theta)), accelerometer and gyroscope bias.
 POSITION = slice(0, 3)
 VELOCITY = slice(3, 6)
 ATTITUDE = slice(6, 9)
@@ -21,7 +21,7 @@ ERROR_STATES = 15
 @dataclass(frozen=True)
 class Estimate:
     """
-    The state of base_link at the newest IMU sample.
+    State of base_link at the newest IMU sample.
 
     Attributes:
         stamp: time of that sample [s].
@@ -31,8 +31,8 @@ class Estimate:
         angular_velocity: (3,) in base_link, bias removed [rad/s].
         accelerometer_bias: (3,) in base_link axes [m/s^2].
         gyroscope_bias: (3,) in base_link axes [rad/s].
-        covariance: (15, 15) of the error, in the order of this module's slices; worked out when
-            first asked for.
+        covariance: (15, 15) of the error, in the order of this module's slices; computed on first
+            access.
 
     """
 
@@ -43,19 +43,19 @@ class Estimate:
     angular_velocity: np.ndarray
     accelerometer_bias: np.ndarray
     gyroscope_bias: np.ndarray
-    find_covariance: Callable[[], np.ndarray] = field(repr=False)
+    compute_covariance: Callable[[], np.ndarray] = field(repr=False)
 
     @cached_property
     def covariance(self) -> np.ndarray:
         """See the class."""
-        return self.find_covariance()
+        return self.compute_covariance()
 
 
 def pose_covariance(estimate: Estimate) -> np.ndarray:
     """
     Covariance (6, 6) of position [m] and rotation about world axes [rad].
 
-    The filter's rotation error is about body axes, that of nav_msgs/Odometry about world's.
+    The filter's rotation error is about body axes, that of nav_msgs/Odometry about world axes.
     """
     jacobian = np.zeros((6, ERROR_STATES))
     jacobian[:3, POSITION] = np.eye(3)
@@ -68,7 +68,7 @@ def twist_covariance(estimate: Estimate, gyroscope_noise: float) -> np.ndarray:
     Covariance (6, 6) of linear [m/s] and angular [rad/s] velocity in base_link.
 
     Args:
-        estimate: of the filter.
+        estimate: output of the filter.
         gyroscope_noise: standard deviation of one angular-rate sample, each axis [rad/s].
 
     """

@@ -1,4 +1,4 @@
-"""One hypothesis of the motion: a short history that delayed poses can correct."""
+"""One hypothesis of the motion, with a short history for delayed poses."""
 
 from bisect import bisect_right
 
@@ -7,12 +7,12 @@ import numpy as np
 from beetle_omni_ros.estimation.model import ErrorStateModel
 from beetle_omni_ros.estimation.propagation import Node
 
-VELOCITY_KNOWN = 5  # poses after which the motion is known well enough to doubt its time
+VELOCITY_KNOWN = 5  # poses after which the velocity is known, so that the time can be uncertain
 SAME_INSTANT = 1e-6  # [s] well below a sample period, well above the resolution of a stamp
 
 
 def interpolate(stamp, before, after) -> tuple[np.ndarray, np.ndarray]:
-    """Force and rate at ``stamp`` on the line between two readings (stamp, force, rate)."""
+    """Force and rate at ``stamp``, linear between two readings (stamp, force, rate)."""
     share = (stamp - before[0]) / (after[0] - before[0])
     return (before[1] + share * (after[1] - before[1]),
             before[2] + share * (after[2] - before[2]))
@@ -20,21 +20,21 @@ def interpolate(stamp, before, after) -> tuple[np.ndarray, np.ndarray]:
 
 class Track:
     """
-    States from the last correction (or as far back as poses may come) to the newest reading.
+    States from the last correction, or from the largest age of a pose, to the newest reading.
 
-    A pose is applied to the state at its capture time; the readings after it are then
-    replayed, so that the result is the same as if it had arrived at once.
+    A pose is applied to the state at its capture time. The later readings are then replayed, so
+    that the result is the same as without the delay.
     """
 
     def __init__(self, model: ErrorStateModel, first: Node, history: float,
                  time_deviation: float = 0.0):
         """
-        Begin with one state.
+        Start with one state.
 
         Args:
-            model: predicts and corrects.
-            first: the state and its covariance.
-            history: how far back a pose may lie [s].
+            model: prediction and correction.
+            first: state with its covariance.
+            history: largest age of a pose [s].
             time_deviation: standard deviation of the first state's time offset [s].
 
         """
@@ -47,33 +47,34 @@ class Track:
 
     @property
     def newest(self) -> Node:
-        """The state at the newest reading."""
+        """State at the newest reading."""
         return self.nodes[-1]
 
     def at(self, stamp: float) -> Node:
-        """The last state not after ``stamp`` [s], or the oldest one."""
+        """Last state not after ``stamp`` [s], or the oldest one."""
         return self.nodes[max(0, bisect_right(self.nodes, stamp + SAME_INSTANT, key=_stamp) - 1)]
 
-    def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray, shaken: bool) -> None:
+    def predict(self, stamp: float, force: np.ndarray, rate: np.ndarray,
+                after_impact: bool) -> None:
         """Append the state at the next reading."""
         nodes = self.nodes
-        nodes.append(self._model.predict(nodes[-1], stamp, force, rate, shaken))
+        nodes.append(self._model.predict(nodes[-1], stamp, force, rate, after_impact))
         while nodes[1].stamp < stamp - self._history:
             del nodes[0]
 
     def correct(self, stamp: float, position: np.ndarray, quaternion: np.ndarray,
-                doubtful: float = 0.0) -> bool:
+                doubt_span: float = 0.0) -> bool:
         """
-        Apply a pose at its capture time and replay what came after.
+        Apply a pose at its capture time and replay the later readings.
 
         Args:
-            stamp: capture time, not after the newest node; before the oldest, that is used [s].
+            stamp: capture time [s], not after the newest node; at least the oldest node's is used.
             position: (3,) of the marker body in world [m].
             quaternion: (4,) marker body to world.
-            doubtful: for how long the IMU may have been wrong [s], 0: not at all.
+            doubt_span: duration for which the IMU may have been wrong [s], 0: not at all.
 
         Returns:
-            False when the pose does not fit; the track is then unchanged.
+            False if the pose fails the gate; the track is then unchanged.
 
         """
         nodes = self.nodes
@@ -84,19 +85,19 @@ class Track:
             after = nodes[index + 1]
             prior = self._model.predict(prior, stamp, *interpolate(
                 stamp, (prior.stamp, prior.force, prior.rate),
-                (after.stamp, after.force, after.rate)), after.shaken)
-        if doubtful:
-            prior = self._model.doubt(prior, doubtful)
+                (after.stamp, after.force, after.rate)), after.after_impact)
+        if doubt_span:
+            prior = self._model.doubt(prior, doubt_span)
         posterior = self._model.correct(prior, position, quaternion)
         if posterior is None:
             return False
         self.fixes += 1
         if self.fixes == VELOCITY_KNOWN:
-            self._model.doubt_time(posterior, self._time_deviation)
+            self._model.add_time_uncertainty(posterior, self._time_deviation)
         replayed = [posterior]
         for node in nodes[index + 1:]:
             replayed.append(self._model.predict(replayed[-1], node.stamp, node.force, node.rate,
-                                                node.shaken))
+                                                node.after_impact))
         self.nodes = replayed
         self.last_fix = stamp
         return True
