@@ -27,7 +27,7 @@ from beetle_omni_ros.identify.gap.joint_search import Search
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
 from beetle_omni_ros.identify.joint_results import joint_results
-from beetle_omni_ros.identify.joint_servos import believed_sets
+from beetle_omni_ros.identify.joint_servos import file_sets
 from beetle_omni_ros.identify.servo_model import simulate
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -114,7 +114,7 @@ def drawn(residual: np.ndarray, period: float, rng: np.random.Generator) -> np.n
 def made_log(log: JointLog, robot: RobotParameters, residual, rng) -> JointLog:
     """Log of a robot's servos behind the commands of a real one."""
     joints = np.arange(len(log.joints))
-    positions = simulate(log, joints, believed_sets(robot, log.joints)) \
+    positions = simulate(log, joints, file_sets(robot, log.joints)) \
         + drawn(residual, log.period, rng)
     return JointLog('made.csv', log.t, log.joints, np.round(positions / COUNT) * COUNT,
                     log.command)
@@ -138,7 +138,7 @@ def run(log: JointLog, cases: int, seed: int, console: Console) -> dict:
     robot = corrected(shipped, first)
     second = judged(log, robot)
     residual = log.measured - simulate(log, np.arange(len(log.joints)),
-                                       believed_sets(robot, log.joints))
+                                       file_sets(robot, log.joints))
     rows = []
     for k in range(cases):
         rng = np.random.default_rng([seed, k])

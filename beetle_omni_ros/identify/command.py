@@ -38,10 +38,10 @@ def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path
     """
     console = console or Console()
     _check_outputs(json_path, report, params, robot)
-    believed = RobotParameters.load(robot)
-    published = believed.joints
+    robot_parameters = RobotParameters.load(robot)
+    published = robot_parameters.joints
     log = read_joint_log(path)
-    servos = file_servos(believed, log.joints)
+    servos = file_servos(robot_parameters, log.joints)
     validations = [read_joint_log(other) for other in validate]
     with console.status(f'identifying {len(log.joints)} joints'):
         models = identify_joints(log, published)
@@ -76,7 +76,7 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
     """
     console = console or Console()
     _check_outputs(json_path, report, params, robot)
-    believed = RobotParameters.load(robot)
+    robot_parameters = RobotParameters.load(robot)
     log = read_rotor_log(path)
     rows, ratio = identify_rotor(log)
     results = of_rotor.rotor_results(log, rows, ratio)
@@ -86,7 +86,7 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
     if json_path:
         write_json(json_path, results)
     if report:
-        write_text(report, of_rotor.rotor_page(log, rows, ratio, believed, results),
+        write_text(report, of_rotor.rotor_page(log, rows, ratio, robot_parameters, results),
                              'report')
     if params:
         of_rotor.write_rotor_file(params, results, robot)

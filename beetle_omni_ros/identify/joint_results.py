@@ -18,21 +18,21 @@ from beetle_omni_ros.robot.parameters import JointParameters
 
 
 def joint_results(log: JointLog, validations: list[JointLog], models: list[JointModel],
-                  published: JointParameters, believed: FileServos | None = None) -> dict:
+                  published: JointParameters, servos: FileServos | None = None) -> dict:
     """
-    All numbers of an identification.
+    Results of an identification as plain data.
 
     Args:
-        log: that was identified from.
-        validations: other logs of the same servos.
-        models: of the log's joints, in its order.
-        published: gains and limits of the robot file's servo.
-        believed: the file's servos with its effects; default: without any.
+        log: fitted log.
+        validations: further logs of the same servos.
+        models: models of the log's joints, in its order.
+        published: gains and limits of the robot file.
+        servos: servos of the robot file with its effects; default: without effects.
 
     """
-    if believed is None:
-        believed = FileServos(np.tile(published_set(published), (len(models), 1)), held=False)
-    joints = [_joint(log, k, validations, model, published, believed)
+    if servos is None:
+        servos = FileServos(np.tile(published_set(published), (len(models), 1)), held=False)
+    joints = [_joint(log, k, validations, model, published, servos)
               for k, model in enumerate(models)]
     return {'meta': {'log': log.name, 'validate': [other.name for other in validations],
                      'fitted_part': shipped().servo.fitted, 'version': __version__},
@@ -49,10 +49,10 @@ def _merged(joints):
             for text, numbers in about.items()]
 
 
-def _joint(log, index, validations, model, published, believed):
+def _joint(log, index, validations, model, published, servos):
     end = log.end_of(shipped().servo.fitted)
     first, last = slice(0, end), slice(end, None)
-    start, held, inertia = believed.sets[index], believed.held, published.inertia
+    start, held, inertia = servos.sets[index], servos.held, published.inertia
     wn, zeta = (model.values[INDEX[name]] for name in LINEAR)
     kp = inertia * wn**2
     known = [(other, other.joints.index(model.joint) if model.joint in other.joints else None)

@@ -84,9 +84,9 @@ class Servos:
         self.coordinates = Coordinates(self.numbers)
         self.values, self.scale = self.coordinates.decode, self.coordinates.scale
         self.owner = np.array([-1 if n.joint is None else n.joint for n in self.numbers])
-        self.believed = self.coordinates.encode(self._believed())
+        self.file_point = self.coordinates.encode(self._file_values())
 
-    def _believed(self):
+    def _file_values(self):
         servo, effects = self.robot.joints, self.robot.effects
         friction = effects.get('joint_friction', {'coulomb': 0.0, 'stiction': 0.0})
         coulomb = np.array([per_joint(friction['coulomb'], j - 1) for j in self.joints])
@@ -149,7 +149,7 @@ class Servos:
         return coulomb * self.values(point)[self.index('kp')]
 
 
-def believed_sets(robot: RobotParameters, joints: tuple[int, ...]) -> np.ndarray:
+def file_sets(robot: RobotParameters, joints: tuple[int, ...]) -> np.ndarray:
     """
     Parameter sets (J, len(NAMES)) of the complete servos of a robot file, effects included.
 
@@ -158,7 +158,7 @@ def believed_sets(robot: RobotParameters, joints: tuple[int, ...]) -> np.ndarray
     Deflection needs a thrust, which a response log does not have.
     """
     servos = Servos(robot, joints)
-    return servos.sets(servos.believed[None])[0]
+    return servos.sets(servos.file_point[None])[0]
 
 
 @dataclass(frozen=True)
@@ -179,6 +179,6 @@ class FileServos:
 
 def file_servos(robot: RobotParameters, joints: tuple[int, ...]) -> FileServos:
     """Servos of a robot file for the joints of a log, as they are replayed."""
-    return FileServos(believed_sets(robot, joints),
+    return FileServos(file_sets(robot, joints),
                       any(name in robot.effects for name in (*GROUPS, 'command_latency',
                                                              'joint_feedback_delay')))

@@ -54,13 +54,13 @@ def grids(results: dict) -> list[Grid]:
                 f'{ratio["interval"][0]:.5f}..{ratio["interval"][1]:.5f}']])]
 
 
-def rotor_page(log: RotorLog, rows: list[MapRow], ratio: Ratio, believed: RobotParameters,
+def rotor_page(log: RotorLog, rows: list[MapRow], ratio: Ratio, robot: RobotParameters,
                results: dict) -> str:
     """HTML page with the map, residuals and torque."""
     with matplotlib.rc_context(STYLE):
         sections = [
             section('Map', 'Dots: measured; lines: fitted; dashed: the robot file.',
-                    svg(_maps(log, rows, believed), 'thrust over duty')),
+                    svg(_maps(log, rows, robot), 'thrust over duty')),
             section('Residuals', 'Measured thrust minus the map at the duty sent.',
                     svg(_residuals(log, rows), 'residual over thrust')),
             section('Torque', 'Reaction torque over thrust, and what the ratio leaves.',
@@ -73,14 +73,14 @@ def _colours(count):
     return [matplotlib.colormaps['viridis'](0.9 * k / max(count - 1, 1)) for k in range(count)]
 
 
-def _maps(log, rows, believed) -> Figure:
+def _maps(log, rows, robot) -> Figure:
     figure, axes = panels(1, height=4.0)
     axis = axes[0, 0]
     for row, plateau, colour in zip(rows, log.plateaus, _colours(len(rows)), strict=True):
         axis.plot(plateau.duty, plateau.force, '.', ms=2.5, color=colour, alpha=0.6)
         thrust = np.linspace(0, row.thrust_max, 200)
         axis.plot(row.duty(thrust), thrust, color=colour, label=f'{row.voltage:.2f} V')
-    for known in believed.rotors.map:
+    for known in robot.rotors.map:
         thrust = np.linspace(0, known.thrust_max, 200)
         axis.plot(np.polyval(known.coefficients[::-1], thrust / 10), thrust, color=FAINT, lw=0.8,
                   ls=(0, (4, 3)))

@@ -1,4 +1,4 @@
-"""Slow and quick motion: a number of the robot is the same in both, an answer to a gust is not."""
+"""Closed-loop bias: a parameter is the same in slow and in fast motion, a bias by gusts is not."""
 
 from itertools import product
 from types import SimpleNamespace
@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfilt
 
-from beetle_omni_ros.identify.gap.bands import apart, aside, by_band, in_part_alone
+from beetle_omni_ros.identify.gap.bands import (
+    by_band,
+    differs_between_bands,
+    gain_by_part,
+    project_out,
+)
 from beetle_omni_ros.identify.gap.residual import THIN
 from beetle_omni_ros.identify.inference.noise import autoregression
 
@@ -21,7 +26,7 @@ CHANNELS = BODY + OTHERS
 def problem(flights=2):
     """What a fit says of its samples, all flights' channels in a row."""
     where = np.repeat(np.arange(CHANNELS), LENGTH)
-    return SimpleNamespace(p=P, beliefs={}, where=np.tile(where, flights),
+    return SimpleNamespace(p=P, priors={}, where=np.tile(where, flights),
                            flight=np.repeat(np.arange(flights), len(where)))
 
 
@@ -39,7 +44,7 @@ def flown(seed, gusts, wanted):
     Args:
         seed: of everything random.
         gusts: rms [rad/s^2].
-        wanted: rms of the motion that somebody planned [rad/s^2].
+        wanted: rms of the planned motion [rad/s^2].
 
     """
     rng = np.random.default_rng(seed)
@@ -56,7 +61,7 @@ def flown(seed, gusts, wanted):
 def test_a_number_that_is_the_same_everywhere_gains_less_in_a_part():
     p = problem()
     x = noise(3 * len(p.where), 1).reshape(-1, 3)
-    everywhere, part = apart(p, x, x @ [0.3, -0.1, 0.05] + noise(len(p.where), 2))
+    everywhere, part = gain_by_part(p, x, x @ [0.3, -0.1, 0.05] + noise(len(p.where), 2))
     assert part < everywhere
 
 
@@ -64,7 +69,7 @@ def test_a_number_that_is_there_in_slow_motion_only_gains_more():
     p = problem()
     x = noise(len(p.where), 1)[:, None]
     slowly = lfilter([0.05], [1, -0.95], x[:, 0])
-    everywhere, part = apart(p, x, 1.0 * slowly + noise(len(p.where), 2))
+    everywhere, part = gain_by_part(p, x, 1.0 * slowly + noise(len(p.where), 2))
     assert part > 1.5 * everywhere > 20
 
 
@@ -80,11 +85,11 @@ def test_bands_together_hold_all_that_is_in_time(groups, channels):
 
 
 @pytest.mark.parametrize('gusts, wanted, true, passes', [
-    (0.3, 0.0, 0.0, False),      # gusts that are fought look like an inertia
+    (0.3, 0.0, 0.0, False),      # closed-loop bias: gusts look like an inertia
     (0.3, 0.2, 0.0, False),
     (0.0, 0.5, 0.3, True),       # an inertia that is there
     (0.1, 0.5, 0.3, True)])
-def test_answers_to_gusts_are_told_from_an_inertia(gusts, wanted, true, passes):
+def test_closed_loop_bias_is_separated_from_an_inertia(gusts, wanted, true, passes):
     p = problem(3)
     x, r = np.zeros((len(p.where), 1)), np.zeros(len(p.where))
     for flight, c in product(range(3), range(3, BODY)):
@@ -93,8 +98,8 @@ def test_answers_to_gusts_are_told_from_an_inertia(gusts, wanted, true, passes):
         taps, sigma = autoregression([rest], P.body_order)
         x[rows, 0] = lfilter(taps, 1, acceleration) / sigma
         r[rows] = lfilter(taps, 1, rest - true * acceleration) / sigma
-    assert apart(p, x, r)[0] > P.least_gain
-    assert in_part_alone(p, x, r) != passes
+    assert gain_by_part(p, x, r)[0] > P.least_gain
+    assert differs_between_bands(p, x, r) != passes
 
 
 def test_what_others_could_take_over_is_no_evidence():
@@ -103,17 +108,17 @@ def test_what_others_could_take_over_is_no_evidence():
     own = noise(len(p.where), 2)
     state = SimpleNamespace(slopes=np.stack([known, own + 2 * known], axis=1), theta={},
                             r=own + 3 * known, index={'known': 0, 'own': 1})
-    slopes, rest = aside(p, state, ['known'], state.slopes[:, 1:], frozenset())
+    slopes, rest = project_out(p, state, ['known'], state.slopes[:, 1:], frozenset())
     np.testing.assert_allclose(slopes.T @ known, 0, atol=1e-3)
     np.testing.assert_allclose(rest @ known, 0, atol=1e-3)
     np.testing.assert_allclose(rest, slopes[:, 0], atol=1e-6)
 
 
-def test_a_gain_of_beliefs_is_not_held_against_the_noise_of_bands():
+def test_a_gain_in_the_priors_is_no_closed_loop_bias():
     p = problem()
     x = noise(len(p.where), 1)[:, None]
     slowly = lfilter([0.05], [1, -0.95], x[:, 0])
     r = 0.4 * slowly + noise(len(p.where), 2)
-    part = apart(p, x, r)[1]
-    assert in_part_alone(p, x, r)
-    assert not in_part_alone(p, x, r, gain=part)
+    part = gain_by_part(p, x, r)[1]
+    assert differs_between_bands(p, x, r)
+    assert not differs_between_bands(p, x, r, gain=part)

@@ -91,7 +91,7 @@ def test_what_leaves_most_of_a_large_gap_is_not_named(made):
     results = gap_results([folder / 'flight0'], [folder / 'storm'], console=quiet())
     assert results['gap_before'] > 10
     assert results['verdict'] == 'unknown' and results['effects'] == []
-    assert 'wind' in results['reason'] and 'leaves most' in results['reason']
+    assert 'wind' in results['reason'] and 'does not explain most' in results['reason']
 
 
 def test_the_json_holds_what_the_interfaces_fix(made):
@@ -224,12 +224,12 @@ def test_the_sentence_says_size_and_closure(made):
 
 
 def test_tables_explain_their_columns(made):
-    for words in ('sign reversed', 'closure: part of the gap', 'standard deviations'):
+    for words in ('sign reversed', 'closure: closed share', 'standard deviations'):
         assert words in made[2]
     assert 'placebo' not in made[2]
 
 
-def test_the_believed_file_is_not_overwritten(tmp_path):
+def test_the_base_file_is_not_overwritten(tmp_path):
     (tmp_path / 'mine.yaml').write_text('extends: robot.yaml\n')
     with pytest.raises(ParameterError, match='extends'):
         run_gap([tmp_path], robot=tmp_path / 'mine.yaml', apply=tmp_path / 'mine.yaml',

@@ -9,7 +9,7 @@ import pytest
 
 from beetle_omni_ros.identify.gap.candidates import Candidate, Trial
 from beetle_omni_ros.identify.gap.fit import Problem, State
-from beetle_omni_ros.identify.gap.gates import at_bound, cross_validate, holds
+from beetle_omni_ros.identify.gap.gates import at_bound, confirmed, cross_validate
 from beetle_omni_ros.identify.gap.keys import (
     all_keys,
     THRUST_BUS,
@@ -27,7 +27,7 @@ class Straight(Problem):
 
     def __init__(self, truth, overlap):
         self.keys, self.p = KEYS, P
-        self.beliefs = {name: tolerances(P)[name] for name in (LAG, OTHER)}
+        self.priors = {name: tolerances(P)[name] for name in (LAG, OTHER)}
         rng = np.random.default_rng(0)
         one, two = rng.standard_normal((2, 2000))
         self.columns = 30 * np.stack([one, overlap * one + (1 - overlap) * two], axis=1)
@@ -48,10 +48,10 @@ class Curved(Straight):
     def state(self, theta, names):
         self.at = theta
 
-    def guide(self, theta):
+    def smooth_tilts(self, theta):
         pass
 
-    def renew(self, theta):
+    def update_residual(self, theta):
         self.at = theta
 
 
@@ -60,7 +60,7 @@ def test_a_slow_fit_leaves_nothing_for_others_to_gain():
     search = Search.__new__(Search)
     search.p = P
     search.problem, search.always, search.wide, search.names = problem, [LAG, OTHER], {}, []
-    state, cost = search._settle({}, [])
+    state, cost = search._fit_with_noise({}, [])
     _, again = problem.refine(state, search.always, frozenset(), 10)
     assert cost - again < 1.0
 
@@ -87,14 +87,14 @@ class Rough(Straight):
         return State(theta, self.residual(theta), slopes, names)
 
 
-@pytest.mark.parametrize('apart', [False, True])
-def test_a_rough_slope_need_not_hold_up_the_others(apart):
+@pytest.mark.parametrize('split', [False, True])
+def test_a_rough_slope_need_not_hold_up_the_others(split):
     problem = Rough(0.02, 0.0)
     start, free = problem.start(), frozenset({Rough.FRICTION})
-    state, cost = problem.refine(start, [LAG, OTHER, Rough.FRICTION], free, 5, apart)
+    state, cost = problem.refine(start, [LAG, OTHER, Rough.FRICTION], free, 5, split)
     assert state.theta[Rough.FRICTION] == 0.005
-    assert (cost < float(start.r @ start.r) - 100.0) == apart
-    if apart:
+    assert (cost < float(start.r @ start.r) - 100.0) == split
+    if split:
         assert state.theta[LAG] == pytest.approx(0.02, abs=0.005)
 
 
@@ -106,7 +106,7 @@ def before(truth, overlap=0.0):
     search.problem, search.always = problem, [LAG, OTHER]
     start = State({}, problem.residual({}), problem.columns, [LAG, OTHER])
     state, cost = problem.refine(start, search.always, frozenset())
-    return cost, search._believable(state, cost)
+    return cost, search._plausible_cost(state, cost)
 
 
 def test_a_lag_far_beyond_tolerance_is_not_taken_over_by_it():
@@ -126,18 +126,18 @@ def test_a_lag_within_tolerance_is():
 
 
 @pytest.mark.parametrize('x, expected', [(0.02, 0.02), (0.2, 0.09), (-0.2, -0.09)])
-def test_a_belief_has_an_end(x, expected):
+def test_a_prior_has_a_plausible_range(x, expected):
     assert Prior(0.03).within(x, P.beyond) == pytest.approx(expected)
 
 
 def test_a_free_range_ends_beyond_itself():
-    belief = Prior(5e-4, 0.010, 0.005, 0.003)
-    assert belief.within(0.004, P.beyond) == 0.004
-    assert belief.within(0.02, P.beyond) == pytest.approx(0.0065)
-    assert belief.within(-0.02, P.beyond) == pytest.approx(-0.0115)
+    prior = Prior(5e-4, 0.010, 0.005, 0.003)
+    assert prior.within(0.004, P.beyond) == 0.004
+    assert prior.within(0.02, P.beyond) == pytest.approx(0.0065)
+    assert prior.within(-0.02, P.beyond) == pytest.approx(-0.0115)
 
 
-@pytest.mark.parametrize('gain, left, agreement, of_beliefs, named', [
+@pytest.mark.parametrize('gain, left, agreement, prior_gain, named', [
     (60.0, 70.0, 4.0, 0.0, True), (60.0, 170.0, 4.0, 0.0, False), (60.0, 170.0, 10.0, 0.0, True),
     (60.0, 600.0, 10.0, 0.0, False), (600.0, 1700.0, 4.0, 0.0, True),
     (600.0, 1700.0, 2.5, 0.0, False), (600.0, 6000.0, 10.0, 0.0, False),
@@ -146,32 +146,32 @@ def test_a_free_range_ends_beyond_itself():
     (20.0, 21.0, 10.0, 40.0, False), (60.0, 600.0, 10.0, 20.0, False),
     (60.0, 600.0, 10.0, 60.0, True)])
 def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch, gain, left,
-                                                                     agreement, of_beliefs,
+                                                                     agreement, prior_gain,
                                                                      named):
     drag = Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag')
     trial = Trial(drag, gain, {'rotor_drag.coefficient': 0.4}, refined=True,
-                  believed=of_beliefs)
+                  prior_gain=prior_gain)
 
     def agreed(self, trial, accepted):
         trial.held = SimpleNamespace(total=gain, error=gain / agreement, positive=1.0,
                                      without_best=0.9 * gain)
 
     monkeypatch.setattr(Search, '_cross_validate', agreed)
-    monkeypatch.setattr(Search, '_fought', lambda self, trial, accepted: False)
+    monkeypatch.setattr(Search, '_closed_loop_bias', lambda self, trial, accepted: False)
     search = Search.__new__(Search)
     search.p = P
     search.problem = type('Problem', (), {'keys': KEYS})()
-    assert (search._judge([trial], 1000.0 + left, 1000.0, []) is trial) == named
+    assert (search._select([trial], 1000.0 + left, 1000.0, []) is trial) == named
 
 
-@pytest.mark.parametrize('gain, error, positive, of_beliefs, held', [
+@pytest.mark.parametrize('gain, error, positive, prior_gain, held', [
     (100.0, 40.0, 0.6, 0.0, True), (100.0, 80.0, 1.0, 0.0, False), (1000.0, 800.0, 1.0, 0.0, True),
     (1000.0, 800.0, 0.75, 0.0, False), (100.0, 80.0, 1.0, 90.0, True),
     (100.0, 80.0, 0.75, 90.0, False), (100.0, 80.0, 1.0, 10.0, False)])
-def test_what_gains_little_must_gain_it_evenly(gain, error, positive, of_beliefs, held):
+def test_what_gains_little_must_gain_it_evenly(gain, error, positive, prior_gain, held):
     drag = Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag')
     blocks = SimpleNamespace(total=gain, error=error, positive=positive, without_best=0.5 * gain)
-    assert holds(Trial(drag, gain, {}, held=blocks, believed=of_beliefs), P) == held
+    assert confirmed(Trial(drag, gain, {}, held=blocks, prior_gain=prior_gain), P) == held
 
 
 @pytest.mark.parametrize('name, delay, physical', [
@@ -219,8 +219,8 @@ def test_a_reading_may_be_younger_than_the_robot_file_says():
     (0.0, 0.0, True), (0.004, -0.009, True), (-0.009, 0.004, True), (0.011, 0.0, False),
     (0.0, 0.011, False), (-0.014, 0.0, False)])
 def test_each_bus_is_late_within_its_own_range(tilt, thrust, usual):
-    beliefs = tolerances(P)
-    beyond = [abs(beliefs[name].residual(x)) for name, x in
+    priors = tolerances(P)
+    beyond = [abs(priors[name].residual(x)) for name, x in
               ((TILT_BUS, tilt), (THRUST_BUS, thrust))]
     assert (max(beyond) < 5.0) == usual
 
@@ -231,7 +231,7 @@ class Capped(Problem):
     KEY = 'joint_velocity_limit.velocity_limit'
 
     def __init__(self):
-        self.keys, self.p, self.beliefs, self.blocks = KEYS, P, {}, 8
+        self.keys, self.p, self.priors, self.blocks = KEYS, P, {}, 8
         rng = np.random.default_rng(0)
         self.block = np.repeat(np.arange(8), 250)
         self.speed = rng.uniform(0.0, 1.0, 2000) * np.where(self.block == 3, 1.6, 0.95)

@@ -11,7 +11,7 @@ from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.residual import THIN
-from beetle_omni_ros.identify.gap.rollouts import gap, HORIZONS, noise_floor, Runs, trimmed
+from beetle_omni_ros.identify.gap.rollouts import floor_factors, gap, HORIZONS, noise_floor, Runs
 
 HALF = HORIZONS.index(0.5)
 MOTION = Motion(7, duration=60.0)
@@ -25,8 +25,8 @@ def made(push):
     return flight
 
 
-def fitted(*pushes, others=()):
-    problem = Problem([made(push) for push in pushes], KEYS, tolerances(P), P, others)
+def fitted(*acts_on_body_only, others=()):
+    problem = Problem([made(push) for push in acts_on_body_only], KEYS, tolerances(P), P, others)
     problem.state({}, NAMES)
     problem.learn_noise(WIDE)
     return problem
@@ -39,7 +39,7 @@ def spread(noise):
 def test_every_flight_has_its_own_gusts():
     windy = made(gusts(MOTION, 3, 0.4))
     problem = fitted(gusts(MOTION, 1, 0.1), gusts(MOTION, 2, 0.1), others=[windy])
-    *calm, storm = problem.noises({}, WIDE)
+    *calm, storm = problem.noise_of_each({}, WIDE)
     assert spread(storm) / spread(calm[0]) == pytest.approx(4, rel=0.3)
     assert spread(calm[1]) / spread(calm[0]) == pytest.approx(1, rel=0.3)
     calm, storm = (replace(noise, seen={'B': noise.seen['B'] * ([1] * 3 + [0] * 3)})
@@ -50,7 +50,7 @@ def test_every_flight_has_its_own_gusts():
 def test_a_force_that_the_catalogue_knows_is_no_noise():
     problem = fitted(gusts(MOTION, 1, 0.1), others=[
         made(gusts(MOTION, 3, 0.1) + push) for push in ([0, 0, 0], [0.8, -0.5, 0.0])])
-    _, plain, blown = problem.noises({}, WIDE)
+    _, plain, blown = problem.noise_of_each({}, WIDE)
     assert spread(blown) == pytest.approx(spread(plain), rel=0.02)
 
 
@@ -61,18 +61,18 @@ def runs(error, floor):
 
 
 def test_a_perfect_model_is_at_the_floor_on_a_windy_day_too():
-    trim = trimmed([runs(0.1, 0.1), runs(0.2, 0.2)])
+    trim = floor_factors([runs(0.1, 0.1), runs(0.2, 0.2)])
     assert gap([runs(0.5, 0.5)], HALF, trim=trim) == pytest.approx(1)
 
 
 def test_no_floor_is_higher_than_what_the_model_reaches():
-    trim = trimmed([runs(0.05, 0.1), runs(0.1, 0.2)])
+    trim = floor_factors([runs(0.05, 0.1), runs(0.1, 0.2)])
     assert trim == pytest.approx(0.5)
     assert gap([runs(0.5, 0.5)], HALF, trim=trim) == pytest.approx(2)
 
 
 def test_a_bad_fit_does_not_raise_the_floor():
-    assert trimmed([runs(3.0, 0.1)]) == pytest.approx(1)
+    assert floor_factors([runs(3.0, 0.1)]) == pytest.approx(1)
 
 
 def test_joints_are_at_the_floor_where_they_spread_as_the_noise_does():

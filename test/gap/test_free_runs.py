@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.identify.gap.noise import Noise
-from beetle_omni_ros.identify.gap.rollouts import _tilts, free_runs
+from beetle_omni_ros.identify.gap.rollouts import _servo_runs, free_runs
 
 GAP = 0.04
 STATES = {'position': 0, 'velocity': 1, 'orientation': 2, 'rate': 3, 'joint': 4}
@@ -18,8 +18,8 @@ def made():
 
 def test_rotors_follow_their_servos_through_the_play_between(made):
     starts, steps = np.arange(0, 1200, 50), 100
-    _, shaft, tight = _tilts(made, {}, starts, steps)
-    _, same, loose = _tilts(made, {'joint_backlash.gap': GAP}, starts, steps)
+    _, shaft, tight = _servo_runs(made, {}, starts, steps)
+    _, same, loose = _servo_runs(made, {'joint_backlash.gap': GAP}, starts, steps)
     seen = made.signals.joints({'joint_backlash.gap': GAP})[0]
     np.testing.assert_array_equal(shaft, tight)     # without play, rotors are their servos
     np.testing.assert_array_equal(same, tight)      # which it does not move

@@ -32,7 +32,7 @@ def learnt(ratio, keep):
 
 
 @pytest.mark.parametrize('keep', KEEPS)
-def test_a_quiet_channel_is_believed_to_spread_by_its_floor_whatever_its_colour(keep):
+def test_a_quiet_channel_gets_the_spread_of_its_floor_whatever_its_colour(keep):
     noise, rest = learnt(0.2, keep)
     for group, floor in FLOORS.items():
         assert noise.spread[group][:3] == pytest.approx(floor, rel=0.03)
@@ -44,7 +44,7 @@ def test_a_quiet_channel_is_believed_to_spread_by_its_floor_whatever_its_colour(
 
 
 @pytest.mark.parametrize('keep', KEEPS)
-def test_a_loud_channel_is_believed_as_it_is(keep):
+def test_a_loud_channel_keeps_its_estimate(keep):
     noise, rest = learnt(4.0, keep)
     white = noise.whiten(rest)
     assert noise.spread['J'] == pytest.approx(4 * FLOORS['J'], rel=0.1)

@@ -65,7 +65,7 @@ def test_tilts_follow_the_servo_where_encoders_are_noisy():
     inside = slice(100, -150)
     truth = at(made, MOTION.tilt), at(made, MOTION.tilt_acceleration)
     before = [made.signals.joints({})[k] - truth[j] for j, k in enumerate((0, 2))]
-    made.guide({})
+    made.smooth_tilts({})
     after = [made.signals.joints({})[k] - truth[j] for j, k in enumerate((0, 2))]
     assert rms(after[0][inside]) < 0.35 * rms(before[0][inside])
     assert rms(after[1][inside]) < 0.05 * rms(before[1][inside])
@@ -73,16 +73,16 @@ def test_tilts_follow_the_servo_where_encoders_are_noisy():
 
 def test_slow_errors_of_the_servo_model_are_corrected_by_the_encoders():
     made = model(noisy(0.02))
-    made.guide({})
-    made.signals.follow(made.signals.guide + 0.1)
+    made.smooth_tilts({})
+    made.signals.use_model_tilts(made.signals.model_tilts + 0.1)
     error = made.signals.joints({})[0] - at(made, MOTION.tilt)
     assert rms(error[100:-150]) < 0.01
 
 
 def test_good_encoders_stand_for_themselves():
     made = model(noisy(4e-4))
-    made.guide({})
-    assert made.signals.guide is None
+    made.smooth_tilts({})
+    assert made.signals.model_tilts is None
 
 
 def test_the_imu_carries_the_velocity_where_positions_are_noisy():
@@ -104,8 +104,8 @@ def test_inertia_of_a_servo_is_the_inverse_of_its_gains():
 
 
 def test_a_module_may_be_heavier_about_its_joint_than_the_servo_says():
-    belief = tolerances(P, swing=0.28)['swing.ratio']
-    assert abs(belief.residual(0.25)) < 1 < abs(belief.residual(0.4))
+    prior = tolerances(P, swing=0.28)['swing.ratio']
+    assert abs(prior.residual(0.25)) < 1 < abs(prior.residual(0.4))
     assert abs(tolerances(P)['swing.ratio'].residual(0.25)) > 2
 
 
@@ -114,13 +114,14 @@ def pruned(monkeypatch, name, value, loss):
     trial = Trial(Candidate(name.split('.')[0], (name,), label=name), 99.0, {name: value})
     search = Search.__new__(Search)
     search.p = P
-    search.problem = type('Problem', (), {'keys': KEYS, 'beliefs': {},
+    search.problem = type('Problem', (), {'keys': KEYS, 'priors': {},
                                           'residual': lambda self, theta: np.zeros(1),
-                                          'prior': lambda self, theta, free: 0.0})()
+                                          'prior_cost': lambda self, theta, free: 0.0})()
     state = State(dict(trial.theta), np.zeros(1), np.zeros((1, 0)), [])
     monkeypatch.setattr(search, '_refit', lambda start, rest, n: (start, 100.0 + loss),
                         raising=False)
-    monkeypatch.setattr(search, '_settle', lambda theta, rest: (state, 100.0), raising=False)
+    monkeypatch.setattr(search, '_fit_with_noise', lambda theta, rest: (state, 100.0),
+                        raising=False)
     found = Found(accepted=[trial])
     search._prune(found, state, 100.0)
     return len(found.accepted)

@@ -12,7 +12,13 @@ from beetle_omni_ros.identify.gap.candidates import Candidate, Found, TOO_SMALL,
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.noise import Noise
-from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, Rhythm, rhythm, SWINGING
+from beetle_omni_ros.identify.gap.patterns import (
+    Pattern,
+    patterns,
+    spectral_line,
+    SpectralLine,
+    SWINGING,
+)
 from beetle_omni_ros.identify.gap.unknown import Remainder
 from beetle_omni_ros.identify.gap.verdict import decide
 
@@ -61,7 +67,7 @@ def test_a_constant_wind_is_no_pattern():
 def test_a_line_in_the_spectrum_is_found_with_its_size():
     wave = 0.3 * np.sin(2 * np.pi * 3.3 * MOTION.t + 0.4)
     made, _ = problem(gust(2) + np.outer(wave, [0.6, 0.8, 0.0]))
-    line = rhythm(made, {})
+    line = spectral_line(made, {})
     assert line.frequency == pytest.approx(3.3, abs=0.03)
     assert line.size == pytest.approx(0.3 / np.sqrt(2), rel=0.15)
     assert line.ratio > 3 * P.least_line
@@ -70,26 +76,26 @@ def test_a_line_in_the_spectrum_is_found_with_its_size():
 @pytest.mark.parametrize('seed', range(3))
 def test_gusts_have_no_line(seed):
     made, _ = problem(gust(seed, 0.2))
-    assert rhythm(made, {}).ratio < P.least_line
+    assert spectral_line(made, {}).ratio < P.least_line
 
 
-def decided(accepted=(), found=(), line=Rhythm(0.0, 0.0, 0.0), left=0.0, trials=()):
+def decided(accepted=(), found=(), line=SpectralLine(0.0, 0.0, 0.0), left=0.0, trials=()):
     names = [n for t in accepted for n in t.candidate.keys]
     search = Found(accepted=list(accepted), state=SimpleNamespace(names=names),
                    cost=(1000.0, 1000.0 - 200.0 * len(names),
                          1000.0 - 200.0 * len(names) - left),
                    trials={t.candidate.label: t for t in trials})
-    a = Analysis(keys=KEYS, found=search, rest=NOTHING, patterns=list(found), rhythm=line)
-    a.problem = SimpleNamespace(time=np.zeros(1000), beliefs={})
+    a = Analysis(keys=KEYS, found=search, rest=NOTHING, patterns=list(found), spectral_line=line)
+    a.problem = SimpleNamespace(time=np.zeros(1000), priors={})
     decide(a, P)
     return a
 
 
-def test_a_force_with_a_rhythm_of_its_own_is_unknown():
+def test_a_periodic_force_is_unknown():
     assert decided().verdict == 'no_gap'
-    a = decided(line=Rhythm(3.3, 500.0, 0.2))
+    a = decided(line=SpectralLine(3.3, 500.0, 0.2))
     assert a.verdict == 'unknown' and '3.30 Hz' in a.reason
-    assert decided(line=Rhythm(3.3, 500.0, 0.5 * P.least_force)).verdict == 'no_gap'
+    assert decided(line=SpectralLine(3.3, 500.0, 0.5 * P.least_force)).verdict == 'no_gap'
 
 
 def wind():

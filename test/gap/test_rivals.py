@@ -35,7 +35,7 @@ def rivals(monkeypatch, accepted, other, beside, instead):
     search.problem = SimpleNamespace(keys=KEYS, residual=lambda theta: np.zeros(4),
                                      models=[SimpleNamespace(signals=signals)])
     monkeypatch.setattr(Search, '_refit', lambda self, start, others, n: (start, 1220.0))
-    monkeypatch.setattr(Search, '_step', lambda *rest: [trial(other, instead)])
+    monkeypatch.setattr(Search, '_propose', lambda *rest: [trial(other, instead)])
 
     def agreed(self, trial, accepted):
         trial.held = SimpleNamespace(total=trial.gain, error=0.1 * trial.gain, positive=1.0,

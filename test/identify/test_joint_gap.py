@@ -18,7 +18,7 @@ from beetle_omni_ros.identify.gap.keys import all_keys
 from beetle_omni_ros.identify.gap.keys import friction as friction_of
 from beetle_omni_ros.identify.inference.noise import Noise
 from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
-from beetle_omni_ros.identify.joint_servos import believed_sets, Servos
+from beetle_omni_ros.identify.joint_servos import file_sets, Servos
 from beetle_omni_ros.identify.servo_fit import Problems, ServoFitter
 from beetle_omni_ros.identify.servo_model import INDEX, simulate
 from beetle_omni_ros.robot import dynamics
@@ -55,13 +55,13 @@ def made(seed, *changed, **both):
                                for band, own in zip(BANDS, changed, strict=True)], seed)
 
 
-def judged(log, believed=None):
-    return gap_of(Search(log, believed or robot()).run(), log)
+def judged(log, file_robot=None):
+    return gap_of(Search(log, file_robot or robot()).run(), log)
 
 
-def corrected(believed, result):
-    effects = effects_with(believed, result['effects'])
-    return replace(believed, effects={
+def corrected(file_robot, result):
+    effects = effects_with(file_robot, result['effects'])
+    return replace(file_robot, effects={
         name: {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
         for name, values in effects.items()})
 
@@ -78,24 +78,24 @@ def against_shipped():
 
 
 def test_the_files_servos_move_as_a_plain_simulation_with_its_effects():
-    believed = robot(joint_offset={'offset': (0.02, -0.01, 0.0, 0.0)},
+    file_robot = robot(joint_offset={'offset': (0.02, -0.01, 0.0, 0.0)},
                      joint_backlash={'gap': 0.024}, joint_feedback_delay={'delay': 0.006})
     shown = np.array([servo(T, COMMAND, frequency=FREQUENCY, damping=DAMPING,
                             delay=DELAY + 0.006, coulomb=band, backlash=0.012, offset=-zero)
                       for band, zero in zip(BANDS, (0.02, -0.01), strict=True)])
     log = JointLog('made.csv', T, (1, 2), shown, np.tile(COMMAND, (2, 1)))
-    error = simulate(log, np.arange(2), believed_sets(believed, (1, 2))) - shown
+    error = simulate(log, np.arange(2), file_sets(file_robot, (1, 2))) - shown
     assert np.sqrt(np.mean(error[:, 25:]**2)) < 5e-4 and np.abs(error[:, 25:]).max() < 2e-3
 
 
 def test_a_servo_with_an_offset_turns_its_thrust_where_it_is_told_to():
     zero, target = np.array([0.02, -0.03, 0.0, 0.05]), np.array([0.3, -0.2, 0.8, 0.0])
-    believed = replace(SHIPPED, effects={'joint_offset': {'offset': tuple(zero)}})
-    encoder = target + believed_sets(believed, (1, 2, 3, 4))[:, INDEX['offset']]
+    file_robot = replace(SHIPPED, effects={'joint_offset': {'offset': tuple(zero)}})
+    encoder = target + file_sets(file_robot, (1, 2, 3, 4))[:, INDEX['offset']]
     state = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
     thrust = np.array([7.0, 8.0, 6.0, 9.0])
     seen, plain = ([np.array(part).ravel() for part in dynamics.body_acceleration(r)(
-        *state, tilt, thrust)] for r, tilt in ((believed, encoder), (SHIPPED, target)))
+        *state, tilt, thrust)] for r, tilt in ((file_robot, encoder), (SHIPPED, target)))
     assert np.allclose(seen[0], plain[0], atol=1e-9) and np.allclose(seen[1], plain[1], atol=1e-9)
 
 
@@ -103,7 +103,7 @@ def test_points_and_their_shared_slopes_agree_with_single_simulations():
     servos, log = Servos(robot(), (1, 2)), made(2)
     fitter = ServoFitter(log, Noise.white(2), servos)
     free = servos.mask('joint_bandwidth') | servos.mask('joint_offset', 1)
-    point, weight, joints = servos.believed, np.ones((1, len(T))), np.array([[0, 1]])
+    point, weight, joints = servos.file_point, np.ones((1, len(T))), np.array([[0, 1]])
     base = fitter.residuals(point[None], joints, weight)
     slopes = fitter.jacobian(Problems(joints, point[None], free[None], weight), base)[0]
     for k in range(len(point)):
@@ -152,7 +152,7 @@ def test_one_servo_that_differs_is_not_explained_by_what_all_share(change, tmp_p
     result, page = analyse_joint_log([write(tmp_path / 'log.csv', made(31, {}, change))], [],
                                      robot(), None)
     assert result['verdict'] == 'unknown' and result['effects'] == []
-    assert 'joint 2 is off by' in result['reason'] and 'joint 2' in result['summary']
+    assert 'joint 2 has an error of' in result['reason'] and 'joint 2' in result['summary']
     assert result['where'][0]['channel'] == 'joint_2' and result['where'][0]['excess_after'] > 2
     assert page.index('class="verdict"') < page.index('<img') < page.index('<table')
 
@@ -168,7 +168,7 @@ def test_friction_of_one_joint_is_named_and_its_joint_told():
 def test_what_is_fitted_is_what_is_written(against_shipped):
     log, result = against_shipped
     found = Search(log, SHIPPED).run()
-    written = believed_sets(corrected(SHIPPED, result), log.joints)
+    written = file_sets(corrected(SHIPPED, result), log.joints)
     fitted = found.servos.sets(found.point[None])[0]
     a, b = (simulate(log, np.arange(2), sets) for sets in (written, fitted))
     assert np.abs(a - b).max() < 2e-4
@@ -215,17 +215,17 @@ def test_two_logs_of_the_same_servos_show_no_change():
 
 
 def test_friction_may_stand_for_each_joint():
-    believed = replace(SHIPPED, effects={'joint_friction': {
+    file_robot = replace(SHIPPED, effects={'joint_friction': {
         'coulomb': (0.001, 0.002, 0.003, 0.004), 'stiction': 0.002}})
     for joint in range(4):
-        slow = dynamics.servo_acceleration(believed, 0.0, 2.0, 0.0, joint=joint)
+        slow = dynamics.servo_acceleration(file_robot, 0.0, 2.0, 0.0, joint=joint)
         free = dynamics.servo_acceleration(SHIPPED, 0.0, 2.0, 0.0, joint=joint)
         torque = float(ca.DM(free - slow)) * INERTIA
         assert torque == pytest.approx(0.001 * (joint + 1), rel=0.01)
-    coulomb, stiction = friction_of(believed)
+    coulomb, stiction = friction_of(file_robot)
     assert np.allclose(coulomb, [0.001, 0.002, 0.003, 0.004])
     assert np.allclose(stiction, [0.002, 0.002, 0.003, 0.004])
-    assert all_keys(believed)['joint_friction.coulomb'].base == pytest.approx(0.0025)
+    assert all_keys(file_robot)['joint_friction.coulomb'].base == pytest.approx(0.0025)
 
 
 def test_a_list_of_the_wrong_length_is_refused():
@@ -234,11 +234,11 @@ def test_a_list_of_the_wrong_length_is_refused():
 
 
 def test_a_flight_keeps_the_differences_between_joints():
-    believed = replace(SHIPPED, effects={'joint_friction': {
+    file_robot = replace(SHIPPED, effects={'joint_friction': {
         'coulomb': (0.001, 0.002, 0.003, 0.004), 'stiction': 0.004}})
     named = [{'names': ['joint_friction'], 'parameters': {
         'coulomb': {'value': 0.0045, 'unit': 'N m'}, 'stiction': {'value': 0.006, 'unit': 'N m'}}}]
-    written = effects_with(believed, named)['joint_friction']
+    written = effects_with(file_robot, named)['joint_friction']
     assert np.allclose(written['coulomb'], [0.003, 0.004, 0.005, 0.006])
     assert written['stiction'] == 0.006
 

@@ -1,1 +1,1 @@
-"""Where model and measurement disagree, and which named effect explains it."""
+"""Gap finder: differences between model and measurement, and the effects that explain them."""

@@ -1,4 +1,4 @@
-"""From checked flights to a verdict."""
+"""Analysis of checked flights: fit, search, free runs, verdict."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import candidates, Found, Trial
 from beetle_omni_ros.identify.gap.certainty import (
     deviations,
-    limits_out_of_sight,
+    undetectable_limits,
     Visibility,
     visibility,
 )
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import all_keys, extra_keys, Key, tolerances
-from beetle_omni_ros.identify.gap.noise import ceilings, Loud, too_loud
+from beetle_omni_ros.identify.gap.noise import ceilings, channels_above_ceiling, ExcessNoise
 from beetle_omni_ros.identify.gap.parameters import GapParameters
-from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, Rhythm, rhythm
+from beetle_omni_ros.identify.gap.patterns import Pattern, patterns, spectral_line, SpectralLine
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel
 from beetle_omni_ros.identify.gap.rollouts import (
+    floor_factors,
     free_runs,
     gap,
     HORIZONS,
     regimes_at,
     Runs,
-    trimmed,
 )
 from beetle_omni_ros.identify.gap.search import Search
 from beetle_omni_ros.identify.gap.unknown import Remainder, remainder
@@ -47,33 +47,33 @@ CLOSURES = (('closure', 'before', 'after'), ('placebo_closure', 'before', 'place
 @dataclass
 class Analysis:
     """
-    Everything that was found.
+    All results.
 
     Attributes:
-        verdict: see INTERFACES.
-        reason: one sentence.
-        keys: by name.
-        found: the search.
+        verdict: verdict as in INTERFACES.
+        reason: reason of the verdict.
+        keys: all keys by name.
+        found: result of the search.
         widths: key -> half width of its 95 % interval, as deviation.
-        visible: label -> what the data could show.
-        rest: what is left.
-        patterns: questions beyond the catalogue, best answer first.
-        rhythm: the sharpest line of what is left.
-        where: channels and regimes by disagreement.
-        runs: 'before', 'after', 'placebo' -> free runs of the flights that judge.
-        gaps: horizon -> before, after, placebo, closure.
-        regimes: regime -> before and after at 0.5 s.
-        held_out: whether the flights that judge were not fitted.
-        problem: of the fit.
-        models: fitted; judging.
-        experiment: what to fly next, or None.
+        visible: label -> detectability of a candidate.
+        rest: regression of the unexplained residual.
+        patterns: tests of forces outside the catalogue, largest gain first.
+        spectral_line: the sharpest line of the residual.
+        where: channels and regimes, largest residual first.
+        runs: 'before', 'after', 'placebo', ... -> free runs of the judging flights.
+        gaps: horizon -> errors over noise floor, closures.
+        regimes: regime -> errors before and after at 0.5 s.
+        held_out: whether the judging flights were not fitted.
+        problem: problem of the fit.
+        models: (fitted flights, judging flights).
+        experiment: next experiment, or None.
         findings: remarks of the checks.
         partial: effects that explain a part and are not named.
-        damages: what is wrong with the recordings.
-        unseen: what acts in a regime alone (limits, friction, play, the ground) that these flights
-            would not show, where no gap is found.
-        damaged: the recording of the first of ``damages``, and that damage, for the page.
-        loud: channels beyond what sensors and gusts may make, with everything that was found.
+        damages: damages of the recordings.
+        unseen: limits, friction, play and effects of one regime that these flights would not show;
+            set for no gap.
+        damaged: recording of the first damage and that damage, for the page.
+        above_ceiling: channels whose residual exceeds its ceiling after the fit.
 
     """
 
@@ -85,7 +85,7 @@ class Analysis:
     visible: dict[str, Visibility] = field(default_factory=dict)
     rest: Remainder = field(default_factory=Remainder)
     patterns: list[Pattern] = field(default_factory=list)
-    rhythm: Rhythm = Rhythm(0.0, 0.0, 0.0)
+    spectral_line: SpectralLine = SpectralLine(0.0, 0.0, 0.0)
     where: list[dict] = field(default_factory=list)
     runs: dict[str, list[Runs]] = field(default_factory=dict)
     gaps: dict[float, dict] = field(default_factory=dict)
@@ -97,34 +97,34 @@ class Analysis:
     findings: list[str] = field(default_factory=list)
     partial: list[Trial] = field(default_factory=list)
     damages: list[Damage] = field(default_factory=list)
-    loud: list[Loud] = field(default_factory=list)
+    above_ceiling: list[ExcessNoise] = field(default_factory=list)
     unseen: list[str] = field(default_factory=list)
     damaged: tuple[Recording, Damage] | None = None
 
     @property
     def fit(self) -> Problem:
-        """The problem; where the recordings are bad there is none."""
+        """The problem of the fit; bad recordings have none."""
         if self.problem is None:
             raise ValueError('no flight was fitted: the recordings are bad')
         return self.problem
 
     @property
     def accepted(self) -> list[Trial]:
-        """Effects that are named, strongest first."""
+        """Named effects, largest gain first."""
         return sorted(self.found.accepted, key=lambda t: -t.gain)
 
 
 def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
             p: GapParameters, progress: Callable[[str], None] = lambda text: None) -> Analysis:
     """
-    Find what explains the disagreement between flights and model.
+    Find the effects that explain the difference between flights and model.
 
     Args:
         fitted: flights that are fitted.
-        judging: flights that are not; empty: the fitted ones judge, too.
-        robot: as believed.
-        p: parameters.
-        progress: called with a short text at each stage.
+        judging: held-out flights; empty: the fitted flights also judge.
+        robot: parameters of the robot file.
+        p: parameters (params/gap.yaml).
+        progress: callback with a short text at each stage.
 
     """
     a = Analysis(held_out=bool(judging))
@@ -136,10 +136,10 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
     coarse = float(np.median([m.signals.position_noise for m in models])) > p.coarse_noise
     if coarse:
         a.findings.append('sensors are noisy: latencies within their usual range are not named')
-    beliefs = tolerances(p, coarse, _swing(robot))
+    priors = tolerances(p, coarse, _swing(robot))
     if robot.multibody is None or 'module_reaction' in robot.effects:
-        del beliefs['modules.share']
-    a.problem = Problem(models, a.keys, beliefs, p, others)
+        del priors['modules.share']
+    a.problem = Problem(models, a.keys, priors, p, others)
     _choose_modules(a.problem)
     with Workers(a.problem) as a.problem.workers:
         _find(a, progress)
@@ -147,7 +147,7 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
 
 
 def _find(a, progress):
-    """Search, judge what was found, and decide."""
+    """Search, compute intervals and detectability, and decide."""
     models, p = a.models[0], a.problem.p
     tried = candidates(a.keys, models)
     search = Search(a.problem, tried, progress)
@@ -159,12 +159,12 @@ def _find(a, progress):
     a.visible = visibility(a.problem, a.found.state, search.always, tried)
     a.rest = remainder(a.problem, a.found.state, involved)
     a.patterns = patterns(a.problem, a.found.state, involved)
-    a.rhythm = rhythm(a.problem, a.found.theta)
+    a.spectral_line = spectral_line(a.problem, a.found.theta)
     a.where = _where(a)
-    a.loud = too_loud(models, a.found.theta, p)
+    a.above_ceiling = channels_above_ceiling(models, a.found.theta, p)
     decide(a, p)
     if a.verdict == 'no_gap':
-        a.unseen = [*not_met(a, p), *limits_out_of_sight(a.problem, a.found.state)]
+        a.unseen = [*not_met(a, p), *undetectable_limits(a.problem, a.found.state)]
     progress('free runs')
     _falsify(a, search.wide)
 
@@ -178,27 +178,27 @@ def _modules(robot):
 
 
 def _swing(robot):
-    """Logarithm of a module's inertia about its joint over the servo's number."""
+    """Logarithm of the ratio of a module's inertia about its joint and the servo's inertia."""
     inertia = _modules(robot)[0]
     return float(np.log(max(inertia / robot.joints.inertia, 1.0))) if inertia else 0.0
 
 
 def _choose_modules(problem):
-    """Take the file's tilting modules into the model where the data have them."""
-    if 'modules.share' not in problem.beliefs:
+    """Use the file's tilting modules in the model if the data agree better with them."""
+    if 'modules.share' not in problem.priors:
         return
     costs = []
     for share in (0.0, 1.0):
-        for model in problem.everyone:
+        for model in problem.all_models:
             model.modules = share
         r = problem.residual({})
         costs.append(float(np.minimum(r * r, 100.0).sum()))
-    for model in problem.everyone:
+    for model in problem.all_models:
         model.modules = float(np.argmin(costs))
 
 
 def _where(a):
-    """Channels and regimes, ranked by how far the model without effects is off."""
+    """Channels and regimes, ranked by the residual of the model without effects."""
     problem, rows = a.problem, []
     r = problem.residual(a.found.base)
     after = a.found.state.r
@@ -216,33 +216,33 @@ def _where(a):
 
 
 def _falsify(a, wide):
-    """Free runs before, after and with a placebo, on the flights that judge."""
+    """Free runs before, after and with a placebo, on the judging flights."""
     found, judges = a.found, a.models[1]
-    a.problem.guide(found.theta, judges)
+    a.problem.smooth_tilts(found.theta, judges)
     keys, refused = ({n for t in trials for n in t.candidate.keys}
                      for trials in (found.accepted, a.partial))
-    # What explains a part and is not named closes no gap.
+    # Partial effects are not named, so they close no gap.
     reached = {n: x for n, x in found.theta.items() if n not in refused}
     reached |= {n: found.base[n] for n in refused if n in found.base}
-    # The same robot, with its tolerances as found, without and with what was named ...
+    # Tolerances as fitted, without and with the named effects ...
     points = {'before': {n: x for n, x in reached.items() if n not in keys}, 'after': reached}
-    # ... and the robot file as it is, and with nothing but what was named.
+    # ... and the robot file alone, and with the named effects only.
     plain = _plain(a, reached, keys)
     points |= {'file': plain, 'effects_alone': {**plain, **{n: found.theta[n] for n in keys}},
                'placebo': _placebo(a)}
-    everyone = a.problem.everyone
+    all_models = a.problem.all_models
     noise = [own.bounded(ceilings(model, a.problem.p)) for model, own in zip(
-        everyone, a.problem.noises(found.theta, wide), strict=True)]
-    fitted, judging = range(len(a.models[0])), [everyone.index(model) for model in judges]
+        all_models, a.problem.noise_of_each(found.theta, wide), strict=True)]
+    fitted, judging = range(len(a.models[0])), [all_models.index(model) for model in judges]
     if not found.accepted:
         points = {name: points[name] for name in ('before', 'file')}
-    flown = iter(a.problem.share(_flown, [(theta, k) for theta in points.values()
+    flown = iter(a.problem.parallel(_flown, [(theta, k) for theta in points.values()
                                           for k in judging], noise))
     for name in points:
         a.runs[name] = [next(flown) for _ in judges]
     for name, same in (('after', 'before'), ('placebo', 'before'), ('effects_alone', 'file')):
         a.runs.setdefault(name, a.runs[same])
-    trim = trimmed(a.problem.share(_flown, [(found.theta, k) for k in fitted], noise))
+    trim = floor_factors(a.problem.parallel(_flown, [(found.theta, k) for k in fitted], noise))
     _measure(a, trim)
     why = _refuted(a, trim) if found.accepted else ''
     if why:
@@ -259,21 +259,21 @@ def _falsify(a, wide):
 
 
 def _flown(problem, item, noise):
-    """Free runs of a flight at a point."""
+    """Free runs of a flight with given deviations."""
     theta, k = item
-    return free_runs(problem.everyone[k], theta, noise[k])
+    return free_runs(problem.all_models[k], theta, noise[k])
 
 
 def _refuted(a, trim):
-    """Why flights that judge speak against what is named, in words; '' where they do not."""
+    """How the judging flights refute the named effects, as the end of a sentence; or ''."""
     judged, p = a.gaps[HORIZONS[JUDGED]], a.problem.p
     before, after = judged['before'], judged['after']
     if not np.isfinite([before, after]).all():
-        return 'leaves free runs that end nowhere'
+        return 'makes free runs diverge'
     if a.held_out and after > max(p.at_floor, p.regime_worse * before):
         return 'makes the held-out ones worse'
     if after > max(p.far_off, 1 + (1 - p.least_closed) * (before - 1)):
-        return 'leaves most of what free runs show'
+        return 'does not explain most of the error of free runs'
     if not a.held_out:
         return ''
     fall, scatter = _fall(a.runs['before'], a.runs['after'], trim, p.runs_a_block)
@@ -286,7 +286,7 @@ def _refuted(a, trim):
 
 
 def _fall(before, after, trim, together):
-    """Mean fall of the squared gap at 0.5 s over blocks of free runs, and its standard error."""
+    """Mean decrease of the squared gap at 0.5 s over blocks of runs, and its standard error."""
     falls = []
     for one, other in zip(before, after, strict=True):
         floor = one.floor[JUDGED] * trim[JUDGED]
@@ -298,8 +298,8 @@ def _fall(before, after, trim, together):
 
 
 def _gain_held_out(a):
-    """Gain of chi2 on flights that were not fitted, in the noise of the fit."""
-    judges = Problem(a.models[1], a.problem.keys, a.problem.beliefs, a.problem.p)
+    """Gain in chi2 on held-out flights, with the noise of the fit."""
+    judges = Problem(a.models[1], a.problem.keys, a.problem.priors, a.problem.p)
     judges.use(a.problem.noise)
     before, after = (judges.residual(theta)**2 for theta in (a.found.base, a.found.theta))
     return HeldOut(np.array([(before - after)[judges.block == b].sum()
@@ -307,7 +307,7 @@ def _gain_held_out(a):
 
 
 def _measure(a, trim):
-    """The gap at each horizon, and what of it is closed."""
+    """Set the errors at each horizon and the closures."""
     for h, horizon in enumerate(HORIZONS):
         values = {name: gap(runs, h, trim=trim) for name, runs in a.runs.items()}
         a.gaps[horizon] = values | {name: closure(values[before], values[after],
@@ -316,27 +316,27 @@ def _measure(a, trim):
 
 
 def _plain(a, theta, named):
-    """The robot file's own numbers, with the sensors and the bus as they were found."""
+    """The robot file, with delays and mounting of the sensors and of the bus as fitted."""
     return {name: x for name, x in theta.items() if not a.keys[name].body
             and a.keys[name].effect not in ('rotor_lag', 'joint_bandwidth', 'modules', 'swing',
                                              'rotor', 'servo')
-            and name in a.problem.beliefs and name not in named}
+            and name in a.problem.priors and name not in named}
 
 
 def closure(before: float, after: float, at_floor: float) -> float | None:
-    """Part of the excess over the floor (1) that is gone; None where there was none."""
+    """Closed share of the excess over the noise floor (1); None if there was no excess."""
     if not before > at_floor:
         return None
     return float(1 - max(after**2 - 1, 0.0) / (before**2 - 1))
 
 
 def _placebo(a) -> dict[str, float]:
-    """The same effects with the opposite sign: they must not help."""
+    """The named effects with the opposite sign, as a control that must not help."""
     theta = dict(a.found.theta)
     for trial in a.found.accepted:
         for name in trial.candidate.keys:
             key = a.keys[name]
-            # The equations bear a drag that pushes; a servo would not bear negative friction.
+            # Body equations accept any sign; a servo with negative friction is unstable.
             theta[name] = -theta[name] if key.body else float(
                 np.clip(-theta[name], key.low, key.high))
     return theta

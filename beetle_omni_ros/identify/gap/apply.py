@@ -1,4 +1,4 @@
-"""The robot file with the named effects added; taking the keys out again undoes it."""
+"""The robot file with the named effects; removing their keys undoes it."""
 
 from __future__ import annotations
 
@@ -16,16 +16,15 @@ from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 
-# What the rotors or joints share stands once in a file; what each has of its own, for all four.
-MEMBERS = 4
+MEMBERS = 4     # length of a list with one value for each rotor or joint
 
 
 def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
     """
-    The file's effects and the named ones, most likely member of each set.
+    The file's effects and the first member of each named set.
 
     Args:
-        robot: as believed.
+        robot: parameters of the robot file.
         named: ``effects`` of the results.
 
     """
@@ -55,15 +54,15 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
 def own_numbers(robot: RobotParameters, tolerances: dict[str, dict],
                 named: Iterable[str] = ()) -> dict:
     """
-    Numbers of the robot file as these flights found them within manufacturing tolerances.
+    Values of the robot file, corrected by the fitted tolerances.
 
     Args:
-        robot: as believed.
+        robot: parameters of the robot file.
         tolerances: ``tolerances`` of the results.
-        named: effects that replace a number and go first.
+        named: effects that replace a value and have priority.
 
     Returns:
-        nested as in a robot file; mass, inertia, gains, lags and rotor positions.
+        mass, inertia, gains, lags and rotor positions, nested as in a robot file.
 
     """
     made: dict = {}
@@ -90,10 +89,10 @@ def _put(content, key, value):
 
 def _of_each(own, found):
     """
-    One number where all joints share it, else a list of four.
+    One value if all joints share it, else a list of four.
 
-    A log gives each joint's (``each``). A flight gives one for all: differences between joints
-    that the file already has stay.
+    A log has a value for each joint (``each``). A flight has one for all, and differences between
+    the joints of the file stay.
     """
     each = found.get('each')
     if each is None:
@@ -108,19 +107,19 @@ def _of_each(own, found):
 def write_corrected(path: Path, results: dict, robot: RobotParameters,
                     base: Path | None, tolerances: bool = False) -> None:
     """
-    Write a robot file that extends the believed one by the named effects.
+    Write a robot file that extends the base file by the named effects.
 
-    Effects of sensors stand there too: the estimator reads them.
+    It includes effects of sensors, which the estimator reads.
 
     Args:
-        path: to write.
-        results: of the analysis.
-        robot: as believed.
-        base: its file; None: the shipped one.
-        tolerances: whether this robot's own numbers within tolerance take the place of the file's.
+        path: output file.
+        results: results of the analysis.
+        robot: parameters of the base file.
+        base: path of the base file; None: the shipped one.
+        tolerances: whether fitted tolerances replace values of the base file.
 
     Raises:
-        ParameterError: the file cannot be written, or would not be a robot.
+        ParameterError: the file cannot be written, or the corrected robot is invalid.
 
     """
     effects = effects_with(robot, results['effects'])

@@ -1,4 +1,4 @@
-"""The measured topics of a bag as arrays, in the order of recording and without ROS."""
+"""The measured topics of a bag as arrays, in the order of recording; needs no ROS."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from beetle_omni_ros.messages.topics import is_ambiguous, split_topic, TOPICS
 from beetle_omni_ros.robot.parameters import JOINT_NAMES, ROTOR_NAMES
 from beetle_omni_ros.runs.bag_files import BagError, read_together
 
-# Topic -> width of its table, and the parts of its values that are the columns.
+# Topic -> columns of its table; PARTS: fields of the message that they come from.
 NEEDED = {'imu/data_raw': 6, 'mocap/pose': 7, 'joint_states': 4, 'command': 8}
 OPTIONAL = {'battery_state': 1}
 PARTS = {'imu/data_raw': ('specific_force', 'angular_velocity'),
@@ -26,16 +26,16 @@ PARTS = {'imu/data_raw': ('specific_force', 'angular_velocity'),
 @dataclass
 class Recording:
     """
-    What one bag holds.
+    Contents of one bag.
 
     Attributes:
-        name: of the bag.
+        name: name of the bag.
         times: topic -> (N,) header stamps [s], in the order of recording.
-        values: topic -> (N, width): IMU specific force and rates, pose and quaternion xyzw,
-            joint positions, tilt and thrust commands, voltage.
-        states: (time of recording, supervisor state), where recorded.
-        warnings: what was wrong while reading.
-        received: topic -> (N,) times of recording [s]; empty where they are not known.
+        values: topic -> (N, width): IMU specific force and rates, pose and quaternion xyzw, joint
+            positions, tilt and thrust commands, voltage.
+        states: (time of recording, supervisor state), if recorded.
+        warnings: problems while reading.
+        received: topic -> (N,) times of recording [s]; empty if unknown.
 
     """
 
@@ -52,7 +52,7 @@ def read_recording(path: str | Path) -> Recording:
     Read the topics that the gap finder needs.
 
     Raises:
-        BagError: no such bag, not readable, several robots in it, or none of this kind.
+        BagError: no such bag, unreadable bag, several robots, or another robot.
 
     """
     warnings: list[str] = []
@@ -106,21 +106,21 @@ def read_recording(path: str | Path) -> Recording:
 
 def _note(states, messages):
     for data, received in zip(messages.data, messages.received.tolist(), strict=True):
-        # Whatever broken bytes provoke: one state is lost, no recording.
+        # A message that cannot be decoded costs one state, not the recording.
         with suppress(Exception):
             states.append((received, from_bytes(data, messages.type).data))
 
 
 def _check_members(path, data, times):
     """Refuse joints and rotors of another robot, whose IMU and MoCap may have the same topics."""
-    told = [name for name in ('joint_states', 'command') if data[name]]
-    if not told or any(len(times[name]) for name in told):
+    named = [name for name in ('joint_states', 'command') if data[name]]
+    if not named or any(len(times[name]) for name in named):
         return
-    for name in told:
+    for name in named:
         try:
             others = from_bytes(data[name][0], TOPICS[name].type).name
-        except Exception:       # whatever broken bytes provoke
+        except Exception:       # a message that cannot be decoded
             continue
         if others and not {*JOINT_NAMES, *ROTOR_NAMES} & set(others):
-            raise BagError(f'{path}: no recording of this robot: {" and ".join(told)} hold '
+            raise BagError(f'{path}: no recording of this robot: {" and ".join(named)} hold '
                            f'{", ".join(others)}, expected {", ".join(JOINT_NAMES)}')

@@ -1,12 +1,11 @@
 """
-Whether slow and quick motion tell the same of an entry, or of what a controller answers to gusts.
+Test for closed-loop bias: comparison of gains in slow and in fast motion.
 
-In closed loop a gust d and the motion go together: a controller with loop gain L leaves of it
-d / (1 + L), and answers with the rest. Where L is large, below about 1 Hz, the commands say -d
-and hardly anything moves: a fit takes that for an inertia twice as large, or a thrust half as
-strong. Above, nothing answers, and what moves goes with the gust. A number of the robot is the
-same at all frequencies. (Bias of closed-loop identification by frequency: Forssell and Ljung,
-Closed-loop identification revisited, Automatica 35, 1999.)
+In closed loop, gust and motion are correlated. A controller with loop gain L leaves d / (1 + L)
+of a gust d. At low frequencies, where L is large, the commands are about -d with little motion. A
+fit explains this by a larger inertia or a smaller thrust. At high frequencies the motion follows
+the gust. A parameter of the robot is the same at all frequencies. Source: Forssell and Ljung,
+Closed-loop identification revisited, Automatica 35, 1999 (bias by frequency).
 """
 
 from __future__ import annotations
@@ -24,15 +23,15 @@ from beetle_omni_ros.identify.inference.prior import together
 def by_band(problem: Problem, x: np.ndarray, r: np.ndarray,
             groups: str = 'B') -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """
-    Scores (K,) and information (K, K) of each band of each group of channels.
+    Scores (K,) and information (K, K) of each frequency band of each group of channels.
 
     Their sums are ``x.T @ r`` and ``x.T @ x`` of these channels.
 
     Args:
-        problem: which channel and flight a sample belongs to.
+        problem: channel and flight of each sample.
         x: (n, K) whitened slopes.
         r: (n,) whitened residual.
-        groups: of channels.
+        groups: groups of channels.
 
     """
     p, first = problem.p, 0
@@ -55,18 +54,18 @@ def by_band(problem: Problem, x: np.ndarray, r: np.ndarray,
             yield score, information
 
 
-def apart(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float, float]:
+def gain_by_part(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float, float]:
     """
-    What numbers of the body's equations explain that hold in all motion, or in a part of it.
+    Gains in chi2 of body parameters for all bands together and for a part of them.
 
     Args:
-        problem: as of :func:`by_band`.
-        x: (n, K) whitened slopes, without what other numbers could take over.
-        r: (n,) whitened residual without the numbers, likewise.
+        problem: see :func:`by_band`.
+        x: (n, K) whitened slopes, other keys projected out.
+        r: (n,) whitened residual without the parameters, other keys projected out.
 
     Returns:
-        chi2 gained by one set of numbers for all bands; by one for the bands below ``slow_below``
-        and none above, or the other way round, whichever is more.
+        gain of one set of values for all bands; larger gain of one set for the bands below or for
+        those above ``slow_below``.
 
     """
     parts = list(by_band(problem, x, r))
@@ -76,19 +75,20 @@ def apart(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float, float]
     return everywhere, max(slow, quick)
 
 
-def in_part_alone(problem: Problem, x: np.ndarray, r: np.ndarray, gain: float = 0.0) -> bool:
+def differs_between_bands(problem: Problem, x: np.ndarray, r: np.ndarray,
+                          gain: float = 0.0) -> bool:
     """
-    Whether numbers explain far more in a part of the motion than in all.
+    Whether parameters explain far more in a part of the bands than in all.
 
     Args:
-        problem: as of :func:`by_band`.
-        x: as of :func:`apart`.
-        r: likewise.
-        gain: of the objective in all, where beliefs are part of it: what tolerances beyond all
-            belief could take over, a mass by thrust, shows in no band and is none the less there.
+        problem: see :func:`by_band`.
+        x: see :func:`gain_by_part`.
+        r: see :func:`gain_by_part`.
+        gain: total gain of the objective with the priors. An effect that implausible tolerances
+            could absorb gains in the priors and not in the bands.
 
     """
-    everywhere, part = apart(problem, x, r)
+    everywhere, part = gain_by_part(problem, x, r)
     return part > problem.p.part_share * max(everywhere, gain) + problem.p.part_free * x.shape[1]
 
 
@@ -97,7 +97,7 @@ def _gain(score, information):
 
 
 def _spectrum(x, r, period):
-    """Frequencies [Hz], and spectra of the columns whose products add up to those in time."""
+    """Frequencies [Hz] and one-sided spectra with the inner products of the time series."""
     n = len(r)
     frequency = np.fft.rfftfreq(n, period)
     twice = np.where((frequency == 0) | (2 * np.arange(len(frequency)) == n), 1.0, 2.0)
@@ -105,21 +105,21 @@ def _spectrum(x, r, period):
     return frequency, weight[:, None] * np.fft.rfft(x, axis=0), weight * np.fft.rfft(r)
 
 
-def aside(problem: Problem, state: State, names: list[str], columns: np.ndarray,
+def project_out(problem: Problem, state: State, names: list[str], columns: np.ndarray,
           free: frozenset[str]) -> tuple[np.ndarray, np.ndarray]:
     """
-    ``columns`` (n, K) and the residual (n,) of a fit, less what the named keys could take over.
+    Columns (n, K) and residual (n,) of a fit without what the named keys explain.
 
     Args:
-        problem: beliefs.
+        problem: priors.
         state: the fit, with slopes.
-        names: of the keys.
-        columns: whitened.
-        free: keys of which nothing is believed.
+        names: keys to project out.
+        columns: (n, K) whitened columns.
+        free: keys whose priors are ignored.
 
     """
     s = state.slopes[:, [state.index[name] for name in names]]
-    slope, _ = together(problem.beliefs, state.theta, names, free)
+    slope, _ = together(problem.priors, state.theta, names, free)
     left = np.column_stack([columns, state.r])
     left -= s @ solved(s.T @ s + np.diag(slope**2), s.T @ left)
     return left[:, :-1], left[:, -1]

@@ -1,4 +1,4 @@
-"""The body's equations with every effect's number as a symbol, over many samples at once."""
+"""Body equations with every effect's parameters as symbols, for many samples at once."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ WIDTHS = {'velocity': 3, 'quaternion': 4, 'rate': 3, 'tilt': 4, 'thrust': 4, 'ti
 
 class BodyModel:
     """
-    Specific force and angular acceleration that the model expects of measured states.
+    Expected specific force and angular acceleration for measured states.
 
     Args:
-        robot: parameters with the effects that are believed.
-        keys: of the catalogue and the extra ones.
-        modules: module inertia [kg m^2] and mass moment [kg m] that the robot file implies.
+        robot: parameters of the robot file with its effects.
+        keys: keys of the catalogue and the extra ones.
+        modules: module inertia [kg m^2] and mass moment [kg m] of the robot file.
 
     Attributes:
-        names: of the keys that its parameter vector holds, in order.
+        names: keys of the parameter vector, in order.
 
     """
 
@@ -75,7 +75,7 @@ class BodyModel:
         return native.compiled(ca.Function('body', [*self._x.values(), self._p], [self._out]))
 
     def _over(self, what, count, make):
-        """The function over so many samples, and how it is called; see :func:`_called`."""
+        """The function mapped over ``count`` samples, as buffer and evaluation."""
         if (what, count) not in self._maps:
             function = make()
             self._maps[what, count] = function.map(
@@ -108,14 +108,13 @@ class BodyModel:
 
 def _called(function, inputs, vector, result):
     """
-    Evaluate in place: CasADi's own conversion of arrays takes longer than the equations.
+    Evaluate in place; CasADi's conversion of arrays would take longer than the equations.
 
     Args:
         function: buffer and evaluation of a mapped function.
-        inputs: by name, (N, width); a sample is a row here and a column there, which is the
-            same in memory.
-        vector: parameters.
-        result: (N, ...) to write to.
+        inputs: name -> (N, width). Memory order equals CasADi's (width, N).
+        vector: parameter vector.
+        result: (N, ...) output array.
 
     """
     buffer, evaluate = function

@@ -1,4 +1,4 @@
-"""The catalogue as candidates of a fit: which numbers are free, in which form, from where."""
+"""Catalogue entries as candidates of a fit: free keys, form and starting points."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from beetle_omni_ros.identify.inference.blocks import HeldOut
 from beetle_omni_ros.robot.effects import CATALOGUE, LimitStarts
 from beetle_omni_ros.robot.servo import NUMPY, Servo
 
-TOO_SMALL = 'too small to matter'
-IMPOSSIBLE = 'beyond what is physical'
-NOT_HELD = 'does not hold on data left out'
-FOUGHT = 'in slow or in quick motion alone, as gusts and answers to them'
+# Reasons of a rejection.
+TOO_SMALL = 'smaller than the smallest relevant size'
+IMPOSSIBLE = 'value is physically impossible'
+NOT_CONFIRMED = 'held-out blocks do not confirm it'
+CLOSED_LOOP_BIAS = 'only in slow or only in fast motion, as with closed-loop bias by gusts'
 
 
 @dataclass(frozen=True)
 class Candidate:
     """
-    One way in which a catalogue entry may be true.
+    One form of a catalogue entry.
 
     Attributes:
-        name: of the entry.
-        keys: that are free.
-        fixed: form of the entry, as deviations.
-        starts: deviations from which to start, each complete for ``keys``; () is zero.
-        label: unique.
+        name: catalogue name.
+        keys: free keys.
+        fixed: deviations that select the form.
+        starts: starting deviations, each complete for ``keys``; () is zero.
+        label: unique name.
         member: number of the rotor or joint, or None.
 
     """
@@ -41,19 +42,19 @@ class Candidate:
     label: str = ''
     member: int | None = None
 
-    def pushes(self, keys: dict[str, Key]) -> bool:
-        """Whether it shows in nothing but the forces on the body, as gusts do."""
+    def acts_on_body_only(self, keys: dict[str, Key]) -> bool:
+        """Whether it changes only forces and torques on the body, as gusts do."""
         return all(keys[name].groups == 'B' for name in self.keys)
 
     def large_enough(self, keys: dict[str, Key], theta: dict[str, float]) -> bool:
-        """Whether anyone would act on it."""
+        """Whether a deviation has at least the smallest relevant size."""
         if isinstance(CATALOGUE[self.name].starts, LimitStarts):
             return True
         return any(abs(theta.get(name, 0.0)) >= keys[name].smallest for name in self.keys)
 
 
 def candidates(keys: dict[str, Key], models: list[FlightModel]) -> list[Candidate]:
-    """All candidates, with starts that these flights suggest."""
+    """All candidates; starts of limits depend on the flights."""
     made = []
     for name, effect in CATALOGUE.items():
         own = tuple(key.name for key in keys.values() if key.effect == name
@@ -67,7 +68,7 @@ def candidates(keys: dict[str, Key], models: list[FlightModel]) -> list[Candidat
             made += [Candidate(name, own[:1], label=f'{name} (inertia)'),
                      Candidate(name, own, label=name)]
         else:
-            starts = _started(keys[own[0]], effect.starts, models) \
+            starts = _limit_starts(keys[own[0]], effect.starts, models) \
                 if isinstance(effect.starts, LimitStarts) else effect.starts
             if effect.starts and not starts:
                 continue
@@ -77,22 +78,22 @@ def candidates(keys: dict[str, Key], models: list[FlightModel]) -> list[Candidat
     return made
 
 
-def _started(key, asked, models):
-    """Values of a limit at which it begins to show."""
+def _limit_starts(key, limit, models):
+    """Starts at which a limit begins to act in these flights."""
     most = max(float({
         'tilt_rate': lambda m: np.abs(m.signals.joints({})[1]).max(),
         'torque': lambda m: np.quantile(np.abs(_torques(m)), 0.999),
-        'thrust': lambda m: np.quantile(m.flight.command[:, 4:], 0.999)}[asked.of](m))
+        'thrust': lambda m: np.quantile(m.flight.command[:, 4:], 0.999)}[limit.of](m))
         for m in models)
-    return tuple((float(np.log(part * most / key.base)),) for part in asked.parts
-                 if part * most < asked.below * key.base)
+    return tuple((float(np.log(part * most / key.base)),) for part in limit.parts
+                 if part * most < limit.below * key.base)
 
 
 def _torques(model):
     """
-    Torques [N m] that the servos' loops ask for, free of limits and of the encoders' noise.
+    Torques [N m] that the simulated servo loops request, without limits and encoder noise.
 
-    Not the stiffness times the error alone: while a servo turns, most of that is for the damping.
+    They include damping, which takes most of the stiffness term while a servo turns.
     """
     s, joint = model.signals, model.robot.joints
     run = model._servos([{}], {})[0]
@@ -106,17 +107,17 @@ def _torques(model):
 @dataclass
 class Trial:
     """
-    One candidate joined to the model.
+    Result of a fit with one more candidate.
 
     Attributes:
-        candidate: which.
-        gain: of the objective.
-        theta: all numbers with it.
-        refined: whether fitted, else a straight line's estimate.
-        believed: part of the gain that is of beliefs: tolerances which stray less beside it.
-        held: gains on blocks left out.
-        share: of what was left unexplained.
-        reason: why not accepted, '' if it was.
+        candidate: the candidate.
+        gain: decrease of the objective.
+        theta: all deviations with it.
+        refined: whether fitted; else a linear estimate.
+        prior_gain: part of ``gain`` in the priors of tolerances.
+        held: gains on held-out blocks.
+        share: part of the unexplained objective.
+        reason: reason of the rejection, '' if accepted.
 
     """
 
@@ -124,7 +125,7 @@ class Trial:
     gain: float
     theta: dict[str, float]
     refined: bool = False
-    believed: float = 0.0
+    prior_gain: float = 0.0
     held: HeldOut = HeldOut(np.zeros(1))
     share: float = 0.0
     reason: str = ''
@@ -133,17 +134,18 @@ class Trial:
 @dataclass
 class Found:
     """
-    What a search found.
+    Result of a search.
 
     Attributes:
-        accepted: steps, in the order of acceptance.
-        trials: label -> last trial of every candidate.
-        rivals: label of an accepted candidate -> trials that explain as much.
-        base: numbers of the fit without effects.
-        theta: of the final fit.
-        state: there, with the slopes of all keys.
-        cost: objective of base, final, and everything (straight line).
-        still: whether the robot hardly moves but where it is pushed; see ``liveliness``.
+        accepted: accepted trials in order.
+        trials: label -> last trial of each candidate.
+        rivals: label of an accepted candidate -> trials that explain as much in its place.
+        base: deviations of the fit without effects.
+        theta: deviations of the final fit.
+        state: the final fit, with slopes of all keys.
+        cost: objectives of base fit, final fit, and linear fit of all keys.
+        low_excitation: whether the motion is mostly a reaction to disturbances; see
+            :func:`~beetle_omni_ros.identify.gap.certainty.excitation`.
 
     """
 
@@ -155,10 +157,10 @@ class Found:
     state: State = field(
         default_factory=lambda: State({}, np.zeros(0), np.zeros((0, 0)), []))
     cost: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    still: bool = False
+    low_excitation: bool = False
 
     @property
     def explained(self) -> float:
-        """Part of the explainable excess that the accepted entries explain."""
+        """Part of the explainable objective that the accepted entries explain."""
         before, after, floor = self.cost
         return (before - after) / max(before - floor, 1e-9)

@@ -1,4 +1,4 @@
-"""How sure the numbers are, what these data could have shown, and what they cannot tell apart."""
+"""Confidence intervals, excitation, and detectability of effects in these data."""
 
 from __future__ import annotations
 
@@ -21,17 +21,25 @@ from beetle_omni_ros.robot.effects import CATALOGUE
 def deviations(problem: Problem, state: State, names: list[str],
                free: frozenset[str]) -> dict[str, float]:
     """
-    Half widths of 95 % intervals.
+    Half widths of 95 % intervals, by key, as deviations.
 
-    The largest of four: noise and beliefs through the curvature of the objective, and the scatter
-    between blocks of the flights, between slow and quick motion, and between weak and strong
-    excitation, none of which needs a noise model. The last two see what is the same in all
-    flights: answers to gusts, and a form that is not quite that of the robot.
+    The half width is the largest of four estimates: the curvature of the objective, and the
+    scatter between time blocks, between frequency bands, and between weak and strong excitation.
+    The last three need no noise model. The last two detect errors that are equal in all flights,
+    such as closed-loop bias or a wrong form of an equation. A share for the error of the form is
+    added.
+
+    Args:
+        problem: flights, priors, noise.
+        state: the final fit.
+        names: fitted keys.
+        free: keys whose priors are ignored.
+
     """
     columns, p = [state.index[name] for name in names], problem.p
     s = state.slopes[:, columns]
     data = s.T @ s
-    prior = together(problem.beliefs, state.theta, names, free)[0]**2
+    prior = together(problem.priors, state.theta, names, free)[0]**2
     inverse = solved(data + np.diag(prior), np.eye(len(names)), 1e-10)
     weights = (s**2).sum(axis=0)
     widths = {}
@@ -43,16 +51,16 @@ def deviations(problem: Problem, state: State, names: list[str],
                     float((s[:, k]**2 * state.r**2).sum() / max(weights[k], 1e-12)))
         a = inverse[k]
         curvature = level * float(a @ data @ a) + float((a * a * prior).sum())
-        half = max(1.96 * np.sqrt(curvature), _scattered(scores @ a, len(blocks)))
+        half = max(1.96 * np.sqrt(curvature), _half_width(scores @ a, len(blocks)))
         shares = np.array([score @ a for score, _ in slow_to_quick])
         expected = level * np.array([a @ information @ a for _, information in slow_to_quick])
         if (shares**2).sum() > p.disagree * expected.sum():
-            half = max(half, _scattered(shares, max(
+            half = max(half, _half_width(shares, max(
                 p.least_bands, expected.sum()**2 / max((expected**2).sum(), 1e-30))))
         if name in free:
             shares = _by_excitation(s @ a, state.r, p.excitations)
             if (shares**2).sum() > p.disagree * level * float(a @ data @ a):
-                half = max(half, _scattered(shares, p.excitations))
+                half = max(half, _half_width(shares, p.excitations))
         form = p.form_part * abs(state.theta.get(name, 0.0)) \
             + p.form_share * problem.keys[name].smallest
         widths[name] = half + form
@@ -61,12 +69,12 @@ def deviations(problem: Problem, state: State, names: list[str],
 
 def _by_excitation(weight, r, groups):
     """
-    Shares (groups,) of a number that weakly to strongly excited samples want to change it by.
+    Contributions (groups,) of weakly to strongly excited samples to the change of a key.
 
     Args:
-        weight: (n,) by which each sample's residual enters the number.
+        weight: (n,) weight of each sample's residual in the key.
         r: (n,) whitened residual.
-        groups: how many, of equal information.
+        groups: number of groups of equal information.
 
     """
     order = np.argsort(np.abs(weight))
@@ -75,21 +83,20 @@ def _by_excitation(weight, r, groups):
     return np.array([some.sum() for some in np.split((weight * r)[order], edges)])
 
 
-def _scattered(shares, count):
-    """Half width of a 95 % interval of a number that so many parts of the data make up."""
+def _half_width(shares, count):
+    """Half width of a 95 % interval from the contributions of so many parts of the data."""
     if count < 2:
         return 0.0
     return student.ppf(0.975, count - 1) * np.sqrt((shares**2).sum() * count / (count - 1))
 
 
-def liveliness(problem: Problem) -> float:
+def excitation(problem: Problem) -> float:
     """
-    How far accelerations exceed what no known effect explains, on the axis where they do most.
+    Ratio of accelerations and unexplained residual, on the axis with the largest ratio.
 
-    Near 1 or below, the robot moves because it is pushed, and its controller's commands answer
-    the push: thrust, speed and rate of turn then go with the push, and a fit takes that for an
-    effect of theirs (a thrust too weak, a negative inflow). Only a motion that somebody planned
-    is independent of what disturbs it.
+    At a ratio of about 1 or less, the motion is mostly a reaction to gusts. The controller's
+    commands then correlate with the gusts, and a fit attributes the gusts to thrust, speed or rate
+    (closed-loop bias). Only a planned motion is independent of disturbances.
     """
     moved = []
     for model in problem.models:
@@ -98,7 +105,7 @@ def liveliness(problem: Problem) -> float:
         both = np.concatenate([np.einsum('nij,nj->ni', rotation, force), turning], axis=1)
         moved.append(model.filters['B'](both[::THIN]).var(axis=0))
     noise = problem.noise.spread['B']
-    # Axes of the world against axes of the body: the mean over the three.
+    # Motion is in world axes and noise in body axes, so the mean over three axes is compared.
     level = np.repeat([(noise[:3]**2).mean(), (noise[3:]**2).mean()], 3)
     return float(np.sqrt((np.mean(moved, axis=0) / level).max()))
 
@@ -106,11 +113,11 @@ def liveliness(problem: Problem) -> float:
 @dataclass(frozen=True)
 class Visibility:
     """
-    What the data could show of one candidate.
+    Detectability of one candidate.
 
     Attributes:
-        sigma: of a realistic effect beside everything that is believed.
-        rivals: name -> sigma that is left beside that rival alone.
+        sigma: standard deviations that an effect of typical size shows beside all tolerances.
+        rivals: label of a rival -> standard deviations that remain beside this rival.
 
     """
 
@@ -120,18 +127,18 @@ class Visibility:
 
 def visibility(problem: Problem, state: State, always: list[str],
                candidates: list[Candidate]) -> dict[str, Visibility]:
-    """Label -> what the data could show of each candidate with slopes at its neutral value."""
+    """Label -> detectability of each candidate that is linear at its neutral value."""
     s = state.slopes
     data = s.T @ s
     keys, index = problem.keys, state.index
     base = np.array([index[name] for name in always])
-    # Where a belief says nothing within a range, a realistic effect may well lie outside.
-    prior = np.array([problem.beliefs[name].slope(state.theta.get(name, 0.0))**2
+    # Priors with a flat range: a typical effect may be outside the range.
+    prior = np.array([problem.priors[name].slope(state.theta.get(name, 0.0))**2
                       if not name.startswith('base.') else problem.p.bus_seen**-2
                       for name in always])
 
     def left(own, also):
-        """Information on ``own`` beside what is believed and ``also``."""
+        """Standard deviations of ``own`` beside all tolerances and free keys ``also``."""
         mask = np.array([name not in own for name in always])
         other = np.concatenate([base[mask], [index[n] for n in also if n not in own
                                              and n not in np.array(always)[mask]]]).astype(int)
@@ -151,29 +158,25 @@ def visibility(problem: Problem, state: State, always: list[str],
     for c in smooth:
         rivals = {}
         for o in smooth:
-            if o.name in _rivals_of(c) and o.label != c.label:
+            if o.name in CATALOGUE[c.name].confused_with and o.label != c.label:
                 rivals[o.label] = left(c.keys, o.keys)
         made[c.label] = Visibility(left(c.keys, ()), rivals)
     return made
 
 
-def limits_out_of_sight(problem: Problem, state: State) -> list[str]:
+def undetectable_limits(problem: Problem, state: State) -> list[str]:
     """
-    Names of limits, friction and play that these flights would not show at a realistic size.
+    Names of limits, friction and play that these flights would not show at a typical size.
 
-    They have no slope where they do not act, so the residual itself says what they would change.
+    They have no slope where they do not act, so the residual itself is compared.
     """
     unseen = []
     for name in LIMITS:
         own = [key for key in problem.keys.values() if key.effect == name]
-        # Realistic is a limit that is lower by this part, or a friction of this size.
+        # The typical size is a share by which a limit is lower, or a value of friction or play.
         theta = {key.name: float(np.log(max(1 - key.typical, 0.05))) if key.relative
                  else key.typical for key in own}
         change = problem.residual({**state.theta, **theta}) - state.r
         if np.sqrt(change @ change) < problem.p.decidable:
             unseen.append(name)
     return unseen
-
-
-def _rivals_of(candidate):
-    return CATALOGUE[candidate.name].confused_with

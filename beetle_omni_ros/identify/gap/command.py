@@ -1,4 +1,4 @@
-"""`beetle_omni gap`: recorded flights in; verdict, numbers, page and corrected robot file out."""
+"""`beetle_omni gap`: from recorded flights to verdict, numbers, page and corrected robot file."""
 
 from __future__ import annotations
 
@@ -27,11 +27,10 @@ from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.robot_file import check_not_base, write_text
 from beetle_omni_ros.pages.table import print_grids
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import check_writable, write_json
 
 BAD_DATA = 3        # exit status
-LEAST_FITTED = 2    # flights, above which the last one judges where nobody named one
+LEAST_FITTED = 2    # with more flights, the last one is held out if none is given
 
 
 def run_gap(runs: list[Path], holdout: Sequence[Path] = (), robot: Path | None = None,
@@ -39,15 +38,15 @@ def run_gap(runs: list[Path], holdout: Sequence[Path] = (), robot: Path | None =
             console: Console | None = None, parameters: Path | None = None,
             fix: bool = False, tolerances: bool = False) -> int:
     """
-    Find where model and measurement disagree.
+    Find differences between model and measurement.
 
     Arguments are those of `beetle_omni gap`.
 
     Returns:
-        3 for the verdict `bad_data`; 0 for any other, which is no error.
+        exit status: 3 for the verdict `bad_data`, else 0.
 
     Raises:
-        BagError: a run that does not exist or is no recording of this robot, in one line.
+        BagError: a run does not exist or is no recording of this robot.
         ParameterError, LogError: unusable robot file, log or output, or the same run twice.
 
     """
@@ -58,25 +57,27 @@ def run_gap(runs: list[Path], holdout: Sequence[Path] = (), robot: Path | None =
 
 def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=None,
                 console=None, parameters=None, fix=False, tolerances=False) -> dict:
-    """Do as :func:`run_gap`, and return what it writes to JSON."""
+    """As :func:`run_gap`, but return the results that it writes as JSON."""
     console = console or Console()
     runs, holdout = [Path(r) for r in runs], [Path(h) for h in holdout]
     _check_outputs(apply, robot, json_path, page)
     check_apart([*runs, *holdout])
-    believed, p = RobotParameters.load(robot), GapParameters.load(parameters)
+    robot_parameters, p = RobotParameters.load(robot), GapParameters.load(parameters)
     if any(run.suffix.lower() == '.csv' for run in runs):
-        made, html = analyse_joint_log(runs, holdout, believed, robot, p)
+        made, html = analyse_joint_log(runs, holdout, robot_parameters, robot, p)
     else:
         meta = {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                 'robot': str(robot) if robot else 'params/robot.yaml'}
         with Progress(SpinnerColumn(), TextColumn('{task.description}'), TimeElapsedColumn(),
                       console=console, transient=True) as bars:
             bar = bars.add_task('reading')
-            a = _analysed(runs, holdout, believed, p, fix,
+            a = _analysed(runs, holdout, robot_parameters, p, fix,
                           lambda text: bars.update(bar, description=text))
-        made = results(a, believed, p, meta)
-        if page and a.damages:
-            a.damaged = _first_damaged([*runs, *holdout], a.damages[0])
+        made = results(a, robot_parameters, p, meta)
+        if page and a.damages:      # workers return only the damages, so the bag is read again
+            given = [*runs, *holdout]
+            path = given[names_of(given).index(a.damages[0].run)]
+            a.damaged = read_recording(path), a.damages[0]
         html = gap_page(a, made) if page else ''
     _print(console, made)
     if json_path:
@@ -85,10 +86,10 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
         write_text(page, html, 'page')
     if apply:
         if made['effects']:
-            write_corrected(apply, made, believed, robot, tolerances)
+            write_corrected(apply, made, robot_parameters, robot, tolerances)
             console.print(f'corrected robot: {apply}', highlight=False)
         else:
-            console.print('nothing is named: no robot file is written', highlight=False)
+            console.print('no effect is named: no robot file is written', highlight=False)
     return made
 
 
@@ -98,7 +99,7 @@ def _analysed(runs, holdout, robot, p, fix, progress):
         flights = workers.map(_loaded, zip(given, names_of(given), strict=True), robot, p, fix)
     unusable = [flight for flight in flights if isinstance(flight, UnusableFlight)]
     if unusable:
-        # A verdict about the other flights would pass for one about all that were given.
+        # A verdict from the other flights would be read as one from all of them.
         return Analysis('bad_data', str(unusable[0]),
                         damages=[damage for f in unusable for damage in f.problems])
     check_flights(given, flights, p.same_flight)
@@ -111,7 +112,7 @@ def _analysed(runs, holdout, robot, p, fix, progress):
 
 
 def _loaded(_, named, robot, p, fix):
-    """A flight, or why it cannot be used."""
+    """A flight, or the error that makes it unusable."""
     path, name = named
     try:
         return load_flight(path, robot, p, fix, name)
@@ -119,10 +120,6 @@ def _loaded(_, named, robot, p, fix):
         return error
 
 
-def _first_damaged(paths, damage):
-    """Recording of a damage, read again: what worked on it kept only what is wrong."""
-    path = paths[names_of(paths).index(damage.run)]
-    return read_recording(path), damage
 
 
 def _check_outputs(apply, robot, json_path, page):
@@ -141,6 +138,3 @@ def _print(console, made):
     print_grids([*grids(made), *change_grids(made.get('changes', []))], console)
     if made['next_experiment']:
         console.print(f"Next: {made['next_experiment']}", highlight=False, markup=False)
-
-
-__all__ = ['gap_results', 'ParameterError', 'run_gap']

@@ -1,4 +1,4 @@
-"""Fits of several flights together, by Gauss and Newton with beliefs beside the data."""
+"""Gauss-Newton fits of several flights with Gaussian priors and coloured noise."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from beetle_omni_ros.identify.gap.workers import Workers
 from beetle_omni_ros.identify.inference.least_squares import solved
 from beetle_omni_ros.identify.inference.prior import Prior, together
 
-HALVINGS = 4
-# Deviations, residual, columns that changed and their slopes: what a state is beside another.
+HALVINGS = 4    # of a step, in the line search
+# Deviations, residual, indices of changed columns, and those columns.
 Difference = tuple[dict[str, float], np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass
 class State:
     """
-    Everything at one point.
+    Point of a fit with its residual and slopes.
 
     Attributes:
         theta: deviations by key name.
         r: (n,) whitened residual of all flights.
-        slopes: (n, K) whitened, for ``names``.
-        names: of the columns.
+        slopes: (n, K) whitened derivatives, for ``names``.
+        names: keys of the columns.
 
     """
 
@@ -43,14 +43,14 @@ class State:
     def __post_init__(self):
         self.index = {name: k for k, name in enumerate(self.names)}
 
-    def beside(self, other: State) -> Difference:
-        """What of this state differs from another one with the same names."""
+    def difference_to(self, other: State) -> Difference:
+        """Difference to a state with the same names; cheap to send to another process."""
         changed = np.flatnonzero((self.slopes != other.slopes).any(axis=0)) \
             if self.slopes is not other.slopes else np.zeros(0, dtype=int)
         return self.theta, self.r, changed, self.slopes[:, changed]
 
     def with_difference(self, difference: Difference) -> State:
-        """The state of which :meth:`beside` this one told the difference."""
+        """The state that has this ``difference`` to this one; inverse of :meth:`difference_to`."""
         theta, r, changed, columns = difference
         slopes = self.slopes
         if len(changed):
@@ -61,33 +61,35 @@ class State:
 
 class Problem:
     """
-    The flights, what is believed, and the noise.
+    The flights of a fit, the priors and the noise.
 
     Args:
-        models: one for each flight.
-        keys: by name.
-        beliefs: of keys that always are free.
-        p: parameters.
-        others: flights that judge, whose work is shared as well.
+        models: one for each fitted flight.
+        keys: all keys by name.
+        priors: priors of the keys that every fit includes.
+        p: parameters (params/gap.yaml).
+        held_out: flights that are not fitted; :meth:`parallel` also works on them.
 
     Attributes:
-        noise: in force; change it by :meth:`learn_noise`.
-        workers: processes that share the work, or None.
-        block: (n,) number of the block that a whitened sample belongs to.
+        noise: noise in force; :meth:`learn_noise` changes it.
+        workers: processes for :meth:`parallel`, or None.
+        block: (n,) index of the cross-validation block of each whitened sample.
         where: (n,) index of group and channel of a sample.
+        flight: (n,) index of its flight.
+        time: (n,) its time in the flight [s].
 
     """
 
     workers: Workers | None = None
 
     def __init__(self, models: list[FlightModel], keys: dict[str, Key],
-                 beliefs: dict[str, Prior], p: GapParameters,
-                 others: list[FlightModel] | tuple = ()):
-        self.models, self.keys, self.beliefs, self.p = models, keys, beliefs, p
-        self.everyone = [*models, *others]
-        self._guides: list[tuple[dict[str, float], list[int]]] = []
+                 priors: dict[str, Prior], p: GapParameters,
+                 held_out: list[FlightModel] | tuple = ()):
+        self.models, self.keys, self.priors, self.p = models, keys, priors, p
+        self.all_models = [*models, *held_out]
+        self._smoothing: list[tuple[dict[str, float], list[int]]] = []
         self.noise = Noise.white(p)
-        self._raw: list[tuple] = []     # of each flight, as the last state found them
+        self._raw: list[tuple] = []     # of each flight: residual, slopes, names, theta
         self._label()
 
     def _label(self):
@@ -108,53 +110,55 @@ class Problem:
         self.flight, self.time, self.blocks = np.concatenate(flights), np.concatenate(times), first
 
     def use(self, noise: Noise) -> None:
-        """Take a noise that was learnt elsewhere."""
+        """Set the noise."""
         self.noise = noise
         self._label()
 
     def residual(self, theta: dict[str, float]) -> np.ndarray:
-        """(n,) whitened."""
-        return np.concatenate(self.share(_residual, range(len(self.models)), theta))
+        """(n,) whitened residual."""
+        return np.concatenate(self.parallel(_residual, range(len(self.models)), theta))
 
     def slopes(self, theta: dict[str, float], names: list[str]) -> np.ndarray:
-        """(n, len(names)) whitened."""
-        return np.concatenate(self.share(_slopes, range(len(self.models)), theta, names))
+        """(n, len(names)) whitened derivatives of the residual."""
+        return np.concatenate(self.parallel(_slopes, range(len(self.models)), theta, names))
 
     def state(self, theta: dict[str, float], names: list[str]) -> State:
         """Residual and slopes at a point."""
         self._raw = [(*raw, names, theta)
-                     for raw in self.share(_raw, range(len(self.models)), theta, names)]
+                     for raw in self.parallel(_raw, range(len(self.models)), theta, names)]
         return self._whitened()
 
-    def guide(self, theta: dict[str, float], models: list[FlightModel] | None = None) -> None:
-        """Let noisy encoders' tilts follow the servos at this point; see FlightModel."""
-        self._follow([*self._guides, (theta, [self.everyone.index(model) for model in (
-            self.models if models is None else models)])])
+    def smooth_tilts(self, theta: dict[str, float],
+                     models: list[FlightModel] | None = None) -> None:
+        """Take the fast part of noisy tilts from the servo model at ``theta``; see FlightModel."""
+        some = self.models if models is None else models
+        self._apply_smoothing([
+            *self._smoothing, (theta, [self.all_models.index(model) for model in some])])
 
-    def _follow(self, guides):
-        """Do the last of these, those that were not done here; each builds on the one before."""
-        for theta, some in guides[len(self._guides):]:
+    def _apply_smoothing(self, smoothing):
+        """Apply the entries that this process has not applied yet, in order."""
+        for theta, some in smoothing[len(self._smoothing):]:
             for k in some:
-                self.everyone[k].guide(theta)
-        self._guides = guides
+                self.all_models[k].smooth_tilts(theta)
+        self._smoothing = smoothing
 
-    def share(self, function: Callable, items: Iterable, *common: Any) -> list:
+    def parallel(self, function: Callable, items: Iterable, *common: Any) -> list:
         """
         ``[function(self, item, *common) for item in items]``, in several processes.
 
         Args:
-            function: of a module. It sees this noise and these guides, and must not change them.
-            items: which can be sent to another process.
-            common: likewise.
+            function: module-level function. It must not change the noise or the smoothing.
+            items: picklable arguments, one for each call.
+            common: further picklable arguments.
 
         """
         if self.workers is None:
             return [function(self, item, *common) for item in items]
-        return self.workers.map(_shared, items, self.noise, self._guides, function, common)
+        return self.workers.map(_run_item, items, self.noise, self._smoothing, function, common)
 
-    def renew(self, theta: dict[str, float]) -> None:
-        """Take the residual at a point nearby; slopes stay those of the last :meth:`state`."""
-        rest = self.share(_raw, range(len(self.models)), theta, [])
+    def update_residual(self, theta: dict[str, float]) -> None:
+        """Replace the residual by that at a nearby point; keep the slopes of :meth:`state`."""
+        rest = self.parallel(_raw, range(len(self.models)), theta, [])
         self._raw = [(r, old[1], old[2], theta)
                      for (r, _), old in zip(rest, self._raw, strict=True)]
 
@@ -165,20 +169,20 @@ class Problem:
 
     def learn_noise(self, wide: dict[str, float], rounds: int = 3) -> State:
         """
-        Estimate the noise around a fit of everything, linear from the last state.
+        Estimate the noise around a fit of all keys, linear from the last state.
 
         Args:
-            wide: key -> deviation within which numbers without a belief are sought.
-            rounds: of noise and fit.
+            wide: key -> standard deviation of the search range of a key without prior.
+            rounds: alternations of noise and fit.
 
         Returns:
-            the last state, whitened anew.
+            the last state, whitened with the new noise.
 
         """
         names = self._raw[0][2]
         state = self._whitened()
         for _ in range(rounds):
-            step = self._solve_all(state, wide)
+            step = self.linear_fit_of_all(state, wide)
             rest = []
             for raw, slopes, *_ in self._raw:
                 rest.append({g: raw[g] + slopes[g] @ step for g in raw})
@@ -188,48 +192,49 @@ class Problem:
         assert len(names) == state.slopes.shape[1]
         return state
 
-    def noises(self, theta: dict[str, float], wide: dict[str, float]) -> list[Noise]:
+    def noise_of_each(self, theta: dict[str, float], wide: dict[str, float]) -> list[Noise]:
         """
-        Noise of each flight alone, around a fit of everything to it.
+        Noise of each flight, around a fit of all keys to this flight alone.
 
-        Gusts differ from flight to flight; what any known number could explain is none of them.
+        Gusts differ between flights. The fit removes what any known effect explains.
 
         Args:
-            theta: point at which slopes are taken of flights that were not fitted.
-            wide: as of :meth:`learn_noise`.
+            theta: point of linearisation for flights that were not fitted.
+            wide: see :meth:`learn_noise`.
 
         Returns:
-            the noise of each flight that was fitted, then of the others.
+            noise of each fitted flight, then of each held-out flight.
 
         """
-        raw = [*self._raw, *[None] * (len(self.everyone) - len(self.models))]
-        return self.share(_noise_of, enumerate(raw), self._raw[0][2], theta, wide)
+        raw = [*self._raw, *[None] * (len(self.all_models) - len(self.models))]
+        return self.parallel(_noise_of, enumerate(raw), self._raw[0][2], theta, wide)
 
-    def _solve_all(self, state, wide):
+    def linear_fit_of_all(self, state: State, wide: dict[str, float]) -> np.ndarray:
+        """(K,) step of a linear fit of all keys; ``wide``: see :meth:`learn_noise`."""
         h, g = state.slopes.T @ state.slopes, state.slopes.T @ state.r
-        slope, off = together(self.beliefs, state.theta, state.names)
-        sought = [0.0 if name in self.beliefs else wide.get(name, 1.0)**-2
+        slope, off = together(self.priors, state.theta, state.names)
+        sought = [0.0 if name in self.priors else wide.get(name, 1.0)**-2
                   for name in state.names]
         return -np.linalg.solve(h + np.diag(slope**2 + sought), g + slope * off)
 
-    def prior(self, theta: dict[str, float], free: frozenset[str] = frozenset()) -> float:
-        """Cost of straying from what is believed, of keys that are not ``free``."""
-        return sum(belief.residual(theta.get(name, 0.0))**2
-                   for name, belief in self.beliefs.items() if name not in free)
+    def prior_cost(self, theta: dict[str, float], free: frozenset[str] = frozenset()) -> float:
+        """Chi2 of the priors, without those of the keys in ``free``."""
+        return sum(prior.residual(theta.get(name, 0.0))**2
+                   for name, prior in self.priors.items() if name not in free)
 
     def linear_step(self, state: State, names: list[str], free: frozenset[str],
                     rows: np.ndarray | None = None) -> tuple[np.ndarray, float, np.ndarray]:
         """
-        The best change of the named keys if slopes were constant.
+        Gauss-Newton step of the named keys.
 
         Args:
-            state: point, residual and slopes.
+            state: point of linearisation.
             names: keys that may change.
-            free: of which nothing is believed.
-            rows: samples that count; default all.
+            free: keys whose priors are ignored.
+            rows: samples to use; default all.
 
         Returns:
-            (K,) change, the objective expected after it, (K, K) normal matrix.
+            (K,) step, expected objective after it, (K, K) normal matrix.
 
         """
         columns = [state.index[name] for name in names]
@@ -241,45 +246,45 @@ class Problem:
         return self.solve(state.theta, names, free, h, g, float(r @ r))
 
     def solve(self, theta, names, free, h, g, chi2):
-        """Finish :meth:`linear_step` from the data's normal equations."""
-        slope, off = together(self.beliefs, theta, names, free)
+        """Complete :meth:`linear_step` from the normal equations of the data."""
+        slope, off = together(self.priors, theta, names, free)
         h, g = h + np.diag(slope**2), g + slope * off
         step = -solved(h, g)
-        cost = chi2 + self.prior(theta, free) + 2 * g @ step + step @ h @ step
+        cost = chi2 + self.prior_cost(theta, free) + 2 * g @ step + step @ h @ step
         return step, float(cost), h
 
     def refine(self, state: State, names: list[str], free: frozenset[str],
-               iterations: int = 3, apart: bool = False) -> tuple[State, float]:
+               iterations: int = 3, split: bool = False) -> tuple[State, float]:
         """
         Fit the named keys.
 
-        Slopes of keys that act almost linearly are kept; those of curved ones are renewed.
+        Only slopes of curved keys are renewed after a step.
 
         Args:
-            state: where to begin, with residual and slopes.
+            state: start.
             names: keys that may change.
-            free: of which nothing is believed.
-            iterations: at most.
-            apart: whether, where no part of a step of all is better, keys whose slopes are smooth
-                go on without those of friction, play and limits.
+            free: keys whose priors are ignored.
+            iterations: largest number of steps.
+            split: whether a failed step of all keys is retried without keys of friction, play and
+                limits, whose slopes are not smooth.
 
         Returns:
-            the point reached, and the objective there.
+            the fitted state and its objective.
 
         """
         theta, r = dict(state.theta), state.r
-        slopes, cost = state.slopes, float(r @ r) + self.prior(theta, free)
+        slopes, cost = state.slopes, float(r @ r) + self.prior_cost(theta, free)
         timing = any(self.keys[name].parameter == 'delay' for name in free)
         curved = [name for name in names if self.keys[name].curved and (
-            name not in self.beliefs or name in free
+            name not in self.priors or name in free
             or timing and self.keys[name].parameter == 'delay')]
         smooth = [name for name in names if not (
             name in free and self.keys[name].effect in LIMITS)]
         now = State(theta, r, slopes, state.names)
         for iteration in range(iterations):
-            found = self._descended(now, names, free, cost)
-            if found is None and apart and len(smooth) < len(names):
-                found = self._descended(now, smooth, free, cost)
+            found = self._line_search(now, names, free, cost)
+            if found is None and split and len(smooth) < len(names):
+                found = self._line_search(now, smooth, free, cost)
             if found is None:
                 break
             trial, r, new = found
@@ -293,20 +298,20 @@ class Problem:
                 break
         return now, cost
 
-    def _descended(self, now, names, free, cost):
-        """Keys, residual and objective after the longest tried part of a step that is better."""
+    def _line_search(self, now, names, free, cost):
+        """Keys, residual and objective of the first halved step that decreases the objective."""
         step, _, _ = self.linear_step(now, names, free)
         for halving in range(HALVINGS):
             trial = self.moved(now.theta, names, 0.5**halving * step)
             r = self.residual(trial)
-            new = float(r @ r) + self.prior(trial, free)
+            new = float(r @ r) + self.prior_cost(trial, free)
             if new < cost - 1e-9:
                 return trial, r, new
         return None
 
     def moved(self, theta: dict[str, float], names: list[str],
               step: np.ndarray) -> dict[str, float]:
-        """``theta`` with the named keys changed by ``step`` (K,), within what is physical."""
+        """``theta`` with the named keys changed by ``step`` (K,), within their physical ranges."""
         moved = dict(theta)
         for name, change in zip(names, step, strict=True):
             key = self.keys[name]
@@ -314,10 +319,10 @@ class Problem:
         return moved
 
 
-def _shared(problem, item, noise, guides, function, common):
-    """Do one piece of work at the noise and the guides that the first process has by now."""
+def _run_item(problem, item, noise, smoothing, function, common):
+    """Call ``function`` in a worker, with noise and smoothing of the parent process."""
     problem.noise = noise
-    problem._follow(guides)
+    problem._apply_smoothing(smoothing)
     return function(problem, item, *common)
 
 
@@ -336,7 +341,7 @@ def _raw(problem, k, theta, names):
 
 def _noise_of(problem, item, names, theta, wide):
     k, raw = item
-    alone = Problem([problem.everyone[k]], problem.keys, problem.beliefs, problem.p)
+    alone = Problem([problem.all_models[k]], problem.keys, problem.priors, problem.p)
     if raw is None:
         alone.state(theta, names)
     else:

@@ -1,10 +1,10 @@
-"""What a step of the search must pass beside its gain: blocks left out, gusts, physical bounds."""
+"""Criteria of acceptance beside the gain: held-out blocks, closed-loop bias, physical bounds."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from beetle_omni_ros.identify.gap.bands import aside, in_part_alone
+from beetle_omni_ros.identify.gap.bands import differs_between_bands, project_out
 from beetle_omni_ros.identify.gap.candidates import Found, Trial
 from beetle_omni_ros.identify.gap.fit import HALVINGS, Problem, State
 from beetle_omni_ros.identify.gap.keys import delays_of, Key, LIMITS
@@ -15,50 +15,44 @@ from beetle_omni_ros.robot.effects import CATALOGUE
 COMMANDS = delays_of('tilt', 'thrust')
 
 
-def enough(p: GapParameters, gain: float, of_beliefs: float, price: float = 0.0) -> bool:
+def significant(p: GapParameters, gain: float, prior_gain: float, price: float = 0.0) -> bool:
     """
-    Whether a step gains enough to be no chance.
+    Whether a gain is too large to be chance.
 
     Args:
-        p: parameters.
-        gain: of the objective.
-        of_beliefs: part of it.
-        price: of numbers beyond the first.
+        p: parameters (params/gap.yaml).
+        gain: decrease of the objective.
+        prior_gain: part of it in the priors.
+        price: further required gain for keys beyond the first.
 
     """
-    return gain >= p.least_gain + price or believed(p, gain, of_beliefs, price)
+    return gain >= p.least_gain + price or significant_in_prior(p, gain, prior_gain, price)
 
 
-def believed(p: GapParameters, gain: float, of_beliefs: float, price: float = 0.0) -> bool:
+def significant_in_prior(p: GapParameters, gain: float, prior_gain: float,
+                         price: float = 0.0) -> bool:
     """
-    Whether what a step gains is of beliefs, and enough of it.
+    Whether the gain in the priors alone is significant; arguments as of :func:`significant`.
 
-    What data gain may be gusts and the answers to them. Beliefs gain where tolerances would have
-    to be farther off than robots are: that is no noise, and less of it says as much.
-
-    Args:
-        p: parameters.
-        gain: of the objective.
-        of_beliefs: part of it.
-        price: of numbers beyond the first.
-
+    A gain in the data may be closed-loop bias by gusts. A gain in the priors means that tolerances
+    would otherwise exceed those of real robots. It is not noise, so a smaller gain suffices.
     """
-    return min(gain, of_beliefs) >= p.least_believed + price
+    return min(gain, prior_gain) >= p.least_believed + price
 
 
 def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = (),
              early: float = 0.0) -> bool:
     """
-    Whether a number is as far off as it can be.
+    Whether a value is at its bound or physically impossible.
 
-    An effect of one sign may end at zero: the flights lack what the file has. Readings that would
-    be younger than their stamps are beyond it, and so are commands that would act before theirs.
+    Zero is a valid bound of an effect of one sign: the robot lacks an effect of the robot file.
+    A reading must not be younger than its stamp, and a command must not act before its stamp.
 
     Args:
-        keys: by name.
-        trial: with its numbers.
-        delays: from the stamps of tilt and thrust commands until they act, with them [s].
-        early: that a command may act before its stamp [s].
+        keys: all keys by name.
+        trial: trial with its deviations.
+        delays: delays of tilt and thrust commands with these deviations [s].
+        early: accepted lead of a command on its stamp [s].
 
     """
     if any(name in COMMANDS for name in trial.candidate.keys) \
@@ -74,30 +68,30 @@ def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = (),
     return False
 
 
-def holds(trial: Trial, p: GapParameters) -> bool:
-    """Whether blocks that were left out agree; see :func:`cross_validate`."""
+def confirmed(trial: Trial, p: GapParameters) -> bool:
+    """Whether held-out blocks confirm a trial; see :func:`cross_validate`."""
     held = trial.held
     sure = held.total >= p.held_out_errors * held.error \
         or held.positive >= p.held_out_nearly_all and (
-            trial.gain >= p.least_uneven or trial.believed >= p.least_believed)
+            trial.gain >= p.least_uneven or trial.prior_gain >= p.least_believed)
     return sure and held.total >= p.held_out_share * trial.gain \
         and held.positive >= p.held_out_blocks \
         and held.without_best >= max(p.elsewhere_share * min(held.total, trial.gain),
                                      p.least_elsewhere)
 
 
-def neither_holds(found: Found, own: str, other: str, least: float) -> bool:
+def same_response(found: Found, own: str, other: str, least: float) -> bool:
     """
-    Whether two entries are forms of one response, whose shape is neither's.
+    Whether two entries approximate one response that neither describes completely.
 
-    Where one is joined and the other still gains beside it, the response has a shape that neither
-    holds, such as a lag of second order, and which number is wrong is open.
+    Example: a lag of second order, if the catalogue has only dead time and a lag of first order.
+    Then one entry still gains beside the other, and the data do not determine which one is wrong.
 
     Args:
-        found: with the trials beside what is accepted.
+        found: search result with the trials beside the accepted entries.
         own: name of an accepted entry.
-        other: name of the entry that might be meant as well.
-        least: of chi2, that the other gains beside it.
+        other: name of the possible alternative.
+        least: required gain in chi2 of the alternative beside the accepted entry.
 
     """
     beside = found.trials.get(other)
@@ -105,54 +99,54 @@ def neither_holds(found: Found, own: str, other: str, least: float) -> bool:
         and beside not in found.accepted
 
 
-def fought(problem: Problem, trial: Trial, point: State, involved: list[str],
+def closed_loop_bias(problem: Problem, trial: Trial, point: State, involved: list[str],
            free: frozenset[str]) -> bool:
     """
-    Whether what shows in forces alone may be a controller's answers to gusts.
+    Whether a trial that acts on body forces alone may be closed-loop bias by gusts.
 
     Args:
-        problem: flights, beliefs, noise.
-        trial: fitted.
-        point: of its fit.
+        problem: flights, priors, noise.
+        trial: fitted trial.
+        point: state of its fit.
         involved: keys of the fit without the entry.
-        free: of which nothing is believed there.
+        free: keys whose priors are ignored in that fit.
 
     """
     c = trial.candidate
-    if not c.pushes(problem.keys):
+    if not c.acts_on_body_only(problem.keys):
         return False
     others = [name for name in involved if name not in c.keys]
-    slopes, r = aside(problem, point, others, point.slopes[
+    slopes, r = project_out(problem, point, others, point.slopes[
         :, [point.index[name] for name in c.keys]], free)
-    return in_part_alone(problem, slopes, r - slopes @ [
+    return differs_between_bands(problem, slopes, r - slopes @ [
         trial.theta.get(name, 0.0) for name in c.keys], trial.gain)
 
 
 def cross_validate(problem: Problem, trial: Trial, point: State, without: State,
                    involved: list[str], free: frozenset[str]) -> None:
     """
-    Set a trial's gain on each block left out, with all numbers fitted to the others.
+    Set ``trial.held``: gains on each block, with all keys fitted to the other blocks.
 
     Args:
-        problem: flights, beliefs, noise.
-        trial: fitted.
-        point: of its fit.
-        without: the best fit without the entry. Not ``point`` with its keys at zero: far from its
-            own fit a straight line promises more than it holds, where slopes are those of noise.
+        problem: flights, priors, noise.
+        trial: fitted trial.
+        point: state of its fit.
+        without: best fit without the entry. ``point`` with the candidate's keys at zero would be
+            too far from its own fit for a linear prediction.
         involved: keys of that fit.
-        free: of which nothing is believed there.
+        free: keys whose priors are ignored in that fit.
 
     """
     c = trial.candidate
     with_it = list(dict.fromkeys([*involved, *c.keys]))
-    others = [name for name in with_it if name not in c.keys or name in problem.beliefs]
+    others = [name for name in with_it if name not in c.keys or name in problem.priors]
     trial.held = HeldOut(
-        _left_out(problem, without, others, free)
-        - _left_out(problem, point, with_it, free | set(c.keys), c.name in LIMITS))
+        _held_out_costs(problem, without, others, free)
+        - _held_out_costs(problem, point, with_it, free | set(c.keys), c.name in LIMITS))
 
 
-def _left_out(problem, at, names, free, bent=False):
-    """Objective (blocks,) on each block of a fit to the others; ``bent``: no straight line."""
+def _held_out_costs(problem, at, names, free, nonlinear=False):
+    """Objective (blocks,) on each block of a fit to the others; ``nonlinear``: by the residual."""
     s = at.slopes[:, [at.index[name] for name in names]]
     parts = [(s[rows].T @ s[rows], s[rows].T @ at.r[rows], float(at.r[rows] @ at.r[rows]))
              for rows in (problem.block == b for b in range(problem.blocks))]
@@ -161,23 +155,23 @@ def _left_out(problem, at, names, free, bent=False):
     for block, (h, g, chi2) in enumerate(parts):
         step, _, _ = problem.solve(at.theta, names, free, total[0] - h, total[1] - g,
                                    total[2] - chi2)
-        if bent:
-            costs.append(_reached(problem, at, names, free, step, problem.block == block))
+        if nonlinear:
+            costs.append(_cost_after_step(problem, at, names, free, step, problem.block == block))
             continue
-        belief = problem.prior(problem.moved(at.theta, names, step), free)
-        costs.append(chi2 + 2 * g @ step + step @ h @ step + belief / problem.blocks)
+        prior = problem.prior_cost(problem.moved(at.theta, names, step), free)
+        costs.append(chi2 + 2 * g @ step + step @ h @ step + prior / problem.blocks)
     return np.array(costs)
 
 
-def _reached(problem, at, names, free, step, rows):
+def _cost_after_step(problem, at, names, free, step, rows):
     """
     Objective on ``rows`` after a step, by the residual itself.
 
-    A limit that acts in one block most is hardly known without it: there a straight line
-    promises anything. The step is as long as the other rows gain by it.
+    A limit that acts mostly in one block is undetermined without it, so a linear prediction is
+    useless. The step is halved until the other rows gain.
     """
     def objective(theta, r, some):
-        return float(r[some] @ r[some]) + problem.prior(theta, free)
+        return float(r[some] @ r[some]) + problem.prior_cost(theta, free)
 
     theta, r = at.theta, at.r
     before = objective(theta, r, ~rows)
@@ -187,4 +181,4 @@ def _reached(problem, at, names, free, step, rows):
         if objective(moved, there, ~rows) <= before:
             theta, r = moved, there
             break
-    return float(r[rows] @ r[rows]) + problem.prior(theta, free) / problem.blocks
+    return float(r[rows] @ r[rows]) + problem.prior_cost(theta, free) / problem.blocks

@@ -1,4 +1,4 @@
-"""From a recording to a flight that can be judged, or the reason why it cannot."""
+"""From a recording to a checked flight, or the reason why it is unusable."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from beetle_omni_ros.runs.bag_files import bag_files
 
 class UnusableFlight(ValueError):
     """
-    A recording cannot be judged; the text says why, in one line.
+    A recording cannot be used; the text states the reason in one line.
 
     Attributes:
-        problems: what is wrong with it, as far as it is known.
+        problems: the detected damages.
 
     """
 
     def __init__(self, text: str, problems: list[Damage] | tuple = ()):
-        # Both go to the parent's process, too, which cannot take functions.
+        # The error is sent to the parent process, and functions cannot be pickled.
         super().__init__(text, [replace(damage, repair=None) for damage in problems])
 
     @property
@@ -46,15 +46,15 @@ class Flight:
     One contiguous piece of flight.
 
     Attributes:
-        name: of the recording.
-        start: of the piece [s]; all times below are relative to it.
-        duration: [s].
+        name: name of the recording.
+        start: stamp of its beginning [s]; all times below are relative to it.
+        duration: duration [s].
         imu_t, imu: (N,) and (N, 6) specific force [m/s^2], rates [rad/s].
         pose_t, pose: (N,) and (N, 7) position [m] and quaternion xyzw, sign-continuous.
         joint_t, joint: (N,) and (N, 4) [rad].
         command_t, command: (N,) and (N, 8) [rad], [N].
-        battery_t, battery: (N,) and (N, 1) [V], perhaps empty.
-        findings: what the checks noticed.
+        battery_t, battery: (N,) and (N, 1) [V], possibly empty.
+        findings: remarks of the checks.
 
     """
 
@@ -80,15 +80,15 @@ def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
     Read and check one recording.
 
     Args:
-        path: of the bag.
-        robot: as believed.
-        p: parameters.
-        fix: whether corrections that are certain are applied to what was read.
-        name: by which it is spoken of; default: that of its folder.
+        path: path of the bag.
+        robot: parameters of the robot file.
+        p: parameters (params/gap.yaml).
+        fix: whether certain corrections are applied to the data.
+        name: name in messages; default: that of the folder.
 
     Raises:
         BagError: no such bag, or no recording of this robot.
-        UnusableFlight: naming the recording and what is wrong with it.
+        UnusableFlight: with name and damages of the recording.
 
     """
     recording = read_recording(path)
@@ -99,10 +99,10 @@ def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
 def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
             fix: bool = False) -> Flight:
     """
-    Check a recording and cut the flight out of it; see :func:`load_flight`.
+    Check a recording and select the flight; see :func:`load_flight`.
 
     Raises:
-        UnusableFlight: naming the recording and what is wrong with it.
+        UnusableFlight: with name and damages of the recording.
 
     """
     name = recording.name
@@ -141,13 +141,13 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
 
 
 def _unusable(name, topic, cause, at_s=None):
-    """An error with its one cause, which the results list as they list damages."""
+    """An error with one damage, as the checks of :mod:`recording` report it."""
     damage = Damage(name, topic, cause, at_s)
     return UnusableFlight(damage.text, [damage])
 
 
 def _in_order(name, topic, recording, findings):
-    """Stamps ascending, each once."""
+    """Finite samples in ascending order, without repeated stamps."""
     t, values = recording.times[topic], recording.values[topic]
     fine = np.isfinite(t) & np.isfinite(values).all(axis=1)
     if not fine.all():
@@ -161,7 +161,7 @@ def _in_order(name, topic, recording, findings):
 
 
 def _flown(name, recording, series, robot, p):
-    """First and last moment of the flight that is looked at."""
+    """First and last time of the usable flight."""
     t, command = series['command']
     lifted = command[:, 4:].sum(axis=1) > p.lifted * robot.mass * robot.gravity
     if lifted.mean() < 0.2:
@@ -181,7 +181,7 @@ def _flown(name, recording, series, robot, p):
 
 
 def _without_gaps(name, series, begin, end, p, findings):
-    """The longest piece in which no topic is silent for long."""
+    """The longest piece without a long gap in any topic."""
     breaks, lost, longest = [], 0.0, (0.0, '', 0.0)
     for topic in NEEDED:
         t = series[topic][0]
@@ -204,19 +204,19 @@ def _without_gaps(name, series, begin, end, p, findings):
 
 
 def _continuous(quaternion):
-    """Quaternions without changes of sign, normalised."""
+    """Normalised quaternions with continuous signs."""
     norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
     return aligned(quaternion / np.where(norm > 1e-6, norm, 1.0))
 
 
 def _check_robot(flight, robot, p):
-    """A robot file that is of another robot altogether."""
+    """Refuse a flight of a completely different robot."""
     total = np.median(np.linalg.norm(flight.imu[:, :3], axis=1))
     if total < 0.3 * robot.gravity:
         raise _unusable(flight.name, 'imu/data_raw', f'specific force is {total:.2f} m/s^2, '
                         f'near {robot.gravity:.2f} m/s^2 expected')
     asked = np.median(flight.command[:, 4:].sum(axis=1)) / robot.mass
-    # Thrusts also work against each other, so only far too little is impossible.
+    # Thrusts may partly cancel each other, so only too small a sum is impossible.
     if asked < (1 - p.wrong_robot) * total or asked > 3 * total:
         raise _unusable(flight.name, 'command', 'the robot file does not fit: commanded thrust '
                         f'over its mass is {asked:.1f} m/s^2, the IMU measures {total:.1f} m/s^2')
@@ -224,20 +224,20 @@ def _check_robot(flight, robot, p):
 
 def check_apart(runs: list[Path]) -> None:
     """
-    Refuse a recording that is given twice, under whatever name.
+    Refuse a recording that is given twice, even under different names.
 
-    A flight that is fitted and judges as well would confirm whatever was fitted to it.
+    A flight that is both fitted and held out would confirm any fit.
 
     Raises:
-        BagError: no recording there, in one line.
-        ParameterError: the same recording twice, naming both.
+        BagError: no recording at a path.
+        ParameterError: the same recording twice, with both paths.
 
     """
     known: dict[tuple, Path] = {}
     for run in runs:
         files = [run] if run.suffix.lower() == '.csv' else bag_files(run)
         if not all(file.is_file() for file in files):
-            continue        # whoever reads it says what is missing
+            continue        # reading it raises the error
         size = tuple(file.stat().st_size for file in files)
         digest = tuple(_digest(file) for file in files)
         if (size, digest) in known:
@@ -247,7 +247,7 @@ def check_apart(runs: list[Path]) -> None:
 
 
 def names_of(runs: list[Path]) -> list[str]:
-    """As much of each path, from its end, as tells the recordings apart."""
+    """Shortest endings of the paths that are all different."""
     paths = [run.absolute().parts for run in runs]
     for depth in range(1, max((len(parts) for parts in paths), default=1) + 1):
         names = ['/'.join(parts[-depth:]) for parts in paths]
@@ -258,15 +258,15 @@ def names_of(runs: list[Path]) -> list[str]:
 
 def check_flights(runs: list[Path], flights: list[Flight], same: float) -> None:
     """
-    Refuse one flight in two recordings, whose files differ: cut, converted or recorded twice.
+    Refuse one flight in two different files: cut, converted or recorded twice.
 
     Args:
         runs: paths, for the message.
-        flights: what was read there.
-        same: part of the IMU's readings that only one flight has in common.
+        flights: flights that were read there.
+        same: share of equal IMU readings from which two flights are the same.
 
     Raises:
-        ParameterError: naming both recordings.
+        ParameterError: with both paths.
 
     """
     readings = [{row.tobytes() for row in flight.imu} for flight in flights]

@@ -1,9 +1,9 @@
 """
-What changed in the servos between two response logs.
+Changes of the servos between two response logs.
 
-Both logs are fitted with the same numbers, joint by joint. As in `identify joint`, servos of one
-type on one bus are expected to differ from their mean by 10 % and 3 ms: where a slow log trades
-delay against stiffness, the other joints help.
+Both logs are fitted with the same parameters, each joint alone. As in `identify joint`, the prior
+of the differences between servos on one bus is 10 % and 3 ms about their mean, which helps if a
+slow log does not separate delay and stiffness.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 FITTED = ('natural_frequency', 'damping_ratio', 'delay', 'coulomb_friction', 'offset')
-# Catalogue entry, parameter, unit. A log without a torque determines friction over stiffness (the
-# dead band) better than either, and the lag behind a ramp better than its parts.
+# Catalogue entry, parameter, unit. A log without a torque determines the dead band (friction over
+# stiffness) and the lag behind a ramp better than the parameters that they consist of.
 ROWS = tuple(
     row for name, parameters in GROUPS.items() for parameter in parameters
     for spec in [CATALOGUE[name].parameters[parameter]]
@@ -48,16 +48,16 @@ def changes(before: JointLog, after: JointLog, robot: RobotParameters,
     Compare the servos of two logs.
 
     Args:
-        before: the first log.
-        after: the second.
-        robot: the servos as believed, from which both fits start.
-        p: parameters; default the shipped ones.
+        before: first log.
+        after: second log.
+        robot: parameters of the robot file; start of both fits.
+        p: parameters (params/gap.yaml); default the shipped ones.
 
     Returns:
-        for each joint of both logs and each of ``ROWS`` the second ``log``, ``joint``, ``name``
-        of the catalogue entry, ``parameter``, ``unit``, ``before``,
-        ``after``, their ``difference``, its 95 % ``interval`` and ``significant``: whether
-        chance makes so large a difference anywhere between two logs in 5 % of the cases at most.
+        a row for each joint of both logs and each of ``ROWS``: second ``log``, ``joint``, ``name``
+        of the catalogue entry, ``parameter``, ``unit``, ``before``, ``after``, ``difference``, its
+        95 % ``interval``, and ``significant``: at most 5 % of pairs of logs without a change have
+        any significant row.
 
     """
     p = p or GapParameters.load()
@@ -85,11 +85,11 @@ def estimate(log: JointLog, robot: RobotParameters,
     Zero, gains, friction and delay of each joint of a log.
 
     Returns:
-        (J, 7) values in the order of ``ROWS``, and (J, 7) their standard errors.
+        (J, 7) values in the order of ``ROWS``, and (J, 7) standard errors.
 
     """
     servos = Servos(robot, log.joints)
-    start = servos.sets(servos.believed[None])[0]
+    start = servos.sets(servos.file_point[None])[0]
     count, free = len(log.joints), np.array([name in FITTED for name in NAMES])
     weight = np.tile(fitted_samples(log), (count, 1))
     start[:, INDEX['coulomb_friction']] = np.maximum(start[:, INDEX['coulomb_friction']], 0.005)
@@ -97,7 +97,7 @@ def estimate(log: JointLog, robot: RobotParameters,
     noise = first_noise(log)
     problems = Problems.apart(np.arange(count), start, np.tile(free, (count, 1)), weight)
     for _ in range(2):
-        # Frequency and damping within a factor of the median joint's keep a fit in place.
+        # A weak prior of frequency and damping about the median joint regularises the fit.
         prior = prior_of(np.median(problems.points, axis=0), dict.fromkeys(
             ('natural_frequency', 'damping_ratio'), float(np.log(p.log_changes_factor))))
         fits = ServoFitter(log, noise, prior=prior).solve(problems, 15)
@@ -108,7 +108,7 @@ def estimate(log: JointLog, robot: RobotParameters,
 
 
 def _pooled(fitter, problems, free):
-    """(J, n) encoded numbers drawn to the mean of all joints, and (J n, J n) their covariance."""
+    """(J, n) encoded values with the prior about the mean of the joints, (J n, J n) covariance."""
     count, size = len(problems.points), int(free.sum())
     precision = np.zeros((count * size, count * size))
     for j, (own, scatter) in enumerate(fitter.certainty(problems)):
@@ -125,7 +125,7 @@ def _pooled(fitter, problems, free):
 
 
 def _physical(points, covariance, free, servos):
-    """Values and standard errors in the units of the catalogue, by finite differences."""
+    """Values and standard errors in catalogue units, by finite differences."""
     count, size = points.shape
     scale = np.array([term.scale for term in TERMS.values()])[free]
     errors = np.zeros((count, len(ROWS)))
@@ -151,7 +151,7 @@ def _physical(points, covariance, free, servos):
 
 
 def sentences(rows: list[dict], log: str) -> list[str]:
-    """One line for each significant change, or that there is none."""
+    """One line for each significant change, or one line if there is none."""
     changed = [row for row in rows if row['significant']]
     if not changed:
         return [f'{log}: no significant change of zero, gains, friction or delay']
@@ -159,7 +159,7 @@ def sentences(rows: list[dict], log: str) -> list[str]:
 
 
 def change_grids(rows: list[dict]) -> list[Grid]:
-    """One table for each further log: before, after and their difference."""
+    """One table for each further log: before, after and difference."""
     made = []
     for log in dict.fromkeys(row['log'] for row in rows):
         cells = []
@@ -173,13 +173,13 @@ def change_grids(rows: list[dict]) -> list[Grid]:
         made.append(Grid(f'Changes to {log}', ['joint', 'parameter', 'before', 'after',
                                                'difference', '95 %', 'significant'], cells,
                          note='dead_band: friction over stiffness. ramp_lag: lag behind a ramp, '
-                              'delay and damping together. significant: chance makes so large a '
-                              'difference anywhere between two logs in 5 of 100 cases at most.'))
+                              'from delay and damping. significant: two logs without a change '
+                              'have any such row in at most 5 of 100 cases.'))
     return made
 
 
 def line(row: dict) -> str:
-    """A row in words, e.g. 'joint 2: joint_offset offset 0.4 to 18.2 mrad, change 17.8 ...'."""
+    """Text of a row, e.g. 'joint 2: joint_offset offset 0.4 to 18.2 mrad, change 17.8 ...'."""
     unit, factor = MILLI.get(row['unit'], (row['unit'], 1.0))
     old, new, difference, low, high = (factor * x for x in (
         row['before'], row['after'], row['difference'], *row['interval']))

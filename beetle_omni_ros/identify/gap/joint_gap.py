@@ -1,4 +1,4 @@
-"""The joint layer alone: a servo's response log, judged as flights are."""
+"""Gap analysis of the joint layer alone, from a response log of the servos."""
 
 from __future__ import annotations
 
@@ -9,12 +9,7 @@ import numpy as np
 
 from beetle_omni_ros import __version__
 from beetle_omni_ros.identify.gap.joint_changes import change_grids, changes, sentences
-from beetle_omni_ros.identify.gap.joint_search import (
-    Entry,
-    Found,
-    Search,
-    Trial,
-)
+from beetle_omni_ros.identify.gap.joint_search import Entry, Found, Search, Trial
 from beetle_omni_ros.identify.gap.keys import friction
 from beetle_omni_ros.identify.gap.page import AFTER, BEFORE, head
 from beetle_omni_ros.identify.gap.parameters import GapParameters
@@ -34,17 +29,17 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParameters,
                       base: Path | None, p: GapParameters | None = None) -> tuple[dict, str]:
     """
-    Judge a response log, and compare it with others.
+    Analyse a response log, and compare it with others.
 
     Args:
-        runs: the log; further ones are compared with it, as are those of ``holdout``.
+        runs: the log; it is compared with further ones and with those of ``holdout``.
         holdout: further logs.
-        robot: as believed.
-        base: its file, for the record.
-        p: parameters.
+        robot: parameters of the robot file.
+        base: path of the robot file, for the record.
+        p: parameters (params/gap.yaml).
 
     Returns:
-        results as for flights, and an HTML page.
+        results with the keys of flights, and an HTML page.
 
     Raises:
         LogError: unusable log.
@@ -58,7 +53,7 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
     joints = identified['joints']
     made = gap_of(found, log, joints)
     for k, joint in enumerate(joints):
-        joint['file_heldout_rms_rad'] = float(found.errors['believed'][k])
+        joint['file_heldout_rms_rad'] = float(found.errors['file'][k])
         joint['corrected_heldout_rms_rad'] = float(found.errors['corrected'][k])
     made['changes'] = [row for other in others for row in changes(log, other, robot, p)]
     made['findings'] = [text for other in others for text in sentences(
@@ -76,11 +71,11 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
 
 
 def _picture(found, log):
-    """Error of the file's servos, and of the corrected ones, over the log."""
+    """Errors of the file's servos and of the corrected ones over the log."""
     joints, t = np.arange(len(log.joints)), log.t - log.t[0]
-    points = [('robot file', BEFORE, found.believed)]
+    points = [('robot file', BEFORE, found.file_point)]
     if found.accepted:
-        points.append(('with what is named', AFTER, found.point))
+        points.append(('with named effects', AFTER, found.point))
     with matplotlib.rc_context(STYLE):
         figure, axes = panels(len(joints), 1, height=1.1, sharex=True)
         for text, colour, point in points:
@@ -94,18 +89,18 @@ def _picture(found, log):
             axis.axvspan(t[0], held_out, color='#eef3f8', lw=0)
         axes[-1, 0].set_xlabel('time [s]; shaded: fitted, the rest is held out')
         legend(figure, axes[0, 0])
-        return svg(figure, 'error of the servos alone over the log')
+        return svg(figure, 'error of the simulated servos over the log')
 
 
 def gap_of(found: Found, log: JointLog, apart: list[dict] | tuple = ()) -> dict:
     """
-    Verdict, effects and errors of a search, as INTERFACES lays them out.
+    Verdict, effects and errors of a search, with the keys of INTERFACES.
 
     Args:
-        found: by the search.
-        log: that was searched.
-        apart: each joint identified by itself, as ``identify joint`` has it, for what no servo
-            that all joints share explains.
+        found: result of the search.
+        log: the log.
+        apart: results of `identify joint` for each joint alone, for a joint that differs from the
+            others.
 
     """
     effects = _effects(found)
@@ -113,25 +108,25 @@ def gap_of(found: Found, log: JointLog, apart: list[dict] | tuple = ()) -> dict:
     if apart:
         best = np.minimum(best, [joint['heldout_rms_rad'] for joint in apart])
     allowed = np.hypot(found.p.log_as_well * best, found.tolerated)
-    before, after, floor = (_rms(e) for e in (found.errors['believed'],
+    before, after, floor = (_rms(e) for e in (found.errors['file'],
                                               found.errors['corrected'], best))
     closure = _closure(before, after, floor)
     reason = (f'error on the held-out part {1e3 * before:.1f} mrad before, '
               f'{1e3 * after:.1f} mrad after')
     partial, different = [], int(np.argmax(found.errors['corrected'] / allowed))
     if apart and found.errors['corrected'][different] > allowed[different]:
-        # What all joints share is no explanation of one that differs from them.
+        # Shared parameters do not explain a joint that differs from the others.
         effects, partial = [], effects
-        reason = _different(apart, different, found.errors['corrected'][different])
+        reason = _joint_differs(apart, different, found.errors['corrected'][different])
         after, closure = before, _closure(before, before, floor)
     return {
         'verdict': _verdict(found, effects, allowed),
         'reason': reason,
         'closure': closure, 'gap_before': before / floor, 'gap_after': after / floor,
         'noise_floor': 1.0, 'effects': effects, 'partial': partial,
-        'candidates': _candidates(found), 'hidden': found.out_of_sight,
+        'candidates': _candidates(found), 'hidden': found.undetectable,
         'where': sorted(({'channel': f'joint_{number}', 'regime': 'log',
-                          'excess': float(found.errors['believed'][k] / best[k]),
+                          'excess': float(found.errors['file'][k] / best[k]),
                           'excess_after': float(found.errors['corrected'][k] / best[k])}
                          for k, number in enumerate(log.joints)),
                         key=lambda row: -row['excess']),
@@ -141,32 +136,32 @@ def gap_of(found: Found, log: JointLog, apart: list[dict] | tuple = ()) -> dict:
         'regimes': {}, 'held_out': True, 'findings': []}
 
 
-def _different(joints, k, error):
-    """Why one joint is not explained by what all share, with the numbers that differ."""
+def _joint_differs(joints, k, error):
+    """Reason with the values in which one joint differs from the others."""
     own, others = joints[k], [joint for joint in joints if joint is not joints[k]]
-    told = []
+    differences = []
     for term, text, factor, unit in (('natural_frequency', 'natural frequency', 1.0, 'rad/s'),
                                      ('damping_ratio', 'damping ratio', 1.0, ''),
                                      ('delay', 'delay', 1e3, 'ms')):
         usual = np.median([joint['terms'][term]['value'] for joint in others]) if others else 0.0
-        told.append(f'{text} {factor * own["terms"][term]["value"]:.3g}'
-                    + (f' against {factor * usual:.3g}' if others else '')
-                    + (f' {unit}' if unit else ''))
-    return (f'joint {own["joint"]} is off by {1e3 * error:.1f} mrad with what all joints share '
-            f'and by {1e3 * own["heldout_rms_rad"]:.1f} mrad fitted by itself: its servo differs '
-            f'from the others ({", ".join(told)})')
+        differences.append(f'{text} {factor * own["terms"][term]["value"]:.3g}'
+                           + (f' against {factor * usual:.3g}' if others else '')
+                           + (f' {unit}' if unit else ''))
+    return (f'joint {own["joint"]} has an error of {1e3 * error:.1f} mrad with shared parameters '
+            f'and of {1e3 * own["heldout_rms_rad"]:.1f} mrad fitted alone: its servo differs '
+            f'from the others ({", ".join(differences)})')
 
 
 def _verdict(found, effects, allowed):
     """
-    What the search means.
+    Verdict of the search.
 
-    Without an effect there is no gap where the file predicts the held-out part as well as the
-    freest fit, up to what manufacturing tolerances make.
+    Without an effect there is no gap if the file predicts the held-out part as well as the most
+    flexible fit, within manufacturing tolerance.
     """
     if effects:
         return 'named_set' if any(len(e['names']) > 1 for e in effects) else 'named'
-    return 'no_gap' if (found.errors['believed'] <= allowed).all() else 'unknown'
+    return 'no_gap' if (found.errors['file'] <= allowed).all() else 'unknown'
 
 
 def _rms(values):
@@ -180,7 +175,7 @@ def _closure(before, after, floor):
 
 
 def _evidence(trial: Trial):
-    """Evidence of one entry beside the others; ``cv_gain``: on blocks that were not fitted."""
+    """Evidence of one entry beside the others; ``cv_gain``: on held-out blocks."""
     held = trial.held
     return {'delta_bic': trial.gain - trial.numbers * float(np.log(trial.samples)),
             'delta_chi2': trial.gain, 'cv_gain': held.total,
@@ -189,7 +184,7 @@ def _evidence(trial: Trial):
 
 
 def _effects(found: Found):
-    """Accepted entries, the strongest first; friction of several joints is one."""
+    """Accepted entries, largest gain first; friction of several joints is one effect."""
     made, friction = [], [t for t in found.accepted if t.entry.name == 'joint_friction'
                           and t.entry in found.sets]
     for trial in found.accepted:
@@ -224,24 +219,24 @@ def _joints(found, trials):
 
 
 def _also(found, members):
-    """What was fitted with an effect and must be written with it, though it is not named."""
+    """Entries that were fitted with an effect and must be written with it, but are not named."""
     also = {t.entry.name: _parameters(found, t.entry) for t in members[1:]
             if any(t.entry == a.entry for a in found.accepted)}
     servos, fitted = found.servos, [t.entry.name for t in found.accepted]
     held = found.point[servos.index('dead_band_held')] > 0.5
     if members[0].entry.name == 'joint_bandwidth' and held and 'joint_friction' not in fitted \
-            and servos.friction(found.believed).any():
+            and servos.friction(found.file_point).any():
         also['joint_friction'] = _parameters(found, Entry('joint_friction'))
     return also
 
 
 def _parameters(found: Found, entry: Entry, point=None):
-    """Parameter -> value, unit, 95 % interval of one entry; ``point``: a model of its own."""
+    """Parameter -> value, unit, 95 % interval of one entry; ``point``: its own model, if any."""
     servos, other = found.servos, point is not None
     point = found.point if point is None else point
     if entry.name == 'joint_friction':
         return _friction(found, point)
-    made, values, believed = {}, servos.values(point), servos.values(found.believed)
+    made, values, file_values = {}, servos.values(point), servos.values(found.file_point)
     for k in np.flatnonzero(servos.mask(entry.name, entry.joint)):
         number, width = servos.numbers[k], 0.0 if other else found.widths[k] * servos.scale[k]
         ends = [values[k] * np.exp(s * width) if number.logarithmic else values[k] + s * width
@@ -250,7 +245,7 @@ def _parameters(found: Found, entry: Entry, point=None):
         spec = CATALOGUE[entry.name].parameters[number.name]
         value = float(values[k] - less)
         made[number.name] = {'value': value, 'unit': spec.unit,
-                             'file': float(believed[k] - less)}
+                             'file': float(file_values[k] - less)}
         if not other:
             low, high = (float(end - less) for end in ends)
             made[number.name]['interval'] = [max(low, min(value, spec.low)),
@@ -259,7 +254,7 @@ def _parameters(found: Found, entry: Entry, point=None):
 
 
 def _friction(found, point):
-    """Coulomb friction and stiction [N m]: the median of the joints, and each joint's own."""
+    """Coulomb friction and stiction [N m]: median of the joints, and each joint's value."""
     servos, mask = found.servos, found.servos.mask('joint_friction')
     force, count = servos.friction(point), len(servos.joints)
     torque = servos.friction(np.where(mask, 1.0, point))    # [N m] for each scale of a dead band
@@ -280,7 +275,7 @@ def _friction(found, point):
 
 
 def _candidates(found: Found):
-    """One row for each entry, with its own evidence; the strongest first."""
+    """One row for each entry with its evidence, largest gain first."""
     members = {t.entry: t for group in found.sets.values() for t in group}
     rows = [(t, True) for t in members.values()] + [(t, False) for t in found.rejected]
     made = []
@@ -298,6 +293,3 @@ def _experiment(joints):
     plan = joints[0]['experiment']
     return (f'sine of {plan["frequency_Hz"]:g} Hz and {plan["amplitude_rad"]:.2f} rad for '
             f'{plan["duration_s"]:g} s on the joints (separates latency from bandwidth)')
-
-
-__all__ = ['analyse_joint_log', 'gap_of']

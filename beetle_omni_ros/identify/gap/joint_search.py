@@ -1,11 +1,11 @@
 """
-Which catalogue entries a response log needs beside the servos of the robot file.
+Selection of the catalogue entries that explain a response log of the servos.
 
-Entries join one by one, from the file's servos on: the one that explains most for its numbers.
-What is fitted is what a robot file can hold, so the corrected file is the fitted model itself,
-and the same log judged against that file shows no gap. An entry counts if chance would hardly
-gain as much, if blocks of the log that it was not fitted to agree, and if it is larger than what
-servos of one type differ by anyway.
+Entries are added one by one to the servos of the robot file, the largest gain for its parameters
+first. The fitted model has the parameters of a robot file, so the corrected file is the fitted
+model, and the same log shows no gap with it. An entry is accepted if its gain is significant, if
+held-out blocks of the log confirm it, and if it exceeds the differences between servos of one
+type.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from beetle_omni_ros.robot.effects import CATALOGUE
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 FIT = shipped().servo
-QUICK = 5               # iterations that show what an entry gains; the accepted are fitted again
+QUICK = 5               # iterations that estimate a gain; accepted entries are fitted again
 MOST_PASSES = 3
-# Delay and stiffness of a pair are told apart where both are known better than the smallest
-# change of each that matters; else they are one set.
+# The members are separable if both are known better than their smallest relevant change; else
+# they are one set.
 LATENCY = 'joint_command_latency'
 PAIR = (LATENCY, CATALOGUE[LATENCY].log_rival)
 
@@ -47,8 +47,8 @@ class Entry:
     A catalogue entry as a candidate.
 
     Attributes:
-        name: of the catalogue.
-        joint: index in the log of the one joint that it is about, or None.
+        name: catalogue name.
+        joint: index in the log of the only joint that it changes, or None for all.
 
     """
 
@@ -59,17 +59,17 @@ class Entry:
 @dataclass
 class Trial:
     """
-    What an entry gains.
+    Gain of an entry.
 
     Attributes:
-        entry: which.
-        gain: fall of chi2 beside the accepted others, over the residuals' scatter.
-        numbers: how many it has.
-        samples: that were fitted.
-        needed: gain that chance hardly reaches, and that is worth its numbers (BIC).
-        held: gains on blocks of the log that were left out.
-        point: the fitted model with it.
-        reason: why it is not accepted, or ''.
+        entry: the entry.
+        gain: decrease of chi2 beside the other accepted entries, over the residuals' scatter.
+        numbers: number of its parameters.
+        samples: number of fitted samples.
+        needed: required gain: significance and price of the parameters (BIC).
+        held: gains on held-out blocks of the log.
+        point: the fitted model with the entry.
+        reason: reason of the rejection, or ''.
 
     """
 
@@ -83,40 +83,40 @@ class Trial:
     reason: str = ''
 
     @property
-    def unlikely(self) -> bool:
+    def significant(self) -> bool:
         """Whether chance would hardly gain as much."""
         return self.gain > self.needed
 
     @property
-    def agreed(self) -> bool:
-        """Whether blocks that were left out gain, most of them and all together."""
+    def confirmed(self) -> bool:
+        """Whether held-out blocks gain, most of them and all together."""
         return self.held.total > 0 and self.held.positive > 0.5
 
 
 @dataclass
 class Found:
     """
-    The outcome of a search.
+    Result of a search.
 
     Attributes:
-        p: parameters.
+        p: parameters (params/gap.yaml).
         servos: layout of the points.
-        believed: (P,) the file's servos.
+        file_point: (P,) servos of the robot file.
         point: (P,) corrected servos.
-        accepted: trials of the accepted entries, the strongest first.
-        sets: accepted name -> trials that do as well in its place, itself among them.
-        rejected: trials of all other entries, beside the accepted ones.
-        widths: (P,) half widths of 95 % intervals, 0 where a number was not fitted.
-        errors: 'believed', 'corrected', 'free' -> (J,) RMS on the held-out part [rad]; free: with
-            gains, delay, friction and zeros fitted, whether they are worth it or not.
-        tolerated: (J,) RMS that tolerances of manufacturing make on that part [rad].
-        out_of_sight: names of entries that the log would not show at a realistic size.
+        accepted: trials of the accepted entries, largest gain first.
+        sets: accepted entry -> trials that explain as much in its place, itself included.
+        rejected: trials of all other entries beside the accepted ones.
+        widths: (P,) half widths of 95 % intervals, 0 if not fitted.
+        errors: 'file', 'corrected', 'free' -> (J,) RMS on the held-out part [rad]; free: with
+            gains, delay, friction and zeros fitted, whether significant or not.
+        tolerated: (J,) RMS that manufacturing tolerances cause on that part [rad].
+        undetectable: names of entries that the log would not show at a typical size.
 
     """
 
     p: GapParameters
     servos: Servos
-    believed: np.ndarray
+    file_point: np.ndarray
     point: np.ndarray
     accepted: list[Trial]
     sets: dict[Entry, list[Trial]]
@@ -124,7 +124,7 @@ class Found:
     widths: np.ndarray
     errors: dict[str, np.ndarray]
     tolerated: np.ndarray
-    out_of_sight: list[str]
+    undetectable: list[str]
 
 
 class Search:
@@ -133,8 +133,8 @@ class Search:
 
     Args:
         log: the whole log; only its first part is fitted.
-        robot: as believed.
-        p: parameters; default the shipped ones.
+        robot: parameters of the robot file.
+        p: parameters (params/gap.yaml); default the shipped ones.
 
     """
 
@@ -152,15 +152,15 @@ class Search:
         made = [Entry(name, j) for name in ('joint_offset', 'joint_friction')
                 for j in range(len(self.log.joints))]
         made += [Entry(name) for name in GROUPS if name != 'joint_offset']
-        # A speed limit that the command never asks for cannot show.
+        # A speed limit shows only if the command asks for that speed.
         slow = (self.log.asked_speed() < FIT.beyond * 0.95 * self.log.speed()).all()
         return [e for e in made if not (e.name == 'joint_velocity_limit' and slow)]
 
     def _estimate_noise(self):
-        """Noise around the best servos that a robot file can hold, from two starts."""
+        """Noise around the best servos that a robot file can describe, from two starts."""
         usual = [e for e in self.entries if e.name == 'joint_offset' or (
             e.name in ('joint_friction', 'joint_velocity_limit', *PAIR) and e.joint is None)]
-        starts = [self._started(self.servos.believed, usual, k) for k in range(2)]
+        starts = [self._start_point(self.servos.file_point, usual, k) for k in range(2)]
         noise = first_noise(self.log)
         for _ in range(2):
             self.fitter = self._fitter(noise)
@@ -192,11 +192,11 @@ class Search:
         return self.fitter.solve(self._problems(points, models, weights), iterations)
 
     def _starts(self, entry):
-        """How many starts an entry has: a stiffness with and without friction's torque."""
+        """Number of starts; a stiffness is tried with and without friction's torque."""
         return 1 if entry.name in ('joint_offset', 'joint_friction') else 2
 
-    def _started(self, point, entries, k):
-        """A point moved to where the entries have a slope and do not contradict the log."""
+    def _start_point(self, point, entries, k):
+        """A point at which the entries have a slope and do not contradict the log."""
         point = point.copy()
         for entry in entries:
             if entry.name == 'joint_friction':
@@ -207,7 +207,7 @@ class Search:
                 point[at] = max(point[at] + (4.0, -2.0)[k], 0.5)
             elif entry.name == 'joint_bandwidth':
                 point[self.servos.index('dead_band_held')] = float(k)
-                if len(entries) > 1:    # from scratch: as soft as slow servos are, or as believed
+                if len(entries) > 1:    # initial fit: as in the file, or as soft as slow servos
                     point[self.servos.index('kp')] += (0.0, -8.0)[k]
                     point[self.servos.index('kd')] += (0.0, -8.0)[k]
             elif entry.name == 'joint_backlash':
@@ -226,37 +226,38 @@ class Search:
         point[at] = np.log(value) / self.servos.scale[at]
 
     def run(self) -> Found:
-        """Select, drop what became superfluous, find what does as well."""
+        """Select entries, drop superfluous ones, find alternatives."""
         kept: list[Entry] = []
-        point = self.servos.believed.copy()
+        point = self.servos.file_point.copy()
         for _ in range(MOST_PASSES):
-            accepted, point = grow(kept, point, self._best, self._joined, self.p.log_effects)
-            kept, point = prune(accepted, point, self._worst, self._refitted)
+            accepted, point = grow(kept, point, self._best_entry, self._with_entry,
+                                   self.p.log_effects)
+            kept, point = prune(accepted, point, self._weakest_entry, self._refitted)
             noise = self._noise(point)
             if (noise.sigma > FIT.nearly * self.noise.sigma).all():
                 break
             self.noise, self.full = noise, point
             self.fitter = self._fitter(noise)
         return self._found(kept, point, self._others if kept == accepted
-                           else self._beside(kept, point))
+                           else self._trials_with(kept, point))
 
-    def _best(self, accepted, point):
-        self._others = self._beside(accepted, point)
-        # The most for its numbers: one zero outdoes a friction of four.
-        return max((t for t in self._others if t.unlikely and self._matters(t)),
+    def _best_entry(self, accepted, point):
+        self._others = self._trials_with(accepted, point)
+        # The largest excess over the required gain, so that few parameters have an advantage.
+        return max((t for t in self._others if t.significant and self._is_relevant(t)),
                    key=lambda t: t.gain - t.needed, default=None)
 
-    def _joined(self, accepted, best):
+    def _with_entry(self, accepted, best):
         free = self._free([best.entry])
         outside = [e for e in accepted if (self._free([e]) & ~free).any()]
         return [*outside, best.entry], best.point
 
-    def _beside(self, accepted, point):
+    def _trials_with(self, accepted, point):
         """A trial of each other entry beside the accepted ones."""
         free = self._free(accepted)
         asked = [(e, k) for e in self.entries if (self._free([e]) & ~free).any()
                  for k in range(self._starts(e))]
-        points = [point, *(self._started(point, [e], k) for e, k in asked)]
+        points = [point, *(self._start_point(point, [e], k) for e, k in asked)]
         models = [accepted, *([*accepted, e] for e, _ in asked)]
         solved = self._solve(points, models, QUICK)
         best: dict = {}
@@ -269,12 +270,12 @@ class Search:
     def _count(self, entry):
         return int(self._free([entry]).sum())
 
-    def _matters(self, trial):
-        """Whether an entry changes more than what servos of one type differ by."""
-        return self.is_large(trial.entry, self.servos.believed, trial.point)
+    def _is_relevant(self, trial):
+        """Whether an entry exceeds the differences between servos of one type."""
+        return self.is_large(trial.entry, self.servos.file_point, trial.point)
 
     def is_large(self, entry: Entry, before: np.ndarray, after: np.ndarray) -> bool:
-        """Whether the entry's change from one point to another is worth a name."""
+        """Whether the entry's change between two points exceeds its smallest relevant size."""
         old, new = self.servos.values(before), self.servos.values(after)
         if entry.name == 'joint_friction':
             force = [self.servos.friction(p) for p in (before, after)]
@@ -297,35 +298,35 @@ class Search:
                 return True
         return False
 
-    def _worst(self, accepted, point):
-        """The weakest entry that others explain or that unseen blocks do not confirm."""
-        weak = [t for t in self._dropped(accepted, point)
-                if not (t.unlikely and t.agreed and self._matters(t))]
+    def _weakest_entry(self, accepted, point):
+        """The weakest superfluous or unconfirmed entry, or None."""
+        weak = [t for t in self._trials_without(accepted, point)
+                if not (t.significant and t.confirmed and self._is_relevant(t))]
         return min(weak, key=lambda t: t.gain).entry if weak else None
 
     def _refitted(self, accepted, point, _=None):
-        """The model with these entries alone, all else as the file has it."""
-        start = self._kept(accepted, point)
+        """The model with these entries only, all else as in the file."""
+        start = self._restricted(accepted, point)
         return self._solve([start], [accepted]).points[0] if accepted else start
 
-    def _kept(self, accepted, point):
+    def _restricted(self, accepted, point):
         free = self._free(accepted)
         free[self.servos.index('dead_band_held')] = Entry('joint_bandwidth') in accepted
-        return np.where(free, point, self.servos.believed)
+        return np.where(free, point, self.servos.file_point)
 
-    def _dropped(self, accepted, point, each=None):
+    def _trials_without(self, accepted, point, each=None):
         """
-        A trial of each accepted entry: what the model loses without it, fitted and unseen.
+        A trial of each accepted entry: loss of the model without it, fitted and held out.
 
         Args:
             accepted: entries of the model.
-            point: its fitted numbers.
+            point: its fitted parameters.
             each: entries to judge, default all of them.
 
         """
         each = accepted if each is None else each
         models = [accepted, *([o for o in accepted if o != e] for e in each)]
-        points = [point, *(self._kept(m, point) for m in models[1:])]
+        points = [point, *(self._restricted(m, point) for m in models[1:])]
         solved = self._solve(points, models)
         unseen = self._unseen(solved.points, models)
         return [self._trial(e, (chi2 - solved.chi2[0]) / self.scatter,
@@ -342,7 +343,7 @@ class Search:
         return cost.reshape(len(models), FIT.blocks)
 
     def _found(self, accepted, point, others):
-        trials = self._dropped(accepted, point) if accepted else []
+        trials = self._trials_without(accepted, point) if accepted else []
         if trials:
             point = trials[0].point
         widths = self._widths(accepted, point)
@@ -352,11 +353,11 @@ class Search:
         for trial in rejected:
             trial.reason = self._reason(trial)
         strongest = sorted(trials, key=lambda t: -t.gain)
-        return Found(self.p, self.servos, self.servos.believed, point, strongest, sets, rejected,
-                     widths, self._errors(point), self._tolerated(), self._out_of_sight(point))
+        return Found(self.p, self.servos, self.servos.file_point, point, strongest, sets, rejected,
+                     widths, self._errors(point), self._tolerated(), self._undetectable(point))
 
-    def _out_of_sight(self, point):
-        """Entries whose realistic size would change the log by less than chance gains."""
+    def _undetectable(self, point):
+        """Entries whose typical size would change the log by less than the required gain."""
         servos, kp = self.servos, self.servos.values(point)[self.servos.index('kp')]
         points = [point]
         for name in GROUPS:
@@ -364,7 +365,7 @@ class Search:
             for k in np.flatnonzero(servos.mask(name)):
                 number = servos.numbers[k]
                 size = CATALOGUE[name].parameters[number.name].typical
-                if number.logarithmic:      # softer, or a limit that is lower
+                if number.logarithmic:      # softer, or a lower limit
                     size = np.log(1 - size)
                 elif number.name == 'coulomb':
                     size /= kp
@@ -385,11 +386,11 @@ class Search:
         return max(chi_square.isf(self.p.log_chance, numbers), numbers * np.log(self.samples))
 
     def _reason(self, trial):
-        if not trial.unlikely:
-            return 'gains no more than chance'
-        if not self._matters(trial):
-            return 'smaller than servos of one type differ by'
-        return 'does not help on data left out'
+        if not trial.significant:
+            return 'gain is not significant'
+        if not self._is_relevant(trial):
+            return 'smaller than the differences between servos of one type'
+        return 'held-out blocks do not confirm it'
 
     def _widths(self, accepted, point):
         free = self._free(accepted)
@@ -399,60 +400,60 @@ class Search:
         return 1.96 * np.sqrt(self.scatter * np.diag(own))
 
     def _sets(self, accepted, point, trials, widths):
-        """Accepted entry -> what may stand in its place; a pair that is not told apart is one."""
+        """Accepted entry -> alternatives; a pair that is not separable is one set."""
         sets: dict[Entry, list[Trial]] = {t.entry: [t] for t in trials}
         pair = [Entry(name) for name in PAIR]
-        if all(e in accepted for e in pair) and not self._told_apart(widths):
-            alone = self._alone(accepted, point, pair)
+        if all(e in accepted for e in pair) and not self._separable(widths):
+            alone = self._gains_alone(accepted, point, pair)
             first, second = sorted(alone, key=lambda t: -t.gain)
-            # One that explains nothing alone is no alternative, but needed beside the other.
-            if second.unlikely:
+            # A member that explains nothing alone is no alternative; both are needed.
+            if second.significant:
                 sets[first.entry] = [first, second]
                 del sets[second.entry]
             return sets
         for entry in accepted:
             rival = Entry(CATALOGUE[entry.name].log_rival)
             if rival in self.entries and rival not in accepted:
-                own, other = self._alone(accepted, point, [entry, rival])
+                own, other = self._gains_alone(accepted, point, [entry, rival])
                 near = own.gain - other.gain < chi_square.isf(self.p.log_chance, 1)
-                if near and other.unlikely and other.agreed and self._matters(other):
+                if near and other.significant and other.confirmed and self._is_relevant(other):
                     sets[entry] = [own, other]
         return sets
 
-    def _told_apart(self, widths):
-        """Whether delay, stiffness and damping are known better than what matters of each."""
+    def _separable(self, widths):
+        """Whether delay, stiffness and damping are known better than their relevant changes."""
         least = {name: CATALOGUE[group].parameters[name].smallest
                  for group in PAIR for name in GROUPS[group]}
         return all(widths[self.servos.index(name)] * self.servos.scale[self.servos.index(name)]
                    < size for name, size in least.items())
 
-    def _alone(self, accepted, point, members):
-        """What each member gains beside the others of the model, without the other members."""
+    def _gains_alone(self, accepted, point, members):
+        """Gain of each member beside the other entries, without the other members."""
         others = [e for e in accepted if e not in members]
         found = []
         for member in members:
-            starts = [self._kept([*others, member], point) if member in accepted and not k
-                      else self._started(self._kept(others, point), [member], k)
+            starts = [self._restricted([*others, member], point) if member in accepted and not k
+                      else self._start_point(self._restricted(others, point), [member], k)
                       for k in range(self._starts(member))]
             best = min((self._solve([start], [[*others, member]]) for start in starts),
                        key=lambda solved: solved.chi2[0])
-            found.append(self._dropped([*others, member], best.points[0], [member])[0])
+            found.append(self._trials_without([*others, member], best.points[0], [member])[0])
         return found
 
     def _errors(self, point):
-        """(J,) RMS on the held-out part of the file's, the corrected and the freest servos."""
+        """(J,) RMS on the held-out part with the servos of the file, corrected, most flexible."""
         return {name: held_out_rms(self.whole, self.servos, p) for name, p in (
-            ('believed', self.servos.believed), ('corrected', point), ('free', self.full))}
+            ('file', self.servos.file_point), ('corrected', point), ('free', self.full))}
 
     def _tolerated(self):
-        """(J,) RMS on the held-out part of changes just too small to be named, together."""
+        """(J,) RMS on the held-out part of all changes just too small to be named."""
         changes = {'kp': 0.05, 'kd': 0.05, 'delay': 0.001}
         total = np.zeros(len(self.log.joints))
         for name, size in changes.items():
-            point, at = self.servos.believed.copy(), self.servos.index(name)
+            point, at = self.servos.file_point.copy(), self.servos.index(name)
             point[at] += size / self.servos.scale[at]
             total += self._moved(point)**2
-        point = self.servos.believed.copy()
+        point = self.servos.file_point.copy()
         for j in range(len(self.log.joints)):
             point[self.servos.index('coulomb', j)] *= 1 + self.p.log_friction
             point[self.servos.index('offset', j)] += 0.5
@@ -461,12 +462,12 @@ class Search:
     def _moved(self, point):
         joints = np.arange(len(self.log.joints))
         a, b = (simulate(self.whole, joints, self.servos.sets(p[None])[0])
-                for p in (point, self.servos.believed))
+                for p in (point, self.servos.file_point))
         return np.sqrt(np.mean((a - b)[:, self.whole.end_of(FIT.fitted):]**2, axis=1))
 
 
 def held_out_rms(log: JointLog, servos: Servos, point: np.ndarray) -> np.ndarray:
-    """(J,) RMS [rad] of free runs minus the log, over its part that is not fitted."""
+    """(J,) RMS of simulation minus log over the held-out part [rad]."""
     sets = servos.sets(point[None])[0]
     error = simulate(log, np.arange(len(sets)), sets) - log.measured
     return np.sqrt(np.mean(error[:, log.end_of(FIT.fitted):]**2, axis=1))

@@ -1,9 +1,9 @@
 """
-The numbers of a fit: every scalar of every catalogue entry, and what else robots differ by.
+Fitted scalars: parameters of the catalogue, tolerances of the robot, delays of the bus.
 
-A fit works with deviations from what the robot file says: differences, or logarithms of ratios
-for masses, gains and the like: mass, inertia and thrust scale together without a trace in motion,
-and in logarithms that is a straight line. A key is 'effect.parameter' or
+A fit works with deviations from the robot file: differences, or logarithms of ratios for masses,
+gains and the like. Mass, inertia and thrust scaled by one factor do not change the motion, and
+in logarithms this direction is a straight line. A key is 'effect.parameter' or
 'effect.parameter[index]'.
 """
 
@@ -21,9 +21,9 @@ from beetle_omni_ros.robot.effects import CATALOGUE, delaying
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 MODULES = 'module_reaction'
-# Effects without a slope at their neutral value: they need a start where they already act.
+# Effects without a slope at their neutral value; they need a start where they act.
 LIMITS = tuple(name for name, effect in CATALOGUE.items() if effect.starts)
-TILT_BUS, THRUST_BUS = 'base.tilt_delay', 'base.thrust_delay'   # of commands on their way
+TILT_BUS, THRUST_BUS = 'base.tilt_delay', 'base.thrust_delay'   # delays of commands
 
 
 @dataclass(frozen=True)
@@ -35,18 +35,18 @@ class Key:
         name: 'effect.parameter[index]'.
         effect: catalogue name.
         parameter: its name there.
-        index: within a vector, or None.
-        base: value that the robot file has.
+        index: index in a vector, or None.
+        base: value of the robot file.
         relative: whether a deviation is the logarithm of a ratio to ``base``.
         low: smallest deviation.
-        high: largest.
-        typical: realistic deviation.
-        smallest: worth naming.
+        high: largest deviation.
+        typical: typical deviation.
+        smallest: smallest relevant deviation.
         groups: channel groups that depend on it.
-        body: whether the body's equations hold it, else a signal does.
-        step: change by which its derivatives are taken.
-        curved: whether they change along a fit.
-        form: whether it chooses between forms and is not fitted.
+        body: whether it is in the body equations, not in a signal.
+        step: step of finite differences.
+        curved: whether slopes change considerably along a fit.
+        form: whether it selects a form and is not fitted.
 
     """
 
@@ -71,17 +71,17 @@ class Key:
         return self.base * math.exp(deviation) if self.relative else self.base + deviation
 
     def width(self, deviation: float, half: float) -> float:
-        """Half width in the catalogue's unit of one in deviations."""
+        """Half width in the catalogue's unit."""
         return half * abs(self.value(deviation)) if self.relative else half
 
     @property
     def ends_at_none(self) -> bool:
-        """Whether the smallest value is an effect that is not there, as of drag or friction."""
+        """Whether the smallest value means no effect, as of drag or friction."""
         return not self.relative and self.value(self.low) == 0.0
 
 
 def number_of(robot: RobotParameters, key: str) -> float | np.ndarray:
-    """Number of the robot file at a dotted key."""
+    """Value of the robot file at a dotted key."""
     value: Any = robot
     for part in key.split('.'):
         value = getattr(value, part)
@@ -89,32 +89,32 @@ def number_of(robot: RobotParameters, key: str) -> float | np.ndarray:
 
 
 def names_of(effect: str, parameter: str) -> list[str]:
-    """Names of the scalars of a parameter."""
+    """Key names of a parameter."""
     neutral, text = CATALOGUE[effect].parameters[parameter].neutral, f'{effect}.{parameter}'
     return [f'{text}[{k}]' for k in range(len(neutral))] if isinstance(neutral, tuple) else [text]
 
 
 def delays_of(*what: str) -> tuple[str, ...]:
-    """Names of the scalars that delay any of ``what``; see :attr:`Effect.delays`."""
+    """Key names of delays of any of ``what``; see :attr:`Effect.delays`."""
     return tuple(f'{name}.delay' for name in delaying(*what))
 
 
 def friction(robot: RobotParameters) -> tuple[np.ndarray, np.ndarray]:
-    """Coulomb friction and stiction of the file [N m], the latter at least the former; (4,)."""
+    """Coulomb friction and stiction of the file [N m], (4,) each; stiction is the larger one."""
     own = robot.effects.get('joint_friction', {'coulomb': 0.0, 'stiction': 0.0})
     coulomb, stiction = (np.broadcast_to(own[name], 4) for name in ('coulomb', 'stiction'))
     return coulomb, np.maximum(stiction, coulomb)
 
 
 def all_keys(robot: RobotParameters) -> dict[str, Key]:
-    """Every scalar of the catalogue around what ``robot`` has, by name."""
+    """Keys of the whole catalogue with base values of ``robot``, by name."""
     keys, effects = {}, dict(robot.effects)
     if 'joint_friction' in effects:
-        # a flight judges what all joints share; differences between them stay as the file has them
+        # A flight fits the mean of the joints; differences between joints stay as in the file.
         effects['joint_friction'] = {name: float(np.mean(value)) for name, value in zip(
             CATALOGUE['joint_friction'].parameters, friction(robot), strict=True)}
     for name, effect in CATALOGUE.items():
-        # described modules load the joints with their share, and this entry is what goes beyond
+        # The file's modules load the joints by their share, so this entry is only the excess.
         groups = 'B' if name == MODULES and robot.multibody else effect.channels
         for parameter, spec in effect.parameters.items():
             absent = bool(np.isnan(spec.neutral).any())
@@ -137,12 +137,12 @@ def all_keys(robot: RobotParameters) -> dict[str, Key]:
 def tolerances(p: GapParameters, coarse: bool = False,
                swing: float = 0.0) -> dict[str, Prior]:
     """
-    Keys that every robot differs by, with the belief that it is by little.
+    Priors of the keys by which every robot differs from the robot file.
 
     Args:
-        p: parameters.
-        coarse: whether the sensors are of the kind whose stamps hide their latency.
-        swing: logarithm by which a servo's inertia may be larger than it says.
+        p: parameters (params/gap.yaml).
+        coarse: whether the sensors are noisy, so that their latency is unknown.
+        swing: logarithm of the factor by which a servo's inertia may exceed that of the file.
 
     """
     made = {key: getattr(p, f'tolerance_{spec.tolerance}')
@@ -154,24 +154,24 @@ def tolerances(p: GapParameters, coarse: bool = False,
                  f'servo.kd[{k}]': p.tolerance_lag}
     for k in range(12):
         made[f'position.offset[{k}]'] = p.tolerance_position
-    beliefs = {name: Prior(deviation) for name, deviation in made.items()}
-    beliefs['imu_filter_lag.delay'] = Prior(p.tolerance_delay, 0.0, p.imu_averaging, 0.002)
+    priors = {name: Prior(deviation) for name, deviation in made.items()}
+    priors['imu_filter_lag.delay'] = Prior(p.tolerance_delay, 0.0, p.imu_averaging, 0.002)
     reach, nominal = p.command_delay_range, p.command_delay
     for bus in (TILT_BUS, THRUST_BUS):
-        beliefs[bus] = Prior(5e-4, nominal, reach / 2, p.bus_near[0])
+        priors[bus] = Prior(5e-4, nominal, reach / 2, p.bus_near[0])
     near = p.tolerance_swing
-    beliefs['swing.ratio'] = Prior(p.tolerance_lag, near, max(swing, near), swing + near)
+    priors['swing.ratio'] = Prior(p.tolerance_lag, near, max(swing, near), swing + near)
     if coarse:
         imu, joint = p.coarse_latency
-        beliefs['imu_filter_lag.delay'] = Prior(p.tolerance_delay, 0.0, imu, imu)
-        beliefs['joint_feedback_delay.delay'] = Prior(p.tolerance_delay, 0.0, joint, joint)
+        priors['imu_filter_lag.delay'] = Prior(p.tolerance_delay, 0.0, imu, imu)
+        priors['joint_feedback_delay.delay'] = Prior(p.tolerance_delay, 0.0, joint, joint)
         for bus in (TILT_BUS, THRUST_BUS):
-            beliefs[bus] = Prior(5e-4, nominal, reach / 2, p.bus_near[1])
-    return beliefs
+            priors[bus] = Prior(5e-4, nominal, reach / 2, p.bus_near[1])
+    return priors
 
 
 def extra_keys() -> dict[str, Key]:
-    """Keys of what is no catalogue entry: rotor positions, modules, servos, delays of the bus."""
+    """Keys outside the catalogue: rotor positions, modules, servos, delays of the bus."""
     keys = {}
 
     def add(name, index, reach, typical, groups, **more):

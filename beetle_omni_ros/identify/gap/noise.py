@@ -1,4 +1,4 @@
-"""Coloured noise of the residual's channels, and how loud each of them may be."""
+"""Autoregressive noise of the residual's channels, and ceilings of their RMS."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Noise:
 
     Attributes:
         taps: group -> (channels, order + 1) prediction-error filters, first entry 1.
-        sigma: group -> (channels,) standard deviation of what cannot be predicted, as a fit
-            believes it: raised where a floor says so.
-        seen: likewise, as the residual shows it; empty: as believed.
+        sigma: group -> (channels,) standard deviation of the innovation for fits, raised to the
+            floors.
+        seen: group -> (channels,) estimated standard deviation without floors; empty: ``sigma``.
 
     """
 
@@ -32,7 +32,7 @@ class Noise:
 
     @classmethod
     def white(cls, p: GapParameters) -> Noise:
-        """The floors, before anything is known."""
+        """White noise at three times the floors, as a start."""
         floors = _floors(p)
         return cls({g: np.ones((len(c), 1)) for g, c in CHANNELS.items()},
                    {g: 3 * floors[g] for g in CHANNELS})
@@ -40,9 +40,9 @@ class Noise:
     @classmethod
     def of(cls, residuals: list[dict[str, np.ndarray]], p: GapParameters) -> Noise:
         """
-        Estimate from the residuals of several flights, by group.
+        Estimate the noise from the residuals of several flights, by group.
 
-        A channel is never believed to be quieter than its floor: no model is that good.
+        No model is accurate enough for a channel below its floor.
         """
         taps, sigma, seen, floors = {}, {}, {}, _floors(p)
         for group, channels in CHANNELS.items():
@@ -61,10 +61,10 @@ class Noise:
 
     def bounded(self, ceilings: dict[str, np.ndarray]) -> Noise:
         """
-        Return the same noise, no channel louder than it may be.
+        The same noise with each channel at most at its ceiling.
 
         Args:
-            ceilings: group -> (channels,) root mean square of a sound residual.
+            ceilings: group -> (channels,) RMS of a valid residual.
 
         """
         shares = {group: np.minimum(1.0, ceilings[group] / np.maximum(size, 1e-12))
@@ -73,7 +73,7 @@ class Noise:
                      {g: x * shares[g] for g, x in self.seen.items()})
 
     def whiten(self, residual: dict[str, np.ndarray]) -> np.ndarray:
-        """(n,) or (n, K) whitened samples of one flight's residual or slopes, groups in a row."""
+        """(n,) or (n, K) whitened residual or slopes of one flight, groups one after the other."""
         parts: list[np.ndarray] = []
         for group, taps in self.taps.items():
             parts += [whitened(residual[group][:, k], tap, sigma)
@@ -82,7 +82,7 @@ class Noise:
 
     @property
     def spread(self) -> dict[str, np.ndarray]:
-        """Group -> (channels,) standard deviation of the coloured noise, not whitened."""
+        """Group -> (channels,) standard deviation of the coloured noise."""
         return {group: self.sigma[group] * np.sqrt([gain(tap) for tap in taps])
                 for group, taps in self.taps.items()}
 
@@ -102,14 +102,14 @@ def _floors(p):
 
 
 @dataclass(frozen=True)
-class Loud:
+class ExcessNoise:
     """
-    A channel beyond its ceiling.
+    A channel whose residual exceeds its ceiling.
 
     Attributes:
-        channel: its name.
-        size: root mean square of the residual, in the channel's unit.
-        ceiling: that it may have.
+        channel: name of the channel.
+        size: RMS of the residual, in the channel's unit.
+        ceiling: its ceiling.
         flight: name of the recording.
 
     """
@@ -123,21 +123,21 @@ class Loud:
     def text(self) -> str:
         """One sentence."""
         unit = UNITS[self.channel.rpartition('_')[0]]
-        return (f'{self.flight}: {self.channel} is off by {self.size:.3g} {unit} RMS, '
-                f'{self.size / self.ceiling:.1f} times what its sensors and gusts may make')
+        return (f'{self.flight}: the residual of {self.channel} is {self.size:.3g} {unit} RMS, '
+                f'{self.size / self.ceiling:.1f} times the largest effect of sensors and gusts')
 
 
 def white_noise(series: np.ndarray) -> np.ndarray:
-    """(n,) standard deviations of readings (N, n) that no motion explains."""
+    """(n,) standard deviations of white noise of readings (N, n), from third differences."""
     return np.median(np.abs(np.diff(series, 3, axis=0)), axis=0) / 0.6745 / THIRD
 
 
 def sensor_noise(model: FlightModel) -> dict[str, float]:
     """
-    Group -> root mean square that the sensors' white noise leaves in a channel.
+    Group -> RMS that the white noise of the sensors causes in a channel.
 
-    White noise of standard deviation s, read every T, has s^2 T of power per Hz to both sides; the
-    k-th derivative below an edge f keeps 2 s^2 T (2 pi)^(2k) f^(2k + 1) / (2k + 1) of it.
+    White noise of standard deviation s and period T has the two-sided density s^2 T. The k-th
+    derivative below an edge f keeps the variance 2 s^2 T (2 pi)^(2k) f^(2k + 1) / (2k + 1).
     """
     flight, p = model.flight, model.p
 
@@ -158,7 +158,7 @@ def sensor_noise(model: FlightModel) -> dict[str, float]:
 
 
 def ceilings(model: FlightModel, p: GapParameters) -> dict[str, np.ndarray]:
-    """Group -> (channels,) largest root mean square of a sound residual."""
+    """Group -> (channels,) largest RMS of a valid residual."""
     seen = sensor_noise(model)
     force, torque = p.gust_ceiling
     limits = dict(zip('AWJ', p.model_ceiling, strict=True))
@@ -169,21 +169,20 @@ def ceilings(model: FlightModel, p: GapParameters) -> dict[str, np.ndarray]:
     return made
 
 
-def too_loud(models: list[FlightModel], theta: dict[str, float],
-             p: GapParameters) -> list[Loud]:
+def channels_above_ceiling(models: list[FlightModel], theta: dict[str, float],
+             p: GapParameters) -> list[ExcessNoise]:
     """
-    Channels whose residual is beyond its ceiling, the farthest first.
+    Channels whose residual exceeds its ceiling, largest ratio first.
 
-    The noise of a fit is learnt from its residual, and so whatever no entry explains would become
-    noise. A residual far beyond what the sensors' readings scatter by from one to the next,
-    through the same filters, is a gap, whatever its colour.
+    The noise model of a fit adapts to any unexplained residual. The ceiling comes from the scatter
+    of the readings instead, so a large residual is a gap whatever its spectrum.
     """
     made = []
     for model in models:
         residual, limits = model.residual(theta), ceilings(model, p)
         for group, names in CHANNELS.items():
             size = np.sqrt((residual[group]**2).mean(axis=0))
-            made += [Loud(name, float(s), float(limit), model.flight.name)
+            made += [ExcessNoise(name, float(s), float(limit), model.flight.name)
                      for name, s, limit in zip(names, size, limits[group], strict=True)
                      if s > limit]
     return sorted(made, key=lambda loud: -loud.size / loud.ceiling)

@@ -1,4 +1,4 @@
-"""The HTML page by which a person can judge the verdict."""
+"""The HTML page of an analysis."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from beetle_omni_ros.pages.table import Grid, html
 
 BARS = 16
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
-# Of verdicts: settled, found, open, unusable.
 VERDICT_COLOURS = {'no_gap': '#2b7a3d', 'named': '#1f5fa8', 'named_set': '#1f5fa8',
                    'unknown': '#b06a00', 'not_decidable': '#b06a00', 'bad_data': '#b3261e'}
 SHOWN = ('position', 'orientation')     # states of the first picture
@@ -33,37 +32,38 @@ def gap_page(a: Analysis, made: dict) -> str:
         made: its results.
 
     """
-    said = made['reason'][:1].upper() + made['reason'][1:]
-    notes = [*([] if made['reason'] in made['summary'] else [f'{said}.']),
-             *([f'To fly next: {made["next_experiment"]}.'] if made['next_experiment'] else []),
+    reason = made['reason'][:1].upper() + made['reason'][1:]
+    notes = [*([] if made['reason'] in made['summary'] else [f'{reason}.']),
+             *([f'Next experiment: {made["next_experiment"]}.']
+               if made['next_experiment'] else []),
              *made['findings']]
     sections = []
     if a.problem is not None:
         with matplotlib.rc_context(STYLE):
             sections = [
-                section('Residuals', 'Measured minus expected, in standard deviations of the '
-                        'noise, with the colour of the noise taken out. First fitted flight.',
+                section('Residuals', 'Whitened residual (measured minus expected) of the first '
+                        'fitted flight, in standard deviations of the noise.',
                         svg(_residuals(a), 'residuals')),
-                section('Free runs', 'Error half a second after each measured state, without and '
-                        'with what is named, tolerances as fitted; dashed: noise alone.',
+                section('Free runs', 'Error 0.5 s after each measured state, without and with '
+                        'the named effects, tolerances as fitted; dashed: noise floor.',
                         svg(_runs(a), 'free runs')),
-                section('Evidence', 'Squared residual over noise (chi2) that each entry takes '
-                        'away beside what is accepted; blue: accepted.', svg(_bars(a), 'evidence')
+                section('Evidence', 'Decrease of chi2 (squared residual over noise) by each entry '
+                        'beside the accepted ones; blue: accepted.', svg(_bars(a), 'evidence')
                         + html(_evidence(made['candidates'], 60))),
-                section('What these flights could show', 'Standard deviations by which an effect '
-                        'of realistic size would stand out, alone and beside the entry that it '
-                        f'is most like. Below {a.problem.p.decidable:g} it would not be named.',
+                section('Detectability', 'Standard deviations that an effect of typical size '
+                        'would show, alone and beside the most similar entry. Below '
+                        f'{a.problem.p.decidable:g} it would not be named.',
                         html(_visible(made))),
-                section('Tolerances', 'How this robot differs from the file within what any '
-                        'robot of its type does. Fitted with everything else and not named; '
-                        '--tolerances writes masses, gains, lags and '
-                        'rotor positions to the robot file.', html(_tolerances(made)))]
+                section('Tolerances', 'Deviations of this robot from the robot file within '
+                        'manufacturing tolerance. They are fitted and not named; --tolerances '
+                        'writes masses, gains, lags and rotor positions to the robot file.',
+                        html(_tolerances(made)))]
     tables = [grid for grid in grids(made) if grid.title != CANDIDATES]
     return page('Gap', _about(a, made['meta']), tables, notes, sections, head(made, _picture(a)))
 
 
 def _about(a, meta):
-    """Which flights were fitted, which judged, against which file."""
+    """Fitted flights, held-out flights and robot file in one line."""
     count = len(a.models[0]) or len(meta['runs'])
     parts = {'fitted': meta['runs'][:count], 'held out': [*meta['runs'][count:], *meta['holdout']],
              'robot file': [meta['robot']]}
@@ -71,33 +71,33 @@ def _about(a, meta):
 
 
 def _lines(a, *texts):
-    """Name in ``a.runs``, colour and text of each line; one where nothing is named."""
+    """Name in ``a.runs``, colour and label of each line; only one if no effect is named."""
     if not a.found.accepted:
         return [('before', AFTER, 'robot file, tolerances fitted')]
     return list(zip(('before', 'after'), (BEFORE, AFTER), texts, strict=True))
 
 
 def head(made: dict, picture: str = '') -> str:
-    """Verdict, sentence and picture of any results of `gap`, as HTML."""
+    """Head of the page: verdict, sentence and picture, as HTML."""
     return verdict_head(headline(made), VERDICT_COLOURS[made['verdict']], made['summary'],
                         picture)
 
 
 def _picture(a):
-    """Free runs before and after, or the readings that are wrong; '' where there are neither."""
+    """Free runs before and after, or the damaged readings; '' if there are neither."""
     if a.damaged is not None:
         with matplotlib.rc_context(STYLE):
-            return svg(damage_figure(*a.damaged), 'the readings in question')
+            return svg(damage_figure(*a.damaged), 'damaged readings')
     if not a.runs:
         return ''
     with matplotlib.rc_context(STYLE):
         figure, axes = panels(len(SHOWN), 1, height=1.6, sharex=True)
-        lines = _lines(a, 'robot file, tolerances fitted', 'with what is named')
+        lines = _lines(a, 'robot file, tolerances fitted', 'with named effects')
         for axis, state in zip(axes[:, 0], SHOWN, strict=True):
             _errors(a, axis, state, lines)
         axes[-1, 0].set_xlabel('number of the free run, one every 0.5 s of flight')
         legend(figure, axes[0, 0])
-        return svg(figure, 'error of the model alone after half a second')
+        return svg(figure, 'error of free runs after 0.5 s')
 
 
 def _errors(a, axis, state, lines):
@@ -106,7 +106,7 @@ def _errors(a, axis, state, lines):
         error = np.concatenate([run.error[JUDGED][:, k] for run in a.runs[name]])
         axis.plot(error, color=colour, lw=1.0, label=label)
     axis.axhline(a.runs['before'][0].floor[JUDGED][k], color=FAINT, ls='--', lw=0.9,
-                 label='noise alone')
+                 label='noise floor')
     axis.set_ylabel(f'{state} [{STATE_UNITS[state]}]')
     axis.set_ylim(bottom=0)
 
@@ -119,7 +119,7 @@ def _residuals(a) -> Figure:
     for k, (axis, name) in enumerate(zip(axes.T.ravel(), names, strict=False)):
         rows = (problem.where == k) & (problem.flight == 0)
         t = problem.time[rows]
-        for which, colour, text in _lines(a, 'without what is named', 'with it'):
+        for which, colour, text in _lines(a, 'without named effects', 'with them'):
             line(axis, t, values[which][rows], color=colour, lw=0.7, label=text)
         axis.set_title(f'{name} [1]')
     for axis in axes[-1]:
@@ -130,7 +130,7 @@ def _residuals(a) -> Figure:
 
 def _runs(a) -> Figure:
     figure, axes = panels(len(STATES), 1, height=1.4, sharex=True)
-    lines = _lines(a, 'without what is named', 'with it')
+    lines = _lines(a, 'without named effects', 'with them')
     for axis, state in zip(axes[:, 0], STATES, strict=True):
         _errors(a, axis, state, lines)
     axes[-1, 0].set_xlabel('number of the free run, one every 0.5 s of flight')
@@ -148,7 +148,7 @@ def _bars(a) -> Figure:
     axis.barh(names, [max(gains[n], 0.5) for n in names],
               color=[AFTER if n in taken else FAINT for n in names], height=0.6)
     axis.set_xscale('log')
-    axis.set_xlabel('explained chi2')
+    axis.set_xlabel('gain of chi2')
     axis.grid(axis='y', visible=False)
     return figure
 
@@ -166,7 +166,7 @@ def _visible(made):
         worst = min(rivals, key=rivals.get) if rivals else None
         rows.append([row['name'] + (f' {member}' if member else ''), f'{sigma:.1f}',
                      f'{rivals[worst]:.1f} beside {worst}' if worst else ''])
-    return Grid('', ['entry', 'alone', 'beside its worst rival'], rows)
+    return Grid('', ['entry', 'alone', 'beside the most similar entry'], rows)
 
 
 def _tolerances(made):

@@ -1,4 +1,4 @@
-"""Numbers of the gap finder; params/gap.yaml holds their values and where each comes from."""
+"""Parameters of the gap finder; params/gap.yaml has their values and sources."""
 
 from __future__ import annotations
 
@@ -52,40 +52,40 @@ class GapParameters:
     smooth_joint: float = _edge('Low-pass edge of tilts as inputs of the model.')
     smooth_pose: float = _edge('Low-pass edge of MoCap velocities as inputs of the model.')
     smooth_reading: float = _edge('Low-pass edge of encoder readings that are compared.')
-    memory: float = _time('Time before the first sample from which rotors are simulated.', 0.1)
+    memory: float = _time('Simulated time of the rotors before the first sample.', 0.1)
 
     guide_above: float = parameter(
-        doc='Noise of encoders above which a servo model gives the quick part of tilts.',
+        doc='Encoder noise above which a servo model gives the fast part of tilts.',
         unit='rad', low=0, high=1)
-    guide_edge: float = _edge('Edge below which guided tilts follow the encoders.')
-    velocity_edge: float = _edge('Edge above which the IMU gives the velocity, with noisy MoCap.')
+    guide_edge: float = _edge('Edge below which these tilts come from the encoders.')
+    velocity_edge: float = _edge('Edge above which velocity comes from the IMU, with noisy MoCap.')
 
     body_edge: float = _edge('Low-pass edge of forces and torques.')
-    body_every: int = _count('Of so many samples of forces and torques one is kept.', high=100)
+    body_every: int = _count('Decimation of forces and torques.', high=100)
     world_edge: float = _edge('Low-pass edge of MoCap accelerations.')
-    world_every: int = _count('Of so many samples of MoCap accelerations one is kept.', high=100)
+    world_every: int = _count('Decimation of MoCap accelerations.', high=100)
     rate_edge: float = _edge('Low-pass edge of MoCap rates.')
-    rate_every: int = _count('Of so many samples of MoCap rates one is kept.', high=100)
+    rate_every: int = _count('Decimation of MoCap rates.', high=100)
     joint_edge: float = _edge('Low-pass edge of joint angles.')
-    joint_every: int = _count('Of so many samples of joint angles one is kept.', high=100)
+    joint_every: int = _count('Decimation of joint angles.', high=100)
     body_order: int = _count('Order of the autoregression of forces and torques.', high=50)
     other_order: int = _count('Order of the autoregression of the other channels.', high=50)
     floors: np.ndarray = _several(
         'Least standard deviation of specific force [m/s^2], angular acceleration [rad/s^2], '
         'MoCap acceleration [m/s^2], MoCap rate [rad/s] and joint angle [rad].', 5, low=1e-9)
 
-    noise_ceiling: float = _factor('Largest RMS of a residual over that of the sensors.')
+    noise_ceiling: float = _factor('Largest RMS of a residual over that of the sensor noise.')
     model_ceiling: np.ndarray = _several(
-        'RMS that a sound model leaves in MoCap acceleration [m/s^2], MoCap rate [rad/s] and '
-        'joint angle [rad].', 3)
+        'Largest residual RMS of a valid model in MoCap acceleration [m/s^2], MoCap rate [rad/s] '
+        'and joint angle [rad].', 3)
     gust_ceiling: np.ndarray = _several(
-        'RMS that gusts make in specific force [m/s^2] and angular acceleration [rad/s^2].', 2)
+        'Largest RMS by gusts in specific force [m/s^2] and angular acceleration [rad/s^2].', 2)
 
     tolerance_mass: float = _share('Prior deviation of the mass.')
     tolerance_inertia: float = _share('Prior deviation of each moment of inertia.')
     tolerance_thrust: float = _share('Prior deviation of thrust, of each rotor and of all.')
     tolerance_position: float = parameter(
-        doc='Prior deviation of the place of a rotor, each axis.', unit='m', low=0, high=1)
+        doc='Prior deviation of a rotor position, each axis.', unit='m', low=0, high=1)
     tolerance_lag: float = _share('Prior deviation of lags and servo gains.')
     tolerance_torque_ratio: float = _share('Prior deviation of torque over thrust.')
     tolerance_bias_accelerometer: float = parameter(
@@ -96,151 +96,163 @@ class GapParameters:
         doc='Prior deviation of mountings and joint zeros.', unit='rad', low=0, high=1)
     tolerance_delay: float = _time('Prior deviation of delays of sensors.', 1e-6, 0.1)
     coarse_noise: float = parameter(
-        doc='Noise of MoCap above which latencies of sensors are no finding.', unit='m', low=0,
-        high=1)
+        doc='MoCap noise above which sensors count as noisy, so that latencies are not named.',
+        unit='m', low=0, high=1)
     coarse_latency: np.ndarray = _several(
-        'Latency of IMU and encoders that noisy sensors may have.', 2, 's', 1)
-    imu_averaging: float = _time('Latency of an IMU that averages.', 0, 0.1)
+        'Accepted latency of noisy IMU and encoders.', 2, 's', 1)
+    imu_averaging: float = _time('Latency of an IMU by averaging.', 0, 0.1)
     command_delay: float = _time('Nominal delay from a stamp to the actuator.', 0, 0.1)
-    command_delay_range: float = _time('Range of that delay which has no name.', 0, 0.1)
+    command_delay_range: float = _time('Range of that delay that is not named.', 0, 0.1)
     bus_near: np.ndarray = _several(
         'Prior deviation of that delay within its range, with good and with noisy sensors.', 2,
         's', 1, 1e-6)
-    tolerance_swing: float = _factor('Log ratio of the inertia that a servo may feel.', 10)
+    tolerance_swing: float = _factor(
+        'Log ratio by which the apparent inertia of a servo may differ.', 10)
     modules_tolerance: float = _share('Prior deviation of the terms of the tilting modules.')
 
-    most_effects: int = _count('Most effects that are named.', high=20)
+    most_effects: int = _count('Largest number of named effects.', high=20)
     least_gain: float = _chi2('Least gain of an effect.')
-    least_believed: float = _chi2('Least gain of an effect that brings tolerances back.')
+    least_believed: float = _chi2('Least gain of an effect in the priors of tolerances alone.')
     parameter_price: float = _chi2('Further gain for each parameter beyond the first.')
-    least_share: float = _share('Least part of what is left that an effect explains.')
-    weak_share: float = _share('The same, where blocks left out agree.')
-    weak_agreement: float = _factor('Standard errors by which they agree, of a large gain.')
-    weak_gain: float = _factor('A gain is large beyond so many times the least gain.')
-    strong_agreement: float = _factor('Standard errors by which they agree, of a small gain.')
-    sure_blocks: float = _share('Part of the blocks that must gain then.')
-    held_out_errors: float = _factor('Standard errors of the gain on blocks left out, at least.')
-    held_out_blocks: float = _share('Least part of the blocks left out that gain.')
-    held_out_nearly_all: float = _share('Part of them that replaces the standard errors.')
-    held_out_share: float = _share('Least gain on blocks left out, of the fitted gain.')
-    elsewhere_share: float = _share('The same, without the block that gains most.')
-    least_elsewhere: float = _chi2('Least gain outside the block that gains most.')
+    least_share: float = _share('Least share of the unexplained chi2 that an effect explains.')
+    weak_share: float = _share('The same, if held-out blocks agree.')
+    weak_agreement: float = _factor('Standard errors of the held-out gain then, of a large gain.')
+    weak_gain: float = _factor('Ratio to the least gain from which a gain is large.')
+    strong_agreement: float = _factor('Standard errors of the held-out gain, of a small gain.')
+    sure_blocks: float = _share('Least share of held-out blocks that gain then.')
+    held_out_errors: float = _factor('Least standard errors of the gain on held-out blocks.')
+    held_out_blocks: float = _share('Least share of held-out blocks that gain.')
+    held_out_nearly_all: float = _share(
+        'Share of held-out blocks with a gain that replaces the standard errors.')
+    held_out_share: float = _share('Least gain on held-out blocks over the fitted gain.')
+    elsewhere_share: float = _share('The same, without the block of the largest gain.')
+    least_elsewhere: float = _chi2('Least gain outside the block of the largest gain.')
     least_uneven: float = _chi2('Gain from which blocks may gain unevenly.')
-    part_share: float = _factor('Gain in slow or quick motion alone, over that in all motion.')
+    part_share: float = _factor(
+        'Gain in slow or fast motion alone over that in all motion, above which an effect may be '
+        'closed-loop bias.')
     part_free: float = _chi2('Further such gain for each parameter.')
     band_edges: np.ndarray = _several('Edges between the bands of motion.', 4, 'Hz', 50, 0.01)
     slow_below: float = parameter(
         doc='Edge of slow motion, one of `band_edges`.', unit='Hz', low=0.01, high=50)
     early_command: float = _time('Largest lead of a command on its stamp.', 0, 0.1)
-    enough: float = _share('Least part of what known effects explain.')
-    rival_share: float = _share('Difference of gains within which two effects are a set.')
+    enough: float = _share(
+        'Least gain of the named effects over that of all known effects.')
+    rival_share: float = _share('Relative difference of gains within which effects form a set.')
     rival_gain: float = _chi2('The same, as a gain.')
     decidable: float = parameter(
-        doc='Least standard deviations that a realistic effect shows.', unit='sigma', low=0,
-        high=1e3)
-    least_liveliness: float = _factor('Least acceleration over what nothing explains.')
+        doc='Standard deviations of an effect of typical size from which it is detectable.',
+        unit='sigma', low=0, high=1e3)
+    least_liveliness: float = _factor(
+        'Least excitation: ratio of accelerations and unexplained residual.')
     block: float = _time('Length of a block of cross-validation.', 1)
     least_blocks: int = _count('Least number of blocks of all flights.', 2)
 
-    wide: float = _factor('Typical sizes within which any parameter is sought.')
-    most_turns: int = _count('Most times that slopes are taken anew.', high=50)
-    most_iterations: int = _count('Most iterations of a fit.', high=100)
-    far: float = _factor('Typical sizes of a change that makes slopes useless.')
-    beyond: float = _factor('Prior deviations that no robot has.')
-    takeovers: int = _count('Most times that other parameters take over from those.', 0, 50)
-    refined: int = _count('Candidates of a step that are fitted.', high=100)
-    promising: float = _share('Linear gain of the best that a fitted candidate must promise.')
-    promising_curved: float = _share('The same, of candidates that are far from linear.')
-    looked_at: float = _share('Part of the least gain that a fitted candidate must promise.')
+    wide: float = _factor('Search range of any parameter in typical sizes.')
+    most_turns: int = _count('Largest number of linearisations.', high=50)
+    most_iterations: int = _count('Largest number of iterations of a fit.', high=100)
+    far: float = _factor('Change in typical sizes that needs a new linearisation.')
+    beyond: float = _factor('Largest plausible deviation of a tolerance in prior deviations.')
+    takeovers: int = _count(
+        'Largest number of fits while further tolerances exceed that deviation.', 0, 50)
+    refined: int = _count('Number of fitted candidates of a step.', high=100)
+    promising: float = _share('Least linear gain of a fitted candidate over the best one.')
+    promising_curved: float = _share('The same, of nonlinear candidates.')
+    looked_at: float = _share('Least linear gain of a fitted candidate over the least gain.')
 
-    form_part: float = _share('Relative error of the form of any effect.')
-    form_share: float = _share('Error of that form, of the smallest size worth a name.')
-    bus_seen: float = _time('Delay of commands, where detectability is judged.', 1e-5, 0.1)
-    disagree: float = _factor('Scatter between parts of the data over noise that counts.')
-    excitations: int = _count('Groups of samples by their excitation.', 2, 100)
-    least_bands: int = _count('Least number of bands that a parameter comes from.', 2, 100)
+    form_part: float = _share('Relative error of an effect by its form.')
+    form_share: float = _share('Further such error over the smallest relevant size.')
+    bus_seen: float = _time('Prior deviation of command delays for detectability.', 1e-5, 0.1)
+    disagree: float = _factor('Least relevant scatter between parts of the data over noise.')
+    excitations: int = _count('Number of groups of samples by excitation.', 2, 100)
+    least_bands: int = _count('Least effective number of bands of a parameter.', 2, 100)
     least_variance: float = _share('Least variance of whitened residuals in an interval.')
 
     contact_height: float = parameter(
         doc='Height of base_link below which feet may touch.', unit='m', low=0, high=10)
-    limit_margin: float = _share('Part of the largest thrust up to which samples count.')
-    settle: float = _time('Time after take-off that is not used.', 0)
-    lifted: float = _share('Commanded thrust over weight that flies.')
+    limit_margin: float = _share('Share of the largest thrust up to which samples count.')
+    settle: float = _time('Unused time after take-off.', 0)
+    lifted: float = _share('Commanded thrust over weight from which the robot flies.')
     wrong_robot: float = _share(
-        'Part by which commanded thrust may fall short of the specific force.')
-    same_flight: float = _share('Part of IMU readings in common that makes two files one flight.')
+        'Relative amount by which commanded thrust may be below the specific force.')
+    same_flight: float = _share('Share of equal IMU readings from which two files are one flight.')
 
     least_duration: float = _time('Least duration of a flight.', 1)
     longest_gap: float = _time('Longest silence of a sensor.', 0.01)
-    most_lost: float = _share('Largest part of a flight in silences.')
+    most_lost: float = _share('Largest share of a flight in silences.')
     least_rotation: float = parameter(
         doc='Least RMS of the rate.', unit='rad/s', low=0, high=10)
 
     log_chance: float = parameter(
-        doc='Probability that chance gains as much as an entry in a joint log.', unit='1',
-        low=1e-9, high=0.5)
-    log_effects: int = _count('Most entries that are named of a joint log.', high=50)
+        doc='Significance level of an entry in a joint log.', unit='1', low=1e-9, high=0.5)
+    log_effects: int = _count('Largest number of named entries of a joint log.', high=50)
     log_offset: float = parameter(
-        doc='Least zero that is named of a joint log.', unit='rad', low=0, high=1)
-    log_friction: float = _factor('Least change of friction that is named, of the believed.')
+        doc='Least named zero of a joint log.', unit='rad', low=0, high=1)
+    log_friction: float = _factor('Least named change of friction over that of the robot file.')
     log_dead_band: float = parameter(
-        doc='Least change of its dead band.', unit='rad', low=0, high=1)
+        doc='Least named change of its dead band.', unit='rad', low=0, high=1)
     log_as_well: float = _factor(
-        'Error over that of the freest fit up to which a joint log shows no gap.')
-    log_changes_chance: float = _share('Chance that a row of two logs is called significant.')
-    log_changes_factor: float = _factor('Deviation of frequency and damping about the median.')
+        'Error over that of the most flexible fit up to which a joint log shows no gap.')
+    log_changes_chance: float = _share(
+        'Probability that two logs without a change have a significant row.')
+    log_changes_factor: float = _factor(
+        'Prior deviation (factor) of frequency and damping about the median joint.')
 
-    least_left: float = _chi2('What known effects could still explain, to say unknown.')
-    least_remainder: float = _chi2('Gain of a generic regression, to say unknown.')
+    least_left: float = _chi2(
+        'Remaining gain of known effects from which the verdict is unknown.')
+    least_remainder: float = _chi2(
+        'Gain of a generic regression from which the verdict is unknown.')
     least_channel: float = _chi2('The same, in one channel.')
     remainder_ridge: float = _factor('Ridge of that regression, in percent of its mean diagonal.')
     least_force: float = parameter(
-        doc='Least RMS of what repeats in specific force.', unit='m/s^2', low=0, high=100)
+        doc='Least repeatable RMS in specific force.', unit='m/s^2', low=0, high=100)
     least_torque: float = parameter(
-        doc='Least RMS of what repeats in angular acceleration.', unit='rad/s^2', low=0, high=100)
+        doc='Least repeatable RMS in angular acceleration.', unit='rad/s^2', low=0, high=100)
     least_joint: float = parameter(
-        doc='Least RMS of what repeats in a joint angle.', unit='rad', low=0, high=1)
+        doc='Least repeatable RMS in a joint angle.', unit='rad', low=0, high=1)
     remainder_share: float = _share('Gain of that regression over that of the named effects.')
-    least_pattern: float = _chi2('Gain of one question beyond the catalogue.')
+    least_pattern: float = _chi2('Least gain of a pattern outside the catalogue.')
     pattern_agrees: np.ndarray = parameter(
-        doc='Standard errors of the gain and part of the blocks that gain, of either of which one '
-        'pair is enough.', shape=(2, 2), low=0, high=100)
-    pattern_share: float = _share('The same, over the gain of the named effects.')
+        doc='Pairs of least standard errors of the gain and least share of blocks that gain; one '
+        'pair is sufficient.', shape=(2, 2), low=0, high=100)
+    pattern_share: float = _share('Least gain of a pattern over that of the named effects.')
     pattern_force: float = parameter(
-        doc='Likely size of a force of a question.', unit='N', low=1e-3, high=100)
-    pattern_thrust: float = _share('Likely size of a change of thrust of a question.')
-    warm_up: float = _time('Time constant of what warms up.', 0.1)
+        doc='Typical force of a pattern.', unit='N', low=1e-3, high=100)
+    pattern_thrust: float = _share('Typical relative change of thrust of a pattern.')
+    warm_up: float = _time('Time constant of a drift after take-off.', 0.1)
     place_spacing: float = parameter(
-        doc='Distance of places at which a force is sought.', unit='m', low=0.05, high=10)
+        doc='Spacing of the grid of places for a force.', unit='m', low=0.05, high=10)
     place_width: float = parameter(
         doc='Width of such a place.', unit='m', low=0.05, high=10)
-    swings: np.ndarray = _several('Frequencies of loose masses.', 5, 'Hz', 50, 0.01)
-    swing_damping: float = _share('Damping ratio of loose masses.')
-    swing_mass: float = _share('Likely part of the mass that is loose.')
+    swings: np.ndarray = _several('Frequencies of swinging masses.', 5, 'Hz', 50, 0.01)
+    swing_damping: float = _share('Damping ratio of swinging masses.')
+    swing_mass: float = _share('Typical share of a swinging mass in the total mass.')
     swinging_force: float = parameter(
-        doc='Least RMS of the force of a loose mass.', unit='m/s^2', low=0, high=100)
-    rhythms: np.ndarray = _several('Range in which a line is sought.', 2, 'Hz', 50)
+        doc='Least RMS of the force of a swinging mass.', unit='m/s^2', low=0, high=100)
+    rhythms: np.ndarray = _several('Frequency range of a periodic force.', 2, 'Hz', 50)
     line_beside: float = parameter(
-        doc='Width to each side with which a line is compared.', unit='Hz', low=0.01, high=50)
-    least_line: float = _factor('Power of a line over the median beside it.')
+        doc='Width of the neighbourhood of a spectral line, to each side.', unit='Hz', low=0.01,
+        high=50)
+    least_line: float = _factor('Power of a line over the median of its neighbourhood.')
 
-    agreement: float = _factor('Noise floors up to which no gap can be said.')
-    most_hidden: float = _share('Part of the catalogue out of sight, up to which it can.')
-    crowd: int = _count('Members of a set that is no answer.', 2, 100)
-    at_floor: float = _factor('Noise floors below which a gap cannot be closed.')
+    agreement: float = _factor('Largest error over noise floor for the verdict no gap.')
+    most_hidden: float = _share('Largest undetectable share of the catalogue for that verdict.')
+    crowd: int = _count('Number of members from which a set is not decidable.', 2, 100)
+    at_floor: float = _factor('Error over noise floor below which there is no gap to close.')
     run_every: float = _time('Time between starts of free runs.', 0.01)
     run_floors: np.ndarray = _several(
         'Least noise floor of position [m], velocity [m/s], orientation [rad], rate [rad/s] and '
         'joint angle [rad].', 5, low=1e-9)
     run_draws: int = _count('Draws of gusts for a noise floor.', 10, 100000)
-    runs_a_block: int = _count('Free runs that share gusts.')
-    clearly_worse: float = _factor('Standard errors by which held-out flights are worse.')
+    runs_a_block: int = _count('Number of free runs in a block with common gusts.')
+    clearly_worse: float = _factor(
+        'Standard errors from which held-out flights count as worse.')
     regime_worse: float = _factor('Factor by which a regime may get worse.')
-    far_off: float = _factor('Noise floors that named effects may leave.')
-    least_closed: float = _share('Part of a gap that they close else.')
+    far_off: float = _factor('Largest error over noise floor with named effects.')
+    least_closed: float = _share('Least closed share of a gap if the error is larger.')
 
     def __post_init__(self):
-        """Refuse an edge of slow motion between two bands."""
+        """Check that the edge of slow motion is a band edge."""
         if self.slow_below not in self.band_edges:
             raise ParameterError(f"key 'slow_below': {self.slow_below:g} Hz is none of "
                                  f"band_edges {self.band_edges.tolist()}")
@@ -248,10 +260,14 @@ class GapParameters:
     @classmethod
     def load(cls, path: str | Path | None = None, **changed) -> GapParameters:
         """
-        Read the shipped file, a further one on top of it, and single changes.
+        Read the shipped file, then another file, then single values.
+
+        Args:
+            path: file with values that replace shipped ones, or None.
+            changed: single values that replace those of the files.
 
         Raises:
-            ParameterError: naming file and key; an unknown key, another type or range.
+            ParameterError: with file and key; an unknown key, wrong type or value out of range.
 
         """
         shipped = share_path('params/gap.yaml')

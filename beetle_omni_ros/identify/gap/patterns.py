@@ -1,11 +1,10 @@
 """
-Forces that no catalogue entry makes: where, when and with what they come, tried one by one.
+Tests for forces outside the catalogue, one hypothesis at a time.
 
-A regression on everything at once spreads thin: in gusts it finds nothing that the data would
-show to someone who asked for one thing. Here each question is one of its own: a force that
-depends on the place, one that goes with speed, rotors whose thrust goes with something, a mass
-that swings; all six channels of the body together, judged on blocks left out. A force with a
-rhythm of its own is no function of the state at all and is looked for in the spectrum.
+A regression on all features at once has little power in gusts. Each hypothesis here is tested
+alone: a force that depends on the place or the velocity, a thrust that depends on a state, or a
+swinging mass. All six body channels are judged together on held-out blocks. A periodic force is
+no function of the state; it is found as a line in the spectrum.
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ WORLD = tuple(f'wind.force[{k}]' for k in range(3))
 @dataclass(frozen=True)
 class Pattern:
     """
-    One question and its answer.
+    One hypothesis and its test.
 
     Attributes:
-        text: what goes with what.
-        gain: of chi2 on blocks left out.
-        error: standard error of it.
+        text: description of the correlation.
+        gain: gain in chi2 on held-out blocks.
+        error: standard error of the gain.
         positive: part of the blocks that gain.
-        size: root mean square of specific force [m/s^2] and of angular acceleration [rad/s^2].
+        size: RMS of specific force [m/s^2] and of angular acceleration [rad/s^2].
 
     """
 
@@ -48,22 +47,22 @@ class Pattern:
     size: tuple[float, float]
 
     def agrees(self, p: GapParameters) -> bool:
-        """Whether blocks that were left out gain: enough of them alike, or nearly all."""
+        """Whether held-out blocks gain: enough of them evenly, or nearly all."""
         return any(self.gain > errors * self.error and self.positive >= part
                    for errors, part in p.pattern_agrees)
 
 
 def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:
     """
-    Every question, the best answer first.
+    Tests of all hypotheses, largest gain first.
 
     Args:
         problem: flights and noise.
         state: the final fit.
-        names: keys that were fitted; their slopes are taken out first.
+        names: fitted keys, which are projected out first.
 
     """
-    asked = [questions(model, state.theta) for model in problem.models]
+    asked = [hypotheses(model, state.theta) for model in problem.models]
     rows = problem.where < 6
     fitted = state.slopes[rows][:, [state.index[name] for name in names]]
     used = (fitted**2).sum(axis=0) > 1e-6
@@ -74,15 +73,15 @@ def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:
     r = r - fitted @ np.linalg.lstsq(fitted, r, rcond=None)[0]
     made = []
     for text in asked[0]:
-        white, plain = zip(*(_seen(problem, model, each[text])
+        white, plain = zip(*(_in_residual(problem, model, each[text])
                              for model, each in zip(problem.models, asked, strict=True)),
                            strict=True)
         x = np.concatenate(white)
         known = np.linalg.lstsq(fitted, x, rcond=None)[0]
         x -= fitted @ known
-        # Columns are of likely size: their weights are about one.
+        # Columns have typical size, so a weight is about one.
         held, weights = ridge_held_out(x, r, problem.block[rows], problem.blocks, 1.0)
-        # What a known number takes over, a constant wind or a thrust, is no part of it.
+        # The part that fitted keys absorb, such as a constant wind, is subtracted.
         size = np.sqrt(np.mean([((each @ weights - slopes @ (known @ weights))**2).mean(axis=0)
                                 for each, slopes in zip(plain, raw, strict=True)], axis=0))
         made.append(Pattern(text, held.total, held.error, held.positive,
@@ -90,8 +89,8 @@ def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:
     return sorted(made, key=lambda p: -p.gain)
 
 
-def questions(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarray]:
-    """Text -> (N, 6, K) specific force and angular acceleration of likely size, every THIN."""
+def hypotheses(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarray]:
+    """Text -> (N, 6, K) specific force and angular acceleration of typical size, every THIN."""
     x = {name: values[::THIN] for name, values in model.inputs(theta).items()}
     exact = model._body.derivatives(x, theta, (*ROTORS, *WORLD))
     p = model.p
@@ -103,56 +102,56 @@ def questions(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarr
     time = THIN * p.grid * np.arange(len(speed))[:, None]
     tilts = np.concatenate([np.sin(x['tilt']), np.cos(x['tilt'])], axis=1)
     return {
-        'the place': _times(world, _places(x['position'], p)),
-        'the direction of motion': np.concatenate([
-            _times(world, x['velocity'] / (speed + 0.05)), _times(body, own / (speed + 0.05))],
-            axis=2),
-        'turns of the body, through thrust': _times(rotor, np.tanh(x['rate'])),
-        'motion of the body, through thrust': _times(rotor, np.tanh(own)),
-        'tilts of the rotors, through thrust': _times(rotor, tilts),
-        'thrust of the rotors': _times(rotor, x['thrust'] / 8.0 - 1.0),
-        'time of flight, through thrust': _times(rotor, np.concatenate(
+        'the place': _products(world, _near_points(x['position'], p)),
+        'the direction of motion': np.concatenate(
+            [_products(world, x['velocity'] / (speed + 0.05)),
+             _products(body, own / (speed + 0.05))], axis=2),
+        'turns of the body, through thrust': _products(rotor, np.tanh(x['rate'])),
+        'motion of the body, through thrust': _products(rotor, np.tanh(own)),
+        'tilts of the rotors, through thrust': _products(rotor, tilts),
+        'thrust of the rotors': _products(rotor, x['thrust'] / 8.0 - 1.0),
+        'time of flight, through thrust': _products(rotor, np.concatenate(
             [1 - np.exp(-time / p.warm_up), time / time[-1]], axis=1)),
-        SWINGING: _swings(model._body(x, theta)[:, :3], THIN * p.grid, p)}
+        SWINGING: _swinging_masses(model._body(x, theta)[:, :3], THIN * p.grid, p)}
 
 
-def _times(forces, shares):
-    """(N, 6, A B) every force (N, 6, A) with every share (N, B)."""
+def _products(forces, shares):
+    """(N, 6, A B) products of all forces (N, 6, A) and all factors (N, B)."""
     both = forces[:, :, :, None] * shares[:, None, None, :]
     return both.reshape(*forces.shape[:2], -1)
 
 
-def _places(position, p):
-    """(N, B) nearness to points of a grid in the plane, height, and one."""
+def _near_points(position, p):
+    """(N, B) proximity to the points of a grid in the plane, and height above 1 m."""
     corners = p.place_spacing * np.array([(i, j) for i in range(-2, 3) for j in range(-2, 3)])
     off = position[:, None, :2] - corners
     near = np.exp(-0.5 * (off**2).sum(axis=2) / p.place_width**2)
     return np.column_stack([near, position[:, 2] - 1.0])
 
 
-def _swings(force, period, p):
+def _swinging_masses(force, period, p):
     """
-    (N, 6, K) what masses on weak springs return of the body's specific force.
+    (N, 6, K) forces on the body of masses on weak springs.
 
     Args:
-        force: (N, 3) that the model expects: measured, it would hold the gust that it explains.
-        period: between samples [s].
-        p: parameters.
+        force: (N, 3) specific force of the model. The measured one would contain the gusts.
+        period: period of the samples [s].
+        p: parameters (params/gap.yaml).
 
     """
     size, twice = np.zeros((len(force), 6, 3 * len(p.swings))), 2 * p.swing_damping
     for j, frequency in enumerate(p.swings):
         w = 2 * np.pi * frequency
         b, a = bilinear([twice * w, w * w], [1.0, twice * w, w * w], 1 / period)
-        # Less what a mass that is tied down would do: that is in the robot's own mass.
+        # Without the force of a fixed mass, which is part of the robot's mass.
         swung = lfilter(b, a, force - force[0], axis=0) - (force - force[0])
         for k in range(3):
             size[:, k, k * len(p.swings) + j] = p.swing_mass * swung[:, k]
     return size
 
 
-def _seen(problem, model, columns):
-    """Columns (N, 6, K) as they show in one flight's residual, whitened and not."""
+def _in_residual(problem, model, columns):
+    """Columns (N, 6, K) filtered like one flight's residual, whitened and not."""
     smooth = model._mask[:, None, None] * model.filters['B'](columns)
     white = [whitened(smooth[:, c], tap, sigma) for c, (tap, sigma) in enumerate(zip(
         problem.noise.taps['B'], problem.noise.sigma['B'], strict=True))]
@@ -160,14 +159,14 @@ def _seen(problem, model, columns):
 
 
 @dataclass(frozen=True)
-class Rhythm:
+class SpectralLine:
     """
-    The sharpest line in the spectrum of what is left.
+    The sharpest line in the spectrum of the residual.
 
     Attributes:
-        frequency: [Hz].
-        ratio: of its power to the median of what lies beside it.
-        size: [m/s^2] root mean square.
+        frequency: frequency [Hz].
+        ratio: power over the median of its neighbourhood.
+        size: RMS [m/s^2].
 
     """
 
@@ -176,17 +175,17 @@ class Rhythm:
     size: float
 
 
-def rhythm(problem: Problem, theta: dict[str, float]) -> Rhythm:
+def spectral_line(problem: Problem, theta: dict[str, float]) -> SpectralLine:
     """
-    A force with a rhythm of its own: a line at the same frequency in every flight.
+    The sharpest line at one frequency in all flights, as of a periodic force; gusts have none.
 
-    Gusts have no lines. In the world's axes a force that keeps its direction does not vary with
-    the attitude; in the body's a loose part does not: the sharper one counts.
+    World and body axes are tried: a force with a fixed direction is constant in world axes, and
+    that of a loose part in body axes.
     """
     h = THIN * problem.p.grid * problem.models[0].filters['B'].every
     rest = [(m.residual(theta, 'B')['B'][:, :3], _turns(m)) for m in problem.models]
     count = 2 * min(len(r) for r, _ in rest)
-    best = Rhythm(0.0, 0.0, 0.0)
+    best = SpectralLine(0.0, 0.0, 0.0)
     for frame in (0, 1):
         spectra = []
         for r, rotation in rest:
@@ -200,13 +199,13 @@ def rhythm(problem: Problem, theta: dict[str, float]) -> Rhythm:
 
 
 def _turns(model):
-    """(M, 3, 3) body to world at the samples of the body's residual."""
+    """(M, 3, 3) rotations body to world at the samples of the body residual."""
     rotation = matrices(model.signals.pose({})[1])[::THIN]
     return rotation[model.filters['B'].centres(len(rotation))]
 
 
 def _line(frequency, power, p):
-    """The line that exceeds its surroundings most."""
+    """The line with the largest ratio to its neighbourhood."""
     step = frequency[1]
     reach = round(p.line_beside / step)
     inside = np.flatnonzero((frequency > p.rhythms[0]) & (frequency < p.rhythms[1]))
@@ -214,5 +213,5 @@ def _line(frequency, power, p):
     beside = np.array([np.median(power[k - reach:k + reach + 1]) for k in inside])
     ratio = power[inside] / np.maximum(beside, 1e-30)
     top = int(np.argmax(ratio))
-    return Rhythm(float(frequency[inside[top]]), float(ratio[top]),
+    return SpectralLine(float(frequency[inside[top]]), float(ratio[top]),
                   float(np.sqrt(power[inside[top]])))

@@ -1,4 +1,4 @@
-"""One step's trials: every candidate estimated from slopes, the promising ones fitted."""
+"""Trials of one step of the search: linear estimates of all candidates, fits of the best."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ SENSORS = delays_of('imu', 'mocap', 'encoders')
 
 class Proposals:
     """
-    Every candidate tried beside what is fitted, on all cores.
+    Trials of all candidates beside the present fit, in several processes.
 
     Args:
-        problem: flights, beliefs, noise.
-        candidates: to be tried.
-        state: the fit so far, with slopes of everything.
-        cost: objective there.
-        involved: keys that are fitted in any case.
-        free: of which nothing is believed.
+        problem: flights, priors, noise.
+        candidates: candidates to try.
+        state: present fit, with slopes of all keys.
+        cost: its objective.
+        involved: keys of the present fit.
+        free: keys whose priors are ignored.
 
     Attributes:
-        trials: one for each candidate, most gain first.
-        points: label -> the point at which the trial was judged.
+        trials: one for each candidate, largest gain first.
+        points: label -> state of the trial.
 
     """
 
@@ -36,7 +36,7 @@ class Proposals:
         self.involved, self.free = involved, free
         normal = (state.slopes.T @ state.slopes, state.slopes.T @ state.r,
                   float(state.r @ state.r))
-        made = problem.share(_estimated, candidates, state, cost, involved, free, normal)
+        made = problem.parallel(_estimated, candidates, state, cost, involved, free, normal)
         self.trials: list[Trial] = []
         self.points: dict[str, State] = {}
         for c, (trial, difference) in zip(candidates, made, strict=True):
@@ -45,16 +45,15 @@ class Proposals:
         self.trials.sort(key=lambda t: -t.gain)
 
     def fit_best(self) -> list[Trial]:
-        """Fit the most promising ones; all trials, most gain first."""
+        """Fit the most promising candidates; return all trials, largest gain first."""
         self._fit(_promising(self.problem, self.trials))
         return self.trials
 
     def fit_more(self) -> list[Trial]:
         """
-        Fit the next that gain, whatever stood before them; these, most gain first.
+        Fit the next candidates with sufficient linear gain; return these trials.
 
-        What leads may be too small to matter, or hold in one block only: then it must not hide
-        what explains less and is there.
+        Stronger candidates may have been rejected; they must not hide a weaker valid one.
         """
         p = self.problem.p
         least = p.looked_at * p.least_gain
@@ -66,48 +65,48 @@ class Proposals:
 
     def _fit(self, chosen):
         problem, state, trials, points = self.problem, self.state, self.trials, self.points
-        begun = [(trials[k].candidate, points[trials[k].candidate.label].beside(state))
+        starts = [(trials[k].candidate, points[trials[k].candidate.label].difference_to(state))
                  for k in chosen]
-        made = problem.share(_refined, begun, state, self.involved, self.free)
+        made = problem.parallel(_refined, starts, state, self.involved, self.free)
         for k, (difference, reached) in zip(chosen, made, strict=True):
             c = trials[k].candidate
             points[c.label] = state.with_difference(difference)
             theta = dict(points[c.label].theta)
-            believed = problem.prior(state.theta, self.free) - problem.prior(
+            prior_gain = problem.prior_cost(state.theta, self.free) - problem.prior_cost(
                 theta, _with(c, self.involved, self.free)[1])
-            trials[k] = Trial(c, self.cost - reached, theta, True, believed)
+            trials[k] = Trial(c, self.cost - reached, theta, True, prior_gain)
         trials.sort(key=lambda t: -t.gain)
 
 
 def _with(c, involved, free):
-    """Keys of a fit with a candidate, and those of which nothing is believed."""
+    """Keys of a fit with a candidate, and keys whose priors are ignored."""
     return list(dict.fromkeys([*involved, *c.keys])), free | set(c.keys)
 
 
 def _estimated(problem, c, state, cost, involved, free, normal):
-    """A candidate's trial by slopes alone, and the difference of its point to ``state``."""
+    """Linear estimate of a candidate's trial, and the difference of its state to ``state``."""
     names, released = _with(c, involved, free)
     if c.starts or c.fixed:
         trial, point = _elsewhere(problem, state, cost, c, names, released)
-        return trial, point.beside(state)
+        return trial, point.difference_to(state)
     (h, g, chi2), index = normal, [state.index[name] for name in names]
-    theta = handed_over(state.theta, c)
+    theta = delays_handed_over(state.theta, c)
     step, reached, _ = problem.solve(theta, names, released, h[np.ix_(index, index)], g[index],
                                      chi2)
     trial = Trial(c, cost - reached, problem.moved(theta, names, step))
     return trial, None if theta is state.theta else State(
-        theta, problem.residual(theta), state.slopes, state.names).beside(state)
+        theta, problem.residual(theta), state.slopes, state.names).difference_to(state)
 
 
-def _refined(problem, begun, state, involved, free):
-    """The fitted point of a candidate, as difference to ``state``, and the objective there."""
-    c, difference = begun
+def _refined(problem, starts, state, involved, free):
+    """Fitted state of a candidate as difference to ``state``, and its objective."""
+    c, difference = starts
     new, reached = problem.refine(state.with_difference(difference), *_with(c, involved, free), 4)
-    return new.beside(state), reached
+    return new.difference_to(state), reached
 
 
 def _promising(problem, trials):
-    """Indices of the trials, best first, that are worth a fit of their own."""
+    """Indices of the trials, largest gain first, that are worth a fit."""
     best = max(trials[0].gain, 1.0) if trials else 1.0
     p = problem.p
     chosen: list[int] = []
@@ -123,7 +122,7 @@ def _promising(problem, trials):
 
 
 def _elsewhere(problem, state, cost, c, names, released):
-    """A candidate whose slopes must be taken somewhere else than at zero."""
+    """Trial of a candidate that must be linearised at its own starts."""
     best = None
     for start in c.starts or ((0.0,) * len(c.keys),):
         theta = {**state.theta, **c.fixed, **dict(zip(c.keys, start, strict=True))}
@@ -132,8 +131,8 @@ def _elsewhere(problem, state, cost, c, names, released):
         slopes[:, [state.index[name] for name in c.keys]] = problem.slopes(theta, list(c.keys))
         point = State(theta, r, slopes, state.names)
         step, reached, _ = problem.linear_step(point, names, released)
-        # A straight line must not promise what the point itself shows it has not.
-        actual = cost - float(r @ r) - problem.prior(theta, released)
+        # A linear estimate of a limit is bounded by the actual gain at the start.
+        actual = cost - float(r @ r) - problem.prior_cost(theta, released)
         gain = cost - reached
         if c.name in LIMITS:
             gain = min(gain, max(actual, 0.0) + 0.5 * max(gain, 0.0))
@@ -142,22 +141,22 @@ def _elsewhere(problem, state, cost, c, names, released):
     return best
 
 
-def handed_over(theta, candidate):
+def delays_handed_over(theta, candidate):
     """
-    The same delays, with what the bus was blamed for in the candidate's own number.
+    Deviations with delays moved from the tolerances of the bus to the candidate's own delay.
+
+    The data do not separate the two. A fit that starts with half of the delay in the bus would
+    stay there, because the prior allows it.
 
     Args:
-        theta: numbers by key.
-        candidate: that joins the model.
-
-    Otherwise a fit that starts with half the delay in a number that it need not leave would
-    stay there, for the data cannot tell the two apart.
+        theta: deviations by key.
+        candidate: candidate that joins the model.
 
     """
     key, late = f'{candidate.name}.delay', CATALOGUE[candidate.name].delays
     if not {'tilt', 'thrust'} & set(late) or theta.get(key):
         return theta
-    # All sensors late by the same is all commands early by it: an exact gauge.
+    # Only differences count: all sensors late by dt equals all commands early by dt.
     common = float(np.mean([theta.get(name, 0.0) for name in SENSORS]))
     made = {**theta, **{name: theta.get(name, 0.0) - common for name in SENSORS}}
     tilt, thrust = (theta.get(name, 0.0) + common for name in (TILT_BUS, THRUST_BUS))

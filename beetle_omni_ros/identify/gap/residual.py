@@ -1,12 +1,12 @@
 """
-The residual: what the IMU, MoCap and encoders say against what the model expects of them.
+The residual: measurements of IMU, MoCap and encoders minus the model's expectation.
 
-Four groups of channels, each driven by measurements, so that an error stays where it arises:
+It has four groups of channels. Each group has measured inputs, so that errors do not propagate:
 
-- B: specific force and angular acceleration against the body's equations at the measured tilts,
-- A: MoCap's acceleration against the IMU's specific force; no model of the robot in it,
-- W: MoCap's rate of turn against the gyroscope; likewise,
-- J: encoders against servos simulated from the commands.
+- B: specific force and angular acceleration minus the body equations at the measured tilts,
+- A: acceleration by MoCap minus specific force of the IMU; independent of the robot's model,
+- W: rate by MoCap minus gyroscope; independent of the robot's model,
+- J: encoders minus servos simulated from the commands.
 """
 
 from __future__ import annotations
@@ -18,13 +18,7 @@ from beetle_omni_ros.identify.gap.ingest import Flight
 from beetle_omni_ros.identify.gap.keys import delays_of, Key
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.series import channel_filters, matrices, THIN
-from beetle_omni_ros.identify.gap.servo import (
-    module_load,
-    simulate,
-    spin_load,
-    undescribed_load,
-    Windows,
-)
+from beetle_omni_ros.identify.gap.servo import simulate, targets_at, windows_at
 from beetle_omni_ros.identify.gap.signals import Signals
 from beetle_omni_ros.robot.parameters import RobotParameters
 
@@ -34,27 +28,28 @@ CHANNELS = {'B': ('force_x', 'force_y', 'force_z', 'torque_x', 'torque_y', 'torq
             'J': ('joint_1', 'joint_2', 'joint_3', 'joint_4')}
 UNITS = {'force': 'm/s^2', 'torque': 'rad/s^2', 'acceleration': 'm/s^2', 'rate': 'rad/s',
          'joint': 'rad'}
-# By which an encoder's reading is taken later for each second of a delay of what loads the joints.
+# Time shift of an encoder reading for each second of delay of these sensors.
 SHIFTS = dict.fromkeys(delays_of('imu'), -1.0) | dict.fromkeys(delays_of('encoders'), 1.0)
-# Taken to both sides, by the same shift of a command: one-sided, delays that data cannot tell
-# apart would differ by the second derivative, and a straight line through all would fit that.
+# Parameters with central differences. With one-sided ones, slopes of equivalent delays differ by
+# the second derivative, and a linear fit exploits the difference.
 BOTH_SIDES = 'delay'
 
 
 class FlightModel:
     """
-    Residuals of one flight for any set of numbers.
+    Residuals of one flight at any deviations.
 
     Args:
         flight: measurements.
-        robot: as believed.
-        body: the body's equations, shared by all flights.
-        keys: by name.
-        p: parameters.
+        robot: parameters of the robot file.
+        body: body equations, shared by all flights.
+        keys: all keys by name.
+        p: parameters (params/gap.yaml).
 
     Attributes:
-        modules: share of the file's tilting modules in the model, 0 or 1; fits vary it around.
-        trusted: (N,) grid points away from the floor and the rotors' limits.
+        modules: share of the file's tilting modules in the model, 0 or 1; fits vary it around
+            that.
+        trusted: (N,) whether a grid point is away from the ground and from the rotor limits.
 
     """
 
@@ -68,12 +63,12 @@ class FlightModel:
         count = len(self.signals.t) - round(p.servo_warm_up / p.grid) - 1
         self._starts = np.arange(0, count - self._length + 1, self._length) \
             + round(p.servo_warm_up / p.grid)
-        self._made: dict[tuple, tuple] = {}
-        self._last: tuple = (None, {})      # point of the last residual, and that by group
+        self._cache: dict[tuple, tuple] = {}      # of _windows
+        self._last: tuple = (None, {})      # point of the last residual, and the residual by group
         self._mask = self._trusted()
 
     def _trusted(self):
-        """(M,) 0 for body samples at the rotors' limit for the voltage, or on the floor."""
+        """(M,) 0 for body samples at the rotor limit for the voltage or on the ground, else 1."""
         s, p = self.signals, self.p
         bad = s.pose({})[0][:, 2] < p.contact_height
         rows = sorted(self.robot.rotors.map, key=lambda row: row.voltage)
@@ -84,7 +79,7 @@ class FlightModel:
             asked = self.flight.command[np.clip(np.searchsorted(
                 self.flight.command_t, s.t) - 1, 0, None), 4:].max(axis=1)
             bad |= asked > p.limit_margin * most
-        # A rotor remembers for some of its time constants.
+        # Rotor lag: a limit also affects the following samples.
         memory = round(5 * self.robot.rotors.time_constant / p.grid)
         spread = np.convolve(bad, np.ones(memory))[:len(bad)] > 0
         self.trusted = ~spread
@@ -101,7 +96,7 @@ class FlightModel:
         return t[self.filters[group].centres(len(t))]
 
     def inputs(self, theta: dict[str, float]) -> dict[str, np.ndarray]:
-        """Series (N, width) that the body's equations take."""
+        """Inputs (N, width) of the body equations."""
         s = self.signals
         _, rate, _ = s.imu(theta)
         position, quaternion, velocity = s.pose(theta)
@@ -125,7 +120,7 @@ class FlightModel:
         return {group: made[group] for group in groups}
 
     def _residual(self, theta, groups):
-        """As :meth:`residual`, whatever was worked out before."""
+        """As :meth:`residual`, without the cache."""
         made = {}
         if 'B' in groups:
             force, _, turning = self.signals.imu(theta)
@@ -164,7 +159,7 @@ class FlightModel:
         return self.filters['W'](rate - seen)
 
     def _joints(self, sets):
-        """Encoders less simulated servos, [(M, 4)] for each set."""
+        """Encoders minus simulated servos, [(M, 4)] for each set."""
         groups: dict[tuple, list[int]] = {}
         for k, theta in enumerate(sets):
             groups.setdefault(tuple(theta.get(name, 0.0) for name in SHIFTS), []).append(k)
@@ -175,12 +170,12 @@ class FlightModel:
                 residuals[k] = self.filters['J'](self._reading(sets[k]) - run.reshape(-1, 4))
         return residuals
 
-    def guide(self, theta: dict[str, float]) -> None:
+    def smooth_tilts(self, theta: dict[str, float]) -> None:
         """
-        From now on take quick tilting from the servo model at this point, if encoders are noisy.
+        With noisy encoders, take the fast part of the tilts from the servo model at ``theta``.
 
-        Noise in the tilts stands in the residual and in the slopes of the body's equations: its
-        second derivative, for one, is explained by more mass in the tilting modules.
+        Noise in the tilts would enter the residual and the slopes of the body equations. A fit
+        explains its second derivative by a larger mass of the tilting modules, for example.
         """
         s = self.signals
         if s.reading_noise < self.p.guide_above:
@@ -188,24 +183,19 @@ class FlightModel:
         run = self._servos([theta], theta)[0].reshape(-1, 4)
         tilts = s.joints(theta)[0].copy()
         tilts[self._starts[0]:self._starts[0] + len(run)] = run
-        s.follow(tilts)
-        self._made.clear()
+        s.use_model_tilts(tilts)
+        self._cache.clear()
         self._last = (None, {})
 
     def _reading(self, theta):
-        """Encoders (K, 4) in the windows of the servos, one after the other."""
+        """Encoder readings (K, 4) in the servo windows, one window after the other."""
         first, count = self._starts[0], self._length * len(self._starts)
         return self.signals.joints(theta)[3][first:first + count]
 
     def _servos(self, sets, at):
         """Simulated servos (P, W, M, 4) of each set, begun and loaded as measured under ``at``."""
         windows, edges = self._windows(at)
-        targets = []
-        for theta in sets:
-            t = self.signals.tilt_targets(edges.ravel(), self.signals.delays(theta)[0])
-            # One more edge than steps in each window: the mean across windows is dropped.
-            targets.append(np.concatenate([t, t[-1:]]).reshape(*edges.shape, 4)[
-                :, :-1].transpose(1, 0, 2))
+        targets = [targets_at(self.signals, theta, edges) for theta in sets]
         runs = simulate(self.robot, windows, np.array(targets), sets, self.modules)
         return runs.transpose(0, 2, 1, 3)
 
@@ -213,11 +203,10 @@ class FlightModel:
         """
         Derivatives (M, 4) of the joints' residual by each key.
 
-        By a delay of the readings it is the rate of turn of the simulated servo, not that of the
-        encoder: the derivative of noise explains the same noise shifted, and goes on doing so
-        wherever a fit moves without fresh slopes.
+        The derivative by an encoder delay uses the rate of the simulated servo. The rate of the
+        encoder would explain its own noise, shifted in time.
         """
-        # Servos do not feel each other: what moves one moves it as if all were moved.
+        # Servos are independent, so one run with all gains changed gives the slope of each.
         sources = [f'joint_bandwidth.{self.keys[name].parameter}'
                    if self.keys[name].effect == 'servo' else name for name in names]
         moved = list(dict.fromkeys(sources))
@@ -234,17 +223,17 @@ class FlightModel:
                 for name, source in zip(names, sources, strict=True)]
 
     def _windows(self, theta):
+        """Windows of the servos and the edges of their steps, cached by the sensor delays."""
         timing = {name: theta.get(name, 0.0) for name in SHIFTS}
         key = tuple(timing.values())
-        if key not in self._made:
-            if len(self._made) > 3:
-                del self._made[next(iter(self._made))]
-            self._made[key] = self._make_windows(timing)
-        return self._made[key]
+        if key not in self._cache:
+            if len(self._cache) > 3:
+                del self._cache[next(iter(self._cache))]
+            self._cache[key] = self._make_windows(timing)
+        return self._cache[key]
 
     def _make_windows(self, theta):
         p, s = self.p, self.signals
-        per = round(p.grid / p.servo_step)
         skip, count = round(p.servo_warm_up / p.servo_step), round(p.servo_window / p.servo_step)
         begins = s.t[self._starts] - skip * p.servo_step
         edges = begins[:, None] + p.servo_step * np.arange(skip + count + 1)
@@ -252,14 +241,7 @@ class FlightModel:
         at = self._starts - round(p.servo_warm_up / p.grid)
         middle = edges[:, :-1] + p.servo_step / 2
         index = np.clip(np.rint((middle - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
-        thrust, _ = s.thrust({})
-        load = module_load(s, theta)
-        windows = Windows(tilt[at], rate[at], thrust[index].transpose(1, 0, 2),
-                          load[index].transpose(1, 0, 2),
-                          spin_load(s, theta)[index].transpose(1, 0, 2), p.servo_step, skip,
-                          per, tuple(each[index].transpose(1, 0, 2)
-                                     for each in undescribed_load(s, theta)))
-        return windows, edges
+        return windows_at(s, theta, index, (tilt[at], rate[at]), s.thrust({})[0], skip), edges
 
     def slopes(self, theta: dict[str, float], names: list[str]) -> dict[str, np.ndarray]:
         """Group -> (M, channels, len(names)): derivative of the residual by each key."""

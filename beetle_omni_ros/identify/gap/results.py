@@ -1,4 +1,4 @@
-"""The analysis as INTERFACES lays it out, as tables, and in one sentence."""
+"""The analysis as JSON (docs: INTERFACES), as tables, and as one sentence."""
 
 from __future__ import annotations
 
@@ -17,19 +17,17 @@ from beetle_omni_ros.pages.table import ABSENT, Grid
 from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-MOST_ROWS = 12
 CANDIDATES = 'Candidates, after the last step'     # title of a table
 WORDS = {'no_gap': 'no gap', 'named': 'named', 'named_set': 'one of a set',
          'unknown': 'unknown: none of the known effects', 'not_decidable': 'not decidable',
          'bad_data': 'bad data: a recording cannot be used'}
-MOST_NAMED = 6          # entries in a list before it is cut
-LOPSIDED = 0.2          # of an interval's width, from which both ends are said
-# Words that are no words of a sentence.
+MOST_NAMED = 6          # entries of a list in a sentence
+LOPSIDED = 0.2          # asymmetry of an interval from which a sentence states both ends
 SPELLED = {'imu': 'IMU', 'mocap': 'MoCap'}
 
 
 def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -> dict:
-    """Everything as plain data; the keys are those of INTERFACES."""
+    """Results as plain data with the keys of INTERFACES."""
     judged = a.gaps.get(HORIZONS[JUDGED], {})
     made = {
         'verdict': a.verdict, 'reason': a.reason, 'closure': judged.get('closure'),
@@ -57,19 +55,19 @@ def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -
                                'frame': a.rest.frame, 'channels': dict(a.rest.channels),
                                'terms': dict(a.rest.terms)},
                  'patterns': [asdict(pattern) for pattern in a.patterns],
-                 'rhythm': asdict(a.rhythm)}
+                 'rhythm': asdict(a.spectral_line)}
     made['summary'] = summary(made)
     return made
 
 
 def headline(made: dict) -> str:
-    """Return the verdict and the names, if any."""
+    """Verdict and named effects."""
     names = ', '.join(_label(effect) for effect in made['effects'])
     return f"{WORDS[made['verdict']]}{': ' + names if names else ''}"
 
 
 def _label(effect):
-    """Names of an effect, or of a candidate's row, with the number of its rotor or joint."""
+    """Names of an effect or candidate with the number of its rotor or joint."""
     member = effect.get('rotor') or effect.get('joint')
     names = ' or '.join(effect.get('names') or [effect['name']])
     return names + (f' {member}' if member else '')
@@ -110,7 +108,7 @@ def parameters(a: Analysis, name: str, free: tuple[str, ...], theta: dict[str, f
         if with_intervals:
             widths = [key.width(theta.get(key.name, 0.0), a.widths.get(key.name, 0.0))
                       if key.name in free else 0.0 for key in keys]
-            # No interval holds what cannot be, such as a drag that pushes.
+            # Clip intervals to the physical range.
             spans = [[max(v - w, min(v, spec.low)), min(v + w, max(v, spec.high))]
                      for v, w in zip(values, widths, strict=True)]
             entry['interval'] = spans if len(spans) > 1 else spans[0]
@@ -121,7 +119,7 @@ def parameters(a: Analysis, name: str, free: tuple[str, ...], theta: dict[str, f
 
 
 def at_least(stiction: dict, coulomb: dict) -> None:
-    """Raise what is said of a joint that stands to what one that slides holds."""
+    """Raise the stiction to the Coulomb friction."""
     if stiction['value'] >= coulomb['value']:
         return
     stiction['value'] = coulomb['value']
@@ -157,14 +155,14 @@ def _candidates(a):
 
 
 def _tolerances(a):
-    """What was found of each robot's own differences; carried along, not named."""
+    """Fitted tolerances of this robot, which are not named."""
     theta = a.found.theta
     return {name: {'deviation': theta.get(name, 0.0), 'relative': a.keys[name].relative}
-            for name in a.problem.beliefs if abs(theta.get(name, 0.0)) > 0}
+            for name in a.problem.priors if abs(theta.get(name, 0.0)) > 0}
 
 
 def grids(made: dict) -> list[Grid]:
-    """Tables: what was found, before and after, where, and the strongest candidates."""
+    """Tables: effects, free runs, largest residuals and best candidates."""
     tables = []
     if made.get('bad_data'):
         tables.append(_damages(made['bad_data']))
@@ -181,38 +179,38 @@ def grids(made: dict) -> list[Grid]:
                       _numbers(entry['value']), '', _numbers(entry['file']), '']
                      for rival in effect.get('rivals', [])
                      for k, (parameter, entry) in enumerate(rival['parameters'].items())]
-        title = 'Effects' if made['effects'] else 'Explains a part only, not accepted'
+        title = 'Effects' if made['effects'] else 'Partial explanation, not accepted'
         tables.append(Grid(
             title, ['effect', 'parameter', 'value', '95 %', 'in the file', 'delta BIC'], rows,
-            note='95 %: interval that holds the true number in 95 of 100 cases. delta BIC: '
-                 'evidence less the price of each further number; 10 is strong.'))
+            note='95 %: interval that contains the true value in 95 of 100 cases. delta BIC: '
+                 'gain minus the price of each parameter; 10 is strong evidence.'))
     if made['horizons']:
         tables.append(_horizons(made))
     if made['where']:
         named = bool(made['effects'])
         rows = [[w['channel'], w['regime'], _cell(w['excess']),
                  *([_cell(w['excess_after'])] if named else [])] for w in made['where'][:6]]
-        tables.append(Grid('Where model and measurement disagree most',
+        tables.append(Grid('Largest residuals',
                            ['channel', 'regime', *(['before', 'after'] if named else ['RMS'])],
                            rows, note='RMS of measured minus expected, in standard deviations of '
-                                      'the noise: 1 is noise.'))
+                                      'the noise.'))
     if made['candidates']:
         tables.append(_evidence(made['candidates'], 8))
     return tables
 
 
 def _horizons(made):
-    """Free runs; of what is named only where something is."""
-    columns = {'before': ('before', 'before: without what is named, tolerances as fitted.'),
-               'after': ('after', 'after: with it.'),
+    """Errors of free runs; columns about effects only if an effect is named."""
+    columns = {'before': ('before', 'before: without the named effects, tolerances as fitted.'),
+               'after': ('after', 'after: with them.'),
                'effects_alone': ('file + effects', 'file + effects: the robot file with the '
                                  'effects and without fitted tolerances.'),
                'placebo': ('sign reversed', 'sign reversed: a control that must not help.'),
-               'closure': ('closure', 'closure: part of the gap that is gone.')}
+               'closure': ('closure', 'closure: closed share of the gap.')}
     rows = made['horizons']
-    what = 'The model runs alone from measured states; 1 is nothing but noise. '
+    what = 'Simulation from measured states and commands; 1 is pure noise. '
     if 'joints' in made:
-        what = 'The servos run alone over the log; 1 is the error of the freest fit. '
+        what = 'Simulation of the servos over the log; 1 is the error of the most flexible fit. '
         columns['before'] = ('before', 'before: the robot file.')
         del columns['effects_alone']        # the same as after
     if made['effects']:
@@ -235,10 +233,10 @@ def _evidence(rows, most):
               f"{r['evidence']['delta_chi2']:.0f}",
               *([_cell(r['sigma_of_realistic_size'])] if asked else []),
               'accepted' if r['accepted'] else r['reason']] for r in rows[:most]]
-    note = 'gain of chi2: squared residual over noise that the entry takes away, beside what is ' \
-           'accepted; an accepted entry: what the fit loses without it. (2): a second form of it.'
+    note = 'gain of chi2: decrease of the squared residual over noise beside the accepted ' \
+           'entries; of an accepted entry: increase without it. (2): second form of an entry.'
     if asked:
-        note += ' detectability: standard deviations by which a realistic size would show.'
+        note += ' detectability: standard deviations that a typical size would show.'
     return Grid(CANDIDATES,
                 ['entry', 'gain of chi2', *(['detectability [sigma]'] if asked else []),
                  'decision'], shown, note=note)
@@ -248,10 +246,10 @@ def _damages(rows):
     shown = [[row['run'], row['topic'], row['cause'],
               ABSENT if row['at_s'] is None else f"{row['at_s']:.1f}", f"{row['sure']:.1%}",
               row['fix'] or 'no'] for row in rows]
-    return Grid('What is wrong with the recordings',
+    return Grid('Damages of the recordings',
                 ['recording', 'topic', 'likely cause', 'from [s]', 'sure', '--fix'], shown,
-                note='from: seconds after the first IMU message. sure: probability among the '
-                     'causes that were compared. --fix: correction that the option applies.')
+                note='from: time after the first IMU message. sure: probability among the '
+                     'compared causes. --fix: correction that the option applies.')
 
 
 def _cell(value):
@@ -272,15 +270,12 @@ def _spans(interval):
     return f'{interval[0]:.4g}..{interval[1]:.4g}'
 
 
-__all__ = ['evidence', 'grids', 'headline', 'MOST_ROWS', 'parameters', 'results', 'WORDS']
-
-
 def summary(made: dict) -> str:
     """
-    Say the verdict as one sentence.
+    The verdict as one or two sentences.
 
     Args:
-        made: results as INTERFACES lays them out.
+        made: results with the keys of INTERFACES.
 
     """
     return _SENTENCES[made['verdict']](made)
@@ -298,12 +293,13 @@ def _no_gap(made):
     unseen = made.get('hidden') or []
     text = 'Model and measurement agree to within noise and manufacturing tolerance.'
     if not unseen:
-        return f'{text} Every known effect of realistic size would have shown.'
-    return f'{text} A realistic {listed(unseen, "or")} would not have shown in these data.'
+        return f'{text} Every known effect of typical size would have been detected.'
+    return (f'{text} An effect of typical size of {listed(unseen, "or")} would not have been '
+            'detected in these data.')
 
 
 def _named(made):
-    parts = [_said_effect(effect) for effect in made['effects']]
+    parts = [_effect_text(effect) for effect in made['effects']]
     explain = 'explain' if len(parts) > 1 else 'explains'
     return f'{_capital(listed(parts))} {explain} the disagreement. {_closing(made)}'
 
@@ -324,7 +320,7 @@ _SENTENCES = {'bad_data': _bad_data, 'no_gap': _no_gap, 'named': _named, 'named_
 
 
 def listed(words: list[str], last: str = 'and') -> str:
-    """Join words as 'a, b and c', the rest counted where there are many."""
+    """Join words as 'a, b and c'; a long list ends with the number of others."""
     words = list(words)
     if len(words) > MOST_NAMED:
         words = [*words[:MOST_NAMED - 1], f'{len(words) - MOST_NAMED + 1} others']
@@ -337,7 +333,7 @@ def _spelled(name):
 
 
 def _of_file(found):
-    """What the robot file has in place of a parameter."""
+    """Value of the robot file for a parameter."""
     own = found['file'] if isinstance(found['file'], list) else [found['file']]
     if not any(own):
         return 'none'
@@ -345,7 +341,7 @@ def _of_file(found):
     return text if found['unit'] == '1' else f'{text} {found["unit"]}'
 
 
-def _said_effect(effect):
+def _effect_text(effect):
     names = [_spelled(name) for name in effect['names']]
     member = next((f' of {kind} {effect[kind]}' for kind in ('rotor', 'joint')
                    if effect.get(kind)), '')

@@ -1,9 +1,8 @@
 """
-Free runs: the model alone, from measured states and commands, against what was measured.
+Free runs: simulations from measured states and commands, compared with measurements.
 
-Nothing is fitted here. Errors after 0.1, 0.5 and 1.0 s are divided by what noise alone makes of
-them: uncertain initial states, noisy readings, and forces that come and go without a cause that
-a model could know (gusts).
+Nothing is fitted here. Errors after 0.1, 0.5 and 1.0 s are divided by noise floors: the errors
+that uncertain initial states, noisy readings and gusts cause in a perfect model.
 """
 
 from __future__ import annotations
@@ -16,13 +15,7 @@ from scipy.signal import lfilter
 from beetle_omni_ros.identify.gap.noise import Noise
 from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
 from beetle_omni_ros.identify.gap.series import low_pass
-from beetle_omni_ros.identify.gap.servo import (
-    module_load,
-    simulate,
-    spin_load,
-    undescribed_load,
-    Windows,
-)
+from beetle_omni_ros.identify.gap.servo import simulate, targets_at, windows_at
 from beetle_omni_ros.identify.gap.signals import FINE, matrices
 from beetle_omni_ros.robot.servo import play
 
@@ -39,9 +32,8 @@ class Runs:
 
     Attributes:
         error: (H, S, 5) norm of the error of each state at each horizon, for each start.
-        regime: (S,) what the robot was doing.
-        floor: (H, 5) root mean square that noise alone would make.
-        example: times (K,) and measured, modelled positions (K, 3) of the longest run.
+        regime: (S,) flight regime of each run.
+        floor: (H, 5) noise floors.
 
     """
 
@@ -51,7 +43,7 @@ class Runs:
 
 
 def free_runs(model: FlightModel, theta: dict[str, float], noise: Noise) -> Runs:
-    """Run the model with these numbers through one flight."""
+    """Free runs through one flight with the deviations ``theta``."""
     s, h = model.signals, model.p.grid
     steps, between = round(HORIZONS[-1] / h), round(model.p.run_every / h)
     starts = np.arange(0, len(s.t) - steps - 2, between)
@@ -59,7 +51,7 @@ def free_runs(model: FlightModel, theta: dict[str, float], noise: Noise) -> Runs
     starts = starts[fine] if fine.any() else starts
     inputs = model.inputs(theta)
     grid = starts[:, None] + np.arange(steps + 1)
-    seen_shaft, shaft, tilt = _tilts(model, theta, starts, steps)
+    seen_shaft, shaft, tilt = _servo_runs(model, theta, starts, steps)
     rate = np.gradient(tilt, h, axis=1)
     acceleration = np.gradient(rate, h, axis=1)
     position = inputs['position'][starts].copy()
@@ -105,37 +97,31 @@ def free_runs(model: FlightModel, theta: dict[str, float], noise: Noise) -> Runs
     return Runs(np.array(errors), _regimes(inputs, grid), noise_floor(model, noise))
 
 
-def _tilts(model, theta, starts, steps):
+def _servo_runs(model, theta, starts, steps):
     """
     Angles of the joints.
 
     Returns:
-        (N, 4) as encoders see them, (S, K + 1, 4) the same of servos alone, and of the rotors
-        behind their play.
+        (N, 4) encoder angles; (S, K + 1, 4) simulated servo angles; (S, K + 1, 4) angles of the
+        rotors behind the backlash.
 
     """
     s, p = model.signals, model.p
-    per = round(p.grid / p.servo_step)
-    count = (steps + 1) * per
+    count = (steps + 1) * round(p.grid / p.servo_step)
     own = s.file.get(PLAY, 0.0)
     tilt, rate, _, _ = s.joints({**theta, PLAY: -own})
     gap = own + theta.get(PLAY, 0.0)
     edges = s.t[starts][:, None] + p.servo_step * np.arange(count + 1)
     index = np.clip(np.rint((edges[:, :-1] - s.t[0]) / p.grid).astype(int), 0, len(s.t) - 1)
-    windows = Windows(tilt[starts], rate[starts], s.thrust(theta)[0][index].transpose(1, 0, 2),
-                      module_load(s, theta)[index].transpose(1, 0, 2),
-                      spin_load(s, theta)[index].transpose(1, 0, 2), p.servo_step, 0, per,
-                      tuple(each[index].transpose(1, 0, 2) for each in undescribed_load(s, theta)))
-    targets = s.tilt_targets(edges.ravel(), s.delays(theta)[0])
-    targets = np.concatenate([targets, targets[-1:]]).reshape(*edges.shape, 4)[:, :-1]
-    run = simulate(model.robot, windows, targets.transpose(1, 0, 2)[None], [theta],
+    windows = windows_at(s, theta, index, (tilt[starts], rate[starts]), s.thrust(theta)[0], 0)
+    run = simulate(model.robot, windows, targets_at(s, theta, edges)[None], [theta],
                    model.modules)[0]                                        # (K + 1, S, 4)
     behind = play(run, gap / 2, s.joints(theta)[0][starts]) if gap > 0 else run
     return tilt, run.transpose(1, 0, 2), behind.transpose(1, 0, 2)
 
 
 def _turned(quaternion, vector):
-    """Quaternions (N, 4) followed by turns (N, 3) of the body."""
+    """Quaternions (N, 4) followed by rotation vectors (N, 3) of the body."""
     half = 0.5 * vector
     x, y, z, w = quaternion.T
     a, b, c = half.T
@@ -145,7 +131,7 @@ def _turned(quaternion, vector):
 
 
 def _regimes(inputs, grid):
-    """What each run mostly does: rotate, near ground, translate, tilted or hover."""
+    """Dominant regime of each run: rotate, near ground, translate, tilted or hover."""
     speed = np.linalg.norm(inputs['velocity'], axis=1)[grid].mean(axis=1)
     turn = np.linalg.norm(inputs['rate'], axis=1)[grid].mean(axis=1)
     tilt = np.abs(inputs['tilt']).max(axis=1)[grid].mean(axis=1)
@@ -167,7 +153,7 @@ def regimes_at(model: FlightModel, times: np.ndarray) -> np.ndarray:
 
 
 def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
-    """(H, 5) errors that a perfect model would show."""
+    """(H, 5) RMS errors of a perfect model."""
     pose, gravity, p = model.flight.pose, model.robot.gravity, model.p
     third = np.diff(pose, 3, axis=0)
     seen = np.median(np.abs(third), axis=0) / 0.6745 / np.sqrt(20)
@@ -176,7 +162,7 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
     rate = model.flight.imu[:, 3:]
     gyro = float(np.sqrt(((np.median(np.abs(np.diff(rate, 3, axis=0)), axis=0) / 0.6745)**2
                           / 20).sum()))
-    # Readings at 100 Hz, interpolated to the fine grid: neighbours share their noise.
+    # Readings at 100 Hz are interpolated to the fine grid, so neighbours have correlated noise.
     share = np.sqrt(2.0)
     coarse = model.signals.position_noise > p.coarse_noise
     slope = low_pass(p.velocity_edge if coarse else p.smooth_pose, 1, FINE)
@@ -186,9 +172,9 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
     rate0 = gyro * np.linalg.norm(smooth.taps)
     angle0 = angle * share * np.linalg.norm(low_pass(10.0, 1, FINE).taps)
     s = model.signals
-    edge = p.smooth_joint if s.guide is None else p.guide_edge
+    edge = p.smooth_joint if s.model_tilts is None else p.guide_edge
     joint0 = s.reading_noise * np.linalg.norm(low_pass(edge, 1, FINE).taps)
-    push = _pushed(noise, p, gravity)
+    push = _gust_errors(noise, p, gravity)
     floors = []
     for k, horizon in enumerate(HORIZONS):
         floors.append([
@@ -201,15 +187,14 @@ def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
     return np.maximum(np.sqrt(floors), p.run_floors)
 
 
-def _pushed(noise, p, gravity):
+def _gust_errors(noise, p, gravity):
     """
-    Displacement, speed, angle and rate that the unpredictable forces of the fit make.
+    Errors of position, velocity, angle and rate (H, 4) that gusts of the fit's noise cause.
 
-    What turns the body turns its thrust, too: from half a second on, that moves it further than
-    the forces themselves.
+    Torques also tilt the thrust. From half a second on, this moves the body more than the forces.
     """
     h = THIN * p.grid * p.body_every
-    level = noise.seen.get('B', noise.sigma['B'])   # what a fit is told to believe is more
+    level = noise.seen.get('B', noise.sigma['B'])   # sigma contains the floors
     count = round(HORIZONS[-1] / h)
     rng = np.random.default_rng(0)
     once, twice = [], []
@@ -219,7 +204,7 @@ def _pushed(noise, p, gravity):
         speed = np.cumsum(pushed, axis=1) * h
         once.append(speed)
         twice.append(np.cumsum(speed, axis=1) * h)
-    # A turn about the vertical does not lean the thrust: two axes of three do.
+    # Rotations about two of three axes tilt the thrust.
     lean = [np.sqrt(2 / 3) * gravity * h * np.cumsum(angle, axis=1) for angle in twice[3:]]
     speeds, places = [*once[:3], *lean], [*twice[:3], *(h * np.cumsum(x, axis=1) for x in lean)]
     made = []
@@ -230,12 +215,11 @@ def _pushed(noise, p, gravity):
     return made
 
 
-def trimmed(fitted: list[Runs]) -> np.ndarray:
+def floor_factors(fitted: list[Runs]) -> np.ndarray:
     """
-    (H, 5) part of a floor that is needed: no floor is higher than what the model reaches.
+    (H, 5) factors of the noise floors, at most 1, that lower them to the errors that are reached.
 
-    Each fitted flight is held against its own floor, for gusts differ from flight to flight: what
-    the model reached on a calm day is no floor for a windy one.
+    Each fitted flight is compared with its own floor, because gusts differ between flights.
     """
     reached = np.mean([(run.error**2).mean(axis=1) / run.floor**2 for run in fitted], axis=0)
     return np.clip(np.sqrt(reached), 1e-2, 1.0)
@@ -244,13 +228,13 @@ def trimmed(fitted: list[Runs]) -> np.ndarray:
 def gap(runs: list[Runs], horizon: int, rows: str | None = None,
         trim: np.ndarray | None = None) -> float:
     """
-    Root mean square over states of error over floor, at one horizon; 1 is nothing but noise.
+    RMS over states of error over noise floor, at one horizon; 1 is pure noise.
 
     Args:
-        runs: of all flights.
+        runs: runs of all flights.
         horizon: index into HORIZONS.
-        rows: regime to look at; default all.
-        trim: (H, 5) of each flight's own floor; see :func:`trimmed`.
+        rows: regime; default all.
+        trim: (H, 5) factors of each flight's floor, from :func:`floor_factors`.
 
     """
     parts = []

@@ -1,4 +1,4 @@
-"""Series of readings as arrays: filters, gaps, integrals, rotations."""
+"""Operations on sampled series: filters, gaps, integrals, rotations."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from scipy.signal import firwin, upfirdn
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.robot import rotations
 
-SHARPNESS = 5.0     # taps for each sampling rate over edge
-THIN = 2            # grid points to each at which the body's equations are evaluated
-EDGE = 1.0              # [s] at both ends that smoothing and history need
-LEAST_SAMPLES = 20  # of each channel, from which the autoregression of its noise is estimated
+SHARPNESS = 5.0     # number of taps times edge over sampling rate
+THIN = 2            # decimation of the grid for the body equations
+EDGE = 1.0          # [s] at both ends, for smoothing and history
+LEAST_SAMPLES = 20  # of each channel, for the autoregression of its noise
 
 
 @dataclass(frozen=True)
 class LowPass:
     """
-    A symmetric filter.
+    A symmetric FIR filter with decimation.
 
     Attributes:
-        taps: (L,) of the filter.
-        every: how many samples to each that is kept.
-        period: between samples [s].
+        taps: (L,) taps.
+        every: decimation.
+        period: sampling period [s].
 
     """
 
@@ -44,7 +44,7 @@ class LowPass:
 
         Args:
             x: (N, ...) samples.
-            derivative: 0, 1 or 2, in time.
+            derivative: order of the time derivative: 0, 1 or 2.
 
         Returns:
             (M, ...) samples at ``centres(N)``.
@@ -58,7 +58,7 @@ class LowPass:
         return y[first:last + 1].reshape(-1, *shape[1:])
 
     def centres(self, count: int) -> np.ndarray:
-        """Indices of the samples that a series of this length keeps."""
+        """Indices of the output samples for ``count`` input samples."""
         taps = len(self.taps) - 1
         last = (count - 1) // self.every
         return self.every * np.arange(taps // self.every, last + 1) - taps // 2
@@ -78,16 +78,16 @@ def _derived(taps, order):
 
 @cache
 def low_pass(edge: float, every: int, period: float) -> LowPass:
-    """Filter with the edge [Hz]; length and ``every`` are made to fit."""
+    """Hann-window filter with the edge [Hz]; its length is a multiple of the decimation."""
     length = SHARPNESS / (edge * period)
     step = every * (1 if every % 2 == 0 else 2)
     count = step * max(1, round(length / step)) + 1
-    # Hann: end taps are zero, so that derivatives of the taps are complete
+    # The end taps of a Hann window are zero, so derivatives of the taps are complete.
     return LowPass(firwin(count, edge, window='hann', fs=1 / period), every, period)
 
 
 def channel_filters(p: GapParameters) -> dict[str, LowPass]:
-    """Group of channels -> its filter."""
+    """Filter of each group of channels."""
     return {'B': low_pass(p.body_edge, p.body_every, THIN * p.grid),
             'A': low_pass(p.world_edge, p.world_every, p.grid),
             'W': low_pass(p.rate_edge, p.rate_every, p.grid),
@@ -95,7 +95,7 @@ def channel_filters(p: GapParameters) -> dict[str, LowPass]:
 
 
 def shortest_flight(p: GapParameters) -> float:
-    """Duration [s] below which some channel keeps fewer than ``LEAST_SAMPLES`` samples."""
+    """Duration [s] below which some channel has fewer than ``LEAST_SAMPLES`` samples."""
     return 2 * EDGE + max(kernel.period * (len(kernel.taps) + LEAST_SAMPLES * kernel.every)
                           for kernel in channel_filters(p).values())
 
@@ -126,13 +126,13 @@ def derivatives(series, edge, period):
 
 
 def within(kernel, series, derivative):
-    """Filtered series (N, n), its ends held."""
+    """Filtered series (N, n), padded with its end values."""
     ends = ((kernel.margin, kernel.margin), (0, 0))
     return kernel(np.pad(series, ends, mode='edge'), derivative)
 
 
 def spread(t, values):
-    """Stamps at least a tenth of the usual step apart, so that splines stay tame."""
+    """Samples at least a tenth of the usual step apart, so that splines do not overshoot."""
     usual = np.median(np.diff(t))
     keep, last = [], -np.inf
     for k, at in enumerate(t):
@@ -143,7 +143,7 @@ def spread(t, values):
 
 
 def filled(t, values):
-    """Straight lines across gaps, where a spline would swing."""
+    """Samples with linear interpolation across gaps, where a spline would overshoot."""
     usual = np.median(np.diff(t))
     gaps = np.flatnonzero(np.diff(t) > 2.5 * usual)
     if not len(gaps):
@@ -154,19 +154,19 @@ def filled(t, values):
 
 
 def integral(t, values):
-    """Held values (N, n), and their integral (N, n) at ``t`` (N,) [s]."""
+    """Values (N, n) held between ``t`` (N,) [s], and their integral (N, n)."""
     steps = np.diff(t)[:, None] * values[:-1]
     return values, np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
 
 
 def held_at(times, t, values, sums):
-    """Integral (K, n) of held values at ``times`` (K,) [s], from :func:`integral`."""
+    """Integral (K, n) of held values at ``times`` (K,) [s]; see :func:`integral`."""
     row = np.clip(np.searchsorted(t, times, side='right') - 1, 0, len(t) - 1)
     return sums[row] + (times - t[row])[:, None] * values[row]
 
 
 def turned(quaternion, vector):
-    """Quaternions (N, 4) xyzw, each followed by a small turn of the body [rad]."""
+    """Quaternions (N, 4) xyzw, each followed by a rotation vector of the body [rad]."""
     angle = np.linalg.norm(vector)
     x2, y2, z2 = vector / angle * np.sin(angle / 2)
     w2 = np.cos(angle / 2)
@@ -175,7 +175,7 @@ def turned(quaternion, vector):
 
 
 def aligned(quaternion):
-    """Quaternions (N, 4) without changes of sign from one to the next."""
+    """Quaternions (N, 4) with continuous signs."""
     sign = np.sign((quaternion[1:] * quaternion[:-1]).sum(axis=1))
     sign[sign == 0] = 1
     return quaternion * np.concatenate([[1.0], np.cumprod(sign)])[:, None]

@@ -1,10 +1,9 @@
 """
-Tilt servos simulated from their commands, for many flights' windows and parameter sets at once.
+Tilt servos simulated from commands, for many windows and parameter sets at once.
 
-The step is that of :mod:`beetle_omni_ros.robot.servo`, whose friction holds a joint that stands:
-a fit must have that, and the smooth model of the controllers must not. Each window begins at the
-measured state and has forgotten it when it counts, for a servo's memory is far shorter than the
-run-in.
+The step is that of :mod:`beetle_omni_ros.robot.servo` with static friction, unlike the smooth
+model of the controllers. Each window begins at the measured state. The memory of a servo is far
+shorter than the warm-up, after which samples count.
 """
 
 from __future__ import annotations
@@ -23,19 +22,19 @@ from beetle_omni_ros.robot.servo import NUMPY, Servo, Step
 @dataclass(frozen=True)
 class Windows:
     """
-    What happens to a flight's joints, cut into windows.
+    Inputs of a flight's joints, cut into windows.
 
     Attributes:
-        start: (W, 4) [rad] measured positions at the windows' begins.
-        start_rate: (W, 4) [rad/s].
-        thrust: (K, W, 4) [N] of each joint's rotor, a value for each step.
-        load: (K, W, 4) [N m] torque that motion and gravity put on the joint, for share 1.
-        spin: (K, W, 4) [rad/s] torque of the spinning rotor, for each N m s of its momentum.
-        step: [s].
-        skip: steps of run-in.
-        every: steps from one sample to the next.
-        undescribed: (K, W, 4) torques of modules that the file does not describe, for each kg m
-            of their mass moment and each kg m^2 of their inertia, or nothing.
+        start: (W, 4) measured positions at the beginning of the windows [rad].
+        start_rate: (W, 4) measured rates there [rad/s].
+        thrust: (K, W, 4) thrust of each joint's rotor at each step [N].
+        load: (K, W, 4) torque of motion and gravity on the joint, for share 1 [N m].
+        spin: (K, W, 4) torque of the spinning rotor for each N m s of its momentum [rad/s].
+        step: period of the simulation [s].
+        skip: steps of warm-up.
+        every: steps between samples.
+        undescribed: (K, W, 4) torques of modules that are not in the robot file, for each kg m of
+            mass moment and each kg m^2 of inertia, or nothing.
 
     """
 
@@ -50,20 +49,49 @@ class Windows:
     undescribed: tuple[np.ndarray, ...] = ()
 
 
+def windows_at(signals: Signals, theta: dict[str, float], index: np.ndarray,
+               start: tuple[np.ndarray, np.ndarray], thrust: np.ndarray, skip: int) -> Windows:
+    """
+    Windows with the measured loads.
+
+    Args:
+        signals: measured states.
+        theta: deviations by key name.
+        index: (W, K) row of the common grid of each step.
+        start: ``start`` and ``start_rate`` of the windows.
+        thrust: (N, 4) thrusts on the common grid [N].
+        skip: steps of warm-up.
+
+    """
+    p = signals.p
+    loads = (thrust, module_load(signals, theta), spin_load(signals, theta),
+             *undescribed_load(signals, theta))
+    force, load, spin, *undescribed = (series[index].transpose(1, 0, 2) for series in loads)
+    return Windows(*start, force, load, spin, p.servo_step, skip, round(p.grid / p.servo_step),
+                   tuple(undescribed))
+
+
+def targets_at(signals: Signals, theta: dict[str, float], edges: np.ndarray) -> np.ndarray:
+    """(K, W, 4) mean delayed commands [rad] between the steps ``edges`` (W, K + 1) [s]."""
+    means = signals.tilt_targets(edges.ravel(), signals.delays(theta)[0])
+    # The mean from the end of a window to the next one is dropped.
+    return np.concatenate([means, means[-1:]]).reshape(*edges.shape, 4)[:, :-1].transpose(1, 0, 2)
+
+
 def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
              sets: list[dict[str, float]], modules: float) -> np.ndarray:
     """
-    Free runs.
+    Free runs of the servos.
 
     Args:
-        robot: as believed; its effects count.
-        windows: of one flight.
-        targets: (P, K, W, 4) [rad] for each set.
-        sets: of deviations by key name.
+        robot: parameters of the robot file with its effects.
+        windows: windows of one flight.
+        targets: (P, K, W, 4) commands for each set [rad].
+        sets: P sets of deviations by key name.
         modules: share of the file's tilting modules.
 
     Returns:
-        (P, M, W, 4) positions [rad] after the run-in.
+        (P, M, W, 4) positions after the warm-up [rad].
 
     """
     def column(name, made=lambda x: x):
@@ -88,7 +116,7 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
             made.load = made.load + size * torque[k]
         return made
 
-    # The clip of the torque matters only where the largest error could meet it.
+    # The torque limit is skipped if the largest error cannot reach it.
     reach = kp * np.abs(targets - windows.start).max() * 1.5 + kd * speed
     first = terms_at(0)
     step = Step(NUMPY, Servo(
@@ -110,11 +138,11 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
 
 def _of_effects(robot, column):
     """
-    What the catalogue changes about servos.
+    Servo parameters that the catalogue changes.
 
     Returns:
-        (name of a number of the joints -> its factors), and (servo equation, its parameters) of
-        each effect that acts.
+        (name of a joint parameter -> factors), and (servo equation, parameters) of each active
+        effect.
 
     """
     own = {'joint_friction': dict(zip(('coulomb', 'stiction'), friction(robot), strict=True))}
@@ -128,7 +156,7 @@ def _of_effects(robot, column):
         base = {**robot.effects, **own}.get(name, {})
         values = {p: np.asarray(base.get(p, spec.neutral)) + column(f'{name}.{p}')
                   for p, spec in effect.parameters.items()}
-        if effect.apply is None:    # the body's equations bear what a servo does not
+        if effect.apply is None:    # a servo equation is unstable outside the physical range
             values = {p: np.maximum(x, effect.parameters[p].low) for p, x in values.items()}
         if any(values[p].any() for p in effect.numbers):
             acting.append((effect.servo, values))
@@ -136,7 +164,7 @@ def _of_effects(robot, column):
 
 
 def _loads(windows, hanging, modules, column):
-    """Torques of unit size on the joints with their sizes, of modules in the file or not."""
+    """(unit torque, size) of each load of the modules on the joints."""
     loads = [(windows.load, modules + column('modules.share'))]
     loads += [(torque, hanging.get(name, 0.0) + column(f'{MODULES}.{name}')) for torque, name in
               zip(windows.undescribed, ('mass_moment', 'module_inertia'), strict=False)]
@@ -144,7 +172,7 @@ def _loads(windows, hanging, modules, column):
 
 
 def module_load(signals: Signals, theta: dict[str, float]) -> np.ndarray:
-    """Torque of gravity and motion on each joint, from the file's modules (N, 4) [N m]."""
+    """Torque of gravity and motion on each joint by the file's modules (N, 4) [N m]."""
     robot, tilt = signals.robot, signals.joints(theta)[0]
     load = np.zeros_like(tilt)
     parts = robot.multibody
@@ -163,11 +191,11 @@ def module_load(signals: Signals, theta: dict[str, float]) -> np.ndarray:
 
 def undescribed_load(signals: Signals, theta: dict[str, float]) -> tuple[np.ndarray, ...]:
     """
-    Torque on each joint of modules that the file does not describe.
+    Torque on each joint of modules that are not in the robot file.
 
     Returns:
-        (N, 4) for each kg m of mass moment, (N, 4) for each kg m^2 of inertia about the joint's
-        axis; nothing where the file describes them.
+        (N, 4) for each kg m of mass moment, (N, 4) for each kg m^2 of inertia about the joint
+        axis; nothing if the file describes the modules.
 
     """
     robot, tilt = signals.robot, signals.joints(theta)[0]
@@ -181,7 +209,7 @@ def undescribed_load(signals: Signals, theta: dict[str, float]) -> tuple[np.ndar
 
 
 def _felt(signals, theta, place):
-    """Specific force (N, 3) at a place of the body, in its axes [m/s^2]."""
+    """Specific force (N, 3) at a point of the body, in body axes [m/s^2]."""
     force, rate, turning = signals.imu(theta)
     return force + np.cross(turning, place) + np.cross(rate, np.cross(rate, place))
 
@@ -193,7 +221,7 @@ def _normal(axis, tilt):
 
 
 def spin_load(signals: Signals, theta: dict[str, float]) -> np.ndarray:
-    """Torque of each rotor on its joint for each N m s of momentum in hover (N, 4) [rad/s]."""
+    """Gyroscopic torque on each joint for each N m s of rotor momentum in hover (N, 4) [rad/s]."""
     tilt, rate = signals.joints(theta)[0], signals.imu(theta)[1]
     thrust, robot = signals.thrust(theta)[0], signals.robot
     load = np.empty_like(tilt)

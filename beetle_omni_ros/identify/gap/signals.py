@@ -1,4 +1,4 @@
-"""What a flight's measurements say of its state, given timing and mounting of the sensors."""
+"""Measured states of a flight, given delays and mounting of the sensors."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import play
 
 FINE = 0.005            # [s] grid on which measurements are smoothed
-# The IMU's clock is everybody's: what it is late by, all else is early by. Shifting the IMU itself
-# would sample its noise elsewhere, which changes chi2 by more than a delay is worth.
+# The IMU's clock is the reference: its delay shifts all other signals. Shifting the IMU itself
+# would resample its noise, which changes chi2 by more than a delay does.
 IMU_LAG = 'imu_filter_lag.delay'
 
 
 class Signals:
     """
-    Series of one flight on the common grid, remade only where a fit's numbers change them.
+    Series of one flight on the common grid, cached by the deviations that they depend on.
 
     Args:
         flight: checked measurements.
-        robot: as believed.
-        p: parameters.
+        robot: parameters of the robot file.
+        p: parameters (params/gap.yaml).
 
     Attributes:
         t: (N,) grid [s].
-        reading_noise: [rad] standard deviation of an encoder's reading, from what is no motion.
-        position_noise: [m] likewise of MoCap's positions.
-        guide: (N, 4) [rad] tilts that a servo model expects, or None: encoders alone.
+        reading_noise: standard deviation of an encoder's noise [rad].
+        position_noise: standard deviation of MoCap's position noise [m].
+        model_tilts: (N, 4) tilts of a servo model [rad], or None: encoders alone.
 
     """
 
@@ -60,8 +60,8 @@ class Signals:
         self._fine = np.arange(EDGE - pad, self.t[-1] + pad + FINE / 2, FINE)
         self._lead = round(pad / FINE)
         self._step, self._begin = FINE / 2, self._fine[0] - p.memory    # of the rotors' filter
-        # Not straight lines: between two readings those would halve the noise's power, and a fit
-        # would shift the IMU to where that pays.
+        # Linear interpolation would halve the noise power between readings, and a fit would
+        # shift the IMU accordingly.
         self._imu = CubicSpline(*filled(*spread(flight.imu_t, flight.imu)))
         self._pose = CubicSpline(*filled(*spread(flight.pose_t, flight.pose)))
         self._joint = CubicSpline(*filled(*spread(flight.joint_t, flight.joint)))
@@ -74,7 +74,7 @@ class Signals:
             if len(flight.battery_t) > 1 else np.ones(len(self.t))
         if not (0.5 < self.voltage.min() and self.voltage.max() < 1.5):
             self.voltage = np.ones(len(self.t))
-        # what the robot file already knows of sensors and play; numbers of a fit come on top
+        # Sensor effects and backlash of the robot file; deviations are added to them.
         self.file = {key: float(value) for name, values in robot.effects.items()
                      for parameter, given in values.items()
                      if CATALOGUE[name].in_readings(parameter)
@@ -85,11 +85,12 @@ class Signals:
             third, 0.9, axis=0))**2).mean(axis=0) / 20)))
         third = np.diff(flight.pose[:, :3], 3, axis=0)
         self.position_noise = float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20))
-        self.guide: np.ndarray | None = None
+        self.model_tilts: np.ndarray | None = None
 
-    def follow(self, guide: np.ndarray) -> None:
-        """Take the tilts (N, 4) [rad] of a servo model where encoders say only noise."""
-        self.guide, self._expected = guide, derivatives(guide, self.p.smooth_joint, self.p.grid)
+    def use_model_tilts(self, model_tilts: np.ndarray) -> None:
+        """Take the fast part of the tilts from those of a servo model (N, 4) [rad]."""
+        self.model_tilts = model_tilts
+        self._model_derivatives = derivatives(model_tilts, self.p.smooth_joint, self.p.grid)
         self._kept = {key: value for key, value in self._kept.items() if key[0] != 'joints'}
 
     def _beyond_file(self, theta):
@@ -105,7 +106,7 @@ class Signals:
         return self._kept[key]
 
     def _smooth(self, fine, edge, derivative=0):
-        """Fine series (M, ...) at the common grid."""
+        """Fine series (M, ...) on the common grid."""
         kernel = low_pass(edge, 1, FINE)
         y = kernel(fine, derivative)
         first = self._lead - kernel.margin
@@ -113,7 +114,7 @@ class Signals:
 
     @cached_property
     def _own_imu(self):
-        """Specific force, rates and their derivative (N, 3) each, as the IMU says."""
+        """Specific force, rates and their derivative (N, 3) each, in axes of the IMU."""
         fine = self._imu(np.clip(self._fine, self.flight.imu_t[0], self.flight.imu_t[-1]))
         edge = self.p.smooth_imu
         return (self._smooth(fine[:, :3], edge), self._smooth(fine[:, 3:], edge),
@@ -140,7 +141,7 @@ class Signals:
         return self._cached('imu', theta, names, make)
 
     def pose(self, theta):
-        """Position (N, 3) raw, quaternion (N, 4), velocity (N, 3) in world."""
+        """Raw position (N, 3), quaternion (N, 4), velocity (N, 3) in world axes."""
         theta = self._beyond_file(theta)
         names = ['mocap_time_offset.delay', IMU_LAG, *(f'mocap_misalignment.rotation[{k}]'
                                               for k in range(3))]
@@ -152,7 +153,7 @@ class Signals:
         return position, quaternion, velocity
 
     def _shifted_pose(self, shift):
-        """As :meth:`pose`, of a MoCap that is aligned."""
+        """As :meth:`pose`, without misalignment of MoCap."""
         fine = self._pose(np.clip(self._fine + shift, self.flight.pose_t[0],
                                   self.flight.pose_t[-1]))
         position = fine[self._lead::self._ratio][:len(self.t), :3]
@@ -165,12 +166,12 @@ class Signals:
         return position, quaternion, velocity
 
     def _fused(self, position, quaternion):
-        """Velocity (N, 3): slow changes as positions (N, 3) show them, quick ones by the IMU."""
+        """Velocity (N, 3): slow part from positions (N, 3), fast part from the IMU."""
         acceleration = np.einsum('nij,nj->ni', matrices(quaternion), self.imu({})[0])
         acceleration[:, 2] -= self.robot.gravity
         quick = self.p.grid * np.cumsum(acceleration, axis=0)
         kernel = low_pass(self.p.velocity_edge, 1, self.p.grid)
-        # Positions go on straight at the ends: held, they would stop the robot there.
+        # Linear extrapolation at the ends; constant positions would mean zero velocity.
         lead = np.arange(-kernel.margin, 0)[:, None] * (position[20] - position[0]) / 20
         tail = np.arange(1, kernel.margin + 1)[:, None] * (position[-1] - position[-21]) / 20
         longer = np.concatenate([position[0] + lead, position, position[-1] + tail])
@@ -188,21 +189,21 @@ class Signals:
             raw = self._smooth(fine, self.p.smooth_reading)
             if gap > 0:
                 fine = play(fine, gap / 2)
-            if self.guide is not None:
-                return *self._guided(self.guide, raw, gap), raw
+            if self.model_tilts is not None:
+                return *self._fused_tilts(self.model_tilts, raw, gap), raw
             return tuple(self._smooth(fine, self.p.smooth_joint, k) for k in range(3)) + (raw,)
         return self._cached('joints', theta, names, make)
 
-    def _guided(self, guide, raw, gap):
-        """Angle, rate, acceleration (N, 4): slow motion as read, quick motion as expected."""
-        p, expected = self.p, self._expected
+    def _fused_tilts(self, model_tilts, raw, gap):
+        """Angle, rate, acceleration (N, 4): slow part from encoders, fast part from the model."""
+        p, derivatives_of_model = self.p, self._model_derivatives
         if gap > 0:
-            guide = play(guide, gap / 2)
-            expected = derivatives(guide, p.smooth_joint, p.grid)
-        slow = [within(low_pass(p.guide_edge, 1, p.grid), raw - guide, 0)]
+            model_tilts = play(model_tilts, gap / 2)
+            derivatives_of_model = derivatives(model_tilts, p.smooth_joint, p.grid)
+        slow = [within(low_pass(p.guide_edge, 1, p.grid), raw - model_tilts, 0)]
         for _ in range(2):
             slow.append(np.gradient(slow[-1], p.grid, axis=0))
-        return tuple(a + b for a, b in zip(expected, slow, strict=True))
+        return tuple(a + b for a, b in zip(derivatives_of_model, slow, strict=True))
 
     def delays(self, theta):
         """Delays of tilt and thrust commands [s]."""
@@ -216,7 +217,7 @@ class Signals:
                 + theta.get('rotor_dead_time.delay', 0.0))
 
     def thrust(self, theta):
-        """Thrusts after delay, limits and lag, and their rates of change (N, 4)."""
+        """Thrusts after delay, limits and lag [N], and their rates of change (N, 4)."""
         names = ['rotor_lag.time_constant', 'thrust_saturation.thrust_max',
                  *(f'rotor.lag[{k}]' for k in range(4))]
         lag, limit, *own = (theta.get(name, 0.0) for name in names)
@@ -235,9 +236,9 @@ class Signals:
         return self._cached(('thrust', delay), theta, names, make)
 
     def _asked(self, delay, limit):
-        """Mean thrust commands (K, 4) between the steps of the rotors' filter [N]."""
+        """Mean thrust commands (K, 4) between the steps of the rotor filter [N]."""
         rotors, h = self.robot.rotors, self._step
-        # The file's own limit cuts no earlier than commands are: it is the command's.
+        # Recorded commands are already within the limit of the robot file.
         most = rotors.thrust_max * np.exp(limit) if limit else np.inf
         asked = np.clip(self._command[:, 4:], rotors.thrust_min, most)
         edges = self._begin + h * np.arange(round((self.t[-1] - self._begin) / h) + 3)
@@ -245,6 +246,6 @@ class Signals:
             self._command_t, asked)), axis=0) / h
 
     def tilt_targets(self, edges, delay):
-        """(K, 4) mean tilt commands between ``edges`` (K + 1,) [s], acting after ``delay``."""
+        """(K, 4) mean tilt commands between ``edges`` (K + 1,) [s], delayed by ``delay``."""
         integral = held_at(edges - delay, self._command_t, *self._tilt_integral)
         return np.diff(integral, axis=0) / np.diff(edges)[:, None]

@@ -1,4 +1,4 @@
-"""What no catalogue entry explains: whether it repeats, and what it goes with."""
+"""Regression of the unexplained residual on generic features: whether it is repeatable."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import orth
 
-from beetle_omni_ros.identify.gap.bands import in_part_alone
+from beetle_omni_ros.identify.gap.bands import differs_between_bands
 from beetle_omni_ros.identify.gap.fit import Problem, State
 from beetle_omni_ros.identify.gap.residual import CHANNELS, FlightModel, THIN
 from beetle_omni_ros.identify.gap.series import matrices
@@ -15,7 +15,7 @@ from beetle_omni_ros.identify.inference.blocks import ridge_held_out
 from beetle_omni_ros.identify.inference.noise import whitened
 
 TERMS_SHOWN = 4
-ALIKE = 1e-6            # singular values of slopes, of the largest, below which they say the same
+ALIKE = 1e-6            # relative singular value below which slopes are linearly dependent
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,12 @@ class Remainder:
     Result of the generic regression.
 
     Attributes:
-        gain: of chi2 on blocks left out, by group of channels.
+        gain: gain in chi2 on held-out blocks.
         positive: part of the blocks that gain.
-        channels: (name, gain) of those that gain, most first.
-        terms: (feature, gain) that describe it best, most first.
+        channels: (name, gain) of channels that gain, largest first.
+        terms: (feature, gain) of the best features, largest first.
         frame: 'world', 'body', 'rotor' or 'joint'.
-        size: channel -> root mean square of what repeats, in the channel's unit.
+        size: channel -> RMS of the repeatable part, in the channel's unit.
 
     """
 
@@ -45,15 +45,15 @@ class Remainder:
         """One sentence."""
         where = ', '.join(name for name, _ in self.channels[:3]) or 'no channel'
         what = ', '.join(name for name, _ in self.terms[:TERMS_SHOWN]) or 'nothing tried'
-        return (f'repeatable in {where}; it goes with {what} ({self.frame} frame); it gains '
-                f'{self.gain:.0f} of chi2 on data left out')
+        return (f'the residual is repeatable in {where} and correlates with {what} '
+                f'({self.frame} frame); gain on held-out data: {self.gain:.0f} of chi2')
 
 
 def features(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarray]:
     """
     Generic regressors (N,) on the common grid, by 'frame: name'.
 
-    Rates of turn are none of them: where gusts are fought, they go with the gusts.
+    Rates are not among them, because in closed loop they correlate with gusts.
     """
     x = model.inputs(theta)
     rotation, made = matrices(x['quaternion']), {}
@@ -86,12 +86,12 @@ def features(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarra
 
 def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
     """
-    Regress what is left on generic features, and judge on blocks left out.
+    Regress the residual on generic features with cross-validation.
 
     Args:
         problem: flights and noise.
         state: the final fit.
-        names: keys that were fitted; their slopes are taken out first.
+        names: fitted keys, which are projected out first.
 
     """
     labels: list[str] = []
@@ -114,12 +114,12 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
             both = [_whitened(problem, model, group, k, made)
                     for model, made in zip(problem.models, columns, strict=True)]
             x, smooth = (np.concatenate([pair[i] for pair in both]) for i in (0, 1))
-            held, scores, weights, explained, r = _cross(
+            held, scores, weights, explained, r = _cross_validated(
                 x, fitted[rows], state.r[rows], problem.block[rows], problem.blocks,
                 problem.p.remainder_ridge)
             name = CHANNELS[group][k]
             size[name] = float(np.sqrt(((smooth @ weights)**2).mean()))
-            if group == 'B' and _fought(problem, rows, explained, r):
+            if group == 'B' and _closed_loop_bias(problem, rows, explained, r):
                 continue
             gains[name] = float(held.sum())
             if held.sum() > 0:
@@ -133,15 +133,15 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
                      [(label.partition(': ')[2], g) for label, g in terms], frame, size)
 
 
-def _fought(problem, rows, explained, r):
-    """Whether what was found in a channel of forces may be a controller's answers to gusts."""
+def _closed_loop_bias(problem, rows, explained, r):
+    """Whether the regression in a channel of forces may be closed-loop bias."""
     x, all_r = np.zeros((len(rows), 1)), np.zeros(len(rows))
     x[rows, 0], all_r[rows] = explained, r
-    return in_part_alone(problem, x, all_r)
+    return differs_between_bands(problem, x, all_r)
 
 
 def _whitened(problem, model, group, channel, columns):
-    """Features as they would appear in one channel's residual, whitened and not."""
+    """Features filtered like one channel's residual, whitened and not."""
     if group == 'J':
         first, count = model._starts[0], model._length * len(model._starts)
         columns = columns[first:first + count]
@@ -154,20 +154,20 @@ def _whitened(problem, model, group, channel, columns):
     return whitened(smooth, tap, problem.noise.sigma[group][channel]), smooth[len(tap) - 1:]
 
 
-def _cross(x, fitted, r, block, blocks, ridge):
+def _cross_validated(x, fitted, r, block, blocks, ridge):
     """
-    A ridge regression, judged on blocks left out.
+    Ridge regression with cross-validation.
 
     Returns:
-        gain of chi2 on each block, score of each feature, weights of the whole fit; what these
-        explain of the whitened residual, and the residual without what is fitted already.
+        gain in chi2 on each block; score of each feature; weights of the fit to all blocks; the
+        whitened residual that these explain; the residual with the fitted keys projected out.
 
     """
     scale = np.sqrt((x**2).mean(axis=0)) + 1e-12
     x = x / scale
     size = np.sqrt((fitted**2).sum(axis=0))
     used = size > 1e-3
-    # Not QR: where columns say the same, its further ones are rounding.
+    # QR would return rounding errors as further columns if columns are linearly dependent.
     basis = orth(fitted[:, used] / size[used], ALIKE) if used.any() else np.zeros((len(r), 0))
     x, r = x - basis @ (basis.T @ x), r - basis @ (basis.T @ r)
     weight = np.sqrt((x**2).mean(axis=0))

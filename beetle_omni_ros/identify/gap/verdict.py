@@ -1,10 +1,10 @@
-"""What to say of an analysis: a name, a set, unknown, not decidable, or no gap; and why."""
+"""Verdict, reason and next experiment of an analysis."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from beetle_omni_ros.identify.gap.candidates import FOUGHT, NOT_HELD, TOO_SMALL
+from beetle_omni_ros.identify.gap.candidates import CLOSED_LOOP_BIAS, NOT_CONFIRMED, TOO_SMALL
 from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.patterns import SWINGING
 from beetle_omni_ros.robot.effects import CATALOGUE, separating_experiment
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 def hidden(a: Analysis, p: GapParameters) -> list[str]:
     """
-    Names of entries of which these data could not show a realistic size.
+    Names of entries that these data could not show at a typical size.
 
-    Without those that act in one regime alone, near the ground say; see :func:`not_met`.
+    Entries of a special regime, such as the ground effect, are not included; see :func:`not_met`.
     """
-    return [name for name in _out_of_sight(a, p) if not CATALOGUE[name].one_regime]
+    return [name for name in _undetectable(a, p) if not CATALOGUE[name].one_regime]
 
 
 def not_met(a: Analysis, p: GapParameters) -> list[str]:
-    """Names of entries whose regime these flights did not meet, and so could not show."""
-    return [name for name in _out_of_sight(a, p) if CATALOGUE[name].one_regime]
+    """Names of undetectable entries that act in one regime only."""
+    return [name for name in _undetectable(a, p) if CATALOGUE[name].one_regime]
 
 
-def _out_of_sight(a, p):
+def _undetectable(a, p):
     best: dict[str, float] = {}
     for label, seen in a.visible.items():
         name = label.partition(' ')[0].partition('[')[0]
@@ -36,132 +36,132 @@ def _out_of_sight(a, p):
 
 
 def decide(a: Analysis, p: GapParameters) -> None:
-    """Set verdict, reason, what explains only a part, and what to fly next."""
+    """Set verdict, reason, partial effects and next experiment."""
     found, count = a.found, len(a.fit.time)
     before, after, floor = found.cost
-    # Everything at once also fits some noise: a chi2 of one for each number without a belief.
-    floor += sum(name not in a.fit.beliefs for name in found.state.names)
-    # A latency of a millisecond is no unknown, however clearly it shows; nor is a gust, which
-    # differs from flight to flight, or the answers to it.
+    # The fit of all keys also fits noise: one unit of chi2 for each key without prior.
+    floor += sum(name not in a.fit.priors for name in found.state.names)
+    # An irrelevant size, a gust and closed-loop bias are not unknown effects, even with a large
+    # gain.
     small = max((t.gain for t in found.trials.values()
-                 if t.reason in (TOO_SMALL, NOT_HELD, FOUGHT)), default=0.0)
+                 if t.reason in (TOO_SMALL, NOT_CONFIRMED, CLOSED_LOOP_BIAS)), default=0.0)
     left = max(after - floor - small, 0.0)
     explained = (before - after) / max(before - after + left, 1e-9)
-    out_of_sight = hidden(a, p)
+    undetectable = hidden(a, p)
     seen = {label.partition(' ')[0].partition('[')[0] for label in a.visible}
-    share = len(out_of_sight) / max(sum(not CATALOGUE[name].one_regime for name in seen), 1)
-    repeats = _repeats(a.rest, p)
-    strange = _strange(a, before - after, p)
+    share = len(undetectable) / max(sum(not CATALOGUE[name].one_regime for name in seen), 1)
+    repeatable = _repeatable(a.rest, p)
+    unmodelled = _unmodelled_force(a, before - after, p)
     sets = [[t, *found.rivals.get(t.candidate.label, [])] for t in found.accepted]
     names = [len({t.candidate.name for t in members}) for members in sets]
-    pushed = [t for t in found.accepted if t.candidate.pushes(a.keys)]
-    if found.still and (pushed or not found.accepted):
-        a.verdict, a.partial = 'not_decidable', pushed
-        a.reason = _stillness(sets, pushed, out_of_sight)
-        found.accepted[:] = [t for t in found.accepted if t not in pushed]
+    forces = [t for t in found.accepted if t.candidate.acts_on_body_only(a.keys)]
+    if found.low_excitation and (forces or not found.accepted):
+        a.verdict, a.partial = 'not_decidable', forces
+        a.reason = _low_excitation_reason(sets, forces, undetectable)
+        found.accepted[:] = [t for t in found.accepted if t not in forces]
     elif found.accepted:
         part = a.rest.gain / max(before - after, 1e-9)
-        if left > p.least_left and explained < p.enough or strange \
-                or repeats and part > p.remainder_share or a.loud:
+        if left > p.least_left and explained < p.enough or unmodelled \
+                or repeatable and part > p.remainder_share or a.above_ceiling:
             a.verdict, a.partial = 'unknown', list(found.accepted)
-            rest = strange or (a.loud[0].text if a.loud else a.rest.text)
+            rest = unmodelled or (a.above_ceiling[0].text if a.above_ceiling else a.rest.text)
             known = ', '.join(dict.fromkeys(t.candidate.name for t in found.accepted))
-            a.reason = (f'{rest}, also with {known} ({explained:.0%} of what known effects could '
-                        'explain)')
+            a.reason = (f'{rest}, even with {known} ({explained:.0%} of what all known effects '
+                        'could explain)')
             found.accepted.clear()
         elif max(names) >= p.crowd or (share > p.most_hidden and max(names) > 1):
             a.verdict = 'not_decidable'
-            a.reason = f'these flights cannot tell {max(names)} explanations apart'
+            a.reason = f'these flights do not separate {max(names)} explanations'
         else:
             a.verdict = 'named_set' if max(names) > 1 else 'named'
-            a.reason = f'explains {explained:.1%} of what known effects could explain'
-    elif a.loud:
-        a.verdict, a.reason = 'unknown', f'{a.loud[0].text}, and no known effect explains it'
-    elif repeats or strange or left > 0.05 * count:
-        a.verdict, a.reason = 'unknown', strange or a.rest.text
+            a.reason = f'explains {explained:.1%} of what all known effects could explain'
+    elif a.above_ceiling:
+        a.verdict = 'unknown'
+        a.reason = f'{a.above_ceiling[0].text}, and no known effect explains it'
+    elif repeatable or unmodelled or left > 0.05 * count:
+        a.verdict, a.reason = 'unknown', unmodelled or a.rest.text
     elif share > p.most_hidden:
         a.verdict = 'not_decidable'
-        a.reason = (f'{len(out_of_sight)} known effects of realistic size would not show in '
+        a.reason = (f'{len(undetectable)} known effects of typical size would not be detected in '
                     'these flights')
     else:
-        a.verdict, a.reason = 'no_gap', 'what is left is noise and manufacturing tolerance'
-    a.experiment = _experiment(a, sets if found.accepted or pushed else [], out_of_sight)
+        a.verdict, a.reason = 'no_gap', 'the residual is noise and manufacturing tolerance'
+    a.experiment = _experiment(a, sets if found.accepted or forces else [], undetectable)
 
 
 def disagreement(a: Analysis, gap: float) -> None:
     """
-    Take "no gap" back where free runs or a channel are farther off than noise may be.
+    Replace "no gap" by "unknown" if free runs exceed the noise floor too much.
 
     Args:
-        a: decided, with its free runs.
-        gap: of the flights that judge, in noise floors.
+        a: analysis with a verdict and free runs.
+        gap: error of the free runs over the noise floor.
 
     """
     if a.verdict != 'no_gap':
         return
     if not gap <= a.fit.p.agreement:
         a.verdict = 'unknown'
-        a.reason = (f'free runs are {gap:.2f} noise floors off, and no known effect explains it; '
-                    f'flights without a gap have at most {a.fit.p.agreement:g}')
+        a.reason = (f'the error of free runs is {gap:.2f} noise floors, and no known effect '
+                    f'explains it; flights without a gap have at most {a.fit.p.agreement:g}')
         a.experiment = _experiment(a, [], [])
 
 
 def withdraw(a: Analysis, gap: dict[str, float], why: str) -> None:
     """
-    Take back what flights that judge speak against.
-
-    Such a model is not to be flown with, and such an effect is not what differs.
+    Withdraw effects that the free runs refute.
 
     Args:
-        a: decided, with something named.
-        gap: 'before' and 'after' of the flights that judge, in noise floors.
-        why: what the effects do to those flights.
+        a: analysis with named effects.
+        gap: 'before' and 'after' of the free runs, in noise floors.
+        why: what the effects do to these flights, as the end of a sentence.
 
     """
     names = ' and '.join(t.candidate.name for t in a.accepted)
     a.verdict, a.partial = 'unknown', list(a.found.accepted)
-    a.reason = (f'{names} would explain the fitted flights and {why}: '
-                f'{gap["before"]:.2f} to {gap["after"]:.2f} noise floors in free runs')
+    a.reason = (f'{names} would explain the fitted flights and {why}: error of free runs '
+                f'{gap["before"]:.2f} before, {gap["after"]:.2f} after, in noise floors')
     a.found.accepted.clear()
     a.experiment = _experiment(a, [], [])
 
 
-def _stillness(sets, pushed, out_of_sight):
-    """Why a flight that hardly moves decides nothing about forces."""
-    seen = sorted({t.candidate.name for members in sets if members[0] in pushed
+def _low_excitation_reason(sets, forces, undetectable):
+    """Why a flight with low excitation determines no forces."""
+    seen = sorted({t.candidate.name for members in sets if members[0] in forces
                    for t in members})
-    found = f'; {" or ".join(seen)} would explain it, and others as well' if seen else \
-        f'; {len(out_of_sight)} known effects of realistic size would not show'
-    return 'the robot hardly moves but where it is pushed' + found
+    found = f'{" or ".join(seen)} and other effects would explain the residual' if seen else \
+        f'{len(undetectable)} known effects of typical size would not be detected'
+    return f'the excitation is low, the motion is mostly a reaction to disturbances; {found}'
 
 
-def _strange(a, explained, p):
-    """What no entry can be and these flights show all the same, in words; '' if nothing."""
-    line = a.rhythm
+def _unmodelled_force(a, explained, p):
+    """Description of a force that no entry can cause; '' if there is none."""
+    line = a.spectral_line
     if line.ratio > p.least_line and line.size > p.least_force:
-        return (f'a force with a rhythm of its own, {line.frequency:.2f} Hz and '
-                f'{line.size:.2f} m/s^2, which goes with no state')
+        return (f'a periodic force of {line.frequency:.2f} Hz and {line.size:.2f} m/s^2 RMS, '
+                'which depends on no state')
     for pattern in a.patterns:
         force, torque = pattern.size
         swings = pattern.text == SWINGING and force > p.swinging_force
         large = swings or force > p.least_force or torque > p.least_torque
         share = 0.0 if swings else p.pattern_share
         if pattern.agrees(p) and large and pattern.gain > max(p.least_pattern, share * explained):
-            return (f'a force that goes with {pattern.text} ({force:.2f} m/s^2, {torque:.2f} '
-                    f'rad/s^2); it gains {pattern.gain:.0f} of chi2 on data left out')
+            return (f'a force that correlates with {pattern.text} ({force:.2f} m/s^2, '
+                    f'{torque:.2f} rad/s^2 RMS; gain on held-out data: {pattern.gain:.0f} of '
+                    'chi2)')
     return ''
 
 
-def _repeats(rest, p):
-    """Whether what is left repeats, and is more than tolerances leave behind."""
+def _repeatable(rest, p):
+    """Whether the residual is repeatable and larger than tolerances explain."""
     limits = {'force': p.least_force, 'torque': p.least_torque, 'joint': p.least_joint}
     large = [name for name, gain in rest.channels if gain > p.least_channel
              and rest.size[name] > limits[name.partition('_')[0]]]
     return rest.gain > p.least_remainder and rest.positive >= 0.7 and bool(large)
 
 
-def _experiment(a, sets, out_of_sight):
-    if a.verdict == 'not_decidable' and a.found.still:
+def _experiment(a, sets, undetectable):
+    if a.verdict == 'not_decidable' and a.found.low_excitation:
         own = [CATALOGUE[name].separated_by for name in dict.fromkeys(
             t.candidate.name for members in sets for t in members)]
         return '; '.join(['60 s of poses with large turns, tilts and translation', *own[:3]])
@@ -171,10 +171,10 @@ def _experiment(a, sets, out_of_sight):
         return (f'{separating_experiment([t.candidate.name for t in members])} (separates '
                 f'{members[0].candidate.name} from {", ".join(others) or "the rest"})')
     if a.verdict == 'not_decidable':
-        flights = list(dict.fromkeys(CATALOGUE[name].excited_by for name in out_of_sight))
-        tests = list(dict.fromkeys(CATALOGUE[name].separated_by for name in out_of_sight))
+        flights = list(dict.fromkeys(CATALOGUE[name].excited_by for name in undetectable))
+        tests = list(dict.fromkeys(CATALOGUE[name].separated_by for name in undetectable))
         return (f'poses with large turns, tilts and translation ({"; ".join(flights[:5])}); '
                 f'best: {"; ".join(tests[:3])}')
     if a.verdict == 'unknown':
-        return 'the same task three times over: what repeats is model, the rest is gusts'
+        return 'the same task three times: errors that repeat are of the model, others are gusts'
     return None

@@ -1,10 +1,9 @@
 """
-Processes that hold a copy of a problem each and share its work.
+Worker processes that share the calls on one object.
 
-They are forked: a worker finds flights, splines and compiled equations as they stand, without
-reading or sending them, and keeps what it computes later. A pool of concurrent.futures deals out
-the calls. Where there is one core or one call, no fork, or where a worker died, the work is done
-in this process; the results are the same.
+They are forked, so a worker has flights, splines and compiled equations without reading or
+sending them, and keeps its own caches. With one core, one call, no fork or a crashed worker, the
+calls run in this process; the results are the same.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ try:
 except ImportError:     # apt has it, but rosdep no key for it
     threadpool_limits = None
 
-WIDTH_KEY = 'OMP_NUM_THREADS'       # who limits threads by it means processes, too
-_inside = False                     # of a worker, which shares nothing
-_subject: Any = None                # of a worker
+WIDTH_KEY = 'OMP_NUM_THREADS'       # a limit of threads also limits the processes
+_inside = False                     # whether this process is a worker
+_subject: Any = None                # subject of a worker
 
 
 def width() -> int:
-    """How many processes work at a time; one where threads of linear algebra cannot be limited."""
+    """Number of processes; one if threads of linear algebra cannot be limited."""
     if sys.platform != 'linux' or threadpool_limits is None:
         return 1
     allowed = os.environ.get(WIDTH_KEY, '')
@@ -44,11 +43,11 @@ def width() -> int:
 
 class Workers:
     """
-    A context in which calls are shared; its workers end with it, and with this process.
+    A context with worker processes; they end with it and with this process.
 
     Args:
-        subject: first argument of every call, as it stands at the first shared one. What calls
-            change in it later stays in the worker.
+        subject: first argument of every call, in its state at the first shared call. Later changes
+            by a call stay in the worker.
 
     """
 
@@ -58,13 +57,13 @@ class Workers:
         self._stack = ExitStack()
 
     def __enter__(self) -> Workers:
-        """One thread of linear algebra for each process."""
+        """Limit linear algebra to one thread for each process."""
         if self.width > 1:
             self._stack.enter_context(threadpool_limits(1))
         return self
 
     def __exit__(self, *_) -> None:
-        """End the workers, whatever they do."""
+        """End the workers."""
         self._end()
         self.width = 1
         self._stack.close()
@@ -74,8 +73,8 @@ class Workers:
         ``[function(subject, item, *common) for item in items]``.
 
         Args:
-            function: of a module; it, arguments and results can be pickled.
-            items: independent of each other; the longest first, they are dealt out in turn.
+            function: module-level function; arguments and results are picklable.
+            items: independent items, dealt out in turn; the longest calls first.
             common: further arguments, sent once to each worker.
 
         """
@@ -101,7 +100,7 @@ class Workers:
             self.width, multiprocessing.get_context('fork'), _begin,
             (self.subject, held, self._line))
         with warnings.catch_warnings():
-            # Threads of this process, such as a progress bar's, hold nothing that a worker uses.
+            # Threads of this process, such as the progress bar, hold no lock of a worker.
             warnings.simplefilter('ignore', DeprecationWarning)
             self._pool.submit(os.getpid)
         held.close()
@@ -123,11 +122,11 @@ def _do(function, items, common):
 
 
 def _begin(subject, held, line):
-    """Start a worker: it ends as soon as nobody holds the other end of ``held``."""
+    """Initialise a worker, which ends when the parent's end of ``held`` closes."""
     global _inside, _subject
     _inside, _subject = True, subject
     line.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)    # the parent's to hear
+    signal.signal(signal.SIGINT, signal.SIG_IGN)    # the parent handles it
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     Thread(target=_wait, args=(held,), daemon=True).start()
 

@@ -1,1 +1,1 @@
-"""Fits with priors, coloured noise, intervals and selection on held-out blocks; knows no robot."""
+"""Fits with priors, coloured noise, intervals and cross-validation; independent of the robot."""

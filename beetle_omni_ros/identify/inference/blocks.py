@@ -1,4 +1,4 @@
-"""Blocks of the data: what a model gains on those it was not fitted to, and how they scatter."""
+"""Cross-validation by blocks of the data."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SCATTER = 2.0, 6.0      # range of a gradient's; below 2, slow drifts are covered too seldom
+SCATTER = 2.0, 6.0      # range of gradient_scatter; below 2, intervals miss slow drifts too often
 
 
 def block_masks(weight: np.ndarray, blocks: int) -> np.ndarray:
-    """(blocks, N) 1 within each of the blocks of the samples that have a weight (N,)."""
+    """(blocks, N) masks of consecutive blocks of the samples with a weight (N,)."""
     used = np.flatnonzero(weight)
     edges = np.linspace(used[0], used[-1] + 1, blocks + 1).astype(int)
     index = np.arange(len(weight))
@@ -21,10 +21,10 @@ def block_masks(weight: np.ndarray, blocks: int) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class HeldOut:
     """
-    Gains of chi2 on blocks that were left out.
+    Gains in chi2 on held-out blocks.
 
     Attributes:
-        gains: (blocks,).
+        gains: (blocks,) gains.
 
     """
 
@@ -32,45 +32,45 @@ class HeldOut:
 
     @property
     def total(self) -> float:
-        """Gain of all blocks together."""
+        """Sum of the gains."""
         return float(self.gains.sum())
 
     @property
     def error(self) -> float:
-        """Standard error of :attr:`total`, from the scatter between blocks; inf of one block."""
+        """Standard error of :attr:`total` by the scatter between blocks; inf for one block."""
         count = len(self.gains)
         return float(self.gains.std(ddof=1) * np.sqrt(count)) if count > 1 else np.inf
 
     @property
     def sigmas(self) -> float:
-        """:attr:`total` in standard errors; 0 where there is no scatter."""
+        """:attr:`total` in standard errors; 0 without scatter."""
         return self.total / self.error if self.error > 0 else 0.0
 
     @property
     def positive(self) -> float:
-        """Part of the blocks that gain."""
+        """Share of the blocks that gain."""
         return float((self.gains > 0).mean())
 
     @property
     def without_best(self) -> float:
-        """Gain without the block that gains most: one event is no effect."""
+        """Gain without the block of the largest gain, against effects of one event."""
         return float(self.gains.sum() - self.gains.max()) if len(self.gains) > 1 else 0.0
 
 
 def ridge_held_out(x: np.ndarray, r: np.ndarray, block: np.ndarray, blocks: int,
                    ridge: float) -> tuple[HeldOut, np.ndarray]:
     """
-    Ridge regression of r (n,) on x (n, P), judged on each block by a fit to the others.
+    Cross-validated ridge regression of r (n,) on x (n, P).
 
     Args:
         x: features.
         r: whitened residual.
-        block: (n,) number of each sample's block.
-        blocks: how many.
-        ridge: precision of every weight, about 0.
+        block: (n,) block of each sample.
+        blocks: number of blocks.
+        ridge: precision of the prior of every weight, about 0.
 
     Returns:
-        gains of chi2, and the weights (P,) of a fit to all blocks.
+        gains in chi2 on each block by a fit to the others; weights (P,) of a fit to all blocks.
 
     """
     parts = [(x[block == b].T @ x[block == b], x[block == b].T @ r[block == b])
@@ -87,15 +87,16 @@ def ridge_held_out(x: np.ndarray, r: np.ndarray, block: np.ndarray, blocks: int,
 def gradient_scatter(slopes: np.ndarray, residual: np.ndarray, covariance: np.ndarray,
                      blocks: np.ndarray) -> float:
     """
-    Mean variance of the gradient over blocks, relative to what white residuals give.
+    Mean variance of the gradient between blocks, relative to that of white residuals.
 
-    Chi2 over it counts as independent residuals would, which whitening alone does not ensure.
+    Chi2 divided by it has the distribution of independent residuals even if whitening is
+    imperfect.
 
     Args:
         slopes: (n, N) derivatives of the whitened residuals.
-        residual: (N,) whitened.
-        covariance: (n, n) of the parameters, as white residuals would have it; 0 where not free.
-        blocks: (blocks, N) 1 within each.
+        residual: (N,) whitened residual.
+        covariance: (n, n) covariance of the parameters for white residuals; 0 if not free.
+        blocks: (blocks, N) masks.
 
     """
     scores = np.array([(slopes * block) @ residual for block in blocks])

@@ -1,8 +1,8 @@
 """
-Nonlinear least squares with priors, many small problems side by side.
+Nonlinear least squares with priors for many small problems at once.
 
-A problem's chi2 is the sum of its squared whitened residuals and of its prior's. It is minimised
-by Levenberg and Marquardt's method within bounds; a robust loss stands in the residual itself
+The chi2 of a problem is the sum of squared whitened residuals and of its prior's residuals. The
+method is Levenberg-Marquardt within bounds. A robust loss is applied to the residual
 (:func:`huber`, :func:`soft_l1`).
 """
 
@@ -16,18 +16,18 @@ import numpy as np
 
 from beetle_omni_ros.identify.inference.prior import Prior
 
-HUBER = 3.0         # standard deviations from which a sample counts less
+HUBER = 3.0         # standard deviations from which the loss is linear
 
 
 @dataclass(frozen=True)
 class Coordinates:
     """
-    Points (..., P): values in units of their scales, logarithms where fitted so.
+    Encoding of P parameters as points (..., P): values or logarithms, over their scales.
 
     Attributes:
-        each: the P parameters, each with ``low`` and ``high`` (of a fit), ``scale`` (a change that
-            matters; of the logarithm where ``logarithmic``) and ``logarithmic``.
-        scale, logarithmic: (P,) of each.
+        each: P parameters with ``low``, ``high``, ``scale`` (a relevant change) and
+            ``logarithmic``.
+        scale, logarithmic: (P,) attributes of each.
         low, high: (P,) bounds of points.
 
     """
@@ -60,14 +60,14 @@ class Coordinates:
 @dataclass(frozen=True)
 class Steps:
     """
-    How an iteration moves.
+    Parameters of the Levenberg-Marquardt iteration.
 
     Attributes:
-        tolerance: relative fall of chi2 below which a problem is done.
-        longest: change of a parameter.
-        factors: of the damping, both tried at a time.
-        more: of the damping where the second one was better.
-        failed: of the damping where none was.
+        tolerance: relative decrease of chi2 below which a problem is solved.
+        longest: largest change of a coordinate in one step.
+        factors: factors of the damping; both are tried in each step.
+        more: factor of the damping if the second one was better.
+        failed: factor of the damping if none was better.
 
     """
 
@@ -79,7 +79,7 @@ class Steps:
 
 
 def huber(white: np.ndarray) -> np.ndarray:
-    """Residuals whose squares sum to Huber's cost."""
+    """Residuals whose sum of squares is Huber's loss."""
     size = np.abs(white)
     clipped = np.sqrt(np.maximum(2 * HUBER * size - HUBER**2, 0)) * np.sign(white)
     return np.where(size > HUBER, clipped, white)
@@ -94,11 +94,11 @@ def soft_l1(residual: np.ndarray, scale: float) -> np.ndarray:
 @dataclass(frozen=True)
 class Fits:
     """
-    Answers to several problems.
+    Solutions of several problems.
 
     Attributes:
-        points: (B, P) fitted.
-        chi2: (B,) with the prior's part.
+        points: (B, P) fitted points.
+        chi2: (B,) chi2 with the prior.
 
     """
 
@@ -111,18 +111,18 @@ def minimise(points: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.nda
              jacobian: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
              prior: Prior, iterations: int, steps: Steps = Steps()) -> Fits:
     """
-    Minimise the chi2 of each problem from its start.
+    Minimise the chi2 of each problem.
 
     Args:
         points: (B, P) starts.
-        free: (B, P) what is fitted.
-        low: (P,) bounds.
-        high: (P,) bounds.
+        free: (B, P) mask of fitted coordinates.
+        low: (P,) lower bounds.
+        high: (P,) upper bounds.
         residual: (points (M, P), problems (M,)) -> (M, n).
-        jacobian: (points (M, P), problems (M,), residuals (M, n)) -> (M, P, n); 0 where not free.
-        prior: of all problems.
-        iterations: at most.
-        steps: how they move.
+        jacobian: (points (M, P), problems (M,), residuals (M, n)) -> (M, P, n); 0 if not free.
+        prior: prior of all problems.
+        iterations: largest number of iterations.
+        steps: parameters of the iteration.
 
     """
     points = np.where(free, np.clip(points, low, high), points)
@@ -161,7 +161,7 @@ def minimise(points: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.nda
 
 
 def differences(residual: Callable[[np.ndarray, np.ndarray], np.ndarray], step: float) -> Callable:
-    """Jacobian for :func:`minimise` by one-sided differences of ``step`` in each parameter."""
+    """Jacobian for :func:`minimise` by one-sided differences of ``step`` in each coordinate."""
     def jacobian(points, rows, base):
         return np.stack([(residual(points + move, rows) - base) / step
                          for move in step * np.eye(points.shape[1])], axis=1)
@@ -169,7 +169,7 @@ def differences(residual: Callable[[np.ndarray, np.ndarray], np.ndarray], step: 
 
 
 def _step(points, normal, slope, free, low, high, damping):
-    """Damped steps (B, P); parameters at a bound that push outwards stay."""
+    """Damped steps (B, P); coordinates at a bound with an outward gradient stay."""
     stuck = ((points <= low + 1e-9) & (slope > 0)) | ((points >= high - 1e-9) & (slope < 0))
     move = free & ~stuck
     diagonal = np.arange(points.shape[1])
@@ -182,12 +182,12 @@ def _step(points, normal, slope, free, low, high, damping):
 
 def solved(h: np.ndarray, right: np.ndarray, ridge: float = 1e-9) -> np.ndarray:
     """
-    Solution of ``h x = right`` of normal equations whose parameters differ in scale.
+    Solution of normal equations ``h x = right`` with coordinates of different scale.
 
     Args:
-        h: (P, P) positive.
-        right: (P,) or (P, K).
-        ridge: added to each diagonal element, relative to it.
+        h: (P, P) positive matrix.
+        right: (P,) or (P, K) right side.
+        ridge: relative increase of each diagonal element.
 
     """
     scale = 1 / np.sqrt(np.maximum(np.diag(h), 1e-12))
@@ -199,7 +199,7 @@ def covariance(information: np.ndarray, free: np.ndarray) -> np.ndarray:
     """
     (P, P) inverse of the information on the free parameters; 0 for the others.
 
-    A direction that the data do not see at all gets a width of thousands of scales, not inf.
+    A direction without information gets a width of thousands of scales instead of inf.
     """
     made = np.zeros_like(information)
     chosen = np.ix_(free, free)

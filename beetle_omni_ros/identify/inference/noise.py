@@ -1,4 +1,4 @@
-"""Coloured noise: autoregressions of what a fit leaves, and the filters that whiten it."""
+"""Coloured noise: autoregressions of residuals, and whitening filters."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
-JITTER = 1e-6       # of the variance, added to it: a series may be predictable to the last digit
+JITTER = 1e-6       # relative increase of the variance, for series without noise
 
 
 def autoregression(series: list[np.ndarray], order: int,
@@ -17,12 +17,12 @@ def autoregression(series: list[np.ndarray], order: int,
     Fit one autoregression to several series (Yule-Walker equations).
 
     Args:
-        series: each (N,), of the same process.
-        order: coefficients.
+        series: series (N,) of the same process.
+        order: number of coefficients.
         quantum: standard deviation of rounding, added to the series.
 
     Returns:
-        prediction-error filter (order + 1,), first entry 1, and its error's standard deviation.
+        prediction-error filter (order + 1,), first entry 1; standard deviation of its error.
 
     """
     count = sum(len(x) for x in series)
@@ -36,13 +36,13 @@ def autoregression(series: list[np.ndarray], order: int,
 
 
 def whitened(series: np.ndarray, taps: np.ndarray, sigma: float) -> np.ndarray:
-    """Filtered to unit variance along the first axis; samples without a past are left out."""
+    """Series filtered to unit variance along the first axis, without the first samples."""
     return lfilter(taps, 1.0, series, axis=0)[len(taps) - 1:] / sigma
 
 
 def gain(taps: np.ndarray) -> float:
-    """Variance of the coloured series for unit variance of what drives it."""
-    # Round the whole circle: half of it would count the slowest twice, of which colour is made.
+    """Variance of the coloured series for an innovation of unit variance."""
+    # Mean over the whole circle; over a half circle, the zero frequency would count twice.
     response = np.fft.fft(taps, 4096)
     return float(np.mean(1 / np.maximum(np.abs(response)**2, 1e-9)))
 
@@ -54,7 +54,7 @@ class Noise:
 
     Attributes:
         taps: (n, order + 1) prediction-error filters; (n, 1) ones: white.
-        sigma: (n,) standard deviation of the whitened residual.
+        sigma: (n,) standard deviation of the innovation.
 
     """
 
@@ -63,18 +63,18 @@ class Noise:
 
     @classmethod
     def white(cls, channels: int, sigma: float = 1.0):
-        """No memory."""
+        """White noise."""
         return cls(np.ones((channels, 1)), np.full(channels, sigma))
 
     @classmethod
     def of(cls, residual: np.ndarray, order: int, floor: float):
         """
-        Estimate from residuals (n, N); outliers are clipped.
+        Estimate the noise from residuals; outliers are clipped.
 
         Args:
-            residual: one row for each channel.
-            order: of the filters.
-            floor: below which no whitened residual of a quantised reading can be.
+            residual: (n, N) residuals.
+            order: order of the filters.
+            floor: least standard deviation, by the quantisation of the readings.
 
         """
         made = []
@@ -87,7 +87,7 @@ class Noise:
         return cls(np.array(taps), np.maximum(sigma, floor))
 
     def whiten(self, residual: np.ndarray, channel: np.ndarray) -> np.ndarray:
-        """(B, N) residuals of channels (B,) to unit variance; samples without a past become 0."""
+        """(B, N) residuals of channels (B,) with unit variance; their first samples are 0."""
         white = np.zeros_like(residual)
         for k in np.unique(channel):
             rows = channel == k

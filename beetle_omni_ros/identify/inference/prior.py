@@ -1,4 +1,4 @@
-"""What is known of a parameter beside the data."""
+"""Gaussian priors of fitted parameters."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 @dataclass(frozen=True)
 class Prior:
     """
-    Gaussian about ``centre``, for one parameter or for an array of them.
+    Gaussian prior about ``centre``, for one parameter or an array of them.
 
-    Within -below to above of the centre nothing is said but ``inner``, a very wide deviation.
+    It can have a flat range from ``below`` to ``above`` the centre with the deviation ``inner``.
 
     Attributes:
-        deviation: standard deviation; inf: nothing is known.
-        below: width of the free range on the low side.
-        above: on the high side.
-        inner: standard deviation within the free range.
+        deviation: standard deviation; inf: no prior.
+        below: width of the flat range on the low side.
+        above: width of the flat range on the high side.
+        inner: standard deviation in the flat range, usually very large.
         centre: most likely value.
 
     """
@@ -30,7 +30,7 @@ class Prior:
     centre: float | np.ndarray = 0.0
 
     def residual(self, x):
-        """How many standard deviations ``x`` lies off, and within the free range little."""
+        """Deviation of ``x`` from the prior in standard deviations."""
         off = x - self.centre
         out = np.maximum(off - self.above, 0.0) + np.minimum(off + self.below, 0.0)
         return out / self.deviation + off / self.inner
@@ -46,7 +46,7 @@ class Prior:
         return (self.residual(x)**2).sum(axis=-1)
 
     def within(self, x, deviations: float):
-        """``x``, or the nearest value that is no more than so many deviations off."""
+        """``x``, or the nearest value within so many standard deviations."""
         reach = deviations * self.deviation
         return np.clip(x, self.centre - self.below - reach, self.centre + self.above + reach)
 
@@ -60,13 +60,13 @@ def together(priors: dict[str, Prior], values: dict[str, float], names: list[str
     Slopes and residuals of the priors of several parameters.
 
     Args:
-        priors: by name.
-        values: by name; 0 where it is missing.
-        names: K of them.
-        free: of which nothing is known.
+        priors: priors by name.
+        values: values by name; default 0.
+        names: K names.
+        free: parameters whose priors are ignored.
 
     Returns:
-        (K,) and (K,); 0 where a parameter is free or has no prior.
+        (K,) and (K,); 0 for a parameter that is free or has no prior.
 
     """
     made = np.zeros((2, len(names)))

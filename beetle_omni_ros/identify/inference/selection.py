@@ -1,4 +1,4 @@
-"""Forward addition and backward removal of entries, however they are fitted and judged."""
+"""Forward selection and backward elimination, independent of fit and criterion."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ def grow(accepted: list[Entry], model: Model,
          join: Callable[[list[Entry], Trial], tuple[list[Entry], Model]],
          most: int) -> tuple[list[Entry], Model]:
     """
-    Add entries while one is worth it.
+    Add entries while one is accepted.
 
     Args:
         accepted: entries of the model.
-        model: fitted with them.
-        best: tries all others beside these; the trial that is worth it most, or None.
+        model: model fitted with them.
+        best: the best acceptable trial of another entry, or None.
         join: entries and fitted model with that trial.
-        most: entries.
+        most: largest number of entries.
 
     Returns:
-        Entries and model.
+        entries and model.
 
     """
     while (trial := best(accepted, model)) is not None and len(accepted) < most:
@@ -37,16 +37,16 @@ def prune(accepted: list[Entry], model: Model,
           worst: Callable[[list[Entry], Model], Entry | None],
           without: Callable[[list[Entry], Model, Entry], Model]) -> tuple[list[Entry], Model]:
     """
-    Drop entries while one is not needed.
+    Drop entries while one is superfluous.
 
     Args:
         accepted: entries of the model.
-        model: fitted with them.
+        model: model fitted with them.
         worst: the entry to drop, or None.
-        without: model fitted with the entries that stay; takes the one dropped, too.
+        without: model fitted with the remaining entries; its last argument is the dropped one.
 
     Returns:
-        Entries and model.
+        entries and model.
 
     """
     while accepted and (dropped := worst(accepted, model)) is not None:

@@ -1,8 +1,8 @@
 """
 Units, signs and orders of commands and encoders.
 
-Encoders follow tilt commands, and thrust commands push the body. The hypotheses are weighted as
-those of :mod:`~beetle_omni_ros.identify.recording.conventions`.
+Encoders follow tilt commands, and thrust commands accelerate the body. The hypotheses are
+weighted as in :mod:`~beetle_omni_ros.identify.recording.conventions`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ THRUST_UNITS = {1e3: 'in millinewtons, not N', 1e3 / 9.80665: 'in grams, not N',
 
 def joint_damages(recording: Recording, m: Motion, robot: RobotParameters,
                   limits: RecordingLimits) -> list[Damage]:
-    """What encoders and tilt commands show against each other."""
+    """Contradictions between encoders and tilt commands."""
     asked, read = (x - x.mean(axis=0) for x in (m.tilt_command, m.tilt))
     count, limit = 0.5 * len(m.t), robot.joints.position_limit
     moving = np.sqrt((np.gradient(asked, m.t, axis=0)**2).mean(axis=0)) > limits.least_motion[2]
@@ -63,10 +63,10 @@ def joint_damages(recording: Recording, m: Motion, robot: RobotParameters,
             swaps.append((i, j, sure))
         elif sign < 0:
             signs.append((i, sure))
-    return _joints_said(recording, m, robot, units, swaps, signs, unlike)
+    return _joint_damages_of(recording, m, robot, units, swaps, signs, unlike)
 
 
-def _joints_said(recording, m, robot, units, swaps, signs, unlike):
+def _joint_damages_of(recording, m, robot, units, swaps, signs, unlike):
     def damage(topic, cause, sure, fix=None, repair=None):
         can = fix and sure >= CERTAIN
         return [Damage(recording.name, topic, cause, None, sure, fix if can else None,
@@ -111,16 +111,16 @@ def _joints_said(recording, m, robot, units, swaps, signs, unlike):
 
 def thrust_damages(recording: Recording, m: Motion, robot: RobotParameters,
                    limits: RecordingLimits) -> list[Damage]:
-    """What thrust commands and the accelerometer show against each other."""
+    """Contradictions between thrust commands and the accelerometer."""
     pushed, felt = (np.linalg.norm(x, axis=1) for x in (m.thrust_force, m.force))
     scale = float((pushed * felt).sum() / max((felt**2).sum(), 1e-12))
     unit = min(THRUST_UNITS, key=lambda u: abs(np.log(max(scale, 1e-9) / u)))
-    # Thrusts and accelerometer agree within some per cent; any other factor is another robot's.
+    # Thrusts and accelerometer agree within some per cent, unless the robot file is wrong.
     if not 1 / 3 < scale < 3 and 0.85 < scale / unit < 1.18:
         return [Damage(recording.name, 'command', f'commanded thrusts are {scale:.3g} times what '
                        f'the accelerometer feels: {THRUST_UNITS[unit]}?', None, 0.95)]
-    # Changes alone tell one rotor from another: a constant force or torque is a mass, a centre of
-    # mass or a rotor that differs from the file, and in hover another order can imitate it.
+    # Means are subtracted. A constant force or torque is an error of the robot file, and in hover
+    # another order of the rotors can have the same effect.
     measured = np.concatenate([m.force, 0.1 * m.turning], axis=1)
     measured -= measured.mean(axis=0)
     wrench = m.rotor_wrench * np.array([1, 1, 1, 0.1, 0.1, 0.1])[:, None]

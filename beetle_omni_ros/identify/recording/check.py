@@ -1,4 +1,4 @@
-"""All checks of one recording, and the repairs that they offer."""
+"""All checks of one recording, and repairs."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from beetle_omni_ros.identify.recording.motion import motion_of
 from beetle_omni_ros.identify.recording.readings import noise_damages, reading_damages
 from beetle_omni_ros.robot.parameters import RobotParameters
 
-MOST_REPAIRS = 6        # one after the other, each of which can uncover the next
+MOST_REPAIRS = 6        # successive; a repair can reveal another damage
 
 
 def damages(recording: Recording, robot: RobotParameters,
             limits: RecordingLimits | None = None) -> list[Damage]:
     """
-    Check a recording against itself.
+    Check a recording by redundant signals.
 
     Args:
-        recording: with every topic of ``NEEDED``.
-        robot: as believed; used for its geometry and joint limits only.
-        limits: of a sound recording; default the package's.
+        recording: recording with every topic of ``NEEDED``.
+        robot: parameters of the robot file; only geometry and joint limits are used.
+        limits: limits of a valid recording; default the package's.
 
     Returns:
-        what is wrong, the most fundamental kind of fault alone: values that jump and a clock that
-        is off hide units and axes. Empty for a sound recording.
+        damages of the most fundamental kind only, because jumping values and wrong clocks hide
+        wrong units and axes. Empty for a valid recording.
 
     """
     limits = limits or shipped()
@@ -46,7 +46,6 @@ def damages(recording: Recording, robot: RobotParameters,
 
 
 def _convention_damages(recording, robot, limits):
-    """Everything that sensors and commands show against each other."""
     m = motion_of(recording, robot, limits)
     if m is None:
         return []
@@ -59,15 +58,15 @@ def _convention_damages(recording, robot, limits):
 def repaired(recording: Recording, robot: RobotParameters,
              limits: RecordingLimits | None = None) -> tuple[Recording, list[str], list[Damage]]:
     """
-    Apply every correction that is certain, until none is offered any more.
+    Apply certain corrections until none is left.
 
     Args:
-        recording: as of :func:`damages`.
-        robot: as of :func:`damages`.
-        limits: as of :func:`damages`.
+        recording: see :func:`damages`.
+        robot: see :func:`damages`.
+        limits: see :func:`damages`.
 
     Returns:
-        the corrected recording, what was corrected in words, and the damages that remain.
+        corrected recording, descriptions of the corrections, remaining damages.
 
     """
     done: list[str] = []

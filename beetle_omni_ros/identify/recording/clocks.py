@@ -1,8 +1,8 @@
 """
-Clocks: each topic's stamps against their order, the times of recording, and the other topics.
+Checks of stamps: order, times of recording, and comparison of topics.
 
-A message's age is the time of recording less its stamp. A loaded computer makes all topics older
-at once, so an age counts only relative to the median age of the other topics at that moment.
+The age of a message is its time of recording minus its stamp. Computer load increases the age of
+all topics, so each age is compared with the median age of the other topics at that time.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from beetle_omni_ros.identify.recording.limits import RecordingLimits
 
 LEAST_BINS = 8
 FACTORS = {1e-9: 'nanoseconds', 1e-6: 'microseconds', 1e-3: 'milliseconds'}
-NORMAL = 1.4826         # standard deviations in a median absolute deviation
-MOMENT = 1e-6           # [s] below which stamps are the same
-FOLLOWING = 8           # stamps that must go on from a step of the clock
+NORMAL = 1.4826         # standard deviation over median absolute deviation
+MOMENT = 1e-6           # [s] below which stamps are equal
+FOLLOWING = 8           # stamps that must continue after a step of the clock
 
 
 def clock_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
-    """Everything that the stamps alone show to be wrong, at most one fault a topic."""
+    """Damages by stamps alone, at most one for each topic."""
     found = {}
     for topic in NEEDED:
         for check in (_advance, _order, _repeats):
@@ -32,14 +32,14 @@ def clock_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]
     ages = Ages(recording, limits)
     for topic in NEEDED:
         damage = ages.damage(topic)
-        # A step is better known from ages than from the order of stamps, a wrong unit is not.
+        # Ages determine a step better than the order of stamps does, but not a wrong unit.
         if damage and (topic not in found or 'goes back' in found[topic].cause):
             found[topic] = damage
     return list(found.values())
 
 
 def begin_of(recording: Recording) -> float:
-    """First stamp of the IMU [s], from which moments are told."""
+    """First stamp of the IMU [s], the origin of stated times."""
     t = recording.times['imu/data_raw']
     return float(t[0]) if len(t) else 0.0
 
@@ -50,7 +50,7 @@ def _damage(recording, topic, cause, at=None, **more):
 
 
 def _advance(recording, topic, limits):
-    """Stamps that stand still, or run in another unit."""
+    """Stamps that do not advance, or are in another unit."""
     t = recording.times[topic]
     steps = np.diff(t)
     ahead = steps[steps > 0]
@@ -118,11 +118,11 @@ def _repeats(recording, topic, limits):
 
 class Ages:
     """
-    Ages of all topics against each other over the time of recording.
+    Ages of all topics relative to each other over the time of recording.
 
     Args:
-        recording: with times of recording; without them nothing is found.
-        limits: of a sound recording.
+        recording: recording with times of recording; without them no damage is found.
+        limits: limits of a valid recording.
 
     """
 
@@ -148,7 +148,7 @@ class Ages:
                 for a, b in zip(cuts[:-1], cuts[1:], strict=True)])
 
     def relative(self, topic: str) -> np.ndarray:
-        """(bins,) age of a topic beyond the median age of the others [s]."""
+        """(bins,) age of a topic minus the median age of the others [s]."""
         others = np.array([m for name, m in self.medians.items() if name != topic])
         with np.errstate(all='ignore'):
             return self.medians[topic] - np.nanmedian(others, axis=0)
@@ -215,16 +215,16 @@ def change_point(values: np.ndarray) -> tuple[int, float, float, float]:
     Find the best single step in a series.
 
     Args:
-        values: (n,) finite.
+        values: (n,) finite values.
 
     Returns:
-        index of the first value after the step, the medians before and after it, and the standard
-        deviation of the values about these.
+        index of the first value after the step, medians before and after it, standard deviation
+        about these.
 
     """
     n = len(values)
     total, counts = np.cumsum(values - values.mean()), np.arange(1, n)
-    # Largest difference of means, weighted by how many stand behind each.
+    # Largest difference of means, weighted by their numbers of values.
     score = total[:-1]**2 * (1 / counts + 1 / (n - counts))
     inner = slice(1, n - 2) if n > 4 else slice(0, n - 1)
     split = int(np.argmax(score[inner])) + 1 + (inner.start or 0)

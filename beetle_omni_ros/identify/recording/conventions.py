@@ -1,10 +1,9 @@
 """
 Units and axes of IMU and MoCap, from the motion that both measure.
 
-Gyroscope and MoCap measure the same rate of turn. The accelerometer measures MoCap's second
-derivative less gravity. The conventions that people mix up are hypotheses, weighted by their
-likelihood with Gaussian errors of unknown size and by a prior against every deviation from the
-convention.
+Gyroscope and MoCap measure the same rate. The accelerometer measures MoCap's second derivative
+minus gravity. Each hypothesis is a combination of common mistakes. Its weight is the likelihood
+with Gaussian errors of unknown size, times a prior against each deviation from the convention.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from beetle_omni_ros.identify.recording.damage import (
     PRIOR,
 )
 from beetle_omni_ros.identify.recording.limits import RecordingLimits
-from beetle_omni_ros.identify.recording.motion import MEANINGS, Motion
+from beetle_omni_ros.identify.recording.motion import Motion, QUATERNIONS
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 RATE_UNITS = {1.0: '', 180 / np.pi: 'in degrees per second, not rad/s',
@@ -44,17 +43,17 @@ ONE = np.eye(3)
 
 
 @dataclass(frozen=True)
-class Meaning:
+class Convention:
     """
-    One way in which IMU and MoCap may be meant.
+    One hypothesis about the conventions of IMU and MoCap.
 
     Attributes:
-        quaternion: key of MEANINGS.
+        quaternion: key of QUATERNIONS.
         rate_axes: (3, 3) signed permutation from MoCap's rate to the gyroscope's.
         rate_unit: key of RATE_UNITS, or another factor.
-        force_axes: (3, 3) likewise of the accelerometer.
+        force_axes: (3, 3) signed permutation of the accelerometer.
         force_unit: key of FORCE_UNITS.
-        up: (3,) MoCap's axis that points up.
+        up: (3,) upward axis of MoCap.
         length_unit: key of LENGTH_UNITS.
         position_axes: (3, 3) signed permutation of MoCap's positions alone.
 
@@ -70,69 +69,69 @@ class Meaning:
     position_axes: np.ndarray
 
     def rate(self, m: Motion) -> np.ndarray:
-        """(N, 3) what the gyroscope should say."""
+        """(N, 3) expected readings of the gyroscope."""
         return self.rate_unit * m.seen_rate[self.quaternion] @ self.rate_axes.T
 
     def force(self, m: Motion, gravity: float) -> np.ndarray:
-        """(N, 3) what the accelerometer should say."""
-        push = _pushed(m, self.quaternion, self.position_axes) / self.length_unit
+        """(N, 3) expected readings of the accelerometer."""
+        push = _acceleration(m, self.quaternion, self.position_axes) / self.length_unit
         up = np.einsum('i,nij->nj', self.up, m.seen_up[self.quaternion])
         return self.force_unit * (push + gravity * up) @ self.force_axes.T
 
 
-USUAL = Meaning('', ONE, 1.0, ONE, 1.0, UPS[0], 1.0, ONE)
+USUAL = Convention('', ONE, 1.0, ONE, 1.0, UPS[0], 1.0, ONE)
 
 
-def _pushed(m, meaning, axes):
-    """MoCap's acceleration (N, 3) in the body's axes, positions' axes exchanged first."""
+def _acceleration(m, convention, axes):
+    """MoCap's acceleration (N, 3) in body axes, with exchanged axes of the positions."""
     if axes is ONE:
-        return m.seen_push[meaning].sum(axis=1)
-    # Row i of seen_push is acceleration i along world axis i: divide the axis out and exchange.
-    made = np.zeros_like(m.seen_push[meaning][:, 0])
+        return m.seen_acceleration[convention].sum(axis=1)
+    # Row i of seen_push is acceleration component i times world axis i.
+    made = np.zeros_like(m.seen_acceleration[convention][:, 0])
     for i in range(3):
         j = int(np.argmax(np.abs(axes[i])))
-        made += axes[i, j] * _along(m, meaning, j, i)
+        made += axes[i, j] * _along(m, convention, j, i)
     return made
 
 
-def _along(m, meaning, source, target):
-    """MoCap's acceleration along world axis ``source``, laid along ``target``, in body axes."""
-    up = m.seen_up[meaning]
-    size = np.einsum('nj,nj->n', m.seen_push[meaning][:, source], up[:, source])
+def _along(m, convention, source, target):
+    """MoCap's acceleration component ``source`` along world axis ``target``, in body axes."""
+    up = m.seen_up[convention]
+    size = np.einsum('nj,nj->n', m.seen_acceleration[convention][:, source], up[:, source])
     return size[:, None] * up[:, target]
 
 
 def body_damages(recording: Recording, m: Motion, robot: RobotParameters,
                  limits: RecordingLimits) -> list[Damage]:
-    """What IMU and MoCap show against each other."""
+    """Contradictions between IMU and MoCap."""
     usual_rate, usual_force = _errors(m, USUAL, robot)
-    lively = np.sqrt((m.rate**2).sum(axis=1).mean()) > limits.least_motion[0]
+    moving = np.sqrt((m.rate**2).sum(axis=1).mean()) > limits.least_motion[0]
     fine = 1 - limits.least_agreement
     far = limits.unit_factor**2
     rate_size, seen_size = (np.sqrt((x**2).sum(axis=1).mean())
                             for x in (m.rate, m.seen_rate['']))
-    lively |= bool(seen_size > limits.least_motion[0])
-    rate_bad = lively and (usual_rate.sum() > fine * (m.rate**2).sum()
+    moving |= bool(seen_size > limits.least_motion[0])
+    rate_bad = moving and (usual_rate.sum() > fine * (m.rate**2).sum()
                            or not 1 / far < (rate_size / seen_size)**2 < far)
     force_bad = usual_force.sum() > 0.25 * fine * (m.force**2).sum()
     parts = _parts(len(m.t), limits.blocks)
-    parted = lively and any(
+    parted = moving and any(
         usual_rate[k].sum() > 2 * fine * (m.rate[k]**2).sum()
         and (m.rate[k]**2).sum() > limits.least_motion[0]**2 * len(usual_rate[k])
         or usual_force[k].sum() > fine * (m.force[k]**2).sum() for k in parts)
     if not (rate_bad or force_bad or parted):
         return _position_axes(recording, m, robot, limits)
-    whole, sure = _likeliest(m, robot, slice(None), lively)
-    if _explains(m, whole, robot, lively, limits):
-        return _said(recording, m, whole, sure, None, robot, limits)
-    return _position_axes(recording, m, robot, limits) or _on_the_way(
-        recording, m, robot, limits, parts, lively, usual_rate, usual_force)
+    whole, sure = _most_likely(m, robot, slice(None), moving)
+    if _explains(m, whole, robot, moving, limits):
+        return _damages_of(recording, m, whole, sure, None, robot, limits)
+    return _position_axes(recording, m, robot, limits) or _in_a_part(
+        recording, m, robot, limits, parts, moving, usual_rate, usual_force)
 
 
-def _errors(m, meaning, robot):
+def _errors(m, convention, robot):
     """Squared errors (N,) of rates and of forces."""
-    return (((m.rate - meaning.rate(m))**2).sum(axis=1),
-            ((m.force - meaning.force(m, robot.gravity))**2).sum(axis=1))
+    return (((m.rate - convention.rate(m))**2).sum(axis=1),
+            ((m.force - convention.force(m, robot.gravity))**2).sum(axis=1))
 
 
 def _parts(count, blocks):
@@ -140,24 +139,24 @@ def _parts(count, blocks):
     return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
 
 
-def _explains(m, meaning, robot, lively, limits, part=slice(None)):
-    rate, force = _errors(m, meaning, robot)
+def _explains(m, convention, robot, moving, limits, part=slice(None)):
+    rate, force = _errors(m, convention, robot)
     good = force[part].sum() < 0.25 * (1 - limits.least_agreement) * (m.force[part]**2).sum()
-    return good and (not lively or rate[part].sum() < (1 - limits.least_agreement)
+    return good and (not moving or rate[part].sum() < (1 - limits.least_agreement)
                      * (m.rate[part]**2).sum())
 
 
-def _likeliest(m, robot, part, lively):
-    """The likeliest meaning of a part of the flight, and its probability."""
+def _most_likely(m, robot, part, moving):
+    """The most likely hypothesis for a part of the flight, and its probability."""
     count = 0.5 * len(m.t[part])    # independent samples of an axis, at twice the edge
     tried = []
-    for quaternion in MEANINGS:
+    for quaternion in QUATERNIONS:
         seen = m.seen_rate[quaternion][part]
-        rates = _matched(m.rate[part], seen, RATE_UNITS, count) if lively else [(0.0, ONE, 1.0)]
+        rates = _matched(m.rate[part], seen, RATE_UNITS, count) if moving else [(0.0, ONE, 1.0)]
         forces = []
         for up in UPS:
             lifted = np.einsum('i,nij->nj', up, m.seen_up[quaternion][part])
-            push = m.seen_push[quaternion][part].sum(axis=1)
+            push = m.seen_acceleration[quaternion][part].sum(axis=1)
             for length in LENGTH_UNITS:
                 expected = push / length + robot.gravity * lifted
                 price = PRIOR * ((length != 1.0) + (up is not UPS[0]))
@@ -167,7 +166,7 @@ def _likeliest(m, robot, part, lively):
         for score, axes, unit in rates:
             for other, force_axes, force_unit, up, length in forces[:40]:
                 price = PRIOR * (bool(quaternion) + (quaternion.startswith('inverse (')))
-                tried.append((score + other - price - _price(axes, force_axes), Meaning(
+                tried.append((score + other - price - _price(axes, force_axes), Convention(
                     quaternion, axes, unit, force_axes, force_unit, up, length, ONE)))
     tried.sort(key=lambda pair: -pair[0])
     scores = np.array([score for score, _ in tried])
@@ -176,7 +175,7 @@ def _likeliest(m, robot, part, lively):
 
 
 def _matched(measured, seen, units, count):
-    """(log likelihood, axes, unit) of every signed permutation and unit, the ten best."""
+    """(log likelihood, axes, unit) of the ten best signed permutations and units."""
     cross, size, total = measured.T @ seen, (seen**2).sum(), (measured**2).sum()
     made = []
     for unit in units:
@@ -189,33 +188,33 @@ def _matched(measured, seen, units, count):
 
 
 def _price(rate_axes, force_axes):
-    """Of one frame that is turned or mirrored, or of two mistakes."""
+    """Prior cost of one rotated or mirrored frame, or of two mistakes."""
     if rate_axes is ONE and force_axes is ONE:
         return 0.0
     same = np.allclose(rate_axes, np.linalg.det(force_axes) * force_axes)
     return PRIOR * (1 if same or rate_axes is ONE or force_axes is ONE else 2)
 
 
-def _on_the_way(recording, m, robot, limits, parts, lively, usual_rate, usual_force):
-    """A meaning that changes in flight, or none at all."""
+def _in_a_part(recording, m, robot, limits, parts, moving, usual_rate, usual_force):
+    """A hypothesis for a part of the flight only, or a contradiction without explanation."""
     best = None
     for part in parts:
-        meaning, sure = _likeliest(m, robot, part, lively)
-        if _same(meaning, USUAL) or not _explains(m, meaning, robot, lively, limits, part):
+        convention, sure = _most_likely(m, robot, part, moving)
+        if _same(convention, USUAL) or not _explains(m, convention, robot, moving, limits, part):
             continue
-        rate, force = _errors(m, meaning, robot)
+        rate, force = _errors(m, convention, robot)
         gain = sum((usual - new) / max(size, 1e-9) for usual, new, size in (
             (usual_rate, rate, (m.rate**2).sum()), (usual_force, force, (m.force**2).sum())))
-        after = np.cumsum(gain[::-1])[::-1]     # of the meaning from each sample on
+        after = np.cumsum(gain[::-1])[::-1]     # gain of the hypothesis from each sample on
         k = int(np.argmax(after))
         if best is None or after[k] > best[0]:
-            best = float(after[k]), k, meaning, sure
+            best = float(after[k]), k, convention, sure
     if best:
-        _, k, meaning, sure = best
+        _, k, convention, sure = best
         later = slice(k, len(m.t))
-        if _explains(m, meaning, robot, lively, limits, later):
-            return _said(recording, m, meaning, sure, m.t[k], robot, limits, repair=False)
-    scaled = _weightless(recording, m, robot) or _scaled(recording, m, robot, limits, lively)
+        if _explains(m, convention, robot, moving, limits, later):
+            return _damages_of(recording, m, convention, sure, m.t[k], robot, limits, repair=False)
+    scaled = _without_gravity(recording, m, robot) or _scaled(recording, m, robot, limits, moving)
     if scaled:
         return scaled
     rate_part = usual_rate.sum() / max((m.rate**2).sum(), 1e-12)
@@ -226,12 +225,12 @@ def _on_the_way(recording, m, robot, limits, parts, lively, usual_rate, usual_fo
                    'unexplained by the pose', None, 0.9)]
 
 
-def _weightless(recording, m, robot):
-    """An accelerometer from whose readings gravity was taken off."""
-    without = ((m.force - _pushed(m, '', ONE))**2).sum()
+def _without_gravity(recording, m, robot):
+    """An accelerometer whose driver subtracts gravity."""
+    without = ((m.force - _acceleration(m, '', ONE))**2).sum()
     usual = _errors(m, USUAL, robot)[1].sum()
-    share = robot.gravity**2 * len(m.t)     # of the squares, by gravity
-    # Vibration and the noise of a second derivative stay; nine tenths of gravity go.
+    share = robot.gravity**2 * len(m.t)     # part of the sum of squares by gravity
+    # A tenth is left for vibration and the noise of a second derivative.
     if without > 0.1 * share or not 0.5 * share < usual < 2 * share:
         return []
     felt = float(np.median(np.linalg.norm(m.force, axis=1)))
@@ -240,10 +239,10 @@ def _weightless(recording, m, robot):
                    'the driver takes gravity off', None, 0.9)]
 
 
-def _scaled(recording, m, robot, limits, lively):
-    """A factor that no unit has: a range setting, or a gain."""
+def _scaled(recording, m, robot, limits, moving):
+    """A factor of no known unit: a wrong range or gain."""
     made = []
-    expected = (('angular velocity', m.rate, USUAL.rate(m)) if lively else None,
+    expected = (('angular velocity', m.rate, USUAL.rate(m)) if moving else None,
                 ('linear acceleration', m.force, USUAL.force(m, robot.gravity)))
     for what, measured, seen in filter(None, expected):
         factor = float((measured * seen).sum() / max((seen**2).sum(), 1e-12))
@@ -262,63 +261,63 @@ def _same(a, b):
             (a.rate_axes, b.rate_axes), (a.force_axes, b.force_axes), (a.up, b.up)))
 
 
-def _said(recording, m, meaning, sure, at, robot, limits, repair=True):
-    """The deviations of a meaning from the usual one, in words."""
+def _damages_of(recording, m, convention, sure, at, robot, limits, repair=True):
+    """Deviations of a hypothesis from the conventions, as damages."""
     made = []
     moment = None if at is None else float(at) - begin_of(recording)
 
-    def say(topic, cause, fix=None, change=None):
+    def add(topic, cause, fix=None, change=None):
         can = fix and repair and sure >= CERTAIN and at is None
         made.append(Damage(recording.name, topic, cause, moment, sure, fix if can else None,
                            change if can else None))
 
-    if meaning.quaternion:
-        order, sign = MEANINGS[meaning.quaternion]
-        say('mocap/pose', 'the quaternion is stored as ' + (
-            meaning.quaternion if meaning.quaternion.startswith('(')
-            else f'the {meaning.quaternion}, world seen from the body') +
+    if convention.quaternion:
+        order, sign = QUATERNIONS[convention.quaternion]
+        add('mocap/pose', 'the quaternion is stored as ' + (
+            convention.quaternion if convention.quaternion.startswith('(')
+            else f'the {convention.quaternion}, world seen from the body') +
             '; expected (x, y, z, w), the body seen from the world',
             'reorder the quaternion', columns_changed(3, 7, lambda v: v[:, order] * [sign] * 1.0
                                                   if sign > 0 else v[:, order] * [-1, -1, -1, 1]))
-    if meaning.length_unit != 1.0:
-        unit = meaning.length_unit
-        say('mocap/pose', f'positions accelerate {unit:.4g} times as much as the IMU measures: '
+    if convention.length_unit != 1.0:
+        unit = convention.length_unit
+        add('mocap/pose', f'positions accelerate {unit:.4g} times as much as the IMU measures: '
             f'{LENGTH_UNITS[unit]}?', 'scale the positions',
             columns_changed(0, 3, lambda v: v / unit))
-    if meaning.up is not UPS[0]:
-        k = int(np.argmax(np.abs(meaning.up)))
-        axis = f'{"-" if meaning.up[k] < 0 else ""}{AXES[k]}'
-        say('mocap/pose', f'the {axis} axis points up, against gravity as the accelerometer '
+    if convention.up is not UPS[0]:
+        k = int(np.argmax(np.abs(convention.up)))
+        axis = f'{"-" if convention.up[k] < 0 else ""}{AXES[k]}'
+        add('mocap/pose', f'the {axis} axis points up, against gravity as the accelerometer '
             'measures it; expected z up')
-    if meaning.rate_unit != 1.0:
-        unit = meaning.rate_unit
-        say('imu/data_raw', f"angular velocity is {unit:.3g} times the MoCap's: "
+    if convention.rate_unit != 1.0:
+        unit = convention.rate_unit
+        add('imu/data_raw', f"angular velocity is {unit:.3g} times the MoCap's: "
             f'{RATE_UNITS[unit]}?', 'scale the angular velocity',
             columns_changed(3, 6, lambda v: v / unit, 'imu/data_raw'))
-    if meaning.force_unit != 1.0:
-        unit = meaning.force_unit
-        say('imu/data_raw', f'linear acceleration is {unit:.3g} times what MoCap and gravity '
+    if convention.force_unit != 1.0:
+        unit = convention.force_unit
+        add('imu/data_raw', f'linear acceleration is {unit:.3g} times what MoCap and gravity '
             f'make: {FORCE_UNITS[unit]}?', 'scale the linear acceleration',
             columns_changed(0, 3, lambda v: v / unit, 'imu/data_raw'))
-    _say_axes(say, m, meaning, slice(None) if at is None else m.t >= at)
+    _add_axes(add, m, convention, slice(None) if at is None else m.t >= at)
     return made or [Damage(recording.name, 'imu/data_raw', 'angular velocity and linear '
                            'acceleration contradict mocap/pose', moment, sure)]
 
 
-def _say_axes(say, m, meaning, part):
-    """Frames that are turned or mirrored, and signs."""
-    rate, force = meaning.rate_axes, meaning.force_axes
+def _add_axes(add, m, convention, part):
+    """Rotated or mirrored frames, and signs."""
+    rate, force = convention.rate_axes, convention.force_axes
     if rate is ONE and force is ONE:
         return
-    # An accelerometer of the wrong sign looks like a frame with all axes reversed.
+    # An accelerometer with the wrong sign looks like a frame with all axes reversed.
     if np.allclose(rate, np.linalg.det(force) * force) and not np.array_equal(force, -ONE):
         turned = np.linalg.det(force) > 0
-        topic = 'mocap/pose' if _thrust_agrees(m, meaning, part) else 'imu/data_raw'
+        topic = 'mocap/pose' if _thrust_agrees(m, convention, part) else 'imu/data_raw'
         how = f'axes are turned: {_axes_text(force)}' if turned else \
             f'the frame is left-handed: {_axes_text(force)}'
         whose = "the IMU's axes in those of the MoCap's body"
         fix = topic == 'imu/data_raw'
-        say(topic, f'{how} ({whose})', 'turn the axes back' if fix else None, columns_changed(
+        add(topic, f'{how} ({whose})', 'turn the axes back' if fix else None, columns_changed(
             0, 6, lambda v: np.concatenate([v[:, :3] @ force, v[:, 3:] @ rate], axis=1),
             'imu/data_raw'))
         return
@@ -335,12 +334,12 @@ def _say_axes(say, m, meaning, part):
                 + _axes_text(axes)
         else:
             how = f'has axes that are turned: {_axes_text(axes)}'
-        say('imu/data_raw', f'{what} {how}', 'exchange the axes', columns_changed(
+        add('imu/data_raw', f'{what} {how}', 'exchange the axes', columns_changed(
             *columns, lambda v, axes=axes: v @ axes, 'imu/data_raw'))
 
 
 def _axes_text(axes):
-    """Such as 'x is y, y is -x, z is z'."""
+    """Text such as 'x is y, y is -x, z is z'."""
     parts = []
     for k in range(3):
         j = int(np.argmax(np.abs(axes[k])))
@@ -348,19 +347,19 @@ def _axes_text(axes):
     return ', '.join(parts)
 
 
-def _thrust_agrees(m, meaning, part):
-    """Whether the accelerometer's axes are those that commanded thrusts push along."""
-    force, pushed = m.force[part] / meaning.force_unit, m.thrust_force[part]
+def _thrust_agrees(m, convention, part):
+    """Whether the accelerometer's axes agree with the direction of commanded thrusts."""
+    force, pushed = m.force[part] / convention.force_unit, m.thrust_force[part]
     usual = (force * pushed).sum()
-    turned = (force * (pushed @ meaning.force_axes.T)).sum()
+    turned = (force * (pushed @ convention.force_axes.T)).sum()
     return usual > turned
 
 
 def _position_axes(recording, m, robot, limits):
-    """Axes of positions alone that are exchanged or mirrored."""
+    """Exchanged or mirrored axes of the positions alone."""
     up = robot.gravity * m.seen_up[''][:, 2]
     push = m.force - up
-    seen = _pushed(m, '', ONE)
+    seen = _acceleration(m, '', ONE)
     size = (seen**2).sum(axis=1).mean()
     if np.sqrt(size) < limits.least_motion[1]:
         return []
@@ -369,7 +368,7 @@ def _position_axes(recording, m, robot, limits):
         return []
     count, tried = 0.5 * len(m.t), []
     for axes in ALL_AXES:
-        left = ((push - _pushed(m, '', ONE if (axes == ONE).all() else axes))**2).sum()
+        left = ((push - _acceleration(m, '', ONE if (axes == ONE).all() else axes))**2).sum()
         tried.append((-1.5 * count * np.log(max(left / max((push**2).sum(), 1e-12), FLOOR))
                       - PRIOR * (not (axes == ONE).all()), axes, left))
     tried.sort(key=lambda one: -one[0])

@@ -1,4 +1,4 @@
-"""What is wrong with a recording, in words, with the moment and the probability."""
+"""A damage of a recording: cause in words, time and probability."""
 
 from __future__ import annotations
 
@@ -9,27 +9,26 @@ import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import Recording
 
-MOST_CERTAIN = 0.999    # no probability from a finite model is stated above this
-# A repair changes a recording in place of the user; only a cause this certain offers one.
-CERTAIN = 0.99
-PRIOR = 6.0             # logarithm of the odds against each deviation from a convention
-FLOOR = 1e-4            # part of a variance that no agreement of two sensors is below
+MOST_CERTAIN = 0.999    # largest stated probability
+CERTAIN = 0.99          # least probability of a cause for a repair
+PRIOR = 6.0             # log odds against each deviation from a convention
+FLOOR = 1e-4            # least relative variance of the difference of two sensors
 Repair = Callable[[Recording], Recording]
 
 
 @dataclass(frozen=True)
 class Damage:
     """
-    One fault of a recording.
+    One damage of a recording.
 
     Attributes:
         run: name of the recording.
-        topic: that is wrong.
-        cause: the likely cause in words, with the numbers that show it.
-        at_s: stamp of the onset, from the start of the recording [s]; None: all of it.
-        sure: probability of the cause among the causes that were compared, 0 to 1.
-        fix: what the repair does, in words; None where no correction is certain.
-        repair: function that makes a corrected recording, or None.
+        topic: damaged topic.
+        cause: likely cause in words, with the numbers that show it.
+        at_s: time of the onset after the first IMU message [s]; None: the whole recording.
+        sure: probability of the cause among the compared causes, 0 to 1.
+        fix: description of the repair; None without a certain correction.
+        repair: function that returns a corrected recording, or None.
 
     """
 
@@ -51,14 +50,14 @@ class Damage:
 def changed(recording: Recording, topic: str, times=None, values=None,
             keep=None) -> Recording:
     """
-    Return a copy of a recording with one topic changed.
+    Copy of a recording with one topic changed.
 
     Args:
-        recording: stays as it is.
-        topic: to change.
+        recording: original, not modified.
+        topic: topic to change.
         times: (N,) new stamps [s], or None.
         values: (N, width) new values, or None.
-        keep: (N,) mask or indices of the messages that stay, applied last; or None.
+        keep: (N,) mask or indices of the kept messages, applied last; or None.
 
     """
     made = replace(recording, times=dict(recording.times), values=dict(recording.values),
@@ -76,7 +75,7 @@ def changed(recording: Recording, topic: str, times=None, values=None,
 
 def columns_changed(first: int, last: int, change: Callable[..., np.ndarray],
                     topic: str = 'mocap/pose') -> Repair:
-    """A repair of some columns of a topic."""
+    """Repair of the columns ``first`` to ``last`` of a topic."""
     def repair(recording):
         values = recording.values[topic].copy()
         values[:, first:last] = change(values[:, first:last])

@@ -1,8 +1,7 @@
 """
-Clocks that stamps alone do not betray: one sensor's motion against another's, window by window.
+Clock errors that stamps alone do not show, by correlation of two sensors in time windows.
 
-What is compared does not depend on axes, signs or units: the rate of turn and the tilts' speed,
-both as magnitudes.
+The compared magnitudes of rate and tilt rate do not depend on axes, signs or units.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ from beetle_omni_ros.identify.recording.motion import (
 )
 
 LEAST_WINDOWS = 3       # to each side of a step
-MOST_SILENT = 0.15      # of a window
-LEAST_NOISE = 0.005     # [s] that windows of any flight scatter by
-SHARP = 0.9             # of the best correlation that a second, distant shift may reach
+MOST_SILENT = 0.15      # largest share of silence in a window
+LEAST_NOISE = 0.005     # [s] scatter of windows in any flight
+SHARP = 0.9             # largest correlation of a second, distant shift, relative to the best
 
 
 def lag_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
@@ -59,14 +58,14 @@ def lag_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
 def window_lags(t, late, early, limits: RecordingLimits,
                 gaps: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
-    Shifts by which one series follows another, in windows where both move alike.
+    Time shifts between two similar series, by windows.
 
     Args:
-        t: (N,) [s].
-        late: (N,) magnitude that follows.
-        early: (N,) magnitude that leads.
-        limits: window, reach and least likeness.
-        gaps: (N,) times at which a topic was silent, whose windows are left out.
+        t: (N,) times [s].
+        late: (N,) delayed magnitude.
+        early: (N,) leading magnitude.
+        limits: window, largest shift and least correlation.
+        gaps: (N,) mask of times in a gap, whose windows are ignored.
 
     Returns:
         middles (W,) of the windows [s], and shifts (W,) [s].
@@ -88,7 +87,7 @@ def window_lags(t, late, early, limits: RecordingLimits,
 
 
 def _shift(own, wide, place, likeness):
-    """Samples by which ``own``, at a place of ``wide``, follows it; None where that is unclear."""
+    """Samples by which ``own``, at ``place`` of ``wide``, follows it; None if ambiguous."""
     n = len(own)
     own = own - own.mean()
     size = np.sqrt((own**2).sum())
@@ -111,7 +110,7 @@ def _shift(own, wide, place, likeness):
 
 
 def _judged(recording, topic, other, what, whose, allowed, at, lags, limits):
-    """A step, or a lag outside its range."""
+    """A step, a drift, or a lag out of range."""
     if len(lags) < LEAST_WINDOWS:
         return None
 
@@ -153,7 +152,7 @@ def _judged(recording, topic, other, what, whose, allowed, at, lags, limits):
 
 
 def _onset(recording, topic, near, step, reach):
-    """A silence as long as the step, near the middle between two windows, else that middle [s]."""
+    """Start of a gap as long as the step near the middle of two windows, else that middle [s]."""
     stamps = series_of(recording, topic)[0]
     silences = np.diff(stamps)
     fits = (np.abs(stamps[:-1] - near) < reach) & (np.abs(silences - abs(step)) < 0.3 * abs(step))

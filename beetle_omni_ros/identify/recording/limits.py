@@ -1,4 +1,4 @@
-"""Limits within which a sound recording stays; the numbers stand in params/recording.yaml."""
+"""Limits of a valid recording; params/recording.yaml has their values and sources."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ class RecordingLimits:
     longest_period: float = parameter(
         low=0, unit='s', doc='Longest usual time between messages of a sensor.')
     repeated_stamps: float = parameter(
-        low=0, unit='1', doc='Largest part of a topic whose stamps occur twice.')
+        low=0, unit='1', doc='Largest share of repeated stamps of a topic.')
     disordered: float = parameter(
-        low=0, unit='1', doc='Largest part of a topic that is out of order.')
+        low=0, unit='1', doc='Largest share of messages of a topic out of order.')
     clock_offset: float = parameter(
         low=0, unit='s', doc='Largest difference of ages between topics.')
     clock_step: float = parameter(
         low=0, unit='s', doc='Largest change of an age within a recording.')
     clock_noise: float = parameter(
-        low=0, unit='1', doc='Standard deviations by which such a change must stand out.')
+        low=0, unit='1', doc='The same in standard deviations.')
     clock_bin: float = parameter(low=0, unit='s', doc='Time over which ages are compared.')
     lag_window: float = parameter(low=0, unit='s', doc='Time over which two motions are compared.')
-    lag_reach: float = parameter(low=0, unit='s', doc='Largest shift that is tried.')
+    lag_reach: float = parameter(low=0, unit='s', doc='Largest tried shift.')
     lag_likeness: float = parameter(
-        low=0, unit='1', doc='Least correlation of a shift that counts.')
+        low=0, unit='1', doc='Least correlation of an accepted shift.')
     sensor_lag: np.ndarray = parameter(shape=(2,), unit='s',
         doc='Range of the lag of MoCap behind the IMU.')
     servo_lag: np.ndarray = parameter(shape=(2,), unit='s',
         doc='Range of the lag of encoders behind commands.')
     lag_step: float = parameter(low=0, unit='s', doc='Largest change of a lag within a recording.')
     lag_noise: float = parameter(
-        low=0, unit='1', doc='Standard deviations by which such a change must stand out.')
+        low=0, unit='1', doc='The same in standard deviations.')
     full_scale: np.ndarray = parameter(shape=(2,), unit='',
         doc='Largest specific force [m/s^2] and rate [rad/s].')
     contact: float = parameter(low=0, unit='m', doc='Height below which spikes may be impacts.')
@@ -55,12 +55,12 @@ class RecordingLimits:
     frozen_command: float = parameter(
         low=0, unit='rad', doc='Motion of the command that an encoder must follow.')
     stale: float = parameter(
-        low=0, unit='1', doc='Largest part of readings that repeat the one before.')
+        low=0, unit='1', doc='Largest share of readings equal to the previous one.')
     clipped: float = parameter(
-        low=0, unit='1', doc='Largest part of readings at the largest value of an axis.')
-    outlier_window: int = parameter(low=0, unit='1', doc='Readings of the running median.')
+        low=0, unit='1', doc='Largest share of readings at the largest value of an axis.')
+    outlier_window: int = parameter(low=0, unit='1', doc='Readings of the median filter.')
     outlier_noise: float = parameter(
-        low=0, unit='1', doc='Standard deviations from the running median of an outlier.')
+        low=0, unit='1', doc='Least distance of an outlier from the median in sigma.')
     outlier_position: float = parameter(low=0, unit='m', doc='Least distance of an outlier.')
     outlier_angle: float = parameter(low=0, unit='rad', doc='Least angle of an outlier.')
     outlier_force: float = parameter(
@@ -68,9 +68,10 @@ class RecordingLimits:
     outlier_rate: float = parameter(low=0, unit='rad/s', doc='Least rate of an outlier.')
     outlier_joint: float = parameter(
         low=0, unit='rad', doc='Least angle of an outlier of an encoder.')
-    alternating: float = parameter(low=0, unit='1', doc='Part of outliers that means two sources.')
+    alternating: float = parameter(
+        low=0, unit='1', doc='Share of outliers from which two sources are interleaved.')
     jump_angle: float = parameter(
-        low=0, unit='rad', doc='Turn between two MoCap readings that the gyroscope must show.')
+        low=0, unit='rad', doc='Rotation between two MoCap readings that the gyroscope must show.')
     jump_position: float = parameter(
         low=0, unit='m', doc='Largest distance between two MoCap readings.')
     unit_length: float = parameter(
@@ -79,15 +80,15 @@ class RecordingLimits:
         doc='Largest white noise of specific force [m/s^2], rate [rad/s], MoCap position [m] and '
         'orientation [rad], and encoders [rad].')
     edge: float = parameter(
-        low=0, unit='Hz', doc='Low-pass edge of what two sensors are compared by.')
+        low=0, unit='Hz', doc='Low-pass edge of comparisons of two sensors.')
     least_motion: np.ndarray = parameter(shape=(3,), unit='',
-        doc='RMS of rate, acceleration and tilt rate that shows a convention.')
+        doc='Least RMS of rate, acceleration and tilt rate for the check of a convention.')
     least_agreement: float = parameter(
-        low=0, unit='1', doc='Least part of the variance of one sensor that another explains.')
+        low=0, unit='1', doc='Least share of the variance of one sensor that another explains.')
     unit_factor: float = parameter(low=0, unit='1', doc='Least factor of a wrong unit.')
-    blocks: int = parameter(low=0, unit='1', doc='Parts of a flight that are judged alone.')
+    blocks: int = parameter(low=0, unit='1', doc='Number of separately checked parts of a flight.')
     permuted: float = parameter(
-        low=0, unit='1', doc='Part of the squared error that another order of thrusts may leave.')
+        low=0, unit='1', doc='Largest ratio of squared errors for another order of the thrusts.')
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> RecordingLimits:
@@ -95,7 +96,7 @@ class RecordingLimits:
         Read a file of limits; default the shipped one.
 
         Raises:
-            ParameterError: naming file and key.
+            ParameterError: with file and key.
 
         """
         return schema.load(cls, path or share_path('params/recording.yaml'))
@@ -103,5 +104,5 @@ class RecordingLimits:
 
 @cache
 def shipped() -> RecordingLimits:
-    """Return the limits of the package."""
+    """Limits of the package."""
     return RecordingLimits.load()

@@ -1,4 +1,4 @@
-"""The same motion as each sensor tells it, on one grid and below one frequency."""
+"""The motion as each sensor measures it, on a common grid and with a common low-pass edge."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from beetle_omni_ros.identify.recording.limits import RecordingLimits
 from beetle_omni_ros.robot.parameters import RobotParameters
 
 GRID = 0.01             # [s]
-EVERY = 10              # grid points to each that is kept
-WIDE = 6.0              # [Hz] of a derivative before it is turned into another frame
-LEAST_TIME = 6.0        # [s] that all topics have in common
-LONGEST_GAP = 0.15      # [s] across which a straight line stands for a motion
-LEAST_SAMPLES = 40      # that remain beside such gaps
-# How the four numbers of an orientation may be meant, and which of the stored numbers are then
-# x, y, z and w.
-MEANINGS = {'': ((0, 1, 2, 3), 1.0), '(w, x, y, z)': ((1, 2, 3, 0), 1.0),
+EVERY = 10              # decimation
+WIDE = 6.0              # [Hz] edge of a derivative before its rotation into another frame
+LEAST_TIME = 6.0        # [s] common to all topics
+LONGEST_GAP = 0.15      # [s] for linear interpolation
+LEAST_SAMPLES = 40      # without such gaps
+# Convention of a stored quaternion -> indices of x, y, z and w, and sign of the vector part.
+QUATERNIONS = {'': ((0, 1, 2, 3), 1.0), '(w, x, y, z)': ((1, 2, 3, 0), 1.0),
             'inverse': ((0, 1, 2, 3), -1.0), 'inverse (w, x, y, z)': ((1, 2, 3, 0), -1.0)}
 
 
@@ -31,17 +30,17 @@ class Motion:
 
     Attributes:
         t: (N,) stamps [s].
-        rate: (N, 3) of the gyroscope [rad/s].
-        force: (N, 3) of the accelerometer [m/s^2].
-        seen_rate: meaning of the quaternion -> (N, 3) rate in the body's axes by MoCap [rad/s].
-        seen_up: meaning -> (N, 3, 3) world's axes x, y, z in the body's axes, one a row.
-        seen_push: meaning -> (N, 3, 3) acceleration along each world axis, as vectors in the
-            body's axes, one a row [m/s^2].
-        tilt: (N, 4) encoders [rad].
-        tilt_command: (N, 4) [rad].
+        rate: (N, 3) rates of the gyroscope [rad/s].
+        force: (N, 3) specific force of the accelerometer [m/s^2].
+        seen_rate: convention of the quaternion -> (N, 3) rate by MoCap in body axes [rad/s].
+        seen_up: convention -> (N, 3, 3) world axes x, y, z in body axes, one a row.
+        seen_push: convention -> (N, 3, 3) acceleration along each world axis, as vectors in body
+            axes, one a row [m/s^2].
+        tilt: (N, 4) encoder angles [rad].
+        tilt_command: (N, 4) commanded angles [rad].
         thrust_force: (N, 3) specific force by commanded thrusts at the measured tilts [m/s^2].
-        rotor_wrench: (N, 6, 4) what 1 N of each rotor gives: specific force, torque over inertia.
-        thrust: (N, 4) commanded, behind the rotors' lag [N].
+        rotor_wrench: (N, 6, 4) specific force and torque over inertia by 1 N of each rotor.
+        thrust: (N, 4) commanded thrusts after the rotor lag [N].
         turning: (N, 3) derivative of the gyroscope's rate [rad/s^2].
 
     """
@@ -51,7 +50,7 @@ class Motion:
     force: np.ndarray
     seen_rate: dict[str, np.ndarray]
     seen_up: dict[str, np.ndarray]
-    seen_push: dict[str, np.ndarray]
+    seen_acceleration: dict[str, np.ndarray]
     tilt: np.ndarray
     tilt_command: np.ndarray
     thrust_force: np.ndarray
@@ -61,7 +60,7 @@ class Motion:
 
 
 def series_of(recording: Recording, topic: str) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps (N,) ascending, each once, and finite values (N, width)."""
+    """Ascending unique stamps (N,) and finite values (N, width)."""
     t, values = recording.times[topic], recording.values[topic]
     fine = np.isfinite(t) & np.isfinite(values).all(axis=1)
     t, first = np.unique(t[fine], return_index=True)
@@ -69,7 +68,7 @@ def series_of(recording: Recording, topic: str) -> tuple[np.ndarray, np.ndarray]
 
 
 def common_grid(recording: Recording) -> np.ndarray | None:
-    """(N,) stamps that all topics have in common [s]; None where these are too few."""
+    """(N,) times that all topics have in common [s]; None if these are too few."""
     spans = [series_of(recording, topic)[0] for topic in NEEDED]
     if min(len(t) for t in spans) < 2:
         return None
@@ -80,14 +79,14 @@ def common_grid(recording: Recording) -> np.ndarray | None:
 
 
 def held(recording: Recording, topic: str, t: np.ndarray) -> np.ndarray:
-    """(N, width) values on a grid, straight between messages."""
+    """(N, width) values on a grid by linear interpolation."""
     stamps, values = series_of(recording, topic)
     return np.stack([np.interp(t, stamps, column) for column in values.T], axis=1)
 
 
 def motion_of(recording: Recording, robot: RobotParameters,
               limits: RecordingLimits) -> Motion | None:
-    """Smooth all topics alike; None where they have too little time in common."""
+    """Smooth all topics with the same filter; None if they have too little time in common."""
     grid = common_grid(recording)
     if grid is None:
         return None
@@ -101,13 +100,13 @@ def motion_of(recording: Recording, robot: RobotParameters,
     position = position[:len(t)]
     rates, ups, pushes = {}, {}, {}
     stamps, values = series_of(recording, 'mocap/pose')
-    for meaning, (order, sign) in MEANINGS.items():
+    for convention, (order, sign) in QUATERNIONS.items():
         q = _orientation(stamps, values[:, 3:][:, order] * [sign, sign, sign, 1.0], grid)
         rotation = matrices(q)
-        rates[meaning] = kernel(_body_rate(rotation)[inner])
+        rates[convention] = kernel(_body_rate(rotation)[inner])
         turned = rotation[inner]
-        ups[meaning] = kernel(turned)
-        pushes[meaning] = kernel(turned * position[:, :, None])
+        ups[convention] = kernel(turned)
+        pushes[convention] = kernel(turned * position[:, :, None])
     command = held(recording, 'command', grid)[inner]
     tilt = held(recording, 'joint_states', grid)[inner]
     wrench, thrust = _wrench(robot, tilt), _lagged(robot, command[:, 4:])
@@ -123,8 +122,8 @@ def motion_of(recording: Recording, robot: RobotParameters,
     def smooth(series):
         return part(kernel(series))
 
-    def parts(by_meaning):
-        return {meaning: part(series) for meaning, series in by_meaning.items()}
+    def parts(by_convention):
+        return {convention: part(series) for convention, series in by_convention.items()}
 
     return Motion(part(at), smooth(imu[inner, 3:]), smooth(imu[inner, :3]), parts(rates),
                   parts(ups), parts(pushes), smooth(tilt), smooth(command[:, :4]),
@@ -151,7 +150,7 @@ def _orientation(stamps, quaternion, grid):
 
 
 def _body_rate(rotation):
-    """(N, 3) rate of turn in the body's axes [rad/s] of rotations (N, 3, 3)."""
+    """(N, 3) rates in body axes [rad/s] of rotations (N, 3, 3)."""
     change = np.gradient(rotation, GRID, axis=0)
     skew = np.einsum('nji,njk->nik', rotation, change)
     return np.stack([skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0],
@@ -159,7 +158,7 @@ def _body_rate(rotation):
 
 
 def _wrench(robot, tilt):
-    """(N, 6, 4) specific force and torque over inertia, of 1 N of each rotor at tilts (N, 4)."""
+    """(N, 6, 4) specific force and torque over inertia by 1 N of each rotor at tilts (N, 4)."""
     made = np.empty((len(tilt), 6, 4))
     for i, axis in enumerate(robot.tilt_axes):
         level = np.cross(axis, [0.0, 0.0, 1.0])
@@ -171,6 +170,6 @@ def _wrench(robot, tilt):
 
 
 def _lagged(robot, thrust):
-    """(N, 4) thrusts behind the rotors' first-order lag [N]."""
+    """(N, 4) thrusts after the first-order rotor lag [N]."""
     keep = np.exp(-GRID / robot.rotors.time_constant)
     return lfilter([1 - keep], [1, -keep], thrust, axis=0, zi=keep * thrust[:1])[0]

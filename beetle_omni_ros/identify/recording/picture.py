@@ -1,4 +1,4 @@
-"""What a damaged topic says beside the one that it is compared with, over time."""
+"""Figure of a damaged topic and the topic that it is compared with."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from beetle_omni_ros.identify.recording.clocks import begin_of
 from beetle_omni_ros.identify.recording.damage import Damage
 from beetle_omni_ros.pages.figures import COLOURS, FAINT, legend, line, panels
 
-APART = 5       # MoCap readings between two orientations that make a rate of turn
+APART = 5       # MoCap readings between two orientations of a finite difference
 
 
 def damage_figure(recording: Recording, damage: Damage):
     """
-    Figure of the readings in question; a dashed line marks the onset.
+    Figure of the damaged readings; a dashed line marks the onset.
 
     Args:
-        recording: as it was read.
-        damage: one fault of it.
+        recording: uncorrected recording.
+        damage: one of its damages.
 
     """
     begin = begin_of(recording)
@@ -63,7 +63,7 @@ def _motion(recording, axes, begin):
 
 
 def _turning(t, quaternion):
-    """Times (n,) and size of the rate of turn (n,) [rad/s] that orientations (N, 4) show."""
+    """Times (n,) and magnitude of the rate (n,) [rad/s] of orientations (N, 4)."""
     with np.errstate(all='ignore'):
         unit = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
         cosine = np.clip(np.abs((unit[APART:] * unit[:-APART]).sum(axis=1)), 0, 1)

@@ -1,4 +1,4 @@
-"""Values that no working sensor gives: frozen, repeated, clipped, spikes, no unit quaternions."""
+"""Impossible readings: frozen, repeated, clipped, spikes, quaternions of wrong norm, noise."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ AXES = {'imu/data_raw': [f'linear_acceleration.{a}' for a in 'xyz']
         'joint_states': [f'position of gimbal{k}' for k in range(1, 5)]}
 LEAST_CLIPPED = 10      # readings
 DIFFERENCED = 20**0.5   # deviation of the third difference of white noise: 1 + 9 + 9 + 1
-MOST_REPAIRED = 0.02    # of a topic's readings: more outliers are no few bad readings
+MOST_REPAIRED = 0.02    # largest share of a topic's readings that a repair drops
 
 
 def reading_damages(recording: Recording, limits: RecordingLimits,
                     unclocked: Container[str] = ()) -> list[Damage]:
     """
-    Everything that single topics' values show to be wrong, at most one fault a topic.
+    Damages in the values of single topics, at most one for each topic.
 
     Args:
-        recording: with every topic of ``NEEDED``.
-        limits: of a sound recording.
-        unclocked: topics whose stamps are wrong, which are left out.
+        recording: recording with every topic of ``NEEDED``.
+        limits: limits of a valid recording.
+        unclocked: topics with wrong stamps, which are ignored.
 
     """
     found = {}
@@ -52,14 +52,14 @@ def reading_damages(recording: Recording, limits: RecordingLimits,
 
 def noise_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
     """
-    Sensors that scatter more than any of their kind, at most one fault a topic.
+    Sensors with unusually large noise, at most one damage for each topic.
 
-    The third difference of even readings removes smooth motion. Of white noise it has 20 times the
-    variance; its median does not care for single steps.
+    The third difference of equidistant readings removes smooth motion. Its variance is 20 times
+    that of white noise, and its median is robust against single steps.
 
     Args:
-        recording: whose units and axes are right: in millimetres every sensor is noisy.
-        limits: of a sound recording.
+        recording: recording with correct units and axes; in millimetres, noise would be too large.
+        limits: limits of a valid recording.
 
     """
     force, rate, place, turn, tilt = limits.scatter
@@ -85,7 +85,7 @@ def noise_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]
 
 
 class _Series:
-    """One topic in the order of its stamps, without readings that are no numbers."""
+    """One topic in the order of its stamps, with finite readings only."""
 
     def __init__(self, recording, topic):
         self.recording, self.topic = recording, topic
@@ -102,7 +102,7 @@ class _Series:
         return float(np.median(steps[steps > 0])) if (steps > 0).any() else np.inf
 
     def damage(self, cause, at=None, bad=None, fix=None):
-        """A fault; ``bad`` (n,) marks readings that a repair drops."""
+        """A damage; ``bad`` (n,) marks readings that the repair drops."""
         moment = None if at is None else max(0.0, float(at) - begin_of(self.recording))
         repair = None
         if bad is not None and fix:
@@ -114,14 +114,14 @@ class _Series:
 
 
 def _beyond(series, limits):
-    """Values beyond any sensor's range."""
+    """Values out of any sensor's range."""
     scale = {'imu/data_raw': [limits.full_scale[0]] * 3 + [limits.full_scale[1]] * 3,
              'mocap/pose': [limits.room] * 3 + [np.inf] * 4,
              'joint_states': [np.inf] * 4, 'command': [np.inf] * 8}[series.topic]
     size = np.abs(series.values)
     bad = (size > scale).any(axis=1) & ~_at_floor(series, limits) | (size > 1e5).any(axis=1)
     if not bad.any() or bad.mean() > MOST_REPAIRED:
-        return None         # a unit, if it is all of them
+        return None         # if all are too large, the unit is wrong
     k = int(np.argmax(bad))
     count = int(bad.sum())
     return series.damage(f'{count} spike{"s" if count > 1 else ""} beyond what the sensor can '
@@ -131,7 +131,7 @@ def _beyond(series, limits):
 
 
 def _at_floor(series, limits):
-    """(n,) readings of the IMU that an impact may have made."""
+    """(n,) IMU readings that an impact on the ground may explain."""
     if series.topic != 'imu/data_raw':
         return np.zeros(len(series.t), dtype=bool)
     pose = _Series(series.recording, 'mocap/pose')
@@ -139,7 +139,7 @@ def _at_floor(series, limits):
 
 
 def _norms(series, limits):
-    """Quaternions that are no rotations."""
+    """Quaternions whose norm is not 1."""
     norm = np.linalg.norm(series.values[:, 3:], axis=1)
     zero = norm < 0.1
     if zero.any():
@@ -161,7 +161,7 @@ def _norms(series, limits):
 
 
 def _outliers(series, limits):
-    """Readings far from a running median of their neighbours."""
+    """Readings far from the median of their neighbours."""
     width = limits.outlier_window
     values = series.values
     if series.topic == 'mocap/pose':
@@ -175,7 +175,7 @@ def _outliers(series, limits):
         count = moved[moved > 1e-6].min(initial=10.0)       # of the encoder, in its unit
         floor = [max(limits.outlier_joint, 3 * count)] * 4
     off = np.abs(values - median_filter(values, size=(width, 1), mode='nearest'))
-    # By the usual step there, too: a reading in another unit is none, whatever its noise.
+    # Compared with the usual step there, so that a wrong unit does not make outliers.
     steps = np.abs(np.diff(values, axis=0, prepend=values[:1]))
     usual = median_filter(steps, size=(2 * width + 1, 1), mode='nearest')
     noise = NORMAL * np.maximum(np.median(off, axis=0), usual)
@@ -197,12 +197,12 @@ def _outliers(series, limits):
 
 
 def _alternating(series, limits):
-    """Positions that go to and fro from one message to the next, farther than noise."""
+    """Positions that jump to and fro between messages, farther than noise."""
     steps = np.diff(series.values[:, :3], axis=0)
     size = np.linalg.norm(steps, axis=1)
     cosine = (steps[1:] * steps[:-1]).sum(axis=1) / np.maximum(size[1:] * size[:-1], 1e-12)
     back = (cosine < -0.8) & (size[1:] > limits.outlier_position / 3)
-    # Noise turns back in a third of its steps, motion hardly ever.
+    # Noise reverses direction in a third of its steps, motion hardly ever.
     if back.mean() < 0.6:
         return None
     return series.damage(f'{back.mean():.0%} of the positions jump to and fro by '
@@ -211,7 +211,7 @@ def _alternating(series, limits):
 
 
 def _stale(series, limits):
-    """Readings that repeat the one before, here and there."""
+    """Single readings equal to the previous one."""
     same = (np.diff(series.values, axis=0) == 0).all(axis=1)
     runs = _runs(same)
     short = sum(length for _, length in runs if length < 10)
@@ -225,7 +225,7 @@ def _stale(series, limits):
 
 
 def _frozen(series, limits):
-    """Equal readings for long, of all axes or of one."""
+    """Equal readings for a long time, of all axes or of one."""
     same = np.diff(series.values, axis=0) == 0
     period = series.period
     for what, columns, longest in (
@@ -248,7 +248,7 @@ def _runs(mask):
 
 
 def _clipped(series, limits):
-    """A largest value that occurs again and again."""
+    """An extreme value that occurs repeatedly."""
     for k, column in enumerate(series.values.T):
         for word, extreme in (('largest', column.max()), ('smallest', column.min())):
             at = column == extreme
@@ -262,7 +262,7 @@ def _clipped(series, limits):
 
 
 def _jumps(series, limits):
-    """Poses that leap and stay, which the gyroscope does not show."""
+    """Poses that jump and stay, without a rate of the gyroscope."""
     position = series.values[:, :3]
     q = series.values[:, 3:] / np.linalg.norm(series.values[:, 3:], axis=1, keepdims=True)
     angle = 2 * np.arccos(np.clip(np.abs((q[1:] * q[:-1]).sum(axis=1)), 0, 1))
@@ -273,10 +273,10 @@ def _jumps(series, limits):
     rate = np.linalg.norm(imu.values[:, 3:], axis=1)
     between = 0.5 * (series.t[1:] + series.t[:-1])
     turned = np.interp(between, imu.t, rate) * steps
-    # Gyroscopes in degrees per second show more than there is, and never less.
+    # A gyroscope in degrees per second reads too much, never too little.
     jump = usual & (angle > limits.jump_angle) & (turned < 0.5 * angle)
     spread = float(np.median(leap[usual])) if usual.any() else 0.0
-    # In millimetres every step is large.
+    # Relative to the usual step, because in millimetres every step is large.
     far = usual & (leap > max(limits.jump_position, 20 * spread))
     bad = jump | far
     if not bad.any() or bad.mean() > limits.alternating:
@@ -289,10 +289,10 @@ def _jumps(series, limits):
 
 
 def _stuck(series, limits):
-    """An encoder that rests while its command moves."""
+    """An encoder at rest while its command moves."""
     command = _Series(series.recording, 'command')
     if len(command.t) < 2 or np.abs(command.values[:, :4]).max() > 4 * np.pi:
-        return None         # no angles in radians, which is judged later
+        return None         # not in radians, which a later check reports
     steps = max(1, round(limits.frozen_joint / series.period))
     for k in range(4):
         same = np.diff(series.values[:, k]) == 0

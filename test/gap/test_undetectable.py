@@ -21,7 +21,7 @@ def test_the_ground_shows_near_the_ground_alone(higher, seen):
     made = model(motion.flight())
     problem = Problem([made], KEYS, tolerances(P), P)
     state = problem.state({}, [name for name, key in KEYS.items() if not key.form])
-    visible = visibility(problem, state, list(problem.beliefs), candidates(KEYS, [made]))
+    visible = visibility(problem, state, list(problem.priors), candidates(KEYS, [made]))
     assert {'ground_effect', 'tilt_thrust_loss', 'propeller_gyroscopic_torque'} <= set(visible)
     a = Analysis(visible=visible)
     assert ('ground_effect' not in not_met(a, P)) == seen

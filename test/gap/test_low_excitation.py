@@ -1,4 +1,4 @@
-"""Flights that hardly move: what a controller answers to gusts must not pass for an effect."""
+"""Low excitation: closed-loop bias by gusts must not pass for an effect."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,7 +9,7 @@ import pytest
 
 from beetle_omni_ros.identify.gap.analysis import Analysis
 from beetle_omni_ros.identify.gap.candidates import Candidate, Found, Trial
-from beetle_omni_ros.identify.gap.certainty import liveliness, Visibility
+from beetle_omni_ros.identify.gap.certainty import excitation, Visibility
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.noise import Noise
@@ -38,10 +38,10 @@ def decided(accepted, still, rivals=(), everything=700.0):
     names = [n for t in accepted for n in t.candidate.keys]
     state = SimpleNamespace(names=names)
     found = Found(accepted=list(accepted), state=state, cost=(1000.0, 700.0, everything),
-                  still=still, rivals={t.candidate.label: list(rivals) for t in accepted})
+                  low_excitation=still, rivals={t.candidate.label: list(rivals) for t in accepted})
     a = Analysis(keys=KEYS, found=found, rest=NOTHING,
                  visible={'mass': Visibility(50.0, {}), 'rotor_drag': Visibility(1.0, {})})
-    a.problem = SimpleNamespace(time=np.zeros(1000), beliefs={})
+    a.problem = SimpleNamespace(time=np.zeros(1000), priors={})
     decide(a, P)
     return a
 
@@ -63,22 +63,22 @@ def hovering(push=0.0):
     return replace(flight, pose=pose)
 
 
-def test_a_planned_motion_is_lively():
-    assert liveliness(problem(MOTION.flight())) > 3 * P.least_liveliness
+def test_a_planned_motion_has_excitation():
+    assert excitation(problem(MOTION.flight())) > 3 * P.least_liveliness
 
 
-def test_a_robot_that_its_gusts_push_is_still():
+def test_a_robot_that_gusts_push_has_low_excitation():
     hover = problem(hovering(push=0.1))
     hover.noise = replace(hover.noise, sigma={
         **hover.noise.sigma, 'B': np.array([0.1] * 3 + [0.2] * 3)})
-    assert liveliness(hover) < P.least_liveliness
+    assert excitation(hover) < P.least_liveliness
 
 
-def test_the_same_motion_in_a_storm_is_no_longer_lively():
+def test_excitation_falls_with_the_gusts():
     made = problem(MOTION.flight())
-    calm = liveliness(made)
+    calm = excitation(made)
     made.noise = replace(made.noise, sigma={**made.noise.sigma, 'B': 10 * made.noise.sigma['B']})
-    assert liveliness(made) == pytest.approx(calm / 10)
+    assert excitation(made) == pytest.approx(calm / 10)
 
 
 def test_spread_is_that_of_the_coloured_noise():
@@ -87,7 +87,7 @@ def test_spread_is_that_of_the_coloured_noise():
         2.0 / np.sqrt(1 - 0.9**2), rel=0.02)
 
 
-def test_a_still_flight_names_no_force_but_says_what_would_decide():
+def test_low_excitation_names_no_force_but_says_what_would_decide():
     rival = trial('mass', 'mass.mass')
     a = decided([thrust()], True, [rival])
     assert (a.verdict, a.accepted) == ('not_decidable', [])
@@ -96,17 +96,17 @@ def test_a_still_flight_names_no_force_but_says_what_would_decide():
     assert 'large turns' in a.experiment and 'weigh the robot' in a.experiment
 
 
-def test_a_still_flight_is_not_unknown_for_what_gusts_leave():
+def test_low_excitation_is_not_unknown_for_what_gusts_leave():
     assert decided([thrust()], True, everything=100.0).verdict == 'not_decidable'
     assert decided([thrust()], False, everything=100.0).verdict == 'unknown'
 
 
-def test_the_same_finding_in_a_lively_flight_is_named():
+def test_the_same_finding_with_excitation_is_named():
     a = decided([thrust()], False)
     assert (a.verdict, len(a.accepted)) == ('named', 1)
 
 
-def test_encoders_decide_about_servos_in_a_still_flight_too():
+def test_encoders_decide_about_servos_in_low_excitation_too():
     a = decided([servo()], True)
     assert (a.verdict, a.accepted[0].candidate.name) == ('named', 'joint_command_latency')
     both = decided([thrust(), servo()], True)
@@ -114,29 +114,29 @@ def test_encoders_decide_about_servos_in_a_still_flight_too():
     assert [t.candidate.name for t in both.accepted] == ['joint_command_latency']
 
 
-def test_a_still_flight_without_a_finding_is_not_decidable():
+def test_low_excitation_without_a_finding_is_not_decidable():
     a = decided([], True)
     assert a.verdict == 'not_decidable' and 'large turns' in a.experiment
 
 
 @pytest.mark.parametrize('lively, expected', [(5.0, 2), (0.5, 1)])
-def test_one_explanation_of_a_still_flight_is_enough(monkeypatch, lively, expected):
+def test_one_explanation_of_low_excitation_is_enough(monkeypatch, lively, expected):
     first, second = thrust(), trial('wind', 'wind.force[2]')
     search = Search(problem(MOTION.flight()), [first.candidate, second.candidate])
     search._proposals = SimpleNamespace(fit_more=list)
     state = SimpleNamespace(theta={}, r=np.zeros(1), slopes=np.zeros((1, 0)), names=[])
     module = 'beetle_omni_ros.identify.gap.search.'
-    monkeypatch.setattr(module + 'liveliness', lambda problem: lively)
+    monkeypatch.setattr(module + 'excitation', lambda problem: lively)
     monkeypatch.setattr(module + 'State', lambda *rest: state)
-    monkeypatch.setattr(Search, '_settle', lambda self, theta, rest: (state, 100.0))
-    monkeypatch.setattr(Search, '_floor', lambda self, state: 0.0)
+    monkeypatch.setattr(Search, '_fit_with_noise', lambda self, theta, rest: (state, 100.0))
+    monkeypatch.setattr(Search, '_cost_of_all', lambda self, state: 0.0)
     monkeypatch.setattr(Search, '_refit', lambda self, *rest: (state, 100.0))
     monkeypatch.setattr(Search, '_prune', lambda self, found, state, cost: (state, cost))
     monkeypatch.setattr(Search, '_find_rivals', lambda *rest: None)
-    monkeypatch.setattr(Search, '_step', lambda self, state, cost, taken: [
+    monkeypatch.setattr(Search, '_propose', lambda self, state, cost, taken: [
         t for t in (first, second) if t.candidate in self.candidates
         and t.candidate not in taken])
-    monkeypatch.setattr(Search, '_judge', lambda self, trials, *rest: next(iter(trials), None))
+    monkeypatch.setattr(Search, '_select', lambda self, trials, *rest: next(iter(trials), None))
     found = search.run()
-    assert (len(found.accepted), found.still) == (expected, lively < 1)
+    assert (len(found.accepted), found.low_excitation) == (expected, lively < 1)
     assert len(search.candidates) == 2      # all of them are tried as rivals
