@@ -173,7 +173,8 @@ def rows():
     for value, said in (('times.csv', 'times.csv'), ('one_joint.csv', 'one_joint.csv'),
                         ('word_joint.csv', 'word_joint.csv')):
         yield ['identify', 'joint', value], said
-    yield ['identify', 'joint', 'times.csv', 'more.csv'], 'more.csv: one log is identified from'
+    yield (['identify', 'joint', 'times.csv', 'more.csv'],
+           'more.csv: the identification uses one log')
     for option, value, said in (
             ('--seconds', '0', "--seconds '0': expected"), ('--seconds', 'x', "--seconds 'x'"),
             ('--seconds', 'nan', "--seconds 'nan'"), ('--skip', 'legs', "--skip 'legs': expected"),

@@ -1,8 +1,8 @@
 """
 The `beetle_omni` command.
 
-Every subcommand imports what it needs when it runs, so that `--help` is quick and an
-analysis needs no ROS. Unusable input ends with status 2 and one line on standard error.
+A subcommand imports its modules when it runs, so that `--help` is fast and an analysis needs no
+ROS. Unusable input gives status 2 and one line on standard error.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from beetle_omni_ros.cli.options import fail, INTERRUPTED, refuse_empty, UNUSABL
 from beetle_omni_ros.robot.resources import PACKAGE
 from beetle_omni_ros.robot.schema import ParameterError
 
-# Modules that come with ROS, or with the package's extra 'ros'; those of other extras.
+# Modules of ROS (also of the extra 'ros') and of the other extras of the package.
 ROS_MODULES, ROS_ENDINGS = ('rclpy', 'ament_index_python'), ('_msgs', '_srvs', '_interfaces')
 HARDWARE_MODULES = ('dynamixel_sdk', 'pymavlink', 'serial')
 TRAIN_MODULES = ('onnx', 'onnxscript', 'rsl_rl', 'tensorboard', 'tensordict', 'torch')
@@ -63,7 +63,7 @@ def main(args: list[str] | None = None) -> int:
         top = (error.name or '').partition('.')[0]
         if top == PACKAGE:
             raise
-        cure = 'pip install beetle_omni_ros brings it'
+        cure = 'pip install beetle_omni_ros'
         if top in ROS_MODULES or top.endswith(ROS_ENDINGS):
             cure = "source a ROS 2 Jazzy environment or pip install 'beetle_omni_ros[ros]'"
         elif top in HARDWARE_MODULES:
@@ -76,9 +76,9 @@ def main(args: list[str] | None = None) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return fail('interrupted', INTERRUPTED)
     except Exception as error:
-        # usage errors of typer's parser, and bag errors, without importing either for --help
+        # usage errors of typer's parser and bag errors; importing their types would slow --help
         if hasattr(error, 'format_message'):
-            text = usage_text(error, args)  # empty after the help of a bare `beetle_omni`
+            text = usage_text(error, args)  # empty after the help of `beetle_omni` alone
             return fail(text, UNUSABLE) if text else UNUSABLE
         if type(error).__name__ == 'BagError':
             return fail(error, UNUSABLE)

@@ -1,4 +1,4 @@
-"""Subcommands that fly or look at flights, and the list of controllers."""
+"""Subcommands for flights and their recordings, and the list of controllers."""
 
 from __future__ import annotations
 
@@ -362,7 +362,7 @@ def controllers(json_path: JsonOption = None):
 
 
 def _known(name):
-    """What is told of a controller; of one that cannot be loaded, why."""
+    """Properties of a controller, or the error of its import."""
     try:
         entry = registry.find(name)
     except ParameterError as error:

@@ -82,10 +82,10 @@ def joint(logs: Annotated[list[Path], typer.Argument(
 
     Example: beetle_omni identify joint slow.csv --validate fast.csv --report servos.html
     """
-    log, *more = logs      # `--validate a.csv b.csv` leaves b.csv here
+    log, *more = logs      # `--validate a.csv b.csv` puts b.csv here
     if more and not validate:
-        raise ParameterError(f'{more[0]}: one log is identified from; expected further ones after '
-                             '--validate')
+        raise ParameterError(f'{more[0]}: the identification uses one log; expected further logs '
+                             'after --validate')
     from beetle_omni_ros.identify.command import run_identify_joint
     run_identify_joint(log, validate=[*(validate or []), *more], robot=robot, report=report,
                        params=params, json_path=json_path)

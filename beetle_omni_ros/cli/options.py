@@ -14,7 +14,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 UNUSABLE, FAILED, INTERRUPTED = 2, 1, 130
 CONDITIONS = ('nominal', 'published')
 
-# Not those of other packages: --help looks for no installed package.
+# Without controllers of other packages, because --help does not search installed packages.
 KNOWN = f"{', '.join(registry.SHIPPED)}, any registered one, or package.module:Class"
 
 ControllerOption = Annotated[str, typer.Option(
@@ -76,8 +76,8 @@ def usage_text(error: Exception, args: list[str]) -> str:
     Text of a usage error of typer's parser: the given value, its option, the expected value.
 
     Args:
-        error: with ``format_message()``; a wrong value has ``param`` and ``ctx``.
-        args: of the command line, in which the value is searched.
+        error: error with ``format_message()``; for a wrong value with ``param`` and ``ctx``.
+        args: arguments of the command line, which contain the value.
 
     """
     text, context = error.format_message(), getattr(error, 'ctx', None)
@@ -87,7 +87,7 @@ def usage_text(error: Exception, args: list[str]) -> str:
     if type(error).__name__ == 'BadParameter' and names:
         given = [value for name, value in zip(args, args[1:]) if name in names] + [
             arg.partition('=')[2] for arg in args if arg.partition('=')[0] in names and '=' in arg]
-        # pydantic's words, of newer versions of typer
+        # remove pydantic's wording, of newer versions of typer
         wanted = str(error.message).partition(', unable')[0].replace('Input should be', 'expected')
         text = f"{names[0]} '{given[0]}': {wanted}." if given else text
     command = context.command_path if context else 'beetle_omni'
@@ -116,7 +116,7 @@ def check_flight(*, task, seed, conditions, bag, compression, json_path, files):
 
 
 def names(option: str, text: str | None) -> list[str] | None:
-    """Split a list of names; None stays None; an entry twice or none is a ParameterError."""
+    """Split a list of names; None stays None; no or equal entries are a ParameterError."""
     if text is None:
         return None
     found = [part.strip() for part in text.split(',') if part.strip()]

@@ -1,1 +1,1 @@
-"""Every published experiment for several controllers: one sweep of flights, one page."""
+"""Comparison of controllers in every published experiment: a sweep of flights and one page."""

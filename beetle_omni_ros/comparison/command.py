@@ -1,4 +1,4 @@
-"""`beetle_omni compare`: every experiment for several controllers, from nothing to the page."""
+"""`beetle_omni compare`: flies every experiment with several controllers and writes the page."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.json_file import write_json
 
 PAGE, NUMBERS, TEXT = 'comparison.html', 'comparison.json', 'README.md'
-HOW = '../how-to/comparison.md'     # from a folder in docs/ alone
-WIDE = 120  # characters of a terminal that takes all columns
-KEPT = '.flights'  # folder of finished flights in the output's, unless another is named
+HOW = '../how-to/comparison.md'     # link from a folder in docs/
+WIDE = 120  # columns of a terminal that shows the published numbers
+FLIGHTS = '.flights'  # default folder of finished flights, in the output folder
 
 
 def run_compare(*, output: Path, controllers: list[str] | None = None,
@@ -47,68 +47,69 @@ def run_compare(*, output: Path, controllers: list[str] | None = None,
                 cache: Path | None = None, fresh: bool = False, policy: Path | None = None,
                 json_path: Path | None = None, console: Console | None = None) -> dict:
     """
-    Fly what is missing, then write page, pictures and numbers.
+    Fly the missing flights, then write page, pictures and numbers.
 
     Arguments are the options of `beetle_omni compare`; None is their default.
 
     Returns:
-        What ``comparison.json`` holds.
+        content of ``comparison.json``.
 
     Raises:
-        ParameterError: unusable input; SweepError: workers were lost.
+        ParameterError: unusable input.
+        SweepError: a worker was lost.
 
     """
     console = console or Console()
-    wanted = controllers or registry.compared()
-    arguments = (wanted, tasks or TASKS, conditions or CONDITIONS, seeds)
+    names = controllers or registry.compared()
+    arguments = (names, tasks or TASKS, conditions or CONDITIONS, seeds)
     check_backend(backend)
-    plan(*arguments)  # refuses unusable input before anything is made
-    there, skipped = _available(wanted, policy, refuse=controllers is not None)
+    plan(*arguments)  # refuses unusable input before any work
+    available, skipped = _available(names, policy, refuse=controllers is not None)
     for name, reason in skipped.items():
         print(f'beetle_omni: {name} is left out: {reason}', file=sys.stderr)
-    flights = plan([entry.reference for entry in there], *arguments[1:], policy=policy)
+    flights = plan([entry.reference for entry in available], *arguments[1:], policy=policy)
     output = Path(output)
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ParameterError(f'{output}: cannot write there ({error.strerror})') from None
-    store = Store(cache or output / KEPT)
+    store = Store(cache or output / FLIGHTS)
     try:
         flown = _fly(flights, store, console, backend=backend, jobs=jobs, fresh=fresh,
                      address=address)
     except KeyboardInterrupt:
-        print(f'beetle_omni: finished flights are kept in {store.folder}; the same command goes '
-              'on from there', file=sys.stderr)
+        print(f'beetle_omni: finished flights are kept in {store.folder}; the same command '
+              'continues from there', file=sys.stderr)
         raise
-    results = _results(flown, arguments, [entry.name for entry in there], skipped, policy)
-    results['meta']['guidance'] = {entry.name: text for entry, text in there.items()}
+    results = _results(flown, arguments, [entry.name for entry in available], skipped, policy)
+    results['meta']['guidance'] = {entry.name: text for entry, text in available.items()}
     _write(results, flown, output, console)
     if json_path:
         write_json(json_path, results)
     return results
 
 
-def _available(wanted, policy, refuse):
+def _available(names, policy, refuse):
     """
-    Build each controller once, which also compiles what the workers would all compile.
+    Build each controller once, which also fills the cache of compiled code for the workers.
 
-    Returns the entries of those that can fly with their guidance in words, and the reason for
-    each other one; with ``refuse`` the first of these is raised instead.
+    Returns the entries that can fly with the text of their guidance, and the reason for each
+    other one. With ``refuse`` the first reason is raised instead.
     """
-    robot, there, skipped = RobotParameters.load(), {}, {}
+    robot, available, skipped = RobotParameters.load(), {}, {}
     learnt = registry.owner('--policy')
-    for entry in registry.find_all(wanted):
+    for entry in registry.find_all(names):
         try:
-            there[entry] = guidance_of(entry.make(robot, ControllerOptions(
+            available[entry] = guidance_of(entry.make(robot, ControllerOptions(
                 policy=policy if entry.name == learnt else None)))
         except (ParameterError, FileNotFoundError) as error:
             if refuse:
                 raise ParameterError(str(error)) from None
             skipped[entry.name] = ' '.join(str(error).split())
-    if policy and learnt not in {entry.name for entry in there}:
+    if policy and learnt not in {entry.name for entry in available}:
         raise ParameterError(f"--policy {policy}: for the controller '{learnt}', which does not "
                              'fly')
-    return there, skipped
+    return available, skipped
 
 
 def _fly(flights, store, console, **options):
@@ -148,23 +149,23 @@ def _line(flight, result, kept):
     return f"{flight.name}: {', '.join(parts)}"
 
 
-def _results(flown, arguments, there, skipped, policy):
-    """What the JSON holds; made of plain values only, so that it reads back equal."""
+def _results(flown, arguments, names, skipped, policy):
+    """Content of the JSON file, from plain values, so that it is equal after reading."""
     _, tasks, conditions, seeds = arguments
-    order = {name: k for k, name in enumerate((*tasks, *conditions, *there))}
+    order = {name: k for k, name in enumerate((*tasks, *conditions, *names))}
     flights = sorted(flown, key=lambda flight: (
         order[flight.task], order[flight.conditions], order[flight.controller], flight.seed))
     specs = {flight.controller: flight.spec for flight in flights if flight.spec}
-    references = [specs.get(name, name) for name in there]
+    references = [specs.get(name, name) for name in names]
     files = {name: policy_file(reference, policy)
-             for name, reference in zip(there, references, strict=True)}
+             for name, reference in zip(names, references, strict=True)}
     command = (f"beetle_omni compare --controllers {','.join(references)} "
                f"--tasks {','.join(tasks)} --conditions {','.join(conditions)}"
                + (f" --seeds {','.join(map(str, seeds))}" if seeds else '')
                + (f' --policy {policy}' if policy else ''))
     return {
         'meta': {'version': __version__, 'commit': commit(), 'command': command,
-                 'controllers': there, 'specs': specs, 'skipped': skipped, 'tasks': list(tasks),
+                 'controllers': names, 'specs': specs, 'skipped': skipped, 'tasks': list(tasks),
                  'conditions': list(conditions),
                  'seeds': sorted({flight.seed for flight in flights}),
                  'policy_file': str(policy) if policy else None,
@@ -215,7 +216,7 @@ def _write(results, flown, output, console):
 
 
 def _rich(grid: Grid, results: dict, width: int) -> Table:
-    """Table for the terminal, a narrow one without the published columns."""
+    """Table for the terminal, without the published columns if it is narrow."""
     shown = [k for k, column in enumerate(grid.columns)
              if column.group != 'published' or width >= WIDE]
     table = Table(title=grid.title, title_justify='left', title_style='bold', box=None,

@@ -1,4 +1,4 @@
-"""What decides the numbers of a flight, as a short text that changes with any of it."""
+"""Fingerprint of everything that determines the numbers of a flight."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from beetle_omni_ros.robot.resources import PACKAGE, share_path
 
 ROOMS = ('control', 'estimation', 'evaluation', 'robot', 'runs', 'safety', 'sim')
 LIBRARIES = ('casadi', 'filterpy', 'mujoco', 'numpy', 'onnxruntime', 'scipy')
-# What no other shipped controller reads: folders and files of the package, parameters.
+# Files and folders that only policies read.
 OF_POLICIES = ('control/guidance', 'control/observation.py', 'control/policy.py',
                'control/policy_file.py', 'control/policy_network.py', 'params/rl.yaml')
 NOT_FLOWN = ('gap.yaml', 'train.yaml')  # parameters that no flight reads
@@ -26,11 +26,10 @@ LENGTH = 16  # hexadecimal digits kept
 @cache
 def code_fingerprint(policy: bool = True) -> str:
     """
-    Digest of the code that flies and judges, its parameters and its libraries.
+    Digest of code, parameters and libraries of flights and their metrics.
 
     Args:
-        policy: whether a policy flies, or a controller of which that is not known; else without
-            what only policies are flown with.
+        policy: whether to include the code and parameters that only policies use.
 
     """
     package = Path(__file__).resolve().parents[1]
@@ -51,7 +50,7 @@ def code_fingerprint(policy: bool = True) -> str:
 
 
 def is_of_policies(path: Path) -> bool:
-    """Whether only policies read a file."""
+    """Whether only policies use a file."""
     there = f"/{'/'.join(path.parts[-3:])}"
     return any(there.endswith(f'/{part}') or f'/{part}/' in there for part in OF_POLICIES)
 
@@ -64,7 +63,7 @@ def _version(library):
 
 
 def file_digest(path: str | Path) -> str:
-    """Digest of a file's content; 'absent' without it."""
+    """Digest of a file's content; 'absent' without the file."""
     try:
         return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:LENGTH]
     except OSError:
@@ -76,11 +75,11 @@ def policy_file(controller: str, other: str | Path | None = None) -> Path | None
     Locate a controller's policy.
 
     Args:
-        controller: by which the registry finds it.
-        other: file in place of the shipped policy of the controller that `--policy` is for.
+        controller: name or class, as in the registry.
+        other: file that replaces the shipped policy, for the controller of `--policy`.
 
     Returns:
-        None for a controller that needs none, or whose file is absent.
+        None if the controller needs no policy or its file is absent.
 
     """
     if controller == registry.owner('--policy') and other:
@@ -93,7 +92,7 @@ def policy_file(controller: str, other: str | Path | None = None) -> Path | None
 
 
 def own_code(controller: str) -> str:
-    """Digest of the code of a controller that is not the package's own; '' for one that is."""
+    """Digest of the code of a controller outside the package; '' for a shipped one."""
     if controller in registry.SHIPPED:
         return ''
     file = Path(inspect.getfile(registry.find(controller).builder()))
@@ -106,7 +105,7 @@ def own_code(controller: str) -> str:
 
 
 def flight_key(flight: Flight) -> str:
-    """Digest of all that determines a flight's numbers."""
+    """Digest of everything that determines a flight's numbers."""
     entry, own = registry.find(flight.reference), own_code(flight.reference)
     parts = [code_fingerprint(bool(entry.policy_file or own)), flight.reference,
              flight.conditions, str(flight.seed)]
@@ -119,7 +118,7 @@ def flight_key(flight: Flight) -> str:
 
 
 def commit() -> str | None:
-    """Commit of the checkout, with '+' where files of it are changed; None outside one."""
+    """Commit of the checkout, with '+' if files are changed; None outside a checkout."""
     folder = Path(__file__).resolve().parents[2]
     if not (folder / '.git').exists():
         return None
@@ -133,6 +132,6 @@ def commit() -> str | None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of the package's code and of what it computes with."""
+    """Versions of the package, Python and the libraries."""
     return {PACKAGE: _version(PACKAGE), 'python': platform.python_version(),
             **{library: _version(library) for library in LIBRARIES}}

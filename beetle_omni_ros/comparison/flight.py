@@ -1,7 +1,7 @@
 """
-One flight of a comparison: flown, judged and thinned to what the page draws.
+One flight of a comparison, with its metrics and the samples for the figures.
 
-Runs in a worker, maybe on another computer; nothing here prints or writes.
+This runs in a worker, perhaps on another computer, and prints or writes nothing.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ from beetle_omni_ros.runs.metrics import metrics
 from beetle_omni_ros.runs.tasks import Task
 
 TRACE_PERIOD = 0.02  # [s] between samples of a trace
-LONG_TRACE_PERIOD = 0.05  # [s] the same in a task of many poses
-LONG = 300.0  # [s] of flight, above which a task counts as one of many poses
+LONG_TRACE_PERIOD = 0.05  # [s] between samples in a long task
+LONG = 300.0  # [s] shortest duration of a long task
 COMMAND_WINDOW = 2.0  # [s] of commands kept at the end of a flight
 
 
 def fly_flight(flight: Flight, task: Task, code: str | None = None) -> dict:
     """
-    Fly and judge; a flight that fails is a result too.
+    Fly a flight and compute its metrics; a failed flight has a result, too.
 
     Args:
-        flight: which.
-        task: its task, made where the pose file is.
-        code: fingerprint that this computer's code must have, so that a cluster's workers
-            cannot mix versions; None does not ask.
+        flight: the flight.
+        task: its task, made on the computer with the pose file.
+        code: required fingerprint of this computer's code, so that a cluster's workers cannot mix
+            versions; None: any.
 
     Returns:
         A dictionary with ``failure`` (None or one line), ``metrics`` (None or as in INTERFACES,
-        with ``steps``, how many times the controller was stepped), ``cpu_s``, ``host`` and
-        ``trace`` (name -> array, see :func:`trace`).
+        with ``steps``, the number of controller steps), ``cpu_s``, ``host`` and ``trace`` (name ->
+        array, see :func:`trace`).
 
     """
     start = time.process_time()
     result = {'failure': None, 'metrics': None, 'trace': {}, 'host': platform.node()}
     if code is not None and code != code_fingerprint():
         result['failure'] = (f'{platform.node()} has another version of the code or its '
-                             'parameters than the computer that asks')
+                             'parameters than the computer that started the sweep')
         return result
     try:
         robot = RobotParameters.load()
         with warnings.catch_warnings():
-            # A flight that goes wrong may overflow; it is judged by what came of it.
+            # An unstable flight may overflow; its metrics show the failure.
             warnings.simplefilter('ignore', RuntimeWarning)
             log = fly(flight.reference, task, robot=robot, plant=robot,
                       conditions=flight.conditions, seed=flight.seed,
@@ -69,7 +69,7 @@ def fly_flight(flight: Flight, task: Task, code: str | None = None) -> dict:
             result['trace'] = trace(log, task)
     except (FlightError, ParameterError) as error:
         result['failure'] = _line(error)
-    except Exception as error:  # whatever a controller does, the other flights go on
+    except Exception as error:  # the other flights continue after any failure of a controller
         result['failure'] = f'{type(error).__name__}: {_line(error)}'
     result['cpu_s'] = time.process_time() - start
     return result
@@ -81,13 +81,13 @@ def _line(error):
 
 def trace(log: FlightLog, task: Task) -> dict[str, np.ndarray]:
     """
-    Thin a flight to what figures show.
+    Samples of a flight for the figures.
 
     Returns:
         t (N,) since the first target [s], position (N, 3) [m], quaternion (N, 4), speed (N,)
         [m/s], rate (N,) [rad/s], position_error (N,) [m], orientation_error (N,) [deg], NaN
-        where no target was in force; and command_t (M,) [s], command_tilt (M, 4) [rad],
-        command_thrust (M, 4) [N] of the last 2 s.
+        without a target; and command_t (M,) [s], command_tilt (M, 4) [rad], command_thrust (M, 4)
+        [N] of the last 2 s.
 
     """
     if not log.targets:

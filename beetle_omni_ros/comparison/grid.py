@@ -1,8 +1,8 @@
 """
-Tables whose every number is looked up in the results, and how they become HTML and Markdown.
+Tables of numbers from the results, and their HTML and Markdown.
 
-A cell is a list of texts and numbers. A number names its place in the JSON, so that page and
-JSON cannot differ.
+A cell is a list of texts and numbers. A number is a path in the JSON, so that page and JSON
+cannot differ.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from beetle_omni_ros.pages.table import ABSENT
 
 @dataclass(frozen=True)
 class Number:
-    """A number of the results: path of keys and indices; digits None prints it as it is."""
+    """A number of the results: path of keys and indices; digits None: printed with '%g'."""
 
     path: tuple
     digits: int | None = None
 
     def value(self, results: dict) -> float | None:
-        """Look the number up; None where the results do not have it."""
+        """Value in the results; None if absent."""
         for key in self.path:
             try:
                 results = results[key]
@@ -33,7 +33,7 @@ class Number:
         return results
 
     def text(self, results: dict) -> str:
-        """Return what is printed."""
+        """Printed text."""
         value = self.value(results)
         if value is None or not isfinite(value):
             return ABSENT
@@ -43,7 +43,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Cell:
-    """Main parts and small parts below, each text or Number; best where it wins its row."""
+    """Main parts, small parts below, each text or Number, and whether it is the row's best."""
 
     main: list = field(default_factory=lambda: [ABSENT])
     small: list = field(default_factory=list)
@@ -52,7 +52,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Column:
-    """One column: a controller, and the group that says where its numbers come from."""
+    """One column: a controller, and the group with the source of its numbers."""
 
     controller: str
     group: str
@@ -70,10 +70,10 @@ class Grid:
 
     Attributes:
         title: one line.
-        columns: controllers beside the first column, which holds the rows' names.
+        columns: controllers, to the right of the column of row names.
         rows: (name, cells).
         notes: sentences below.
-        commands: shell lines that fly what the table shows.
+        commands: shell lines that fly the table's flights.
 
     """
 
@@ -92,7 +92,7 @@ def numbers(grid: Grid):
 
 
 def _groups(grid):
-    """(group, how many columns) of neighbours."""
+    """(group, number of its columns) of adjacent columns."""
     groups: list[list] = []
     for column in grid.columns:
         if groups and groups[-1][0] == column.group:
@@ -103,7 +103,7 @@ def _groups(grid):
 
 
 def html(grid: Grid, results: dict) -> str:
-    """Table, notes and commands as HTML; numbers carry their place in ``data-key``."""
+    """Table, notes and commands as HTML; numbers have their path in ``data-key``."""
     kinds = [_kind(column.group) for column in grid.columns]
     first = [k == 0 or grid.columns[k - 1].group != column.group
              for k, column in enumerate(grid.columns)]
@@ -150,7 +150,7 @@ def _html_notes(grid):
 
 
 def markdown(grid: Grid, results: dict) -> str:
-    """Write table, notes and commands as GitHub Markdown."""
+    """Table, notes and commands as GitHub Markdown."""
     multiple = len(_groups(grid)) > 1
     head = [f'{look(column.controller).label}'
             + (f' ({column.group})' if multiple and column.group != OURS else '')

@@ -1,4 +1,4 @@
-"""The tables of a comparison, as the publication lays them out where it has them."""
+"""Tables of a comparison, in the publication's layout where it has them."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from beetle_omni_ros.control import registry
 PAPER = tuple(PUBLISHED)
 GROUP = {'random': GAZEBO, 'force': GAZEBO, 'torque': GAZEBO, 'waypoints': REAL,
          'lemniscate': REAL}
+# Key of a pose error -> displayed digits, and its name.
 SINGLE = {'U_position_m': 4, 'U_orientation_deg': 2, 'L_position_m': 3, 'L_orientation_deg': 2}
-
-"""Key of a pose error -> digits shown."""
 NAMES = {'U_position_m': 'U ‖p error‖ [m]', 'U_orientation_deg': 'U ‖θ error‖ [deg]',
          'L_position_m': 'L ‖p error‖ [m]', 'L_orientation_deg': 'L ‖θ error‖ [deg]'}
 
 
 class Task:
-    """Where a table finds its numbers: a task under one set of conditions."""
+    """Numbers of a table: a task under one set of conditions."""
 
     def __init__(self, results: dict, task: str, conditions: str):
         self.results, self.task, self.conditions = results, task, conditions
@@ -33,30 +32,30 @@ class Task:
                         *(Column(name, GROUP[kind]) for name in self.paper)]
 
     def path(self, controller, *keys):
-        """Path of a number of one column."""
+        """Path of a number in one column."""
         conditions = 'paper' if controller in PAPER else self.conditions
         return ('summary', 'tasks', self.task, conditions, controller, *keys)
 
     def number(self, controller, *keys, digits=None):
-        """Build a number; published ones are printed as they were."""
+        """Number of one column; published numbers keep their digits."""
         return Number(self.path(controller, *keys), None if controller in PAPER else digits)
 
     def value(self, controller, *keys):
-        """Look a number up."""
+        """Value of a number in one column."""
         return Number(self.path(controller, *keys)).value(self.results)
 
     def first(self, *keys):
-        """Return a list that all controllers of ours share, from the first that has it."""
+        """List that all own controllers share, from the first that has it."""
         return next((found for name in self.ours if (found := self.value(name, *keys))), [])
 
     def row(self, name, cell, best=None):
         """
-        Build one row.
+        One row.
 
         Args:
-            name: of the row.
-            cell: controller -> Cell.
-            best: keys of the number that is best where it is least; None marks nothing.
+            name: name of the row.
+            cell: function from controller to Cell.
+            best: keys of the number whose least absolute value is marked as best; None: no mark.
 
         """
         cells = {column.controller: cell(column.controller) for column in self.columns}
@@ -69,7 +68,7 @@ class Task:
         return name, list(cells.values())
 
     def mean_range(self, *keys, digits):
-        """Cells of a mean with its least and largest value."""
+        """Cells of a mean with minimum and maximum."""
         def cell(name):
             if self.value(name, *keys, 'mean') is None:
                 return Cell()
@@ -98,7 +97,7 @@ class Task:
             if self.value(name, *keys) is not None else Cell()
 
     def commands(self):
-        """Shell lines that fly what the table shows."""
+        """Shell lines that fly the table's flights."""
         seeds = sorted({seed for name in self.ours for seed in
                         self.numbers[self.conditions][name]['seeds']})
         meta = self.results['meta']
@@ -109,7 +108,7 @@ class Task:
                 + (f' --policy {policy}' if policy else '') for seed in seeds]
 
     def grid(self, title, rows, notes=()):
-        """Put the table together."""
+        """Grid of these rows."""
         seeds = sorted({seed for name in self.ours for seed in
                         self.numbers[self.conditions][name]['seeds']})
         text = f"Seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}."
@@ -118,7 +117,7 @@ class Task:
 
 
 def reached(task: Task):
-    """Cells of how many poses were reached."""
+    """Cells of the number of reached poses."""
     def cell(name):
         if task.value(name, 'reached') is None:
             return Cell()
@@ -137,7 +136,7 @@ def _crashed(task):
 
 
 def poses(results: dict, name: str, conditions: str) -> Grid:
-    """Poses: the publication's table of 100 random poses, and what ours adds to it."""
+    """Poses: the publication's table of 100 random poses, with further rows."""
     task = Task(results, name, conditions)
     rows = [task.row(f'{NAMES[key]}, mean [min, max]', task.mean_range(key, digits=digits),
                      best=(key, 'mean')) for key, digits in SINGLE.items()]
@@ -167,7 +166,7 @@ def poses(results: dict, name: str, conditions: str) -> Grid:
 
 
 def waypoints(results: dict, conditions: str) -> Grid:
-    """Five waypoints, one row a pose, as the publication's table of the real robot."""
+    """Five waypoints, one row for each pose, as the publication's table of the real robot."""
     task = Task(results, 'waypoints', conditions)
     targets = task.first('by_pose')
     rows = []
@@ -195,7 +194,7 @@ def _both(task, *keys):
 
 
 def lemniscate(results: dict, conditions: str) -> Grid:
-    """Tracking errors over the rounds."""
+    """Tracking errors over all rounds."""
     task = Task(results, 'lemniscate', conditions)
     rows = []
     for text, key, digits in (('position error [m]', 'position_m', 4),
@@ -222,7 +221,7 @@ def _round_range(task, key, digits):
 
 
 def disturbance(results: dict, kind: str, conditions: str) -> Grid:
-    """Peak errors at every level, and the level at which control was lost."""
+    """Peak errors at each level, and the level of lost control."""
     task = Task(results, kind, conditions)
     unit = 'N' if kind == 'force' else 'N m'
     levels = sorted({entry['level'] for name in task.ours
@@ -261,7 +260,7 @@ def _level(task, kind, level):
 
 
 def lost(task: Task, kind: str, unit: str):
-    """Cells of the level at which control was lost, over all flights."""
+    """Cells of the level of lost control over all flights."""
     def cell(name):
         low, high = (task.number(name, kind, f'lost_{end}') for end in ('min', 'max'))
         first, last = low.value(task.results), high.value(task.results)
@@ -277,7 +276,7 @@ def lost(task: Task, kind: str, unit: str):
 
 
 def payload(results: dict, conditions: str) -> Grid:
-    """Steady errors against the mass attached."""
+    """Steady errors against the attached mass."""
     task = Task(results, 'payload', conditions)
     entries = task.first('payload')
     rows = []
@@ -310,7 +309,7 @@ def _signed(task, k):
 
 
 def hover(results: dict, conditions: str) -> Grid:
-    """How still and how smooth a hover of one minute is."""
+    """Errors and command changes in a hover of one minute."""
     task = Task(results, 'hover', conditions)
     rows = [task.row('position error ± std [m]',
                      task.mean_std('hover', 'position_m', digits=4),
@@ -415,7 +414,7 @@ def _pair(task, first, second):
 
 
 def flights(results: dict) -> str:
-    """Every flight as rows of HTML: what, how it ended, how long it took."""
+    """HTML rows of all flights: task, end and CPU time."""
     rows = []
     for k, flight in enumerate(results['flights']):
         end = flight['failure'] or ('touched the ground' if flight['metrics']['crashed']

@@ -1,4 +1,4 @@
-"""The comparison as one HTML page that needs no network, and as Markdown with pictures."""
+"""The comparison as one self-contained HTML page, and as Markdown with pictures."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from beetle_omni_ros.pages import figures
 from beetle_omni_ros.pages.page import frame, shipped
 
 DOTS = 180  # per inch
-COLOURS = 128  # of a picture; its lines are few and their edges smooth
+COLOURS = 128  # of a picture; enough for thin lines with smooth edges
 TITLE = 'RL and NMPC under one architecture'
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawing as PNG, with the name of its file and what it shows."""
+    """A drawing as PNG, with its file name and caption."""
 
     name: str
     caption: str
@@ -34,7 +34,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading, a paragraph, pictures and tables in the order in which they are shown."""
+    """A heading, a paragraph, and pictures and tables in their order."""
 
     title: str
     text: str
@@ -43,10 +43,10 @@ class Section:
 
 def sections(results: dict, flown: dict) -> list[Section]:
     """
-    Draw and tabulate everything that was flown.
+    Pictures and tables of all flights.
 
     Args:
-        results: as written to JSON.
+        results: content of the JSON file.
         flown: flights and their results with traces.
 
     """
@@ -121,7 +121,7 @@ def pictures(made: list[Section]) -> list[Picture]:
 
 
 def png(figure: Figure) -> bytes:
-    """Draw a figure as PNG of few colours, a third of the size of one with all."""
+    """Figure as PNG with few colours, a third of the full size."""
     buffer, small = BytesIO(), BytesIO()
     with matplotlib.rc_context(figures.STYLE):
         figure.savefig(buffer, format='png', dpi=DOTS)
@@ -131,7 +131,7 @@ def png(figure: Figure) -> bytes:
 
 
 def legend(results: dict) -> list[tuple[str, str]]:
-    """Term and meaning, of controllers and conditions that the page shows."""
+    """Term and meaning of the page's controllers and conditions."""
     meta = results['meta']
     made = []
     for name in meta['controllers']:
@@ -145,7 +145,7 @@ def legend(results: dict) -> list[tuple[str, str]]:
 
 
 def facts(results: dict) -> list[str]:
-    """What was computed by which code, where and how."""
+    """Code, number of flights, computer and policies."""
     meta = results['meta']
     code = f"beetle_omni_ros {meta['version']}" + \
         (f", commit {meta['commit']}" if meta.get('commit') else '')
@@ -158,7 +158,7 @@ def facts(results: dict) -> list[str]:
 
 
 def page(results: dict, made: list[Section]) -> str:
-    """Put the page together; everything it needs is in it."""
+    """The self-contained HTML page."""
     body = ''.join(_html_section(section, results) for section in made)
     links = ' · '.join(f'<a href="#{_anchor(section.title)}">{escape(section.title)}</a>'
                        for section in made)
@@ -195,9 +195,9 @@ def _html_section(section, results):
 
 def markdown(results: dict, made: list[Section], how: str = '') -> str:
     """
-    Write the same for readers of the repository, with pictures as files beside it.
+    The page as Markdown, with pictures in files beside it.
 
-    ``how`` is a link to the page that says how it is made, '' where that page is not there.
+    ``how`` is a link to the how-to page; '' if that page is absent.
     """
     parts = [f'# {TITLE}\n', 'Made by `make compare`; the same with every detail is '
              '`comparison.html`, all numbers are in `comparison.json`.'

@@ -1,8 +1,8 @@
 """
-Which flights a comparison needs.
+Flights of a comparison.
 
-A flight is one controller, task, set of conditions and seed. It is the unit that is
-computed, kept and repeated.
+A flight is one controller, task, set of conditions and seed. It is the unit of computation and of
+the cache.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from beetle_omni_ros.runs.tasks import make_task, Task
 
 TASKS = ('random100', 'waypoints', 'lemniscate', 'force', 'torque', 'payload', 'hover')
 CONDITIONS = ('nominal', 'published')
-SEEDS = (0, 1)  # unless others are asked for; a long task is flown with the first alone
+SEEDS = (0, 1)  # default; a long task is flown with the first one only
 LONG = 50.0  # [s]
 
 START_COST = 2.0  # core seconds to build simulator and controller
@@ -34,10 +34,10 @@ class Flight:
     Attributes:
         task: name, or path of a pose file.
         conditions: 'nominal' or 'published'.
-        controller: name, under which its results stand.
-        seed: of the task's poses and of everything random in the simulation.
+        controller: name in the results.
+        seed: seed of the task's poses and of the simulation.
         policy: file in place of its shipped policy, '' for none.
-        spec: where its class is, '' for a registered one.
+        spec: reference to its class, '' for a registered controller.
 
     """
 
@@ -50,7 +50,7 @@ class Flight:
 
     @property
     def name(self) -> str:
-        """What the flight is called in messages."""
+        """Name in messages."""
         return f'{self.controller}, {self.task}, {self.conditions}, seed {self.seed}'
 
     @property
@@ -60,16 +60,16 @@ class Flight:
 
     @cached_property
     def cost(self) -> float:
-        """Rough time that the flight takes [core seconds]."""
+        """Approximate duration of the computation [core seconds]."""
         return START_COST + registry.find(self.reference).cost * self.make_task().duration
 
     @property
     def reference(self) -> str:
-        """By which the registry finds the controller."""
+        """Name or class of the controller, for the registry."""
         return self.spec or self.controller
 
     def make_task(self) -> Task:
-        """Make the task that is flown."""
+        """Task of the flight."""
         return make_task(self.task, self.seed)
 
 
@@ -77,17 +77,17 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
          conditions: Sequence[str] = CONDITIONS, seeds: Sequence[int] | None = None,
          policy: Path | None = None) -> list[Flight]:
     """
-    List all flights, the longest first, so that no long one is left over at the end.
+    List all flights, longest first, so that none of the long ones remains at the end.
 
     Args:
-        controllers: names, or where their classes are.
+        controllers: names, or references to classes.
         tasks: names, or paths of pose files.
         conditions: 'nominal', 'published'.
-        seeds: numbers from 0; None takes 0 and 1, and 0 alone for tasks of more than 50 s.
-        policy: file in place of the shipped policy of the controller that `--policy` is for.
+        seeds: numbers from 0; None: 0 and 1, but only 0 for tasks of more than 50 s.
+        policy: file that replaces the shipped policy, for the controller of `--policy`.
 
     Raises:
-        ParameterError: an entry that stands there twice, or none; unknown conditions or task.
+        ParameterError: no entry or equal entries; unknown conditions or task.
 
     """
     for option, entries in (('--controllers', controllers), ('--tasks', tasks),
@@ -100,7 +100,7 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
     for entry in conditions:
         if entry not in CONDITIONS:
             raise ParameterError(f"--conditions '{entry}': expected {' or '.join(CONDITIONS)}")
-    chosen = {task: seeds_of(task) for task in tasks}  # which refuses unknown tasks
+    chosen = {task: seeds_of(task) for task in tasks}  # also refuses unknown tasks
     if seeds is not None:
         chosen = dict.fromkeys(tasks, seeds)
     other = {registry.owner('--policy'): str(policy)} if policy else {}
@@ -112,5 +112,5 @@ def plan(controllers: Sequence[str], tasks: Sequence[str] = TASKS,
 
 
 def seeds_of(task: str) -> Sequence[int]:
-    """Seeds that a task is flown with unless others are asked for."""
+    """Default seeds of a task."""
     return SEEDS[:1] if make_task(task).duration > LONG else SEEDS

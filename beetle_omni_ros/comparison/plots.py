@@ -26,12 +26,12 @@ UNITS = {'position': 'm', 'orientation': 'deg'}
 STEP = 0.05  # [s] between points of a folded curve
 BINS = 28  # edges of a histogram
 BEFORE = 2.0  # [s] of hover shown before the first disturbance
-SHOWN = {'position': 2.0, 'orientation': 180.0}  # most that a disturbance's axes show [m], [deg]
+SHOWN = {'position': 2.0, 'orientation': 180.0}  # largest limit of a disturbance's axes [m], [deg]
 HOVER_SHOWN = 0.5  # [s] of commands
 
 
 def of(flown: dict[Flight, dict], task: str, conditions: str) -> dict[str, list[dict]]:
-    """Results with a trace: controller -> one for each seed."""
+    """Results with a trace: controller -> one result for each seed."""
     chosen: dict[str, list[dict]] = {}
     for flight, result in flown.items():
         if (flight.task, flight.conditions) == (task, conditions) and result['trace']:
@@ -40,12 +40,12 @@ def of(flown: dict[Flight, dict], task: str, conditions: str) -> dict[str, list[
 
 
 def plain_ticks(axis) -> None:
-    """Write a logarithmic axis as 0.01, 0.1, 1 rather than as powers."""
+    """Label a logarithmic axis with 0.01, 0.1, 1 instead of powers."""
     axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
 
 
 def label_once(figure: Figure, axes, columns: int = 6) -> None:
-    """One legend above the figure, each name once."""
+    """Add one legend above the figure, each name once."""
     handles, labels = axes.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique.keys(), loc='outside upper left', ncols=columns,
@@ -53,7 +53,7 @@ def label_once(figure: Figure, axes, columns: int = 6) -> None:
 
 
 def distributions(flown: dict, task: str, conditions: str) -> Figure | None:
-    """Errors at the target: one against the other, and how they are distributed."""
+    """Position against orientation errors at the target, and their histograms."""
     groups = of(flown, task, conditions)
     points = {name: _points(results) for name, results in groups.items()}
     points = {name: values for name, values in points.items() if len(values)}
@@ -88,7 +88,7 @@ def distributions(flown: dict, task: str, conditions: str) -> Figure | None:
 
 
 def _points(results):
-    """(N, 2) U errors of all poses that were flown, not below the floor of the axes."""
+    """(N, 2) U errors of all flown poses, at least the floor of the axes."""
     values = np.array([[pose['U_position_m'], pose['U_orientation_deg']]
                        for result in results for pose in result['metrics']['poses']
                        if pose['U_position_m'] is not None]).reshape(-1, 2)
@@ -170,7 +170,7 @@ def _folded(results, key, grid):
 
 
 def waypoints(flown: dict, conditions: str) -> Figure | None:
-    """State over one round of the waypoints: mean of all rounds, least to largest as a band."""
+    """States over one round of the waypoints: mean of all rounds, minimum to maximum as a band."""
     groups = of(flown, 'waypoints', conditions)
     if not groups:
         return None
@@ -220,7 +220,7 @@ def _rounds(results, grid, duration):
 
 
 def disturbance(flown: dict, kind: str, conditions: str) -> Figure | None:
-    """Errors in time with the disturbance's magnitude dashed, as the publication draws them."""
+    """Errors over time with the disturbance dashed, as in the publication."""
     groups = of(flown, kind, conditions)
     if not groups:
         return None
@@ -251,7 +251,7 @@ def disturbance(flown: dict, kind: str, conditions: str) -> Figure | None:
 
 
 def _levels(task):
-    """Steps of the level over time, as lists for a step plot."""
+    """Times and levels for a step plot."""
     times, levels, begin = [0.0], [0.0], 0.0
     for segment in task.segments:
         times.append(begin)
@@ -261,7 +261,7 @@ def _levels(task):
 
 
 def _error_curve(panel, result, what, name, k):
-    """One flight's curve, its end marked where control was lost; returns its largest value."""
+    """Plot one flight's errors, mark lost control, and return the largest error."""
     style, trace = look(name), result['trace']
     t, values = trace['t'], trace[f'{what}_error']
     panel.plot(t, values, color=style.colour, ls=style.dashes, lw=1.5 if k == 0 else 0.8,
@@ -278,7 +278,7 @@ def _error_curve(panel, result, what, name, k):
 
 
 def payload(flown: dict, conditions: str) -> Figure | None:
-    """Steady errors against the mass, and the height while it is attached."""
+    """Steady errors against the mass, and the height over time."""
     groups = of(flown, 'payload', conditions)
     if not groups:
         return None
@@ -326,7 +326,7 @@ def _mark_masses(panel):
 
 
 def _laps(results, keys):
-    """Phase grid (N,) [s] in a round and (R, N, len(keys)) values of all complete rounds."""
+    """Phase grid (N,) [s] of a round and (R, N, len(keys)) values of all complete rounds."""
     grid = np.arange(0.0, curve.PERIOD, STEP)
     rounds = []
     for result in results:
@@ -340,7 +340,7 @@ def _laps(results, keys):
 
 
 def lemniscate_path(flown: dict, conditions: str) -> Figure | None:
-    """The path in space, from above and from the side, mean of all rounds."""
+    """Mean path of all rounds in space, from above and from the side."""
     groups = {name: rounds for name, results in of(flown, 'lemniscate', conditions).items()
               if len((rounds := _laps(results, ('position',))[1]))}
     if not groups:
@@ -371,14 +371,14 @@ def lemniscate_path(flown: dict, conditions: str) -> Figure | None:
 
 
 def _path(space, above, side, path, colour, **style):
-    """Draw (N, 3) positions into the view in space and the two projections."""
+    """Draw (N, 3) positions into the 3D view and the two projections."""
     space.plot(*path.T, color=colour, **style)
     above.plot(path[:, 0], path[:, 1], color=colour, **style)
     side.plot(path[:, 0], path[:, 2], color=colour, **style)
 
 
 def lemniscate_errors(flown: dict, conditions: str) -> Figure | None:
-    """Tracking errors over a round: mean of all rounds, least to largest as a band."""
+    """Tracking errors over a round: mean of all rounds, minimum to maximum as a band."""
     groups = of(flown, 'lemniscate', conditions)
     figure, axes = panels(2, height=1.6, sharex=True)
     drawn = False
@@ -403,7 +403,7 @@ def lemniscate_errors(flown: dict, conditions: str) -> Figure | None:
 
 
 def hover_commands(flown: dict, conditions: str) -> Figure | None:
-    """What the actuators were told in the last half second of a hover: smooth, or chatter."""
+    """Commands in the last half second of a hover, which show chatter."""
     groups = of(flown, 'hover', conditions)
     groups = {name: results for name, results in groups.items()
               if len(results[0]['trace']['command_t'])}

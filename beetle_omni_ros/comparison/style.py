@@ -1,4 +1,4 @@
-"""How controllers and conditions are called and drawn, everywhere on the page."""
+"""Names, texts and line styles of controllers and conditions on the page."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from beetle_omni_ros.pages.figures import FAINT, INK
 
 @dataclass(frozen=True)
 class Look:
-    """A controller's name, what it is, and its line: colour, dashes, marker."""
+    """Label and text of a controller, and its line: colour, dashes, marker."""
 
     label: str
     text: str
@@ -21,8 +21,8 @@ class Look:
     marker: str = 'o'
 
 
-PUBLISHED = 'published_'    # before the name of the controller that a published one is
-# Of controllers that are not the package's own, one of these by their name.
+PUBLISHED = 'published_'    # prefix of a controller in the publication
+# Colours of controllers outside the package, chosen by name.
 SPARE = ('#2a9d4b', '#7b4fb0', '#008c95', '#a0522d', '#6b7f1e')
 
 CONDITIONS = {
@@ -36,7 +36,7 @@ __all__ = ['CONDITIONS', 'FAINT', 'INK', 'Look', 'look', 'PUBLISHED']
 
 
 def look(controller: str) -> Look:
-    """Look of a controller, or of the one that the publication flew in its place."""
+    """Look of a controller, or of its published counterpart."""
     name = controller.removeprefix(PUBLISHED)
     entry = registry.SHIPPED.get(name)
     if entry is None:
@@ -48,7 +48,7 @@ def look(controller: str) -> Look:
 
 
 def task_title(task: str) -> str:
-    """What a task is called in headings."""
+    """Heading of a task."""
     titles = {'waypoints': 'Five waypoints', 'lemniscate': '3D lemniscate',
               'force': 'Force disturbance', 'torque': 'Torque disturbance',
               'payload': 'Payload', 'hover': 'Steady hover'}

@@ -1,7 +1,7 @@
 """
-Numbers of a comparison: flights of the same task, conditions and controller become one.
+Numbers of a comparison, summarised over all flights of one task, conditions and controller.
 
-Every number of the page is looked up in what this makes, which is also what the JSON holds.
+The summary is part of the JSON file, and the page takes each of its numbers from it.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.runs import published
 from beetle_omni_ros.runs.metrics import POSE_KEYS
 
-# Column of the publication's numbers -> what it is called there.
+# Column of the publication's numbers -> its name there.
 PUBLISHED = {f'{style.PUBLISHED}{name}': entry.label for name, entry in reversed(
     registry.SHIPPED.items()) if entry.label in published.RANDOM_POSES}
+# Key of the summary -> keys of mean and standard deviation in the metrics of a flight.
 EFFORT = {'hover_speed_m_s': ('hover_speed_mean_m_s', 'hover_speed_std_m_s'),
           'hover_angular_speed_rad_s': ('hover_angular_speed_mean_rad_s',
                                         'hover_angular_speed_std_rad_s'),
           'joint_error_rad': ('joint_error_mean_rad', 'joint_error_std_rad'),
           'thrust_N': ('thrust_mean_N', 'thrust_std_N')}
-"""Our key -> keys of mean and standard deviation in the metrics of a flight."""
 
 
 def summarise(flown: dict[Flight, dict]) -> dict:
     """
-    Sum up results of :func:`fly_flight`.
+    Summarise results of :func:`fly_flight`.
 
     Returns:
-        task -> conditions -> controller -> numbers; published ones stand beside ours under the
-        conditions 'paper', the key ``compute`` beside the tasks.
+        ``tasks``: task -> conditions -> controller -> numbers, with published numbers under the
+        conditions 'paper'; ``compute``: CPU times.
 
     """
     summary: dict = {}
@@ -52,7 +52,7 @@ def summarise(flown: dict[Flight, dict]) -> dict:
 
 
 def _group(task, results):
-    """Numbers of one controller at one task under one set of conditions."""
+    """Numbers of one controller in one task under one set of conditions."""
     made = {'seeds': [flight.seed for flight, _ in results],
             'failures': {str(flight.seed): result['failure'] for flight, result in results
                          if result['failure']}}
@@ -91,7 +91,7 @@ def _poses(judged):
 
 
 def _by_pose(poses):
-    """One entry for each different target, in the order in which they first come."""
+    """One entry for each different target, in the order of the flights."""
     groups: dict[tuple, list] = {}
     for pose in poses:
         groups.setdefault(tuple(round(v, 4) for v in pose['target']), []).append(pose)
@@ -129,7 +129,7 @@ def _hover(parts):
 
 
 def _levels(parts, unit):
-    """What each level did to the robot, and at which level control was lost in each flight."""
+    """Errors at each level, and the level of lost control in each flight."""
     lost = [part[f'lost_at_{unit}'] for part in parts]
     known = [level for level in lost if level is not None]
     steps = sorted({entry[f'level_{unit}'] for part in parts for entry in part['levels']})
@@ -149,7 +149,7 @@ def _levels(parts, unit):
 
 
 def _compute(flown):
-    """CPU time of a step of each controller, over all its flights."""
+    """CPU time of a step of each controller over all its flights."""
     made = {}
     for controller in dict.fromkeys(flight.controller for flight in flown):
         times = [{**result['metrics']['compute_ms'], 'steps': result['metrics'].get('steps', 0)}
@@ -166,7 +166,7 @@ def _compute(flown):
 
 
 def _paper(task):
-    """Published numbers of a task in the form of ours: published controller -> numbers."""
+    """Published numbers of a task: published controller -> numbers in the form of the summary."""
     made: dict = {}
     for column, name in PUBLISHED.items():
         real = f'{name}, real robot'
@@ -228,7 +228,7 @@ def _spread(values):
 
 
 def _pooled(parts, mean, std):
-    """Mean and standard deviation of all samples, of parts that hold equally many."""
+    """Mean and standard deviation of all samples, from parts of equal size."""
     pairs = [(part[mean], part[std]) for part in parts
              if part.get(mean) is not None and part.get(std) is not None]
     if not pairs:

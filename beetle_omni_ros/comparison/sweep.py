@@ -1,8 +1,8 @@
 """
-Many flights at once: on the cores of this computer, or on a Ray cluster.
+Parallel flights, on the cores of this computer or on a Ray cluster.
 
-Both go through joblib and run the same function on the same arguments, so the numbers are
-the same. Results come back one by one, as they are finished, and are kept at once.
+Both use joblib with the same function and arguments, so that the numbers are equal. Each result is
+stored as soon as it is finished.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from beetle_omni_ros.comparison.plan import Flight
 from beetle_omni_ros.robot.schema import ParameterError
 
 BACKENDS = ('processes', 'ray')
-OBJECT_STORE = 200 * 2**20  # [byte] that a Ray of our own may share; traces are far smaller
-REACH_TIMEOUT = 5.0  # [s] for a cluster to answer
+OBJECT_STORE = 200 * 2**20  # [byte] shared memory of a local Ray; traces are far smaller
+REACH_TIMEOUT = 5.0  # [s] for an answer of a cluster
 
 
 class Store:
     """
     A folder with one file for each finished flight.
 
-    A file is found again only while code, parameters, policy, task and seed are those that
-    it was flown with. Failures are not kept: they are tried again.
+    A file is valid for the same code, parameters, policy, task and seed only. Failed flights are
+    not stored, so that they are repeated.
     """
 
     def __init__(self, folder: Path):
-        """Make the folder; raise ParameterError where that cannot be."""
+        """Create the folder; raise ParameterError on failure."""
         self.folder = Path(folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,7 @@ class Store:
         return self.folder / f'{flight.slug}_{flight_key(flight)}.npz'
 
     def load(self, flight: Flight) -> dict | None:
-        """Return the result of :func:`fly_flight`; None where it is not kept or not readable."""
+        """Result of :func:`fly_flight`; None if it is absent or unreadable."""
         try:
             with np.load(self._path(flight), allow_pickle=False) as file:
                 result = json.loads(str(file['result']))
@@ -61,7 +61,7 @@ class Store:
             return None
 
     def save(self, flight: Flight, result: dict) -> None:
-        """Keep a result; raise ParameterError where it cannot be written."""
+        """Store a result; raise ParameterError if it cannot be written."""
         if result['failure']:
             return
         path = self._path(flight)
@@ -79,11 +79,11 @@ class Store:
 
 
 class SweepError(RuntimeError):
-    """Workers were lost; the text says what is kept."""
+    """Workers were lost; the text gives the number of stored flights."""
 
 
 def check_backend(backend: str) -> None:
-    """Refuse an unknown backend with a ParameterError."""
+    """Raise a ParameterError for an unknown backend."""
     if backend not in BACKENDS:
         raise ParameterError(f"--backend '{backend}': expected {' or '.join(BACKENDS)}")
 
@@ -93,22 +93,22 @@ def sweep(flights: list[Flight], *, store: Store, backend: str = 'processes',
           done: Callable[[Flight, dict, bool], None] = lambda flight, result, kept: None,
           ) -> dict[Flight, dict]:
     """
-    Fly what is not kept yet.
+    Fly all flights that are not stored.
 
     Args:
-        flights: which, in the order in which they start.
-        store: where finished flights are kept.
+        flights: the flights, in the order of their start.
+        store: store of finished flights.
         backend: 'processes' or 'ray'.
-        jobs: how many at a time; None is every core, of the cluster too.
-        fresh: fly again what is kept.
-        address: of a running Ray cluster; None starts a Ray on this computer alone.
-        done: called with each flight, its result and whether that was kept from before.
+        jobs: number of parallel flights; None: one on each core, also of a cluster.
+        fresh: whether to repeat stored flights.
+        address: address of a running Ray cluster; None: a Ray on this computer.
+        done: called with each flight, its result and whether it was stored before.
 
     Returns:
-        The result of :func:`fly_flight` for each flight, in the order given.
+        The result of :func:`fly_flight` for each flight, in the order of ``flights``.
 
     Raises:
-        ParameterError: unknown backend, Ray absent or not reachable.
+        ParameterError: unknown backend, or Ray is absent or not reachable.
         SweepError: a worker was killed.
 
     """
@@ -144,8 +144,8 @@ def _fly_all(flights: list[Flight]) -> Iterator[tuple[Flight, dict]]:
                                         'RayActorError', 'ActorDiedError', 'OutOfMemoryError'):
             raise
         raise SweepError(
-            f'a worker was lost, maybe for want of memory; {finished} of {len(flights)} flights '
-            'are kept, the same command goes on from there, --jobs 1 needs the least') from None
+            f'a worker was lost, perhaps for lack of memory; {finished} of {len(flights)} flights '
+            'are kept, the same command continues from there, --jobs 1 needs the least') from None
 
 
 def _fly_numbered(k, flight, task, code):
@@ -154,7 +154,7 @@ def _fly_numbered(k, flight, task, code):
 
 @contextmanager
 def workers(backend, jobs, address):
-    """Set joblib up; numerical libraries in workers keep to one thread each."""
+    """Configure joblib with one thread for the numerical libraries of each worker."""
     if backend == 'processes':
         with joblib.parallel_config('loky', n_jobs=jobs or -1, inner_max_num_threads=1):
             yield
@@ -162,7 +162,7 @@ def workers(backend, jobs, address):
     ray = _start_ray(jobs, address)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter('ignore')  # of Ray, about its own future
+            warnings.simplefilter('ignore')  # Ray warns about its own future
             with joblib.parallel_config('beetle_omni_ray', n_jobs=_ray_workers(ray, jobs)):
                 yield
     finally:
@@ -181,7 +181,7 @@ def _start_ray(jobs, address):
                              "'beetle_omni_ros[ray]' brings it") from None
 
     class Backend(RayBackend):
-        """Ray's, whose pool calls back for each result, as joblib's generators need."""
+        """Ray's backend, with the callbacks that joblib's generators need."""
 
         supports_return_generator = True
 
@@ -203,13 +203,13 @@ def _start_ray(jobs, address):
 
 
 def _reach(address):
-    """Knock first: Ray itself tries for a minute, with many lines."""
+    """Connect first, because Ray itself tries for a minute and prints many lines."""
     host, _, port = address.rpartition('://')[2].rpartition(':')
     if host and port.isdecimal():
         socket.create_connection((host, int(port)), timeout=REACH_TIMEOUT).close()
 
 
 def _ray_workers(ray, jobs):
-    """Two where the cluster has them, because joblib runs single jobs in this process instead."""
+    """At least two if available, because joblib runs a single job in this process."""
     cores = int(ray.cluster_resources().get('CPU', 1))
     return min(max(2, jobs or cores), cores)

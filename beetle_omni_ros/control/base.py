@@ -228,11 +228,11 @@ def corrected(state: State, health: ActuatorHealth) -> State:
     return replace(state, tilt=health.true(state.tilt), command=command)
 
 
-def tell_health(controller: Controller, health: ActuatorHealth) -> None:
+def forward_health(controller: Controller, health: ActuatorHealth) -> None:
     """Pass the health of the actuators to a controller with ``set_health``."""
-    told = getattr(controller, 'set_health', None)
-    if told is not None:
-        told(health)
+    set_health = getattr(controller, 'set_health', None)
+    if set_health is not None:
+        set_health(health)
 
 
 def guidance_of(controller: Controller) -> str:

@@ -32,7 +32,7 @@ class DisturbanceEstimator:
     Estimates the robot's full state and the disturbances.
 
     Args:
-        robot: what the controller believes.
+        robot: nominal robot.
         parameters: bandwidths and limits.
         command_delay: from a command to the actuators [s].
         advance: :func:`dynamics.integrator` of the robot.

@@ -195,7 +195,7 @@ class ControllerEntry:
             if isinstance(self.controller, str):    # a shipped controller: a defect of the package
                 raise
             raise ParameterError(f"controller '{self.reference}': building it raised "
-                                 f'{_told(error)}') from error
+                                 f'{_error_text(error)}') from error
         self._check(controller)
         return controller
 
@@ -368,11 +368,11 @@ def _module(place, spec):
                              'which is not installed') from error
     except Exception as error:
         raise ParameterError(f"controller '{spec}': importing {place} raised "
-                             f'{_told(error)}') from error
+                             f'{_error_text(error)}') from error
 
 
-def _told(error):
-    """Error in one line, with where it was raised."""
+def _error_text(error):
+    """Error in one line, with its place."""
     frames = traceback.extract_tb(error.__traceback__)
     at = f' ({Path(frames[-1].filename).name}, line {frames[-1].lineno})' if frames else ''
     return f'{type(error).__name__}: {error}{at}'

@@ -131,11 +131,11 @@ class HoverController:
         self.observe(state)
         force, torque = self._wrench(state, target)
         present = in_force.tilt if in_force is not None else state.tilt
-        wished = self._near(self._allocator, state, target, present, force, torque) \
+        goal = self._near(self._allocator, state, target, present, force, torque) \
             if isinstance(self._allocator, DegradedAllocator) else \
             self._allocator.hover(state.quaternion, present, force, torque)
-        self._saturations += bool(wished.saturated.any())
-        self._command = Command(state.stamp, *self._targets(state, wished, present, dt))
+        self._saturations += bool(goal.saturated.any())
+        self._command = Command(state.stamp, *self._targets(state, goal, present, dt))
         self._stamp = state.stamp
         return self._command
 
@@ -218,15 +218,15 @@ class HoverController:
         if not self._health.healthy:
             self._thrust = self._health.possible(self._thrust, self._thrust)[1]
 
-    def _targets(self, state, wished, present, dt):
+    def _targets(self, state, goal, present, dt):
         """Tilt and thrust targets after rate limits, projection and lead."""
         p, rotors = self.parameters, self._robot.rotors
         busy = np.ones(4) if p.tilt_full_thrust == 0 or not self._health.healthy else \
-            np.minimum(1.0, wished.thrust / p.tilt_full_thrust)
+            np.minimum(1.0, goal.thrust / p.tilt_full_thrust)
         limit = self._robot.joints.position_limit
         reach = p.tilt_rate * dt * busy
-        tilt = np.clip(present + np.clip(wished.tilt - present, -reach, reach), -limit, limit)
-        thrust = self._thrust_on_the_way(wished, state.tilt)
+        tilt = np.clip(present + np.clip(goal.tilt - present, -reach, reach), -limit, limit)
+        thrust = self._thrust_on_the_way(goal, state.tilt)
         lead = rotors.time_constant / p.thrust_response
         thrust = self._thrust + max(lead, 1.0) * (thrust - self._thrust)
         if state.command is not None:
@@ -235,7 +235,7 @@ class HoverController:
         thrust = np.clip(thrust, rotors.thrust_min, self._thrust_max)
         return (tilt, thrust) if self._health.healthy else self._health.possible(tilt, thrust)
 
-    def _thrust_on_the_way(self, wished, tilt):
+    def _thrust_on_the_way(self, goal, tilt):
         """
         Thrusts along the present rotor directions that are nearest to the desired wrench.
 
@@ -245,9 +245,9 @@ class HoverController:
         """
         rotors, matrix = self._robot.rotors, self._scaled
         now = matrix[:, 0::2] * np.cos(tilt) + matrix[:, 1::2] * np.sin(tilt)
-        wrench = matrix[:, 0::2] @ (wished.thrust * np.cos(wished.tilt)) \
-            + matrix[:, 1::2] @ (wished.thrust * np.sin(wished.tilt))
-        helpful = wished.thrust * np.maximum(0.0, np.cos(wished.tilt - tilt))
+        wrench = matrix[:, 0::2] @ (goal.thrust * np.cos(goal.tilt)) \
+            + matrix[:, 1::2] @ (goal.thrust * np.sin(goal.tilt))
+        helpful = goal.thrust * np.maximum(0.0, np.cos(goal.tilt - tilt))
         thrust, free = helpful.copy(), np.ones(4, dtype=bool)
         for i, held in enumerate(self._health.held):
             if held is not None:

@@ -138,15 +138,15 @@ class PolicyController:
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Counts since reset, and the disturbance estimates of a policy with memory."""
-        told: dict[str, float | int | str] = {
+        values: dict[str, float | int | str] = {
             'policy': self.contract.name, 'steps': self._steps,
             'rejected_states': self._rejected, 'faulty_actions': self._faults,
             'steps_at_a_limit': self._cut, **self._guidance.diagnostics()}
         if self._estimator:
             d = self._estimator.disturbance
-            told['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
-            told['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
-        return told
+            values['force_estimate_N'] = float(np.linalg.norm(d[model.FORCE]))
+            values['torque_estimate_Nm'] = float(np.linalg.norm(d[model.TORQUE]))
+        return values
 
     def _reference(self, state, target):
         """The reference of the policy for this state."""

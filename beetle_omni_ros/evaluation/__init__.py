@@ -1,1 +1,1 @@
-"""The flight stack in one process: the nodes' parts, without ROS, faster than real time."""
+"""The flight stack in one process without ROS, faster than real time."""

@@ -1,4 +1,4 @@
-"""`beetle_omni evaluate`: tasks flown in process, for one or several controllers."""
+"""`beetle_omni evaluate`: flies tasks in one process with one or several controllers."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
         bag: Path | None = None, compression: str = 'none', meta: dict | None = None,
         faults: Sequence[Fault] = (), progress=lambda part: None) -> FlightLog:
     """
-    Fly one task with one controller; see :func:`run_evaluate` for the arguments.
+    Fly one task with one controller; :func:`run_evaluate` describes the arguments.
 
     Returns:
-        the flight, also when the robot crashed (``meta['crashed']``).
+        the flight, also after a crash (``meta['crashed']``).
 
     Raises:
         TaskError: a pose of the task is beyond the controller's reach.
 
     """
-    # With a lost actuator the pilot lands the robot, whoever flew it.
+    # With a lost actuator the pilot lands the robot, whatever the active controller is.
     entries = map(registry.find, dict.fromkeys(
         [controller, registry.pilot()] if faults else [controller]))
     aboard = {entry.name: entry.make(robot, options.get(entry.reference, ControllerOptions()))
@@ -98,32 +98,32 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
     Fly a task with each controller and report.
 
     Args:
-        controllers: names, or where their classes are, see :func:`control.registry.find`.
-        task: name or pose file, or one that was made.
+        controllers: names or references to classes, see :func:`control.registry.find`.
+        task: task, or its name or pose file.
         conditions: 'nominal' or 'published'.
-        robot: file that estimator and controllers believe; default the shipped one.
-        plant: file that is true in the simulation; default ``robot``.
-        seed: of the task's poses and of everything random in the simulation.
-        bag: folder for a bag; with several controllers, one bag for each inside it.
-        compression: of the bags, 'none' or 'zstd'.
+        robot: robot file of estimator and controllers; default the shipped one.
+        plant: robot file of the simulated plant; default ``robot``.
+        seed: seed of the task's poses and of the simulation.
+        bag: folder of a bag; with several controllers it contains one bag for each.
+        compression: compression of the bags, 'none' or 'zstd'.
         json_path: file for the results.
         options: controller -> files in place of its own.
-        faults: file of what fails, when since the task's start and how long; by default nothing.
-        console: where to print.
+        faults: file of faults with times since the task's start and durations.
+        console: console for the output.
 
     Returns:
         the results as in INTERFACES: ``meta`` and a key for each controller.
 
     Raises:
-        ParameterError, TaskError, BagError: unusable input, in one line.
+        ParameterError, TaskError, BagError: unusable input, one line.
 
     """
     console = console or Console()
-    believed = RobotParameters.load(robot)
-    true = RobotParameters.load(plant) if plant else believed
+    nominal = RobotParameters.load(robot)
+    true = RobotParameters.load(plant) if plant else nominal
     entries = registry.find_all(controllers)
     options = {registry.find(name).reference: given for name, given in options.items()}
-    reaches = [_reach(entry, believed, options.get(entry.reference, ControllerOptions()))
+    reaches = [_reach(entry, nominal, options.get(entry.reference, ControllerOptions()))
                for entry in entries]
     flown = task if isinstance(task, Task) else make_task(task, seed, min(reaches))
     task = flown.name
@@ -135,9 +135,9 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             meta['policy'] = str(given.policy)
     if others := {entry.name: entry.spec for entry in entries if entry.spec}:
         meta['controllers'] = others
-    struck = load_faults(faults) if faults else []
-    if struck:
-        meta['faults'] = [str(fault) for fault in struck]
+    injected = load_faults(faults) if faults else []
+    if injected:
+        meta['faults'] = [str(fault) for fault in injected]
     results: dict = {'meta': meta}
     columns = (TextColumn('{task.description}'), BarColumn(),
                TextColumn('{task.percentage:>3.0f} %'), TimeElapsedColumn(), TimeRemainingColumn())
@@ -146,9 +146,9 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
             name = entry.name
             bar = bars.add_task(f'{name}: {task}, {conditions}', total=1.0)
             folder = bag / name if bag and len(controllers) > 1 else bag
-            log = fly(entry.reference, flown, robot=believed, plant=true, conditions=conditions,
+            log = fly(entry.reference, flown, robot=nominal, plant=true, conditions=conditions,
                       seed=seed, options=options, bag=folder, compression=compression,
-                      meta=meta, faults=struck,
+                      meta=meta, faults=injected,
                       progress=lambda part, bar=bar: bars.update(bar, completed=part))
             results[name] = metrics_of_runs.metrics(log, flown)
             if log.meta['ended']:
@@ -162,7 +162,7 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
 
 
 def _reach(entry, robot, options):
-    """Reach of a controller [m]; what may be unusable is built, and so refused before a flight."""
+    """Reach of a controller [m]; builds controllers that may be unusable, before any flight."""
     if entry.policy_file or entry.spec:
         return reach_of(entry.make(robot, options))
     return entry.reach(robot, options)

@@ -12,10 +12,10 @@ import numpy as np
 @contextmanager
 def collector_off():
     """
-    Keep Python's cycle collector out of the flight, as the nodes do.
+    Disable Python's cycle collector during a flight, as the nodes do.
 
-    A growing log makes each of its passes longer, and whichever step it interrupts
-    would seem to have taken tens of milliseconds.
+    Its passes become longer with the log. A controller step that it interrupts would appear to
+    take tens of milliseconds.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -28,18 +28,18 @@ def collector_off():
 
 class ComputeTimer:
     """
-    Collects the CPU time of every step of one controller.
+    CPU times of all steps of one controller.
 
-    CPU time of the calling thread, because on a shared computer wall time holds other
-    programs' slices; a deadline miss is a step that took longer than the period.
+    The CPU time of the calling thread is measured, because wall time on a shared computer includes
+    other programs. A deadline miss is a step that takes longer than the period.
     """
 
     def __init__(self, period: float):
-        """``period`` is the controller's [s]."""
+        """``period``: period of the controller [s]."""
         self._period, self._times = period, []
 
     def call(self, function, *arguments):
-        """Run ``function(*arguments)`` and keep how long it took."""
+        """Run ``function(*arguments)`` and store its CPU time."""
         start = time.thread_time()
         result = function(*arguments)
         self._times.append(time.thread_time() - start)

@@ -1,11 +1,11 @@
 """
 One flight in one process: plant, sensors, estimator, controllers and supervisor.
 
-The same parts as in the ROS graph, joined by function calls in the order in which messages
-would arrive: a tick of the simulator makes readings, the estimator takes them in, every
-second tick the controllers answer the estimate, the supervisor selects and checks, and the
-actuators execute the command after its delay. Nothing depends on wall time, so that a seed
-gives the same numbers every time.
+The parts are those of the ROS graph, called in the order in which messages would arrive. A tick of
+the simulator produces readings, and the estimator uses them. In every second tick the controllers
+compute a command from the estimate. The supervisor selects and checks the command, and the
+actuators execute it after its delay. Nothing depends on wall time, so that a seed determines all
+numbers.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from beetle_omni_ros.control.base import (
     checked,
     Controller,
     corrected,
+    forward_health,
     PoseTarget,
     reach_of,
     State,
     Target,
-    tell_health,
 )
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
@@ -36,33 +36,33 @@ from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.readings import Frame
 from beetle_omni_ros.sim.simulator import Simulator
 
-TAKEOFF_TIMEOUT = 30.0   # [s] of simulated time before a flight that does not start is given up
-COMPUTE_REPORT = 1.0     # [s] between two records of compute times, as the nodes report
-SWAP_CHARGE = 0.3         # [-] a pack below this is swapped at the next target, or once warned of
-CLOCK_SET_BACK = 0.1     # [s] a command that much older comes from a clock that was set back
-SETTLE_TIME = 0.5        # [s] on the ground before arming, in which the estimator starts
+TAKEOFF_TIMEOUT = 30.0   # [s] simulated time for the take-off
+COMPUTE_REPORT = 1.0     # [s] between two records of compute times, as of the nodes
+SWAP_CHARGE = 0.3         # [-] charge below which the pack is replaced at the next target
+CLOCK_SET_BACK = 0.1     # [s] least age of a command that shows that the clock was set back
+SETTLE_TIME = 0.5        # [s] on the ground before arming, for the start of the estimator
 
 
 class FlightError(RuntimeError):
-    """The flight could not begin; the text says what kept it on the ground."""
+    """The flight could not start; the text gives the reason."""
 
 
 class FlightLoop:
     """
-    Flies one task.
+    One flight of a task.
 
     Args:
-        simulator: the world.
+        simulator: plant and sensors.
         estimator: the EKF.
-        controllers: name -> controller; each is stepped, the supervisor selects.
-        supervisor: with the active controller selected.
+        controllers: name -> controller; all are stepped, the supervisor selects one.
+        supervisor: supervisor with a selected controller.
         recorder: LogRecorder, BagWriter or both.
-        gyroscope_noise: of one sample, for the covariance of the recorded twist [rad/s].
-        faults: of robot, devices and processes; their ``at`` counts from the task's start.
-        check_target: reason why a target that somebody else asks for is refused, or ''.
+        gyroscope_noise: noise of one sample, for the covariance of the recorded twist [rad/s].
+        faults: faults of robot, devices and processes; ``at`` counts from the task's start.
+        check_target: function that returns why the target of a fault is refused, or ''.
 
     Attributes:
-        refusals: reasons for which targets were refused.
+        refusals: reasons of refused targets.
 
     """
 
@@ -73,8 +73,8 @@ class FlightLoop:
         self._gyroscope_noise = gyroscope_noise
         self._faults, self._check_target = tuple(faults), check_target
         self._processes = Processes(simulator.tick, supervisor)
-        self._intruder: Target | None = None
-        self._obeys_intruder = False
+        self._other_target: Target | None = None     # of a fault
+        self._accepts_other = False
         self.refusals: list[str] = []
         self._simulator, self._estimator = simulator, estimator
         self._controllers, self._supervisor, self._recorder = controllers, supervisor, recorder
@@ -85,7 +85,7 @@ class FlightLoop:
         self._hold: Target | None = None
         self._joints = self._battery = self._command = self._estimated = None
         self._ticks = 0
-        self._state_name = self._told = ''
+        self._state_name = self._recorded_state = ''
         self._health = ALL_HEALTHY
         self._crashed = False
         self._ending = ''
@@ -97,22 +97,22 @@ class FlightLoop:
 
     @property
     def ending(self) -> str:
-        """When and why the supervisor ended the flight before its task, in words, or ''."""
+        """Time and reason of an early end of the flight by the supervisor, or ''."""
         return self._ending
 
     def fly(self, task: Task, progress: Callable[[float], None] = lambda part: None) -> bool:
         """
-        Take off, fly the task, stop.
+        Take off and fly the task.
 
         Args:
-            task: what to fly.
-            progress: called with the part of the task flown, 0 to 1.
+            task: the task.
+            progress: called with the completed fraction of the task, 0 to 1.
 
         Returns:
-            whether the robot stayed in the air to the end.
+            whether the robot was airborne to the end.
 
         Raises:
-            FlightError: it did not take off.
+            FlightError: no take-off.
 
         """
         with collector_off():
@@ -147,14 +147,14 @@ class FlightLoop:
         return not (self._crashed or moment.lost or self._simulator.broken)
 
     def start_faults(self) -> None:
-        """Let the time of the faults begin now."""
+        """Start the time of the faults."""
         if self._faults:
             self._simulator.set_faults([fault for fault in self._faults if not fault.is_process])
             self._processes.set_faults([fault for fault in self._faults if fault.is_process],
                                        self._simulator.time)
 
     def aim(self, target: Target) -> None:
-        """Make ``target`` the one in force."""
+        """Set the target in force."""
         self._target = target
         self._recorder.write_target(target)
 
@@ -168,7 +168,7 @@ class FlightLoop:
         Arm and climb until a controller flies.
 
         Raises:
-            FlightError: it did not take off.
+            FlightError: no take-off.
 
         """
         while self._simulator.time < SETTLE_TIME:
@@ -184,7 +184,7 @@ class FlightLoop:
                                   f"'{self._supervisor.state}' ({'; '.join(events[-3:])})")
 
     def step(self) -> Frame:
-        """One tick of the simulator and of every process that is due in it."""
+        """Run one tick of the simulator and of every process that is due in it."""
         simulator, processes = self._simulator, self._processes
         frame = processes.frame(simulator.step())
         self._ticks += 1
@@ -193,10 +193,10 @@ class FlightLoop:
         estimate = self._estimator.estimate
         new = estimate is not None and estimate.stamp != self._estimated
         if new and self._joints is not None:
-            self._estimated = estimate.stamp    # the estimator tells each estimate once
+            self._estimated = estimate.stamp    # each estimate is sent once
             state = processes.estimate(State.join(estimate, self._joints, self._command))
             if state is not None:
-                self._answer(state, estimate, now)
+                self._send_estimate(state, estimate, now)
         for late in processes.requests(None, now):
             self._request(self._supervisor.active, late, now)
         if not processes.supervisor_waits:
@@ -204,10 +204,10 @@ class FlightLoop:
             self._note_state(now)
         return frame
 
-    def _answer(self, state, estimate, now):
-        """Let supervisor and controllers have the estimator's state."""
+    def _send_estimate(self, state, estimate, now):
+        """Send the estimate to supervisor, controllers and recorder."""
         recorder = self._recorder
-        self._processes.tell('on_state', state, self._estimator.status)
+        self._processes.send('on_state', state, self._estimator.status)
         self._control(state, now)
         covariances = () if not recorder.keeps_covariances else (
             pose_covariance(estimate), twist_covariance(estimate, self._gyroscope_noise))
@@ -224,43 +224,43 @@ class FlightLoop:
             self._recorder.write('command', command, now)
 
     def _sense(self, frame):
-        recorder, tell, now = self._recorder, self._processes.tell, frame.time
+        recorder, send, now = self._recorder, self._processes.send, frame.time
         recorder.write('ground_truth/odom', Odom.of(frame.truth))
         if frame.mocap is not None:
             self._estimator.pose(frame.mocap)
-            tell('on_mocap', frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion)
+            send('on_mocap', frame.mocap.stamp, frame.mocap.position, frame.mocap.quaternion)
             recorder.write('mocap/pose', frame.mocap, now)
         if frame.joints is not None:
             self._joints = joints = frame.joints
-            tell('on_joints', joints.stamp, joints.position, joints.velocity)
+            send('on_joints', joints.stamp, joints.position, joints.velocity)
             recorder.write('joint_states', joints, now)
         if frame.battery is not None:
-            tell('on_battery', frame.battery.voltage)
+            send('on_battery', frame.battery.voltage)
             recorder.write('battery_state', frame.battery)
         if frame.imu is not None:
             imu = frame.imu
             self._estimator.imu(imu)
-            tell('on_imu', imu.stamp, imu.specific_force, imu.angular_velocity)
+            send('on_imu', imu.stamp, imu.specific_force, imu.angular_velocity)
             recorder.write('imu/data_raw', imu)
         if frame.rotors is not None:
-            tell('on_rotors', frame.rotors.stamp, frame.rotors.speed)
+            send('on_rotors', frame.rotors.stamp, frame.rotors.speed)
         for name, text in self._processes.bridges.items():
-            tell('on_actuators', name, text, now)
+            send('on_actuators', name, text, now)
 
     def _control(self, state, now):
-        """Step whoever is due; without a target yet, hold the pose of the take-off's end."""
+        """Step the controllers that are due; before the first target hold the take-off's pose."""
         if self._target is None and not self._state_name.startswith('flying'):
             self._hold = PoseTarget(state.position, state.quaternion, state.stamp)
         if self._supervisor.health is not self._health:
             self._health = self._supervisor.health
             for controller in self._controllers.values():
-                tell_health(controller, self._health)
+                forward_health(controller, self._health)
         state = corrected(state, self._health)
         for name, controller in self._controllers.items():
             if self._ticks % self._every[name]:
                 continue
             command = checked(name, self._timers[name].call(controller.step, state,
-                                                            self._wanted()))
+                                                            self._target_in_force()))
             if name == self._supervisor.active:
                 for passed in self._processes.requests(command, now):
                     self._request(name, passed, now)
@@ -269,37 +269,37 @@ class FlightLoop:
 
     def _request(self, name, command, now):
         self._recorder.write(f'{name}/command', command, now)
-        self._processes.tell('on_command', name, command, now)
+        self._processes.send('on_command', name, command, now)
 
-    def _wanted(self):
-        """The supervisor's target, else the one in force, unless another's passes the check."""
+    def _target_in_force(self):
+        """Target of the supervisor, else an accepted target of a fault, else that of the task."""
         if self._supervisor.wish is not None:
             return self._supervisor.wish
         target = self._target if self._target is not None else self._hold
         other = self._processes.target(target)
         if other is None:
-            self._intruder = None
+            self._other_target = None
             return target
-        if self._intruder is None:
-            self._intruder = other
+        if self._other_target is None:
+            self._other_target = other
             reason = self._check_target(other) or out_of_reach(
                 other, self._estimator.estimate.position,
                 reach_of(self._controllers[self._supervisor.active]), self.now)
-            self._obeys_intruder = not reason
+            self._accepts_other = not reason
             self.refusals += [reason] if reason else []
-        return self._intruder if self._obeys_intruder else target
+        return self._other_target if self._accepts_other else target
 
     def _note_state(self, now):
-        told = self._supervisor.told
-        name = self._supervisor.state if self._supervisor.state != 'flying' else told
-        if told != self._told:
-            self._told = told
-            self._recorder.write('supervisor/state', told, now)
+        reported = self._supervisor.reported_state
+        name = self._supervisor.state if self._supervisor.state != 'flying' else reported
+        if reported != self._recorded_state:
+            self._recorded_state = reported
+            self._recorder.write('supervisor/state', reported, now)
         if name != self._state_name:
             if self._state_name.startswith(('flying', 'fallback')) \
                     and name in ('landing', 'emergency_stop', 'disarmed'):
-                said = [e.text for e in self._supervisor.events][-1:]
-                self._ending = f'{name} at {now:.1f} s: {said[0] if said else "unknown"}'
+                last = [e.text for e in self._supervisor.events][-1:]
+                self._ending = f'{name} at {now:.1f} s: {last[0] if last else "unknown"}'
             if self._state_name.startswith(('flying', 'fallback', 'landing')) \
                     and name in ('disarmed', 'emergency_stop'):
                 self._crashed = True

@@ -1,4 +1,4 @@
-"""Processes of the in-process flight as faults strike them, and the queues between them."""
+"""Messages between the processes of an in-process flight, with faults and queues."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ QUEUE = 10      # messages of a topic that wait for a process; older ones are dr
 
 class Processes:
     """
-    What estimator, controllers and supervisor say and hear while faults strike them.
+    Messages from and to estimator, controllers and supervisor, modified by faults of processes.
 
-    Without a fault everything passes unchanged.
+    Without a fault all messages pass unchanged.
 
     Attributes:
-        clock_step: by which the flight computer's clock is off [s].
+        clock_step: error of the flight computer's clock [s].
 
     """
 
     def __init__(self, tick: float, supervisor: Supervisor):
-        """``tick`` between two calls of :meth:`frame` [s]."""
+        """``tick``: time between two calls of :meth:`frame` [s]."""
         self._supervisor = supervisor
         self._schedule = Schedule(tick, np.random.SeedSequence(0))
         self._waiting: dict[str, deque] = {}
-        self._told: dict[str, str] = {}
+        self._reported: dict[str, str] = {}     # bridge -> last reported state
         self.clock_step = 0.0
 
     def set_faults(self, faults: Sequence[Fault], now: float) -> None:
-        """Fly with these faults of processes; their ``at`` counts from ``now`` [s]."""
+        """Set the faults of processes; their ``at`` counts from ``now`` [s]."""
         self._schedule.set(faults, now)
 
     @property
     def faults(self) -> list[str]:
-        """Kinds of the faults that are on."""
+        """Kinds of the active faults."""
         return self._schedule.names
 
     def frame(self, frame: Frame) -> Frame:
-        """Begin a tick: the frame with the stamps of the flight computer's clock."""
+        """Start a tick; returns the frame with stamps of the flight computer's clock."""
         if self._schedule.empty:
             return frame
         self._schedule.update(frame.time)
         self.clock_step = sum(effect.clock_step for effect in self._schedule.active)
         if not self.supervisor_waits:
-            self._deliver()
+            self._deliver_queued()
         if not self.clock_step:
             return frame
         shifted = {name: replace(reading, stamp=reading.stamp + self.clock_step)
@@ -61,24 +61,24 @@ class Processes:
 
     @property
     def supervisor_waits(self) -> bool:
-        """Whether the supervisor is not scheduled now."""
+        """Whether the supervisor is not scheduled at present."""
         return any(effect.supervisor_waits for effect in self._schedule.active)
 
-    def tell(self, method: str, *message) -> None:
+    def send(self, method: str, *message) -> None:
         """Call one of the supervisor's ``on_`` methods, or queue the message."""
         if self.supervisor_waits:
             self._waiting.setdefault(method, deque(maxlen=QUEUE)).append(message)
         else:
             getattr(self._supervisor, method)(*message)
 
-    def _deliver(self):
+    def _deliver_queued(self):
         for method, messages in self._waiting.items():
             for message in messages:
                 getattr(self._supervisor, method)(*message)
         self._waiting = {}
 
     def estimate(self, state: State) -> State | None:
-        """What the estimator tells in place of ``state``; None: nothing."""
+        """Estimate after the faults; None if it is not sent."""
         for effect in self._schedule.active:
             if state is None:
                 return None
@@ -86,14 +86,14 @@ class Processes:
         return state
 
     def requests(self, command: Command | None, now: float) -> list[Command]:
-        """Commands of the active controller that arrive now; None releases late ones."""
+        """Commands of the active controller that arrive now; None: delayed ones only."""
         passed = [] if command is None else [command]
         for effect in self._schedule.active:
             passed = [out for one in passed or [None] for out in effect.request(one, now)]
         return passed
 
     def target(self, target: Target) -> PoseTarget | None:
-        """A target that somebody else asks for while ``target`` is in force, or None."""
+        """Target of a fault while ``target`` is in force, or None."""
         for effect in self._schedule.active:
             pose = effect.target()
             if pose is not None:
@@ -102,9 +102,9 @@ class Processes:
 
     @property
     def bridges(self) -> dict[str, str]:
-        """Bridge -> what it says of itself, where that is new."""
-        said = {name: text for effect in self._schedule.active
-                for name, text in effect.bridges.items()}
-        new = {name: text for name, text in said.items() if self._told.get(name) != text}
-        self._told.update(new)
+        """Bridge -> its reported state, if that has changed."""
+        states = {name: text for effect in self._schedule.active
+                  for name, text in effect.bridges.items()}
+        new = {name: text for name, text in states.items() if self._reported.get(name) != text}
+        self._reported.update(new)
         return new

@@ -1,1 +1,1 @@
-"""Flights with faults: what happens, how often it ends as it should, and one page about it."""
+"""Flights with faults: their outcomes, compared with the expected ones, and one page."""

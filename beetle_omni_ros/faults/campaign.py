@@ -1,4 +1,4 @@
-"""Many flights on all cores, and what they come to."""
+"""Parallel flights, and the summaries of their results."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from beetle_omni_ros.sim.faults.listed import FaultList
 def fly_all(function: Callable, trials: Iterable, *arguments, jobs: int | None = None,
             ) -> Iterator[dict]:
     """
-    Call ``function(trial, *arguments)`` for each trial, each in a process of its own.
+    Call ``function(trial, *arguments)`` for each trial, each in its own process.
 
     Args:
-        function: at the top of a module.
+        function: function at the top of a module.
         trials: one for each flight.
-        arguments: the same for all.
-        jobs: how many at a time; None: one a core.
+        arguments: common arguments.
+        jobs: number of parallel flights; None: one on each core.
 
     Yields:
-        results as they are finished.
+        results in the order of completion.
 
     """
     calls = [joblib.delayed(function)(trial, *arguments) for trial in trials]
@@ -34,12 +34,12 @@ def fly_all(function: Callable, trials: Iterable, *arguments, jobs: int | None =
 
 def summary(results: list[dict], listed: FaultList) -> dict:
     """
-    What trials came to.
+    Summarise trials.
 
     Returns:
         ``faults``: name -> what, expected, flights, good, outcomes, impact_median_m_s,
-        impact_worst_m_s, named, named_s (median), told; ``total``: flights, good, share, flyaways,
-        motors_on_after_crash, takeoffs, lost_bags (None where none were recorded).
+        impact_worst_m_s, named, named_s and said_s (medians); ``total``: flights, good, share,
+        flyaways, motors_on_after_crash, takeoffs, errors, lost_bags (None without bags).
 
     """
     faults = {}
@@ -75,7 +75,7 @@ def _row(flown):
 
 
 def landing_summary(results: list[dict]) -> list[dict]:
-    """Landings by conditions and motion capture: flights, good, speeds and inclinations."""
+    """Summarise landings by conditions and motion capture."""
     rows = []
     for conditions, without in sorted({(r['conditions'], r['without_mocap']) for r in results}):
         flown = [r for r in results if (r['conditions'], r['without_mocap'])
@@ -95,7 +95,7 @@ def _spread(name, unit, values):
 
 
 def healthy_summary(results: list[dict]) -> list[dict]:
-    """Healthy flights by conditions: flights, hours, alarms by text, errors, not landed."""
+    """Summarise healthy flights by conditions, with alarms by text."""
     rows = []
     for conditions in dict.fromkeys(r['conditions'] for r in results):
         flown = [r for r in results if r['conditions'] == conditions]

@@ -1,4 +1,4 @@
-"""`beetle_omni faults`: the list of faults flown, landings, healthy flights, one page."""
+"""`beetle_omni faults`: flies listed faults, landings or healthy flights; writes one page."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
                through_ros: Callable[[FaultList], Iterator[dict]] | None = None,
                console: Console | None = None) -> dict:
     """
-    Fly the list of faults; or landings, or healthy flights, where those are asked for.
+    Fly the list of faults, or landings or healthy flights if requested.
 
-    Arguments are the options of `beetle_omni faults`; ``starts`` of ALL_STARTS, ``healthy`` in
-    hours, and ``through_ros`` flies what only the ROS graph shows, in place of the list.
+    Arguments are the options of `beetle_omni faults`. ``starts`` are of ALL_STARTS, ``healthy`` is
+    in hours, and ``through_ros`` flies the faults of the ROS graph in place of the list.
 
     Returns:
         ``meta``; ``flights`` and ``summary``, or ``landings``, ``healthy`` or ``ros``.
 
     Raises:
-        ParameterError: unusable input, in one line.
+        ParameterError: unusable input, one line.
 
     """
     console = console or Console()
@@ -60,7 +60,7 @@ def run_faults(*, faults: Path | None = None, only: list[str] | None = None,
     entry = registry.find(controller)
     controller = entry.reference
     _check(starts, output, json_path, docs, bags)
-    guidance = guidance_of(entry.make(RobotParameters.load()))      # or what is wrong with it
+    guidance = guidance_of(entry.make(RobotParameters.load()))  # refuses an unusable controller
     meta = {'command': _described(faults, only, starts, seeds, seed, conditions, controller,
                                   landings, without_mocap, healthy, bool(through_ros)),
             'version': __version__, 'guidance': guidance}
@@ -138,13 +138,13 @@ def _described(faults, only, starts, seeds, seed, conditions, controller, landin
 
 
 class _Flyer:
-    """Flies trials with a progress bar; what is finished is kept, whatever comes then."""
+    """Flies trials with a progress bar; each finished result is stored at once."""
 
     def __init__(self, console, jobs, output):
         self._console, self._jobs, self._output = console, jobs, output
 
     def __call__(self, title: str, function: Callable, trials: list, *arguments) -> list[dict]:
-        """Fly; return results in the order in which they were finished."""
+        """Fly; returns results in the order of completion."""
         columns = (TextColumn('{task.description}'), BarColumn(), MofNCompleteColumn(),
                    TimeRemainingColumn())
         results = []
@@ -178,7 +178,7 @@ def _print(results, console):
                [row[:1] + row[2:] for row in page.fault_rows(results)])
         console.print(page.total_text(results), highlight=False)
     for title, header, rows in page.other_tables(results):
-        # What happens is told on the page, and too long for a terminal.
+        # The description of a fault is too long for a terminal; the page has it.
         kept = [k for k, name in enumerate(header) if name != 'what happens']
         _table(console, title, [header[k] for k in kept], [[row[k] for k in kept] for row in rows])
 

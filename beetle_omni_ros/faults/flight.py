@@ -1,4 +1,4 @@
-"""A flight of the campaign in one process, and how it goes from one pose to the next."""
+"""A flight of the campaign in one process, from pose to pose."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from beetle_omni_ros.sim.faults.listed import FaultList, FlightPlan
 from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.simulator import Simulator
 
-STARTS = ('hover', 'moving', 'upside_down')      # of the list
+STARTS = ('hover', 'moving', 'upside_down')      # default
 ALL_STARTS = (*STARTS, 'random')
 OFF = ('disarmed', 'emergency_stop')
 
@@ -35,8 +35,8 @@ class Flight:
     One robot with its flight stack.
 
     Attributes:
-        simulator, supervisor, loop: its parts.
-        random: for what is random in the plan of the flight.
+        simulator, supervisor, loop: parts of the stack.
+        random: random numbers of the plan of the flight.
 
     """
 
@@ -44,48 +44,48 @@ class Flight:
                  true_robot: RobotParameters | None = None, strike: tuple[Fault, ...] = (),
                  recorder=None):
         """
-        Build everything anew.
+        Build robot and flight stack.
 
         Args:
-            controller: the active one.
+            controller: the active controller.
             conditions: 'nominal' or 'published'.
-            seed: of everything random.
-            true_robot: in the simulation; by default what the flight stack believes.
-            strike: faults, for ``loop.start_faults``.
-            recorder: as of the loop; by default nothing is recorded.
+            seed: seed of the plan and the simulation.
+            true_robot: simulated robot; by default that of the flight stack.
+            strike: faults, started by ``loop.start_faults``.
+            recorder: recorder of the loop; by default nothing is recorded.
 
         """
-        believed = RobotParameters.load()
-        estimator = EkfParameters.load().of_robot(believed)
+        nominal = RobotParameters.load()
+        estimator = EkfParameters.load().of_robot(nominal)
         safety = SupervisorParameters.load()
-        aboard = {entry.name: entry.make(believed) for entry in map(
+        aboard = {entry.name: entry.make(nominal) for entry in map(
             registry.find, dict.fromkeys([controller, registry.pilot()]))}
         name = next(iter(aboard))
-        self.supervisor = Supervisor(safety, believed, HoverController(believed),
+        self.supervisor = Supervisor(safety, nominal, HoverController(nominal),
                                      tuple(dict.fromkeys((*registry.names(), name))))
-        self.simulator = Simulator(true_robot or believed, SimulatorParameters.load(),
+        self.simulator = Simulator(true_robot or nominal, SimulatorParameters.load(),
                                    conditions=conditions, seed=seed)
         self.loop = FlightLoop(
-            self.simulator, ErrorStateEkf(estimator, believed.gravity), aboard, self.supervisor,
+            self.simulator, ErrorStateEkf(estimator, nominal.gravity), aboard, self.supervisor,
             Tee() if recorder is None else recorder, estimator.imu.gyroscope_noise, strike,
-            TargetChecks(believed).why_not)
+            TargetChecks(nominal).why_not)
         self.supervisor.select(name)
         self.random = np.random.default_rng(seed)
         self._fence = safety.envelope.half_width, safety.envelope.height
 
     def aim(self, position, quaternion=(0.0, 0.0, 0.0, 1.0)) -> None:
-        """Ask for a pose: (3,) in world [m], (4,) xyzw."""
+        """Set the target pose: (3,) in world [m], (4,) xyzw."""
         self.loop.aim(PoseTarget(np.array(position, dtype=float), np.array(quaternion),
                                  self.loop.now))
 
-    def aim_anywhere(self, plan: FlightPlan) -> None:
-        """Ask for a random pose, any attitude."""
+    def aim_randomly(self, plan: FlightPlan) -> None:
+        """Set a random target pose of any attitude."""
         x, y, z = self.random.uniform([-plan.spread, -plan.spread, plan.lowest],
                                       [plan.spread, plan.spread, plan.highest])
         self.aim((x, y, z), rotations.from_rpy(*self.random.uniform(-np.pi, np.pi, 3)))
 
     def fly(self, duration: float, over: Callable[[], bool] = lambda: False) -> bool:
-        """Go on for ``duration`` [s], or until ``over`` says so; return whether it did."""
+        """Fly for ``duration`` [s] or until ``over`` is true; returns whether it became true."""
         end = self.simulator.time + duration
         while self.simulator.time < end:
             self.loop.step()
@@ -94,7 +94,7 @@ class Flight:
         return False
 
     def watch(self, listed: FaultList) -> Watcher:
-        """Begin to watch."""
+        """Start an observation of the flight."""
         return Watcher(self, FlightWatch(listed.limits, *self._fence,
                                          self.simulator.truth.position.copy()),
                        listed.flight.end_time)
@@ -102,47 +102,42 @@ class Flight:
 
 class Watcher:
     """
-    Looks and listens at each tick; called, it says whether there is nothing more to see.
+    Observes a flight in each tick; a call returns whether the observation is complete.
 
     Attributes:
-        seen: what the robot did.
-        said: first complaint of the supervisor, '' for none, and when it came [s].
-        named: name of the first fault that the supervisor told, and when.
+        seen: motion of the robot.
+        said, said_after: first warning of the supervisor, '' for none, and its time [s].
+        named, named_after: name of the first fault that the supervisor named, and its time [s].
 
     """
 
     def __init__(self, flight: Flight, seen: FlightWatch, end_time: float):
-        """Begin now; the flight is over ``end_time`` [s] after the motors stopped."""
+        """Start now; the flight is over ``end_time`` [s] after the motors stopped."""
         self._flight, self.seen, self._end_time = flight, seen, end_time
-        self._heard = len(flight.supervisor.events)
-        self._known = set(told_faults(flight.supervisor))
+        self._past_events = len(flight.supervisor.events)
+        self._past_faults = set(flight.supervisor.faults)
         self._start, self._still = flight.simulator.time, 0.0
         self.said, self.said_after = '', None
         self.named, self.named_after = '', None
 
     def __call__(self) -> bool:
-        """Look at the tick that just was; whether it is over."""
+        """Observe the last tick; returns whether the observation is complete."""
         flight = self._flight
         simulator, supervisor = flight.simulator, flight.supervisor
         self.seen.step(simulator.truth, float(simulator.thrust_command.sum()), simulator.tick)
-        self._listen(supervisor, simulator.time - self._start)
+        self._check_events(supervisor, simulator.time - self._start)
         ended = supervisor.state in OFF or simulator.broken
         self._still = self._still + simulator.tick if ended else 0.0
         return self.seen.flyaway or self._still >= self._end_time
 
-    def _listen(self, supervisor, after):
+    def _check_events(self, supervisor, after):
         if not self.said:
-            for event in supervisor.events[self._heard:]:
+            for event in supervisor.events[self._past_events:]:
                 if event.severity != INFO:
                     self.said, self.said_after = event.text, after
                     break
         if not self.named:
-            for name in told_faults(supervisor):
-                if name not in self._known:
+            for name in supervisor.faults:
+                if name not in self._past_faults:
                     self.named, self.named_after = name, after
                     break
-
-
-def told_faults(supervisor: Supervisor) -> dict[str, float]:
-    """Name -> time [s] of the faults that the supervisor has named."""
-    return supervisor.faults

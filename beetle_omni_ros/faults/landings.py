@@ -1,4 +1,4 @@
-"""Landings from random attitudes, and healthy flights with everything that is said of them."""
+"""Landings from random attitudes, and healthy flights with their alarms."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.evaluation.compute import collector_off
-from beetle_omni_ros.faults.flight import Flight, told_faults
-from beetle_omni_ros.faults.trial import told
+from beetle_omni_ros.faults.flight import Flight
+from beetle_omni_ros.faults.trial import observed
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.safety.events import INFO
@@ -17,19 +17,19 @@ from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.faults.listed import FaultList
 
 CONDITIONS = ('nominal', 'published', 'effects')
-FRESH = 0.5     # [-] of a charge: a pack below it is swapped before the next pose
+FRESH = 0.5     # [-] charge below which the pack is replaced before the next pose
 
 
 @dataclass(frozen=True)
 class LandingTrial:
     """
-    Which landing.
+    Parameters of a landing.
 
     Attributes:
-        seed: of attitude and simulation; every fourth one lands from upside down.
+        seed: seed of attitude and simulation; every fourth landing starts upside down.
         conditions: 'nominal' or 'published'.
-        controller: the active one.
-        without_mocap: whether motion capture is lost as it lands.
+        controller: the active controller.
+        without_mocap: whether motion capture is lost at the start of the landing.
 
     """
 
@@ -41,11 +41,11 @@ class LandingTrial:
 
 def fly_landing(trial: LandingTrial, listed: FaultList) -> dict:
     """
-    Fly to an attitude, ask for a landing.
+    Fly to an attitude and land.
 
     Returns:
-        the trial's fields, roll, pitch and yaw of the attitude [deg], good, and what
-        :func:`~beetle_omni_ros.faults.trial.told` says.
+        the trial's fields, roll, pitch and yaw of the attitude [deg], good, and the fields of
+        :func:`~beetle_omni_ros.faults.trial.observed`.
 
     """
     plan, limits = listed.flight, listed.limits
@@ -54,7 +54,7 @@ def fly_landing(trial: LandingTrial, listed: FaultList) -> dict:
     try:
         with collector_off():
             result.update(_fly(trial, listed, plan, rpy))
-    except Exception as error:          # a campaign goes on, and tells what was raised
+    except Exception as error:          # the campaign continues and reports the error
         result.update(outcome='error', error=f'{type(error).__name__}: {error}'[:200])
     speed, inclined = (result.get(key) for key in ('impact_m_s', 'inclination_deg'))
     result['good'] = result['outcome'] == 'flies_on' and bool(
@@ -63,7 +63,7 @@ def fly_landing(trial: LandingTrial, listed: FaultList) -> dict:
 
 
 def attitude(seed: int) -> np.ndarray:
-    """Roll, pitch, yaw [rad] from which a landing begins; every fourth is upside down."""
+    """Roll, pitch, yaw [rad] at the start of a landing; every fourth is upside down."""
     rpy = np.random.default_rng([seed, 1]).uniform(-np.pi, np.pi, 3)
     if seed % 4 == 3:
         rpy[:2] = np.pi, 0.0
@@ -82,18 +82,18 @@ def _fly(trial, listed, plan, rpy):
     flight.loop.start_faults()
     flight.supervisor.land(flight.loop.now)
     flight.fly(plan.landing_time, watcher)
-    return told(flight, watcher, asked=asked)
+    return observed(flight, watcher, asked=asked)
 
 
 @dataclass(frozen=True)
 class HealthyTrial:
     """
-    Which flight.
+    Parameters of a healthy flight.
 
     Attributes:
-        seed: of poses and simulation.
+        seed: seed of poses and simulation.
         conditions: one of CONDITIONS; 'effects' is nominal with the list's effects in the plant.
-        controller: the active one.
+        controller: the active controller.
 
     """
 
@@ -107,15 +107,15 @@ def fly_healthy(trial: HealthyTrial, listed: FaultList) -> dict:
     Fly random poses and land.
 
     Returns:
-        the trial's fields, flown_s, alarms (a list of stamp, severity and text of every event
-        beyond information, and of named faults), state and error.
+        the trial's fields, flown_s, alarms (list of stamp, severity and text of every event above
+        information and of every named fault), state and error.
 
     """
     result = {**asdict(trial), 'flown_s': 0.0, 'alarms': [], 'state': '', 'error': ''}
     try:
         with collector_off():
             _fly_on(trial, listed, result)
-    except Exception as error:          # a campaign goes on, and tells what was raised
+    except Exception as error:          # the campaign continues and reports the error
         result['error'] = f'{type(error).__name__}: {error}'[:200]
     return result
 
@@ -132,7 +132,7 @@ def _fly_on(trial, listed, result):
             and flight.supervisor.state in ('flying', 'fallback'):
         if flight.simulator.charge < FRESH:
             flight.simulator.swap_battery()
-        flight.aim_anywhere(listed.flight)
+        flight.aim_randomly(listed.flight)
         flight.fly(plan.pose_time)
     flight.supervisor.land(flight.loop.now)
     flight.fly(listed.flight.landing_time, lambda: flight.supervisor.state == 'disarmed')
@@ -141,4 +141,4 @@ def _fly_on(trial, listed, result):
         flown_s=flight.simulator.time - start, state=supervisor.state,
         alarms=[[event.stamp, event.severity, event.text] for event in supervisor.events
                 if event.severity != INFO]
-        + [[stamp, 'fault', name] for name, stamp in told_faults(supervisor).items()])
+        + [[stamp, 'fault', name] for name, stamp in supervisor.faults.items()])

@@ -1,4 +1,4 @@
-"""Results of a campaign as tables: Markdown, and one self-contained page."""
+"""Results of a campaign as tables: Markdown and one self-contained page."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ COLUMNS = ('fault', 'what happens', 'expected', 'flights', 'as expected', 'outco
 
 
 def fault_rows(results: dict) -> list[list[str]]:
-    """Rows under COLUMNS, of the summary in ``results``."""
+    """Rows under COLUMNS, from the summary in ``results``."""
     return [[name, row['what'], row['expected'], str(row['flights']), str(row['good']),
              _counted(row['outcomes']), _number(row['impact_median_m_s']),
              _number(row['impact_worst_m_s']), _number(row['named_s'])]
@@ -20,7 +20,7 @@ def fault_rows(results: dict) -> list[list[str]]:
 
 
 def other_tables(results: dict) -> list[tuple[str, tuple[str, ...], list[list[str]]]]:
-    """Title, header and rows of landings, healthy flights and ROS, where they were flown."""
+    """Title, header and rows of landings, healthy flights and ROS, if flown."""
     tables = []
     if results.get('landings'):
         tables.append(('Landings from random attitudes', (
@@ -48,7 +48,7 @@ def other_tables(results: dict) -> list[tuple[str, tuple[str, ...], list[list[st
 
 
 def total_text(results: dict) -> str:
-    """The campaign in one sentence, '' where no fault was flown."""
+    """Summary of the campaign in one sentence, '' without faults."""
     if not results.get('summary'):
         return ''
     total = results['summary']['total']
@@ -60,7 +60,7 @@ def total_text(results: dict) -> str:
 
 
 def as_markdown(results: dict) -> str:
-    """Everything as Markdown."""
+    """All results as Markdown."""
     parts = [f'# Faults\n\n{results["meta"]["command"]}\n']
     if results.get('summary'):
         parts += [total_text(results) + '\n', markdown(COLUMNS, fault_rows(results))]
@@ -70,7 +70,7 @@ def as_markdown(results: dict) -> str:
 
 
 def as_page(results: dict) -> str:
-    """Everything as one HTML page that needs no network."""
+    """All results as one self-contained HTML page."""
     content = ''
     if results.get('summary'):
         content += section('Faults', total_text(results), _html(COLUMNS, fault_rows(results)))
@@ -88,10 +88,10 @@ def as_page(results: dict) -> str:
 
 def in_docs(text: str, table: str) -> str:
     """
-    Return ``text`` with ``table`` between its markers.
+    Replace the text between the markers by ``table``.
 
     Raises:
-        ValueError: the markers are not there.
+        ValueError: the markers are absent.
 
     """
     if BEGIN not in text or END not in text:

@@ -1,4 +1,4 @@
-"""One flight of the campaign: take off, go there, be struck, fly on, land."""
+"""One flight of the campaign: take-off, start of the fault, flight with the fault, landing."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ IN_FLIGHT = ('flying', 'fallback')
 @dataclass(frozen=True)
 class Trial:
     """
-    Which flight.
+    Parameters of a flight.
 
     Attributes:
-        case: name of what strikes.
+        case: name of the fault in the list.
         start: one of ALL_STARTS.
-        seed: of poses, moment and everything random in the simulation.
+        seed: seed of poses, time of the fault and simulation.
         conditions: 'nominal' or 'published'.
-        controller: the active one.
+        controller: the active controller.
 
     """
 
@@ -42,7 +42,7 @@ class Trial:
     controller: str = registry.DEFAULT
 
     def __str__(self) -> str:
-        """A name for its bag."""
+        """Name of its bag."""
         controller = registry.find(self.controller).name
         return f'{self.case}_{self.start}_{self.conditions}_{controller}_{self.seed}'
 
@@ -52,14 +52,14 @@ def fly_trial(trial: Trial, listed: FaultList, bags: Path | None = None) -> dict
     Fly one trial.
 
     Args:
-        trial: which.
-        listed: the list that holds its case, limits and plan.
-        bags: folder in which it records a bag; None: none is recorded.
+        trial: the trial.
+        listed: list with its case, limits and plan.
+        bags: folder for its bag; None: no bag is recorded.
 
     Returns:
         the trial's fields, expected, outcome, good, impact_m_s, inclination_deg, overrun_s,
-        flyaway, takeoffs, named and named_s, said and said_s, state, farthest_m, flown_s;
-        bag_lost (None where none was asked for) and error ('' where nothing was raised).
+        flyaway, takeoffs, named and named_s, said and said_s, state, farthest_m, flown_s,
+        bag_lost (None without a bag) and error ('' without an exception).
 
     """
     case = listed.cases[trial.case]
@@ -73,7 +73,7 @@ def fly_trial(trial: Trial, listed: FaultList, bags: Path | None = None) -> dict
                     folder, epoch=int(time()),
                     meta={**asdict(trial), 'faults': [str(one) for one in case.strike]}))
             result.update(_fly(trial, listed, recorder))
-    except Exception as error:          # a campaign goes on, and tells what was raised
+    except Exception as error:          # the campaign continues and reports the error
         result.update(outcome='error', error=f'{type(error).__name__}: {error}'[:200])
     if folder:
         result['bag_lost'] = _is_lost(folder)
@@ -87,7 +87,7 @@ def _fly(trial, listed, recorder):
                     strike=listed.cases[trial.case].strike, recorder=recorder)
     loop, supervisor = flight.loop, flight.supervisor
     loop.take_off()
-    go_to_the_fault(flight, trial.start, plan)
+    fly_to_start(flight, trial.start, plan)
     watcher = flight.watch(listed)
     start = flight.simulator.time
     loop.start_faults()
@@ -96,18 +96,18 @@ def _fly(trial, listed, recorder):
     if not over:
         supervisor.land(loop.now)
         flight.fly(plan.landing_time, watcher)
-    return {**told(flight, watcher, asked=asked), 'flown_s': flight.simulator.time - start}
+    return {**observed(flight, watcher, asked=asked), 'flown_s': flight.simulator.time - start}
 
 
-def go_to_the_fault(flight: Flight, start: str, plan: FlightPlan):
-    """Fly to where the fault strikes."""
+def fly_to_start(flight: Flight, start: str, plan: FlightPlan):
+    """Fly to the state in which the fault starts."""
     part = flight.random.uniform()
     later = plan.jitter * part
     if start in ('moving', 'random'):
         random = start == 'random'
-        flight.aim_anywhere(plan)
+        flight.aim_randomly(plan)
         flight.fly(plan.pose_time if random else plan.move_time)
-        flight.aim_anywhere(plan)
+        flight.aim_randomly(plan)
         flight.fly(part * plan.pose_time if random else later)
         return
     upside_down = start == 'upside_down'
@@ -116,7 +116,7 @@ def go_to_the_fault(flight: Flight, start: str, plan: FlightPlan):
 
 
 def _fly_on(flight: Flight, start: str, plan: FlightPlan, watcher: Watcher) -> bool:
-    """Fly on with the fault; return whether the flight ended in it."""
+    """Fly on with the fault; returns whether the flight ended."""
     left = plan.watch_time
     while left > 0:
         time = min(left, plan.move_time) if start in ('moving', 'random') else left
@@ -124,12 +124,12 @@ def _fly_on(flight: Flight, start: str, plan: FlightPlan, watcher: Watcher) -> b
             return True
         left -= time
         if left > 0:
-            flight.aim_anywhere(plan)
+            flight.aim_randomly(plan)
     return False
 
 
-def told(flight: Flight, watcher: Watcher, *, asked: bool) -> dict:
-    """What a flight showed, see :func:`fly_trial`."""
+def observed(flight: Flight, watcher: Watcher, *, asked: bool) -> dict:
+    """Observations of a flight, see :func:`fly_trial`."""
     seen, supervisor = watcher.seen, flight.supervisor
     worst = seen.worst
     inclined = max((impact.inclination for impact in seen.impacts), default=None)
@@ -145,11 +145,11 @@ def told(flight: Flight, watcher: Watcher, *, asked: bool) -> dict:
 
 
 def _is_lost(folder):
-    """Whether a bag cannot be read or misses the flight."""
+    """Whether a bag is unreadable or does not contain the flight."""
     try:
         return not len(read_bag(folder).truth_t)
-    except Exception:       # whatever it is, the bag is lost
+    except Exception:       # any error means an unusable bag
         return True
 
 
-__all__ = ['ALL_STARTS', 'fly_trial', 'told', 'Trial']
+__all__ = ['ALL_STARTS', 'fly_trial', 'observed', 'Trial']

@@ -1,4 +1,4 @@
-"""What one flight with a fault showed, judged by the truth and by what was commanded."""
+"""Outcome of a flight with a fault, from the true motion and the commanded thrust."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from beetle_omni_ros.sim.faults.listed import OutcomeLimits
 from beetle_omni_ros.sim.readings import Impact, Truth
 
+# Expected outcome -> outcomes that are equal or better.
 BETTER = {'flies_on': ('flies_on', 'refused'), 'lands': ('flies_on', 'refused', 'lands'),
           'stops': ('flies_on', 'refused', 'lands', 'stops'), 'refused': ('refused',)}
-"""Expected outcome -> outcomes that are as good or better."""
 
 
 @dataclass
@@ -21,10 +21,10 @@ class FlightWatch:
 
     Attributes:
         impacts: touchdowns.
-        crash: when the robot broke [s], or None.
-        overrun: longest time after the crash in which motors were still commanded [s].
-        flyaway: whether it left the fence or the place by too much.
-        takeoffs: how often it rose again after it had lain on the floor.
+        crash: time at which the robot broke [s], or None.
+        overrun: longest time after the crash with motors still commanded [s].
+        flyaway: whether it left the fence, or its place by too much.
+        takeoffs: number of take-offs after it had lain on the floor.
         farthest: largest distance from the start [m].
 
     """
@@ -44,12 +44,12 @@ class FlightWatch:
 
     def step(self, truth: Truth, thrust: float, tick: float) -> None:
         """
-        Take one tick.
+        Process one tick.
 
         Args:
-            truth: the state.
-            thrust: that the supervisor asks of all rotors together [N].
-            tick: its length [s].
+            truth: true state.
+            thrust: commanded thrust of all rotors together [N].
+            tick: duration of the tick [s].
 
         """
         limits, place = self.limits, truth.position
@@ -82,16 +82,16 @@ class FlightWatch:
 
     def outcome(self, *, asked: bool, stopped: bool, refused: bool) -> str:
         """
-        One word for how it went.
+        Outcome of the flight as one word.
 
         Args:
-            asked: whether it still flew when the landing was asked for.
-            stopped: whether the motors were off in the end.
-            refused: whether something was refused as it should be.
+            asked: whether the robot still flew when the landing was commanded.
+            stopped: whether the motors were off at the end.
+            refused: whether a target was refused, as expected.
 
         Returns:
-            'flies_on', 'refused', 'lands', 'stops', or, what never is right, 'flyaway',
-            'takes off', 'crash, motors on', 'tilted' or 'does not land'.
+            'flies_on', 'refused', 'lands' or 'stops'; or an outcome that is never expected:
+            'flyaway', 'takes off', 'crash, motors on', 'hard', 'tilted' or 'does not land'.
 
         """
         if self.flyaway:
@@ -113,5 +113,5 @@ class FlightWatch:
 
 
 def as_expected(expected: str, outcome: str) -> bool:
-    """Whether ``outcome`` is what was expected, or better."""
+    """Whether ``outcome`` is the expected one or better."""
     return outcome in BETTER[expected]

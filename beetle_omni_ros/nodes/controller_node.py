@@ -11,11 +11,11 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import (
     checked,
     corrected,
+    forward_health,
     guidance_of,
     PoseTarget,
     reach_of,
     State,
-    tell_health,
 )
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages.values import MessageError
@@ -129,7 +129,7 @@ class ControllerNode(FlightNode):
 
     def _on_actuators(self, told):
         self._actuators = told.health
-        tell_health(self._controller, told.health)
+        forward_health(self._controller, told.health)
 
     def _on_mode(self, mode):
         state = mode.partition(':')[0]

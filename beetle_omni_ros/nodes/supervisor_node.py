@@ -150,7 +150,7 @@ class SupervisorNode(FlightNode):
 
     def _tell(self):
         supervisor = self._supervisor
-        state = supervisor.told
+        state = supervisor.reported_state
         if state != self._state:
             self._state = state
             self._states.publish(state)

@@ -15,29 +15,29 @@ class Actuators:
     """
 
     def __init__(self):
-        self._told: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
 
     def tell(self, name: str, text: str) -> bool:
         """Store the state of bridge 'joint' or 'rotor'; False for another name."""
         if name not in NODES:
             return False
-        self._told[name] = ' '.join(text.split()) or 'says nothing'
+        self._reported[name] = ' '.join(text.split()) or 'says nothing'
         return True
 
     def fault(self, name: str) -> str:
         """'' while bridge ``name`` is ready or never reported, else its node and state."""
-        told = self._told.get(name, READY)
-        return '' if told == READY else f'{NODES[name]} {told}'
+        state = self._reported.get(name, READY)
+        return '' if state == READY else f'{NODES[name]} {state}'
 
     @property
     def rotors_may_turn(self) -> bool:
         """Whether the motor board may still execute commands, although it sends nothing."""
-        return self._told.get('rotor', '').startswith(SILENT)
+        return self._reported.get('rotor', '').startswith(SILENT)
 
     @property
     def joints_lost(self) -> bool:
         """Whether some joint does not follow its command."""
-        return self._told.get('joint', '').startswith(LOST)
+        return self._reported.get('joint', '').startswith(LOST)
 
     @property
     def why_not_arm(self) -> str:
@@ -46,4 +46,4 @@ class Actuators:
 
     def diagnostics(self) -> dict[str, str]:
         """Reported states, by node."""
-        return {NODES[name]: told for name, told in self._told.items()}
+        return {NODES[name]: state for name, state in self._reported.items()}

@@ -181,22 +181,22 @@ class BackupEstimator:
         if self.running:
             self._stamp -= by
 
-    def predict(self, now: float, wished_velocity: np.ndarray | None = None,
+    def predict(self, now: float, desired_velocity: np.ndarray | None = None,
                 motion: tuple[np.ndarray, np.ndarray] | None = None) -> None:
         """
         Advance to ``now`` without a sample.
 
         Args:
             now: [s].
-            wished_velocity: (3,) desired velocity in world, given while MoCap is lost [m/s].
+            desired_velocity: (3,) desired velocity in world, given while MoCap is lost [m/s].
             motion: specific force (3,) [m/s^2] and angular acceleration (3,) [rad/s^2] in
                 base_link by the model, used while the IMU is gone.
 
         """
         dt = now - self._stamp
-        if wished_velocity is not None and dt > 0:
+        if desired_velocity is not None and dt > 0:
             self._velocity = self._velocity + min(1.0, dt / self._parameters.velocity_leak_time) \
-                * (wished_velocity - self._velocity)
+                * (desired_velocity - self._velocity)
         if not self.imu_alive:
             self.specific_force_up = None
             if motion is None or dt <= 0:

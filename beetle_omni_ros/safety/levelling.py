@@ -163,13 +163,13 @@ def _follow(tilt, up, allocator, p):
     waits, lost = np.zeros(shape[:2]), np.zeros(len(up))
     for k in range(shape[1]):
         angle = angles[:, k]
-        wished = angle + 2 * np.pi * np.round((present - angle) / (2 * np.pi))
-        wished = np.where(np.abs(wished) > limit, angle, wished)
-        moves = np.abs(wished - present)
+        goal = angle + 2 * np.pi * np.round((present - angle) / (2 * np.pi))
+        goal = np.where(np.abs(goal) > limit, angle, goal)
+        moves = np.abs(goal - present)
         time = moves / p.joint_rate
         waits[:, k] = time.max(axis=1)
         lost += (thrusts[:, k] * np.where(moves > TURNED_OVER, time, 0.0)).sum(axis=1) / hover
-        present = wished
+        present = goal
     return waits, lost
 
 

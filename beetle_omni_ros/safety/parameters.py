@@ -149,8 +149,8 @@ class BackupParameters:
     bias_time: float = parameter(2.0, doc='over which IMU biases are learnt from the estimator',
                                  unit='s', low=0.1, high=100)
     velocity_leak_time: float = parameter(
-        3.0, doc='without MoCap the velocity forgets towards the wished one', unit='s', low=0.2,
-        high=100)
+        3.0, doc='time constant of the velocity towards the desired one without MoCap', unit='s',
+        low=0.2, high=100)
     error_limit: float = parameter(0.2, doc='larger MoCap corrections are shortened',
                                    unit='m or rad', low=0.01, high=5)
 

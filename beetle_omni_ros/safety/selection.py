@@ -67,12 +67,12 @@ class Selection:
 
     def diagnostics(self) -> dict[str, float | int]:
         """For each controller: validity, silence [ms], refusals by reason."""
-        told: dict[str, float | int] = {}
+        values: dict[str, float | int] = {}
         for name, stream in self._streams.items():
-            told[f'{name}.good'] = int(stream.good)
-            told[f'{name}.silent_ms'] = 1000 * stream.silence.elapsed
-            told.update({f'{name}.refused.{reason}': count
+            values[f'{name}.good'] = int(stream.good)
+            values[f'{name}.silent_ms'] = 1000 * stream.silence.elapsed
+            values.update({f'{name}.refused.{reason}': count
                          for reason, count in stream.refused.items()})
         if self._unknown:
-            told[f'refused.{UNKNOWN}'] = self._unknown
-        return told
+            values[f'refused.{UNKNOWN}'] = self._unknown
+        return values

@@ -174,18 +174,18 @@ class Supervisor(Inputs):
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """State, sources and refusals, flat, for operators and logs."""
-        told: dict[str, float | int | str] = {
+        values: dict[str, float | int | str] = {
             'state': self.state, 'controller': self.active, 'source': self.source,
             'estimator': self.vehicle.status or 'never heard',
             'on_backup_estimator': int(self.vehicle.backup.running)}
-        told.update({f'fault.{name}': at for name, at in self.faults.items()})
-        told.update(self.actuators.diagnostics())
-        told.update(self._selection.diagnostics())
+        values.update({f'fault.{name}': at for name, at in self.faults.items()})
+        values.update(self.actuators.diagnostics())
+        values.update(self._selection.diagnostics())
         for reason, count in self.vehicle.refused.items():
-            told[f'refused.{reason}'] = count
+            values[f'refused.{reason}'] = count
         if self.vehicle.voltage is not None:
-            told['battery_V'] = self.vehicle.voltage
-        return told
+            values['battery_V'] = self.vehicle.voltage
+        return values
 
     @property
     def airborne(self) -> bool:
@@ -236,7 +236,7 @@ class Supervisor(Inputs):
             self._landing_way = self._landing.way
 
     @property
-    def told(self) -> str:
+    def reported_state(self) -> str:
         """The state with its controller ('flying:nmpc') or its last fault ('landing:crash')."""
         if self.state == FLYING:
             return f'{FLYING}:{self.active}'

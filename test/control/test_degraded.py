@@ -123,23 +123,23 @@ def test_the_plan_knows_the_bounds(nmpc):
 
 def test_a_feasible_pose_is_held_firmly_at_the_same_place():
     for health in (LOST, STUCK):
-        wished = PoseTarget(PLACE, rotations.from_rpy(1.4, 0.3, 0.7), 3.0)
-        got = feasible_target(wished, health, ROBOT)
+        target = PoseTarget(PLACE, rotations.from_rpy(1.4, 0.3, 0.7), 3.0)
+        got = feasible_target(target, health, ROBOT)
         np.testing.assert_array_equal(got.position, PLACE)
         assert got.stamp == 3.0
         assert Holding(ROBOT, health).margin(got.quaternion) >= 1.0 - 1e-9
-    assert feasible_target(wished, ALL_HEALTHY, ROBOT) is wished
+    assert feasible_target(target, ALL_HEALTHY, ROBOT) is target
 
 
 def test_a_trajectory_that_cannot_be_held_is_flown_in_one_attitude():
     times = np.linspace(0.0, 2.0, 5)
     quaternions = np.array([rotations.from_rpy(0.8 * t, 0.0, 0.0) for t in times])
-    wished = TrajectoryTarget(times, np.outer(times, [1.0, 0, 0]), quaternions,
+    target = TrajectoryTarget(times, np.outer(times, [1.0, 0, 0]), quaternions,
                               np.tile([1.0, 0, 0], (5, 1)), np.tile([0.8, 0, 0], (5, 1)))
-    got = feasible_target(wished, LOST, ROBOT)
-    np.testing.assert_array_equal(got.positions, wished.positions)
+    got = feasible_target(target, LOST, ROBOT)
+    np.testing.assert_array_equal(got.positions, target.positions)
     assert not got.angular_velocities.any()
     assert Holding(ROBOT, LOST).margin(got.quaternions[0]) >= 2.0
-    still = TrajectoryTarget(times, wished.positions, np.tile(got.quaternions[0], (5, 1)),
-                             wished.velocities, np.zeros((5, 3)))
+    still = TrajectoryTarget(times, target.positions, np.tile(got.quaternions[0], (5, 1)),
+                             target.velocities, np.zeros((5, 3)))
     assert feasible_target(still, LOST, ROBOT) is still

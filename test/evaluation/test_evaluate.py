@@ -143,14 +143,14 @@ def test_an_empty_pack_is_swapped_at_the_next_target(charge, tmp_path, monkeypat
     assert drawn > CAPACITY     # more than one pack holds
 
 
-def test_faults_of_a_file_strike_and_are_told(poses, tmp_path):
+def test_faults_of_a_file_act_and_are_listed_in_the_results(poses, tmp_path):
     path = tmp_path / 'faults.yaml'
     path.write_text('faults: [{what: rotor_stops, at: 1.0, rotor: 2}, {what: controller_silent}]')
     results = evaluate(poses, ('hover',), faults=path, bag=tmp_path / 'bag')
-    told = ['rotor_stops(rotor=2) at 1 s', 'controller_silent at 0 s']
-    assert results['meta']['faults'] == told
+    listed = ['rotor_stops(rotor=2) at 1 s', 'controller_silent at 0 s']
+    assert results['meta']['faults'] == listed
     log = read_bag(tmp_path / 'bag')
-    assert log.meta['faults'] == told
+    assert log.meta['faults'] == listed
     assert 'fallback:controller_silent' in log.states
     assert log.meta['broken'] == results['hover']['crashed']
     assert not log.meta['broken'] or log.meta['impact']['speed'] > 1.0

@@ -53,7 +53,7 @@ def test_without_a_fault_everything_passes_as_it_is(struck):
     assert processes.estimate(STATE) is STATE
     assert processes.requests(state, 1.0) == [state] and processes.requests(None, 1.0) == []
     assert processes.target(PoseTarget(np.zeros(3), STATE.quaternion)) is None
-    processes.tell('on_battery', 24.0)
+    processes.send('on_battery', 24.0)
     assert ear.heard == [('on_battery', 24.0)]
 
 
@@ -61,8 +61,8 @@ def test_a_supervisor_that_waits_finds_the_newest_messages_in_its_queues(struck)
     processes, ear = struck(Fault('supervisor_waits', duration=0.1))
     assert processes.supervisor_waits
     for k in range(20):
-        processes.tell('on_battery', k)
-    processes.tell('on_imu', 0)
+        processes.send('on_battery', k)
+    processes.send('on_imu', 0)
     assert ear.heard == []
     processes.frame(frame(0.1))
     assert not processes.supervisor_waits
@@ -107,12 +107,12 @@ def test_estimates(struck):
     frozen, _ = struck(Fault('estimator_frozen'))
     frozen.estimate(STATE)
     later = State(**{**vars(STATE), 'stamp': 2.0, 'position': np.zeros(3)})
-    told = frozen.estimate(later)
-    assert told.stamp == 2.0 and told.position[0] == 1.0
+    estimate = frozen.estimate(later)
+    assert estimate.stamp == 2.0 and estimate.position[0] == 1.0
     away, _ = struck(Fault('estimator_diverges', acceleration=2.0))
     for _ in range(200):
-        told = away.estimate(STATE)
-    assert np.isclose(told.position[0] - 1.0, 1.0) and np.isclose(told.velocity[0], 2.0)
+        estimate = away.estimate(STATE)
+    assert np.isclose(estimate.position[0] - 1.0, 1.0) and np.isclose(estimate.velocity[0], 2.0)
     random, _ = struck(Fault('estimator_rubbish'))
     assert np.isclose(np.linalg.norm(random.estimate(STATE).quaternion), 1.0)
 

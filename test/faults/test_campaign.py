@@ -20,7 +20,7 @@ from beetle_omni_ros.faults.landings import (
     HealthyTrial,
     LandingTrial,
 )
-from beetle_omni_ros.faults.trial import fly_trial, go_to_the_fault, Trial
+from beetle_omni_ros.faults.trial import fly_to_start, fly_trial, Trial
 
 ROOT = Path(__file__).parents[2]
 
@@ -50,13 +50,13 @@ def test_a_trial_is_deterministic_and_its_bag_is_read_back(soft):
     assert 0.1 < first['impact_m_s'] < 1.0
 
 
-def test_lost_commands_end_in_a_crash_that_is_told(quick):
+def test_lost_commands_end_in_a_crash_outcome(quick):
     flown = fly_trial(Trial('commands_lost'), quick)
     assert flown['broken'] and flown['impact_m_s'] > 2
     assert flown['overrun_s'] == 0.0
 
 
-def test_an_error_in_a_flight_is_told_and_the_campaign_goes_on(quick):
+def test_an_error_in_a_flight_is_reported_and_the_campaign_continues(quick):
     flown = fly_trial(Trial('gust', controller='none'), quick)
     assert flown['outcome'] == 'error' and not flown['good'] and 'none' in flown['error']
 
@@ -88,11 +88,11 @@ def test_sums_add_up(listed):
                                     impact_m_s=None),
              result('impact', named='push', named_s=0.2, impact_m_s=0.5, takeoffs=1),
              result('impact', outcome='error', error='x', good=False, bag_lost=True)]
-    told = summary(flown, listed)
-    assert told['faults']['gust']['outcomes'] == {'lands': 1, 'flyaway': 1}
-    assert told['faults']['gust']['impact_worst_m_s'] == 0.3
-    assert told['faults']['impact']['named_s'] == 0.2
-    assert told['total'] == {'flights': 4, 'good': 2, 'share': 0.5, 'flyaways': 1,
+    totals = summary(flown, listed)
+    assert totals['faults']['gust']['outcomes'] == {'lands': 1, 'flyaway': 1}
+    assert totals['faults']['gust']['impact_worst_m_s'] == 0.3
+    assert totals['faults']['impact']['named_s'] == 0.2
+    assert totals['total'] == {'flights': 4, 'good': 2, 'share': 0.5, 'flyaways': 1,
                              'motors_on_after_crash': 0, 'takeoffs': 1, 'errors': 1,
                              'lost_bags': 1}
 
@@ -115,11 +115,11 @@ def test_the_command_writes_page_markdown_and_json(listed, tmp_path, monkeypatch
                                    outcome='<b>') for trial in trials))
     docs = tmp_path / 'safety.md'
     docs.write_text(f'before\n{page.BEGIN}\nold\n{page.END}\nafter\n')
-    told = run_faults(only=['gust', 'impact'], starts=['hover'], seeds=2, seed=7, docs=docs,
+    totals = run_faults(only=['gust', 'impact'], starts=['hover'], seeds=2, seed=7, docs=docs,
                       output=tmp_path / 'out', console=Console(file=io.StringIO()))
-    assert [(one['case'], one['seed']) for one in told['flights']] == [
+    assert [(one['case'], one['seed']) for one in totals['flights']] == [
         ('gust', 7), ('gust', 8), ('impact', 7), ('impact', 8)]
-    assert '--seeds 2 --seed 7 ' in told['meta']['command']
+    assert '--seeds 2 --seed 7 ' in totals['meta']['command']
     html = (tmp_path / 'out' / 'faults.html').read_text()
     assert '&lt;b&gt;' in html and 'http' not in html
     assert json.loads((tmp_path / 'out' / 'faults.json').read_text())['summary']['total']['good']
@@ -154,7 +154,7 @@ def test_at_a_random_moment_faults_strike_all_over_the_time_of_a_pose(listed):
         def __init__(self, seed):
             self.random, self.asked = np.random.default_rng(seed), []
 
-        def aim_anywhere(self, plan):
+        def aim_randomly(self, plan):
             self.asked.append('pose')
 
         def fly(self, duration):
@@ -162,7 +162,7 @@ def test_at_a_random_moment_faults_strike_all_over_the_time_of_a_pose(listed):
 
     flights = [Recorded(seed) for seed in range(40)]
     for flight in flights:
-        go_to_the_fault(flight, 'random', listed.flight)
+        fly_to_start(flight, 'random', listed.flight)
     whole = listed.flight.pose_time
     assert all(flight.asked[:3] == ['pose', whole, 'pose'] for flight in flights)
     moments = np.array([flight.asked[3] for flight in flights]) / whole

@@ -6,7 +6,7 @@ import pytest
 from beetle_omni_ros.safety.actuators import Actuators
 
 
-def told(puppet, name, text):
+def report(puppet, name, text):
     """Let a bridge say something, and the supervisor look at it."""
     assert puppet.supervisor.on_actuators(name, text, puppet.now)
     puppet.run(TICK)
@@ -23,11 +23,11 @@ def test_bridges_that_were_never_heard_have_no_influence():
 def test_a_bridge_that_is_not_ready_refuses_arming_with_its_own_words(name, text):
     puppet = Puppet()
     puppet.run(0.6)
-    told(puppet, name, text)
+    report(puppet, name, text)
     answer = puppet.supervisor.arm(puppet.now)
     assert not answer and f'{name}_bridge_node {text}' in answer.text
     assert puppet.supervisor.state == 'disarmed'
-    told(puppet, name, 'ready')
+    report(puppet, name, 'ready')
     assert puppet.supervisor.arm(puppet.now)
 
 
@@ -42,39 +42,39 @@ def test_both_reasons_are_given_on_one_line():
 @pytest.mark.parametrize('text', ['lost: gimbal3 silent', 'waiting: deactivated'])
 def test_lost_servos_in_flight_lead_to_a_landing_that_names_them(text):
     puppet = flown()
-    told(puppet, 'joint', 'ready')
+    report(puppet, 'joint', 'ready')
     assert puppet.supervisor.state == 'flying'
-    told(puppet, 'joint', text)
+    report(puppet, 'joint', text)
     assert puppet.supervisor.state == 'landing'
     assert any(said.startswith(f'joint_bridge_node {text}: landing')
                for said in puppet.texts('error'))
-    told(puppet, 'joint', 'ready')
+    report(puppet, 'joint', 'ready')
     assert puppet.supervisor.state == 'landing'
 
 
 @pytest.mark.parametrize('landing', [False, True])
 def test_a_lost_motor_board_in_flight_stops_everything_until_disarmed(landing):
     puppet = flown()
-    told(puppet, 'rotor', 'ready')
+    report(puppet, 'rotor', 'ready')
     if landing:
         assert puppet.supervisor.land(puppet.now)
         puppet.run(TICK)
-    told(puppet, 'rotor', 'lost: restarted')
+    report(puppet, 'rotor', 'lost: restarted')
     assert puppet.supervisor.state == 'emergency_stop'
     assert not puppet.command.thrust.any()
     assert any('rotor_bridge_node lost: restarted' in said for said in puppet.texts('error'))
-    told(puppet, 'rotor', 'ready')
+    report(puppet, 'rotor', 'ready')
     assert puppet.supervisor.state == 'emergency_stop'
     assert puppet.supervisor.disarm(puppet.now)
 
 
 def test_a_motor_board_that_is_not_heard_carries_the_robot_to_the_ground():
     puppet = flown()
-    told(puppet, 'rotor', 'silent: nothing heard of the board')
+    report(puppet, 'rotor', 'silent: nothing heard of the board')
     assert puppet.supervisor.state == 'landing' and puppet.command.thrust.any()
     assert any('silent: nothing heard of the board: landing' in said
                for said in puppet.texts('error'))
-    told(puppet, 'rotor', 'lost: restarted')
+    report(puppet, 'rotor', 'lost: restarted')
     assert puppet.supervisor.state == 'emergency_stop'
 
 
@@ -85,7 +85,7 @@ def test_a_bridge_lost_before_lift_off_just_stops_the_motors(name):
     puppet.run(0.6)
     assert puppet.supervisor.arm(puppet.now)
     puppet.run(0.1)
-    told(puppet, name, 'lost: not armed: refused by the board: battery low')
+    report(puppet, name, 'lost: not armed: refused by the board: battery low')
     assert puppet.supervisor.state == 'disarmed'
     assert any('battery low' in said and 'still on the ground: motors off' in said
                for said in puppet.texts('error'))
@@ -94,7 +94,7 @@ def test_a_bridge_lost_before_lift_off_just_stops_the_motors(name):
 def test_the_rest_of_a_flight_is_not_bothered_by_a_bridge_that_is_lost_while_disarmed():
     puppet = Puppet()
     puppet.run(0.6)
-    told(puppet, 'rotor', 'lost: restarted')
+    report(puppet, 'rotor', 'lost: restarted')
     assert puppet.supervisor.state == 'disarmed' and not puppet.texts('error')
     assert puppet.supervisor.diagnostics()['rotor_bridge_node'] == 'lost: restarted'
 

@@ -120,17 +120,17 @@ def test_unusable_readings_are_refused_and_change_nothing(bad):
     assert errors(estimator, 1.0) == before
 
 
-def test_without_mocap_the_velocity_forgets_towards_the_wished_one():
+def test_without_mocap_the_velocity_decays_to_the_desired_one():
     estimator = BackupEstimator(BackupParameters(), GRAVITY)
     still = State(0.0, np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 0, 0, 1.0]), np.zeros(3),
                   np.zeros(4), np.zeros(4), 0.0)
     estimator.start(still)
-    wished = np.array([0.0, 0, -0.3])
+    desired = np.array([0.0, 0, -0.3])
     for k in range(1, 2001):
-        estimator.predict(k / 200, wished)
+        estimator.predict(k / 200, desired)
         estimator.on_imu(k / 200, np.array([0, 0, GRAVITY]), np.zeros(3))
     velocity = estimator.state(np.zeros(4), np.zeros(4), 10.0, 10.0).velocity
-    np.testing.assert_allclose(velocity, wished, atol=0.05)
+    np.testing.assert_allclose(velocity, desired, atol=0.05)
 
 
 def test_clock_set_back_is_followed():

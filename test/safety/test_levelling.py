@@ -26,10 +26,10 @@ def followed(way, tilt):
     """Tilts (P, 4) that the allocation takes along a way, and the largest loss of thrust."""
     present, tilts, jumps = np.array(tilt), [], []
     for elapsed in np.linspace(0, way.duration, 200):
-        wished = ALLOCATOR.hover(way.at(elapsed)[0], present)
-        moved = np.abs(wished.tilt - present) > 1.0
-        jumps.append(float((wished.thrust * moved).sum()))
-        present = wished.tilt
+        goal = ALLOCATOR.hover(way.at(elapsed)[0], present)
+        moved = np.abs(goal.tilt - present) > 1.0
+        jumps.append(float((goal.thrust * moved).sum()))
+        present = goal.tilt
         tilts.append(present)
     return np.array(tilts), np.array(jumps)
 

@@ -380,7 +380,7 @@ def test_an_impact_near_the_floor_stops_the_motors_for_good():
         puppet.supervisor.on_imu(puppet.now + after, np.array([0, 0, 120.0]), np.zeros(3))
     sent = puppet.run(0.1)
     assert puppet.supervisor.state == 'emergency_stop'
-    assert puppet.supervisor.told == 'emergency_stop:crash'
+    assert puppet.supervisor.reported_state == 'emergency_stop:crash'
     assert not sent[0].thrust.any()
     assert not puppet.supervisor.arm(puppet.now)
 

@@ -16,11 +16,11 @@ import numpy as np
 from beetle_omni_ros.control.base import (
     Command,
     Controller,
+    forward_health,
     PoseTarget,
     reach_of,
     State,
     Target,
-    tell_health,
 )
 from beetle_omni_ros.control.guidance.routing import Routing, RoutingParameters
 from beetle_omni_ros.control.guidance.trimming import Trimming, TrimmingParameters
@@ -158,9 +158,9 @@ class Guided:
 
     def set_health(self, health: ActuatorHealth) -> None:
         """Pass the health of the actuators to a controller that accepts it."""
-        tell_health(self._controller, health)
+        forward_health(self._controller, health)
 
     def diagnostics(self) -> dict[str, float | int | str]:
         """Diagnostics of the controller, and the counts of the guidance."""
-        told = getattr(self._controller, 'diagnostics', dict)
-        return {**told(), **self._guidance.diagnostics()}
+        diagnostics = getattr(self._controller, 'diagnostics', dict)
+        return {**diagnostics(), **self._guidance.diagnostics()}

@@ -33,7 +33,7 @@ class FaultWatch:
 
     Args:
         parameters: thresholds.
-        robot: as believed.
+        robot: nominal robot.
         allocator: of the robot.
 
     Attributes:

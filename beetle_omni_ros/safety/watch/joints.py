@@ -23,7 +23,7 @@ class JointWatch:
 
     Args:
         limits: thresholds.
-        robot: as believed.
+        robot: nominal robot.
 
     Attributes:
         jammed: joints (4,) bool that stand still away from their command.

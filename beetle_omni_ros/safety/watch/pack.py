@@ -30,7 +30,7 @@ class PackWatch:
 
     Args:
         limits: noise and times.
-        robot: as believed.
+        robot: nominal robot.
         allocator: of the robot.
         rotor_map: thrust limits by voltage.
 

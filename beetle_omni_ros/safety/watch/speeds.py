@@ -30,7 +30,7 @@ class SpeedWatch:
 
     Args:
         limits: thresholds.
-        robot: as believed.
+        robot: nominal robot.
 
     Attributes:
         lost: the rotor (0 to 3) that turns too slowly, or None.
@@ -128,5 +128,5 @@ class SpeedWatch:
         deaf = full & (variance > self._p.least_variation**2) \
             & (slope_times < self._p.least_slope * variance)
         self._deaf_for = np.where(deaf, self._deaf_for + dt, 0.0)
-        told = (self._deaf_for >= self._p.deaf_time) | (self._more_for >= self._p.speed_time)
-        self.deaf = int(np.argmax(told)) if told.any() else None
+        found = (self._deaf_for >= self._p.deaf_time) | (self._more_for >= self._p.speed_time)
+        self.deaf = int(np.argmax(found)) if found.any() else None

@@ -32,7 +32,7 @@ class WrenchWatch:
     Args:
         rotor: thresholds of a lost rotor.
         contact: thresholds of contact.
-        robot: as believed.
+        robot: nominal robot.
         allocator: of the robot.
 
     Attributes:
