@@ -1,1 +1,1 @@
-"""Driving by hand: keys, sticks and words to target poses. No ROS here."""
+"""Driving by hand: target poses from keys, joystick axes and typed commands; no ROS."""

@@ -1,4 +1,4 @@
-"""Keys and sticks: what they shift."""
+"""Shifts of the goal by keys and joystick axes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ WORDS = {'t': 'arm', 'x': 'land', ' ': 'hold', 'h': 'home', '0': 'level', '!': '
 HELP = ('w s a d r f: forth, back, left, right, up, down    o u i k j l: roll, pitch, yaw\n'
         't arm and take off, x land, space hold, h home, 0 level, c other controller, '
         '! emergency stop, q quit')
-ORDER = (0, 1, 2, 5, 4, 3)      # of DriveParameters.axes among x, y, z, roll, pitch, yaw
+ORDER = (0, 1, 2, 5, 4, 3)      # DriveParameters.axes -> index in x, y, z, roll, pitch, yaw
 
 
 def shift_of_key(key: str, p: DriveParameters) -> tuple[np.ndarray, np.ndarray] | None:
-    """What a key shifts: (3,) [m] and (3,) roll, pitch, yaw [rad]; None for any other key."""
+    """Shift by a key: (3,) [m] and (3,) roll, pitch, yaw [rad]; None for another key."""
     if key not in MOVES:
         return None
     axis, direction = MOVES[key]
@@ -32,29 +32,29 @@ def shift_of_key(key: str, p: DriveParameters) -> tuple[np.ndarray, np.ndarray] 
 def shift_of_sticks(axes: Sequence[float], seconds: float, p: DriveParameters
                     ) -> tuple[np.ndarray, np.ndarray]:
     """
-    What a joystick shifts in ``seconds``, at most speed and rate.
+    Shift by a joystick in ``seconds``; a fully deflected axis moves at full speed or rate.
 
     Args:
-        axes: of sensor_msgs/Joy, -1 to 1; one that is missing or not finite counts as released.
-        seconds: since the last shift.
-        p: which axis does what, and the dead zone, beyond which the way begins at zero.
+        axes: axes of sensor_msgs/Joy, -1 to 1; a missing or not finite one counts as released.
+        seconds: time since the last shift [s].
+        p: mapping of the axes, and the dead zone, at whose edge the speed is zero.
 
     Returns:
-        (3,) [m] and (3,) roll, pitch, yaw [rad].
+        shift (3,) [m] and (3,) roll, pitch, yaw [rad].
 
     """
     shift = np.zeros(6)
-    for place, number, sign in zip(ORDER, p.axes.astype(int), p.signs):
+    for index, number, sign in zip(ORDER, p.axes.astype(int), p.signs):
         value = float(axes[number]) if 0 <= number < len(axes) else 0.0
-        if not abs(value) > p.dead_zone:        # nan neither
+        if not abs(value) > p.dead_zone:        # also for NaN
             continue
-        beyond = (min(abs(value), 1.0) - p.dead_zone) / (1 - p.dead_zone)
-        most = seconds * (p.speed if place < 3 else p.rate)
-        shift[place] = sign * np.sign(value) * beyond * most
+        deflection = (min(abs(value), 1.0) - p.dead_zone) / (1 - p.dead_zone)
+        largest = seconds * (p.speed if index < 3 else p.rate)
+        shift[index] = sign * np.sign(value) * deflection * largest
     return shift[:3], shift[3:]
 
 
 def pressed(before: Sequence[int], now: Sequence[int], p: DriveParameters) -> list[str]:
-    """Names of the buttons that have gone down."""
+    """Names of the buttons pressed since ``before``."""
     return [name for name, number in p.buttons.items() if number < len(now) and now[number]
             and not (number < len(before) and before[number])]

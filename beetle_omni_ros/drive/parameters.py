@@ -1,4 +1,4 @@
-"""How the robot is driven: limits of the target, axes and buttons, named poses."""
+"""Parameters of driving by hand: limits of the target, axes, buttons, named poses."""
 
 from __future__ import annotations
 
@@ -18,24 +18,27 @@ BUTTONS = ('arm', 'land', 'hold', 'home')
 
 @dataclass(frozen=True, kw_only=True)
 class DriveParameters:
-    """params/drive.yaml."""
+    """Content of params/drive.yaml."""
 
-    speed: float = parameter(doc='of the target', unit='m/s', low=0.01, high=5)
-    rate: float = parameter(doc="of the target's attitude", unit='rad/s', low=0.01, high=10)
-    leash: float = parameter(doc='of the target ahead of the robot', unit='m', low=0.05, high=5)
-    step: float = parameter(doc='of one key', unit='m', low=0.001, high=1)
-    turn: float = parameter(doc='of one key', unit='rad', low=0.001, high=1.6)
-    dead_zone: float = parameter(doc="of a joystick's axes", low=0, high=0.9)
-    joystick_timeout: float = parameter(doc='after which a stick counts as released', unit='s',
-                                        low=0.05, high=10)
-    axes: np.ndarray = parameter(doc='of sensor_msgs/Joy for x, y, z, yaw, pitch, roll; -1: none',
-                                 low=-1, high=63, shape=(6,))
-    signs: np.ndarray = parameter(doc='of these axes', low=-1, high=1, shape=(6,))
+    speed: float = parameter(doc='largest speed of the target', unit='m/s', low=0.01, high=5)
+    rate: float = parameter(doc='largest rate of the target attitude', unit='rad/s', low=0.01,
+                            high=10)
+    leash: float = parameter(doc='distance from the robot at which the target waits', unit='m',
+                             low=0.05, high=5)
+    step: float = parameter(doc='shift by one key', unit='m', low=0.001, high=1)
+    turn: float = parameter(doc='rotation by one key', unit='rad', low=0.001, high=1.6)
+    dead_zone: float = parameter(doc='deflection of a joystick axis that counts as none', low=0,
+                                 high=0.9)
+    joystick_timeout: float = parameter(doc='time without a message after which the joystick '
+                                        'counts as released', unit='s', low=0.05, high=10)
+    axes: np.ndarray = parameter(doc='axes of sensor_msgs/Joy for x, y, z, yaw, pitch, roll; '
+                                 '-1: none', low=-1, high=63, shape=(6,))
+    signs: np.ndarray = parameter(doc='signs of these axes', low=-1, high=1, shape=(6,))
     buttons: dict = parameter(doc='arm, land, hold, home -> number of the button')
     poses: dict = parameter(doc='name -> x, y, z [m], roll, pitch, yaw [deg]')
 
     def __post_init__(self):
-        """Refuse buttons and poses that are none."""
+        """Check buttons and poses."""
         for name, number in self.buttons.items():
             if name not in BUTTONS or not isinstance(number, int) or not 0 <= number < 64:
                 raise ParameterError(f"key 'buttons.{name}': expected {', '.join(BUTTONS)} with "
@@ -49,7 +52,7 @@ class DriveParameters:
 
 
 def check_poses(poses: dict, where: str) -> None:
-    """Refuse names and poses of which a word could not be made."""
+    """Check names and values of named poses; raises ParameterError."""
     for name, pose in poses.items():
         if not isinstance(name, str) or not name.isidentifier():
             raise ParameterError(f"{where}{name}': expected a name of letters and digits")
@@ -61,10 +64,10 @@ def check_poses(poses: dict, where: str) -> None:
 
 def read_named_poses(path: str | Path) -> dict:
     """
-    Read more named poses: a YAML file of ``name: [x, y, z, roll, pitch, yaw]``.
+    Read named poses: a YAML file with ``name: [x, y, z, roll, pitch, yaw]`` [m, deg].
 
     Raises:
-        ParameterError: naming file and name.
+        ParameterError: unusable file or pose; the message has file and name.
 
     """
     poses = schema.load_yaml(path)

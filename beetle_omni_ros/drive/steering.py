@@ -1,4 +1,4 @@
-"""The target of a robot that is driven by hand: a goal, and the limited way to it."""
+"""Target of a robot driven by hand, which moves to a goal at limited speed."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from beetle_omni_ros.drive.parameters import DriveParameters
 from beetle_omni_ros.robot import rotations
 
-NEAR = 1e-9     # [m, rad] from the goal that is no way any more
+NEAR = 1e-9     # [m, rad] distance from the goal that counts as arrived
 
 
 class Steering:
     """
-    Moves a target towards a goal, never faster than the limits.
+    Moves a target to a goal within the limits.
 
     Args:
-        parameters: limits.
-        why_not: position (3,) [m] and quaternion (4,) -> '' where the pose may be flown, else why
-            it may not.
-        position: (3,) in world at which it begins [m].
-        quaternion: (4,) body to world at which it begins.
+        parameters: limits of the motion.
+        why_not: check of a pose, position (3,) [m] and quaternion (4,); returns '' or the reason
+            why it must not be flown.
+        position: (3,) initial target in world [m].
+        quaternion: (4,) initial target, body to world, xyzw.
 
     Attributes:
-        position, quaternion: the target to fly now.
-        goal: position and quaternion to which it goes.
+        position, quaternion: present target.
+        goal: position and quaternion of the goal.
 
     """
 
@@ -43,7 +43,7 @@ class Steering:
             and rotations.geodesic_angle(self.goal[1], self.quaternion) < 1e-6
 
     def go(self, position: np.ndarray, quaternion: np.ndarray) -> str:
-        """Set the goal; '' or why it may not be flown, and the goal stays."""
+        """Set the goal; return '', or the reason of a refusal, which leaves the goal as it is."""
         reason = self._why_not(position, quaternion)
         if not reason:
             self.goal = np.array(position, dtype=float), rotations.normalized(quaternion)
@@ -51,11 +51,11 @@ class Steering:
 
     def shift(self, way: np.ndarray, turn: np.ndarray) -> str:
         """
-        Shift the goal; as :meth:`go`.
+        Shift the goal; returns as :meth:`go`.
 
         Args:
-            way: (3,) along world's axes [m].
-            turn: (3,) roll and pitch about the body's axes, yaw about world's z [rad].
+            way: (3,) shift in world [m].
+            turn: (3,) rotation: roll and pitch about the body's axes, yaw about world's z [rad].
 
         """
         position, quaternion = self.goal
@@ -64,19 +64,19 @@ class Steering:
             rotations.exp([0.0, 0.0, turn[2]]), tilted))
 
     def hold(self) -> None:
-        """Stay where the target is now."""
+        """Set the goal to the present target."""
         self.goal = self.position, self.quaternion
 
     def update(self, seconds: float, robot: np.ndarray | None = None) -> str:
         """
-        Move the target on.
+        Move the target.
 
         Args:
-            seconds: since the last update.
-            robot: (3,) where the robot is [m]; a target that is a leash ahead waits.
+            seconds: time since the last update [s].
+            robot: (3,) position of the robot [m]; the target waits at a distance of ``leash``.
 
         Returns:
-            '' or why the way may not be flown; then the target stays where it is.
+            '' or the reason why the next pose must not be flown; then the target stops.
 
         """
         if self.arrived:

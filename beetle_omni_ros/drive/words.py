@@ -1,4 +1,4 @@
-"""Words of the terminal: `up 0.3`, `roll 180`, `goto 1 0 1 0 0 90`, `home`."""
+"""Parser of typed commands: `up 0.3`, `roll 180`, `goto 1 0 1 0 0 90`, `home`."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ ORDERS = ('arm', 'land', 'emergency_stop', 'hold', 'level', 'where', 'help', 'qu
 HELP = ('forth|back|left|right|up|down METRES, roll|pitch|yaw DEGREES, '
         'goto X Y Z [ROLL PITCH YAW], controller NAME, wait [SECONDS], arm, land, hold, level, '
         'where, emergency_stop, quit')
-MOST = 180.0    # [deg] of one turn: beyond it the shorter way is another one
+MAX_TURN = 180.0    # [deg]; the shortest path to a larger rotation has the other direction
 
 
 class WordError(ValueError):
-    """A line of the terminal cannot be understood; the text says what was expected."""
+    """A typed line is not a command; the message has the expected input."""
 
 
 @dataclass(frozen=True)
 class Shift:
-    """Shift of the goal: (3,) along world's axes [m], (3,) roll, pitch, yaw [rad]."""
+    """Shift of the goal: (3,) in world [m], (3,) roll, pitch, yaw [rad]."""
 
     way: np.ndarray
     turn: np.ndarray
@@ -34,7 +34,7 @@ class Shift:
 
 @dataclass(frozen=True)
 class Go:
-    """A goal: (3,) in world [m], (4,) body to world, or None to keep the attitude."""
+    """A goal: (3,) in world [m], (4,) body to world, xyzw, or None to keep the attitude."""
 
     position: np.ndarray
     quaternion: np.ndarray | None
@@ -42,7 +42,7 @@ class Go:
 
 @dataclass(frozen=True)
 class Order:
-    """Something else: its name, and the word or number behind it."""
+    """Another command: its name and its argument."""
 
     name: str
     value: str = ''
@@ -50,14 +50,14 @@ class Order:
 
 def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Shift | Go | Order | None:
     """
-    Understand one line; None for an empty one, and for what follows a #.
+    Parse one line; None for an empty line or a comment after #.
 
     Args:
-        line: as typed.
+        line: the typed line.
         poses: name -> x, y, z [m], roll, pitch, yaw [deg].
 
     Raises:
-        WordError: one line with what was expected.
+        WordError: not a command.
 
     """
     word, *rest = line.partition('#')[0].split() or ['']
@@ -71,8 +71,8 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Shift | Go | Order
         return Shift(way, np.zeros(3))
     if word in TURNS:
         degrees, = _numbers(word, rest, 'DEGREES', (1,))
-        if abs(degrees) > MOST:
-            raise WordError(f"'{line.strip()}': expected at most {MOST:g} degrees")
+        if abs(degrees) > MAX_TURN:
+            raise WordError(f"'{line.strip()}': expected at most {MAX_TURN:g} degrees")
         turn = np.zeros(3)
         turn[TURNS[word]] = radians(degrees)
         return Shift(np.zeros(3), turn)
@@ -81,7 +81,7 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Shift | Go | Order
         return _pose(values)
     if word == 'controller':
         if len(rest) != 1:
-            raise WordError("'controller': expected a NAME behind it")
+            raise WordError("'controller': expected one NAME after it")
         return Order(word, rest[0])
     if word == 'wait':
         seconds = _numbers(word, rest, 'SECONDS', (0, 1))
@@ -89,7 +89,7 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Shift | Go | Order
             raise WordError(f"'{line.strip()}': expected SECONDS from 0")
         return Order(word, str(seconds[0]) if seconds else '')
     if rest:
-        raise WordError(f"'{line.strip()}': expected nothing behind '{word}'" if word in (
+        raise WordError(f"'{line.strip()}': expected nothing after '{word}'" if word in (
             *ORDERS, *poses) else _unknown(word, poses))
     if word in ORDERS:
         return Order(word)

@@ -1,1 +1,1 @@
-"""Films of recorded flights: what flew, where it should have been, what a model expects."""
+"""Films of recorded flights with their targets or with the prediction of a model."""

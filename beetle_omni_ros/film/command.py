@@ -1,4 +1,4 @@
-"""`beetle_omni film`: recorded flights as a film."""
+"""`beetle_omni film`: draws recorded flights as a film."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.runs.log import FlightLog
 
-MOST_PANELS = 4
+MAX_PANELS = 4
 MODEL_COLOURS = (COLOURS[1], COLOURS[2], COLOURS[0], COLOURS[3])
 
 
@@ -28,7 +28,7 @@ def run_film(paths: list[Path], outputs: list[Path], *, models: list[Path] = (),
     """
     Draw flights side by side.
 
-    Arguments are those of `beetle_omni film`; with ``models`` there is one path.
+    The arguments are those of `beetle_omni film`. With ``models`` there must be one path.
 
     Raises:
         BagError: a run cannot be read.
@@ -39,25 +39,25 @@ def run_film(paths: list[Path], outputs: list[Path], *, models: list[Path] = (),
     _check(paths, outputs, models, size, start, duration)
     drawn = RobotParameters.load(robot)
     logs = [_read(path) for path in paths]
-    begins = [(log.targets[0].stamp if log.targets else log.start) + start for log in logs]
-    longest = max(log.end - begin for log, begin in zip(logs, begins, strict=True))
-    lasts = longest if duration is None else min(duration, longest)
-    if not lasts > 0:
+    starts = [(log.targets[0].stamp if log.targets else log.start) + start for log in logs]
+    longest = max(log.end - begin for log, begin in zip(logs, starts, strict=True))
+    length = longest if duration is None else min(duration, longest)
+    if not length > 0:
         raise ParameterError(f'--start {start:g}: expected a time before the end of the flight, '
                              f'{longest + start:.1f} s')
     expected = [(file.stem.replace('_', ' '), free_runs(logs[0], RobotParameters.load(file)))
                 for file in models]
     for output in outputs:
         fps = FORMATS[output.suffix]
-        times = np.arange(0.0, lasts, speed / fps)
+        times = np.arange(0.0, length, speed / fps)
         scenes: list[Scene]
         if models:
-            scenes = [model_scene(logs[0], label, colour, begins[0] + times, motion)
+            scenes = [model_scene(logs[0], label, colour, starts[0] + times, motion)
                       for (label, motion), colour in zip(expected, MODEL_COLOURS)]
         else:
             names = [Path(path).absolute().name for path in paths]
             scenes = [target_scene(log, name, colour, begin + times, drawn) for
-                      log, name, colour, begin in zip(logs, names, COLOURS, begins)]
+                      log, name, colour, begin in zip(logs, names, COLOURS, starts)]
         pictures = frames(scenes, times, drawn, size)
         write_film(output, track(pictures, output.name, total=len(times), console=console,
                                  transient=True), fps)
@@ -74,9 +74,9 @@ def _check(paths, outputs, models, size, start, duration):
         if output.suffix not in FORMATS:
             raise ParameterError(f"{output}: expected a name that ends with "
                                  f"{' or '.join(FORMATS)}")
-    if max(len(paths), len(models)) > MOST_PANELS:
+    if max(len(paths), len(models)) > MAX_PANELS:
         raise ParameterError(f'{max(len(paths), len(models))} panels; a film has at most '
-                             f'{MOST_PANELS}')
+                             f'{MAX_PANELS}')
     if models and len(paths) > 1:
         raise ParameterError(f'--model: expected one RUN with it, found {len(paths)}')
     if size % 2:
@@ -86,5 +86,5 @@ def _check(paths, outputs, models, size, start, duration):
 def _read(path: Path) -> FlightLog:
     log = read_bag(path)
     if not len(log.truth_t) and not len(log.odom_t):
-        raise BagError(f'{path}: no pose of the robot in it (ground_truth/odom or odom)')
+        raise BagError(f'{path}: contains no pose of the robot (ground_truth/odom or odom)')
     return log

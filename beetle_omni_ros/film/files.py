@@ -1,4 +1,4 @@
-"""Frames to files: GIF with one palette, MP4, or one PNG."""
+"""Writes frames as a GIF with one palette, or as an MP4."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from PIL import Image
 
 from beetle_omni_ros.robot.schema import ParameterError
 
-COLOURS = 255               # one more is transparent: what has not changed
-SAMPLES, PIXELS = 24, 6000  # frames and pixels of each from which the palette is made
-STILL = 8                   # a pixel that changes by less stays as it was
+COLOURS = 255               # of the palette; one more is transparent, for unchanged pixels
+SAMPLES, PIXELS = 24, 6000  # frames, and pixels of each, that determine the palette
+STILL = 8                   # smaller changes of a pixel are ignored
 GIF_FPS, MP4_FPS = 12.5, 25.0
 FORMATS = {'.gif': GIF_FPS, '.mp4': MP4_FPS}
 
@@ -22,12 +22,12 @@ def write_film(path: Path, frames: Iterable[Image.Image], fps: float) -> None:
     Write frames as a film.
 
     Args:
-        path: a .gif, which repeats, or an .mp4.
-        frames: all of the same size.
-        fps: frames a second.
+        path: path of a .gif, which repeats, or of an .mp4.
+        frames: frames of equal size.
+        fps: frame rate [1/s].
 
     Raises:
-        ParameterError: the file cannot be written, or MP4 lacks its encoder.
+        ParameterError: the file cannot be written, or the MP4 encoder is not installed.
 
     """
     try:
@@ -62,7 +62,7 @@ def _gif(path, frames, fps):
 
 
 def _palette(frames):
-    """Colours of what moves, mostly: the background has few."""
+    """Palette mostly for the moving pixels, because the background has few colours."""
     random = np.random.default_rng(0)
     chosen = frames[::max(1, len(frames) // SAMPLES)]
     stack = np.stack([np.asarray(frame).reshape(-1, 3) for frame in chosen])

@@ -1,4 +1,4 @@
-"""Frames of a film: panels side by side, captions, and the error so far below them."""
+"""Frames of a film: panels side by side, captions, and a chart of the position error."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ PAPER = tuple(round(255 * c) for c in HAZE)
 TARGET_LOOK, MODEL_LOOK = Look(0.24, (0.20, 0.50, 0.90)), Look(0.40, (0.90, 0.25, 0.15))
 FIELD_OF_VIEW = 30.0            # [deg]
 AZIMUTHS, ELEVATION = np.arange(95.0, 176.0, 10.0), -18.0   # [deg]
-ROBOT_RADIUS = 0.36             # [m] that a picture keeps clear around base_link
+ROBOT_RADIUS = 0.36             # [m] radius around base_link that the picture contains
 ASPECT = 1.15                   # width over height of a panel
-CAPTION, CHART = 0.20, 0.18     # height over that of a panel, over its width
+CAPTION, CHART = 0.20, 0.18     # heights relative to the height and to the width of a panel
 TRAIL_FRAMES, TRAIL_TIME = 60, 3.0  # points, [s]
-LEAST, MOST = 1e-3, 1.0         # [m] of the chart
+LEAST, MOST = 1e-3, 1.0         # [m] range of the chart
 TICKS = ((1e-3, '1 mm'), (1e-2, '1 cm'), (1e-1, '10 cm'), (1.0, '1 m'))
 
 
 def framing(points: np.ndarray) -> Camera:
     """
-    Place a still camera that sees all of a flight, where it can be nearest.
+    Place a fixed camera as near as possible, with the whole flight in its view.
 
     Args:
-        points: (N, 3) places of the robot [m].
+        points: (N, 3) positions of the robot [m].
 
     """
     return min((_framing(points, azimuth) for azimuth in AZIMUTHS), key=lambda c: c.distance)
@@ -56,7 +56,7 @@ def _framing(points, degrees):
         offset = points - lookat
         distance = max(float(np.max((np.abs(offset @ axis) + ROBOT_RADIUS) / tangent
                                     - offset @ forward)) for axis, tangent in tangents)
-    # The caption takes the upper part: the flight moves into the lower one.
+    # The caption covers the upper part, so the flight is placed in the lower one.
     lookat = lookat + up * 0.8 * CAPTION * distance * whole
     return Camera(tuple(map(float, lookat)), distance, float(degrees), ELEVATION)
 
@@ -64,16 +64,16 @@ def _framing(points, degrees):
 def frames(scenes: Sequence[Scene], times: np.ndarray, robot: RobotParameters,
            size: int) -> Iterator[Image.Image]:
     """
-    Draw a film.
+    Draw the frames of a film.
 
     Args:
-        scenes: its panels, from left to right.
-        times: (F,) of the frames since the film's start [s].
-        robot: its dimensions.
+        scenes: panels from left to right.
+        times: (F,) times of the frames since the start of the film [s].
+        robot: robot to draw.
         size: width of a panel [pixels].
 
     Raises:
-        RuntimeError: there is no off-screen OpenGL here.
+        RuntimeError: no off-screen OpenGL.
 
     """
     points = np.concatenate([[pose.position for pose in (*scene.poses, *scene.ghosts)
@@ -106,7 +106,7 @@ def _trails(scene, times, k):
 
 
 class _Texts:
-    """Fonts, and the captions of a panel."""
+    """Fonts and captions."""
 
     def __init__(self, size):
         self._size = size
@@ -120,8 +120,7 @@ class _Texts:
         left, top = 0.035 * s, 0.028 * s
         draw.text((left, top), scene.label, scene.colour, self.title)
         draw.text((s - left, top), f'{time:.1f} s', INK, self.title, anchor='ra')
-        said = scene.notes[k]
-        draw.text((left, top + 0.070 * s), said, FAINT, self.small)
+        draw.text((left, top + 0.070 * s), scene.notes[k], FAINT, self.small)
         if np.isfinite(scene.position[k]):
             number = f'{1e3 * scene.position[k]:.0f} mm', f'{scene.orientation[k]:.1f}°'
             for text, name, x in zip(number, ('position', 'attitude'), (0.035, 0.30)):
@@ -130,7 +129,7 @@ class _Texts:
 
 
 class _Chart:
-    """Position errors of all panels over the film, drawn up to the present."""
+    """Chart of the position errors of all panels up to the present frame."""
 
     def __init__(self, scenes, times, size, texts):
         self.height = 2 * round(CHART * size / 2)
@@ -156,8 +155,6 @@ class _Chart:
         self._curves = [(scene.colour, [(x, y) if np.isfinite(y) else None for x, y in
                                         zip(across, row(scene.position), strict=True)])
                         for scene in scenes]
-        self._row = (top, bottom)
-        self._across = across
 
     def until(self, k):
         """Draw the curves up to frame ``k``."""

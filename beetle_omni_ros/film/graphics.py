@@ -1,4 +1,4 @@
-"""Which off-screen OpenGL this computer has."""
+"""Selection of an off-screen OpenGL back end."""
 
 from __future__ import annotations
 
@@ -19,16 +19,13 @@ TIMEOUT = 60.0          # [s] of one probe
 
 def choose_backend() -> str:
     """
-    Find an OpenGL that draws without a window, and select it for MuJoCo.
+    Find an OpenGL back end that draws without a window, and select it by MUJOCO_GL.
 
-    MuJoCo reads MUJOCO_GL once, when it is imported, so each candidate is tried in a process of
-    its own. A value that is set already is the only candidate.
-
-    Returns:
-        the back end.
+    MuJoCo reads MUJOCO_GL only when it is imported, so each candidate is tried in a new process.
+    A value that is already set is the only candidate.
 
     Raises:
-        ParameterError: none works; the text says what to install.
+        ParameterError: no back end works; the message has the packages to install.
 
     """
     given = os.environ.get('MUJOCO_GL')
@@ -37,7 +34,7 @@ def choose_backend() -> str:
             os.environ['MUJOCO_GL'] = backend
             return backend
     raise ParameterError(
-        (f'MUJOCO_GL={given} draws nothing here; unset it, or ' if given else
+        (f'MUJOCO_GL={given} does not work here; unset it, or ' if given else
          'no off-screen OpenGL here: ')
         + 'install libegl1, libgl1-mesa-dri and libopengl0 (apt), or libosmesa6')
 

@@ -84,8 +84,8 @@ def test_words_that_go_and_order(p):
 @pytest.mark.parametrize(('line', 'said'), [
     ('up', 'expected up METRES'), ('up high', 'expected up METRES'), ('up nan', 'METRES'),
     ('up 1 2', 'METRES'), ('roll 200', 'at most 180'), ('goto 1 2', 'X Y Z'), ('goto', 'X Y Z'),
-    ('jump 3', "'jump': expected"), ('jump', 'or a pose of home'), ('home 3', 'nothing behind'),
-    ('controller', 'NAME'), ('wait -1', 'SECONDS'), ('land now', 'nothing behind')])
+    ('jump 3', "'jump': expected"), ('jump', 'or a pose of home'), ('home 3', 'nothing after'),
+    ('controller', 'NAME'), ('wait -1', 'SECONDS'), ('land now', 'nothing after')])
 def test_what_is_no_word_is_refused_with_what_was_expected(p, line, said):
     with pytest.raises(WordError) as raised:
         parse(line, p.poses)

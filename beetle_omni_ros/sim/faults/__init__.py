@@ -1,8 +1,9 @@
 """
-Faults of the simulated robot, its devices and the flight stack, switched at run time.
+Faults of the simulated robot, its devices and the flight stack.
 
-``Fault('rotor_weak', at=3.0, duration=1.0, rotor=2, share=0.5)`` is one; ``Simulator.set_faults``
-takes a list, the in-process loop those of processes. KINDS names all kinds with their numbers.
+An example is ``Fault('rotor_weak', at=3.0, duration=1.0, rotor=2, share=0.5)``. Faults of robot
+and devices go to ``Simulator.set_faults``, those of processes to the in-process loop. KINDS
+contains all kinds.
 """
 
 from beetle_omni_ros.sim.faults import actuators, processes, sensors, world  # noqa: F401

@@ -30,9 +30,9 @@ class RotorStops(RotorEffect):
 
 @kind('rotor_weak')
 class RotorWeak(RotorEffect):
-    """A rotor turns slower and gives only a share of the thrust asked for."""
+    """A rotor turns slower and gives only a share of the commanded thrust."""
 
-    numbers = {**RotorEffect.numbers, 'share': share('of the thrust asked for')}
+    numbers = {**RotorEffect.numbers, 'share': share('share of the commanded thrust')}
 
     def drive(self, drive):
         drive.thrust[self._k] *= self._numbers['share']
@@ -40,9 +40,9 @@ class RotorWeak(RotorEffect):
 
 @kind('propeller_broken')
 class PropellerBroken(RotorEffect):
-    """A rotor turns at the speed asked for and its propeller gives only a share of the thrust."""
+    """A rotor has the commanded speed, and its propeller gives only a share of the thrust."""
 
-    numbers = {**RotorEffect.numbers, 'share': share('of the thrust at that speed')}
+    numbers = {**RotorEffect.numbers, 'share': share('share of the thrust at that speed')}
 
     def drive(self, drive):
         drive.thrust[self._k] *= self._numbers['share']
@@ -51,7 +51,7 @@ class PropellerBroken(RotorEffect):
 
 @kind('rotor_sticks')
 class RotorSticks(RotorEffect):
-    """A rotor keeps the thrust that it has."""
+    """A rotor keeps its present thrust."""
 
     def start(self, world):
         self._thrust = float(world.truth.thrust[self._k])
@@ -62,10 +62,10 @@ class RotorSticks(RotorEffect):
 
 @kind('rotor_slow')
 class RotorSlow(RotorEffect):
-    """A rotor follows through one more lag."""
+    """A rotor follows its commands through a second lag."""
 
     numbers = {**RotorEffect.numbers,
-               'time_constant': Number('of the additional lag', 's', low=0.005, high=10)}
+               'time_constant': Number('time constant of the second lag', 's', low=0.005, high=10)}
 
     def start(self, world):
         self._thrust = float(world.truth.thrust[self._k])
@@ -86,7 +86,7 @@ class ServoEffect(Effect):
         return int(self._numbers['servo']) - 1
 
     def _shown(self, reading, position=None, velocity=None):
-        """Reading with this servo's angle [rad] and rate [rad/s] replaced."""
+        """Copy of a reading with another angle [rad] and rate [rad/s] of this servo."""
         changed = {}
         for name, value in (('position', position), ('velocity', velocity)):
             if value is not None:
@@ -97,20 +97,20 @@ class ServoEffect(Effect):
 
 @kind('servo_jammed')
 class ServoJammed(ServoEffect):
-    """A joint jams where it is, or after it has slipped by an angle."""
+    """A joint jams at its present angle, or after a slip by an angle."""
 
     numbers = {**ServoEffect.numbers,
-               'offset': Number('by which it slips first', 'rad', 0.0, -8, 8),
-               'rate': Number('of the slip', 'rad/s', 10.0, 0.1, 100)}
+               'offset': Number('angle of the slip', 'rad', 0.0, -8, 8),
+               'rate': Number('rate of the slip', 'rad/s', 10.0, 0.1, 100)}
 
     def start(self, world):
         self._angle = float(world.truth.tilt[self._k])
-        self._left = self._numbers['offset']
+        self._remaining = self._numbers['offset']
 
     def drive(self, drive):
-        most = self._numbers['rate'] * self._tick
-        step = float(np.clip(self._left, -most, most))
-        self._left -= step
+        limit = self._numbers['rate'] * self._tick
+        step = float(np.clip(self._remaining, -limit, limit))
+        self._remaining -= step
         self._angle += step
         drive.tilt[self._k] = self._angle
         drive.jammed[self._k] = True
@@ -118,7 +118,7 @@ class ServoJammed(ServoEffect):
 
 @kind('servo_limp')
 class ServoLimp(ServoEffect):
-    """A servo loses its torque, the joint swings freely."""
+    """A servo loses its torque, so that the joint swings freely."""
 
     def drive(self, drive):
         drive.powered[self._k] = False
@@ -126,10 +126,10 @@ class ServoLimp(ServoEffect):
 
 @kind('servo_slow')
 class ServoSlow(ServoEffect):
-    """A servo turns at most at a rate."""
+    """The rate of a servo is limited."""
 
     numbers = {**ServoEffect.numbers,
-               'rate': Number('that it reaches', 'rad/s', low=0.01, high=100)}
+               'rate': Number('largest rate', 'rad/s', low=0.01, high=100)}
 
     def start(self, world):
         self._angle = float(world.truth.tilt[self._k])
@@ -142,7 +142,7 @@ class ServoSlow(ServoEffect):
 
 @kind('servo_deaf')
 class ServoDeaf(ServoEffect):
-    """A servo holds the target that it had."""
+    """A servo ignores new targets and holds the last one."""
 
     def start(self, world):
         self._target = float(world.tilt[self._k])
@@ -153,7 +153,7 @@ class ServoDeaf(ServoEffect):
 
 @kind('encoder_shifted')
 class EncoderShifted(ServoEffect):
-    """An encoder reads too much by an angle, and its servo regulates by that."""
+    """An encoder has an offset, with which its servo controls the joint."""
 
     numbers = {**ServoEffect.numbers,
                'angle': Number('reading minus true tilt', 'rad', low=-8, high=8)}
@@ -168,7 +168,7 @@ class EncoderShifted(ServoEffect):
 
 @kind('encoder_frozen')
 class EncoderFrozen(ServoEffect):
-    """The told angle of a servo stays as it is, the servo works."""
+    """The angle reported by a servo is frozen; the servo itself works."""
 
     _angle: float | None = None
 

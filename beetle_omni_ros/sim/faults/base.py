@@ -1,10 +1,10 @@
-"""What a fault is: a kind with its numbers, when it starts and how long it lasts."""
+"""Faults: a kind with its numbers, start time and duration; base classes of all kinds."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, ClassVar
 
@@ -13,23 +13,23 @@ import numpy as np
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.yaml_file import quoted
 
-ROUNDING = 1e-9     # [s] sums of ticks differ from their product by less
-LARGEST = 1e9       # of any number; what is beyond is a slip of the pen
+ROUNDING = 1e-9     # [s] bound of the rounding error of sums of ticks
+LARGEST = 1e9       # bound of any number, against typing errors
 KINDS: dict[str, type[Effect]] = {}
-"""Name of a kind -> what it does."""
+"""Name of a kind -> its class."""
 
 
 @dataclass(frozen=True)
 class Number:
     """
-    A number of a kind.
+    Declaration of a number of a kind.
 
     Attributes:
-        doc: what it is.
+        doc: meaning.
         unit: SI unit, '' for a pure number.
-        default: taken where nobody gives it; None: it must be given.
+        default: default value; None: it must be given.
         low, high: smallest and largest legal value.
-        whole: whether it is a whole number.
+        whole: whether it must be a whole number.
 
     """
 
@@ -41,7 +41,7 @@ class Number:
     whole: bool = False
 
     def checked(self, value: Any, at: str) -> float:
-        """``value`` as a float; a ParameterError that begins with ``at`` where it is not legal."""
+        """Return a legal value as a float; otherwise raise ParameterError, with ``at`` in front."""
         unit = f' {self.unit}' if self.unit else ''
         if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) \
                 or not -inf < value < inf or (self.whole and value != int(value)):
@@ -57,12 +57,12 @@ class Number:
 @dataclass(frozen=True, init=False)
 class Fault:
     """
-    One fault, switched on at a time for a time.
+    One fault.
 
     Attributes:
         kind: a name in KINDS.
-        at: since the schedule's start [s].
-        duration: [s]; inf: it stays.
+        at: time from the start of the schedule to the onset [s].
+        duration: [s]; inf: permanent.
         numbers: all numbers of the kind, by name.
 
     """
@@ -74,10 +74,10 @@ class Fault:
 
     def __init__(self, kind: str, at: float = 0.0, duration: float = inf, **numbers: float):
         """
-        Check everything; numbers that are not given take the kind's defaults.
+        Check all arguments; missing numbers have the defaults of the kind.
 
         Raises:
-            ParameterError: naming the kind or the key, in one line.
+            ParameterError: illegal kind or number; the message has kind and key.
 
         """
         if kind not in KINDS:
@@ -104,29 +104,34 @@ class Fault:
 
     @property
     def is_process(self) -> bool:
-        """Whether it strikes a process of the flight stack, not the robot or its devices."""
+        """Whether it affects a process of the flight stack, not the robot or its devices."""
         return KINDS[self.kind].process
 
     def changes(self, *hooks: str) -> bool:
-        """Whether it acts through one of these hooks of Effect."""
+        """Whether its kind overrides one of these hooks of Effect."""
         own = KINDS[self.kind]
         return any(getattr(own, hook) is not getattr(Effect, hook) for hook in hooks)
 
     def __str__(self) -> str:
-        """Kind, numbers and times, as in 'rotor_weak(rotor=2, share=0.5) at 3 s for 1 s'."""
+        """Kind, numbers and times: 'rotor_weak(rotor=2, share=0.5) at 3 s for 1 s'."""
         numbers = ', '.join(f'{key}={value:g}' for key, value in self.numbers.items())
-        lasts = '' if self.duration == inf else f' for {self.duration:g} s'
-        return f"{self.kind}{f'({numbers})' if numbers else ''} at {self.at:g} s{lasts}"
+        duration = '' if self.duration == inf else f' for {self.duration:g} s'
+        return f"{self.kind}{f'({numbers})' if numbers else ''} at {self.at:g} s{duration}"
 
 
 class Effect:
     """
-    What a fault does while it is on. A kind overrides the hooks it needs.
+    Effect of an active fault. A kind overrides some of the hooks.
 
     Attributes:
-        numbers: of the kind, by name.
-        process: whether a process of the flight stack is struck, see
+        numbers: declarations of the kind's numbers, by name.
+        process: whether it affects a process of the flight stack, see
             :class:`~beetle_omni_ros.sim.faults.processes.ProcessEffect`.
+
+    Args:
+        numbers: values of all numbers.
+        tick: time between two calls of a hook [s].
+        generator: generator of random numbers.
 
     """
 
@@ -134,70 +139,61 @@ class Effect:
     process: ClassVar[bool] = False
 
     def __init__(self, numbers: Mapping[str, float], tick: float, generator: np.random.Generator):
-        """
-        Start with nothing done yet.
-
-        Args:
-            numbers: complete and checked.
-            tick: between two calls of a hook [s].
-            generator: for what is random in it.
-
-        """
         self._numbers, self._tick, self._random = numbers, tick, generator
 
     def start(self, world) -> None:
-        """It begins now; ``world`` is what it may look at and change."""
+        """Called once at the onset."""
 
     def end(self, world) -> None:
-        """It ends now."""
+        """Called once at the end."""
 
     def drive(self, drive) -> None:
-        """Change what the actuators do in this tick, see Actuation."""
+        """Change the actuation of this tick in place."""
 
     def imu(self, reading, now):
-        """The IMU's reading of this tick, as it arrives; None: nothing does."""
+        """Return the changed IMU reading that arrives in this tick, or None."""
         return reading
 
     def mocap(self, reading, now):
-        """Likewise for motion capture."""
+        """As :meth:`imu`, for motion capture."""
         return reading
 
     def joints(self, reading, now):
-        """Likewise for joint feedback."""
+        """As :meth:`imu`, for joint feedback."""
         return reading
 
     def rotors(self, reading, now):
-        """Likewise for the rotor speeds."""
+        """As :meth:`imu`, for rotor speeds."""
         return reading
 
     def battery(self, reading, now):
-        """Likewise for the pack."""
+        """As :meth:`imu`, for the battery."""
         return reading
 
     def command(self, command, now) -> list:
-        """Pass on, delay or lose a command; called once with None in every tick."""
+        """Return the commands that arrive now; also called with None once in each tick."""
         return [] if command is None else [command]
 
     @property
     def wrench(self) -> np.ndarray | None:
-        """(6,) force in world [N] and torque in base_link [N m] that it adds, or None."""
+        """(6,) additional force in world [N] and torque in base_link [N m], or None."""
         return None
 
     @property
     def payload(self) -> float:
-        """Mass that it attaches below the body [kg]."""
+        """Additional mass below the body [kg]."""
         return 0.0
 
 
 @dataclass
 class World:
     """
-    What an effect may look at and change when it starts.
+    State that an effect can use and change at its onset and end.
 
     Attributes:
         truth: the present Truth.
         battery: the Battery.
-        tilt: (4,) targets of the servos in force [rad].
+        tilt: (4,) present targets of the servos [rad].
 
     """
 
@@ -209,14 +205,14 @@ class World:
 @dataclass
 class Actuation:
     """
-    What the actuators do in one tick; faults change it in place.
+    Inputs of the actuators in one tick; faults change them in place.
 
     Attributes:
         tilt: (4,) targets of the servos [rad].
         thrust: (4,) targets of the rotors [N].
         powered: (4,) whether a servo has torque.
-        jammed: (4,) whether a joint is held by force at its target.
-        wear: (4,) thrust for each newton that the rotor's speed should give.
+        jammed: (4,) whether a joint is jammed at its target.
+        wear: (4,) thrust relative to that of an intact propeller at the same speed.
 
     """
 
@@ -228,41 +224,58 @@ class Actuation:
 
 
 class Late(Effect):
-    """Holds what passes for a while."""
+    """Delays readings or commands."""
 
-    numbers = {'delay': Number('in addition', 's', low=0, high=5)}
+    numbers = {'delay': Number('additional delay', 's', low=0, high=5)}
 
     def start(self, world):
-        self._way: deque = deque()
+        self._queue: deque = deque()
 
-    def _arrived(self, item: Any, now: float, most: float = inf) -> list:
-        """What has arrived by ``now`` [s], at most so many, where ``item`` (or None) sets out."""
+    def _delayed(self, item: Any, now: float, limit: float = inf) -> list:
+        """Queue ``item``, unless None; return at most ``limit`` items that are due at ``now``."""
         if item is not None:
-            self._way.append((now + self._numbers['delay'], item))
-        arrived: list = []
-        while len(arrived) < most and self._way and self._way[0][0] <= now + ROUNDING:
-            arrived.append(self._way.popleft()[1])
-        return arrived
+            self._queue.append((now + self._numbers['delay'], item))
+        due: list = []
+        while len(due) < limit and self._queue and self._queue[0][0] <= now + ROUNDING:
+            due.append(self._queue.popleft()[1])
+        return due
+
+
+class Lost:
+    """Mixin: no item arrives."""
+
+    def _change(self, item):
+        return None
+
+
+class Frozen:
+    """Mixin: the first item is repeated with new stamps."""
+
+    _first = None
+
+    def _change(self, item):
+        self._first = self._first or item
+        return replace(self._first, stamp=item.stamp)
 
 
 def kind(name: str):
-    """Enter a class into KINDS."""
-    def enter(cls):
+    """Add a class to KINDS."""
+    def register(cls):
         KINDS[name] = cls
         return cls
-    return enter
+    return register
 
 
 def vector(unit: str, what: str, **defaults: float) -> dict[str, Number]:
-    """Numbers x, y, z (or other names), zero by default."""
+    """Declare components of a vector: name -> default."""
     return {key: Number(f'{key} {what}', unit, default) for key, default in defaults.items()}
 
 
-def share(what: str, default: float | None = None) -> Number:
-    """A number from 0 to 1."""
-    return Number(what, '', default, 0.0, 1.0)
+def share(doc: str) -> Number:
+    """Declare a number from 0 to 1."""
+    return Number(doc, low=0.0, high=1.0)
 
 
 def one_of_four(what: str) -> Number:
-    """Number of a rotor or servo, 1 to 4."""
+    """Declare the number of a rotor or servo, 1 to 4."""
     return Number(f'number of the {what}', '', None, 1, 4, whole=True)

@@ -1,4 +1,4 @@
-"""Lists of faults in files: the campaign's named ones, and those of one flight."""
+"""Lists of faults: the named faults of the campaign, and the faults of one flight."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from beetle_omni_ros.robot.schema import parameter, ParameterError
 from beetle_omni_ros.robot.yaml_file import quoted, shortened
 from beetle_omni_ros.sim.faults.base import Fault, KINDS
 
-# Hooks of what emulated devices see to themselves.
+# Hooks without effect if the devices are emulated.
 DEVICES = 'joints', 'rotors', 'battery', 'command'
 GROUPS = ('limits', 'flight', 'healthy')
 OUTCOMES = ('flies_on', 'lands', 'stops', 'refused')
@@ -22,55 +22,64 @@ OUTCOMES = ('flies_on', 'lands', 'stops', 'refused')
 
 @dataclass(frozen=True, kw_only=True)
 class OutcomeLimits:
-    """What counts as what."""
+    """Limits that define the outcome of a flight."""
 
-    impact_speed: float = parameter(doc='of a landing, at most', unit='m/s', low=0.01, high=100)
-    inclination: float = parameter(doc='at a landing, at most', unit='rad', low=0, high=4)
-    stop_time: float = parameter(doc='from a crash until the motors are off', unit='s', low=0,
-                                 high=10)
-    fence_margin: float = parameter(doc='outside the fence that is a flyaway', unit='m', low=0,
-                                    high=1000)
-    distance: float = parameter(doc='from the take-off that is a flyaway', unit='m', low=0,
-                                high=1e4)
-    rise: float = parameter(doc='above the floor after it has lain there: a take-off', unit='m',
-                            low=0.01, high=10)
-    rest_time: float = parameter(doc='on the floor without pause: it lies there', unit='s',
-                                 low=0.01, high=10)
-    idle_thrust: float = parameter(doc='commanded to all rotors: less is off', unit='N', low=0,
-                                   high=10)
-    landing_speed: float = parameter(doc='at touchdown in the landing campaign', unit='m/s',
-                                     low=0.01, high=100)
-    landing_inclination: float = parameter(doc='likewise', unit='rad', low=0, high=4)
+    impact_speed: float = parameter(doc='largest impact speed of a landing', unit='m/s', low=0.01,
+                                    high=100)
+    inclination: float = parameter(doc='largest inclination at a landing', unit='rad', low=0,
+                                   high=4)
+    stop_time: float = parameter(doc='largest time from a crash until the motors are off',
+                                 unit='s', low=0, high=10)
+    fence_margin: float = parameter(doc='distance outside the fence that is a flyaway', unit='m',
+                                    low=0, high=1000)
+    distance: float = parameter(doc='distance from the take-off that is a flyaway', unit='m',
+                                low=0, high=1e4)
+    rise: float = parameter(doc='height above the floor that is a take-off, after the robot lay '
+                            'on it', unit='m', low=0.01, high=10)
+    rest_time: float = parameter(doc='time of contact after which the robot lies on the floor',
+                                 unit='s', low=0.01, high=10)
+    idle_thrust: float = parameter(doc='smallest sum of commanded thrusts with motors on',
+                                   unit='N', low=0, high=10)
+    landing_speed: float = parameter(doc='largest impact speed in the landing campaign',
+                                     unit='m/s', low=0.01, high=100)
+    landing_inclination: float = parameter(doc='largest inclination in the landing campaign',
+                                           unit='rad', low=0, high=4)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlightPlan:
-    """How the campaign flies."""
+    """Flights of the campaign."""
 
-    height: float = parameter(doc='in hover and upside down', unit='m', low=0.5, high=15)
-    spread: float = parameter(doc='|x| and |y| of poses on the move', unit='m', low=0, high=15)
-    lowest: float = parameter(doc='of poses on the move', unit='m', low=0.4, high=15)
-    highest: float = parameter(doc='of poses on the move', unit='m', low=0.4, high=15)
-    hover_time: float = parameter(doc='until the fault, in hover', unit='s', low=0, high=100)
-    turn_time: float = parameter(doc='likewise upside down', unit='s', low=0, high=100)
-    move_time: float = parameter(doc='of each pose on the move', unit='s', low=0.5, high=100)
-    pose_time: float = parameter(doc='of each pose, where it strikes at a random moment',
-                               unit='s', low=0.5, high=100)
-    jitter: float = parameter(doc='of the time of the fault', unit='s', low=0, high=100)
-    watch_time: float = parameter(doc='from the fault to the landing request', unit='s', low=0,
-                                  high=1000)
-    landing_time: float = parameter(doc='longer, it does not land', unit='s', low=1, high=1000)
-    end_time: float = parameter(doc='watched after the motors stopped or the robot broke',
+    height: float = parameter(doc='height of hover and inverted hover', unit='m', low=0.5, high=15)
+    spread: float = parameter(doc='largest |x| and |y| of the poses in motion', unit='m', low=0,
+                              high=15)
+    lowest: float = parameter(doc='smallest height of the poses in motion', unit='m', low=0.4,
+                              high=15)
+    highest: float = parameter(doc='largest height of the poses in motion', unit='m', low=0.4,
+                               high=15)
+    hover_time: float = parameter(doc='time until the fault in hover', unit='s', low=0, high=100)
+    turn_time: float = parameter(doc='time until the fault in inverted hover', unit='s', low=0,
+                                 high=100)
+    move_time: float = parameter(doc='time of each pose in motion', unit='s', low=0.5, high=100)
+    pose_time: float = parameter(doc='time of each pose in flights with a fault at a random time',
+                                 unit='s', low=0.5, high=100)
+    jitter: float = parameter(doc='range of the random time of the fault', unit='s', low=0,
+                              high=100)
+    watch_time: float = parameter(doc='time from the fault to the landing request', unit='s',
+                                  low=0, high=1000)
+    landing_time: float = parameter(doc='largest duration of a landing', unit='s', low=1,
+                                    high=1000)
+    end_time: float = parameter(doc='simulated time after the motors stopped or the robot broke',
                                 unit='s', low=0, high=100)
 
 
 @dataclass(frozen=True, kw_only=True)
 class HealthyFlights:
-    """Flights in which no fault may be named."""
+    """Flights without a fault, in which none may be detected."""
 
-    flight_time: float = parameter(doc='of poses in one flight', unit='s', low=1, high=1e5)
-    pose_time: float = parameter(doc='of each pose', unit='s', low=0.5, high=1e4)
-    effects: dict = parameter(doc="of the plant, as a robot file's")
+    flight_time: float = parameter(doc='duration of one flight', unit='s', low=1, high=1e5)
+    pose_time: float = parameter(doc='time of each pose', unit='s', low=0.5, high=1e4)
+    effects: dict = parameter(doc='effects of the plant, as in a robot file')
 
 
 @dataclass(frozen=True)
@@ -79,10 +88,10 @@ class Case:
     One named fault of the campaign.
 
     Attributes:
-        name: as in the file.
-        expected: one of OUTCOMES.
-        what: happens, in words.
-        strike: the faults that make it up, ``at`` counted from its onset.
+        name: name in the file.
+        expected: expected outcome, one of OUTCOMES.
+        what: description.
+        strike: its faults; ``at`` counts from the onset.
 
     """
 
@@ -94,24 +103,23 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class FaultList:
-    """Everything in params/faults.yaml."""
+    """Content of params/faults.yaml."""
 
-    limits: OutcomeLimits = parameter(doc='what counts as what')
-    flight: FlightPlan = parameter(doc='how the campaign flies')
+    limits: OutcomeLimits = parameter(doc='limits of the outcomes')
+    flight: FlightPlan = parameter(doc='flights of the campaign')
     healthy: HealthyFlights = parameter(doc='flights without a fault')
     faults: dict = parameter(doc='name -> expected, what, strike')
 
     def __post_init__(self):
-        """Refuse faults that are none."""
         object.__setattr__(self, 'cases', _cases(self.faults))
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> FaultList:
         """
-        Read a list; without a path, the shipped one. Groups that it lacks are the shipped ones.
+        Read a file; without a path, the shipped one. Missing groups are those of the shipped one.
 
         Raises:
-            ParameterError: naming file, key and what was expected.
+            ParameterError: unusable file; the message has file, key and the expected value.
 
         """
         shipped = share_path('params/faults.yaml')
@@ -129,7 +137,7 @@ class FaultList:
         Cases by name, all by default.
 
         Raises:
-            ParameterError: an unknown name, with those that are known.
+            ParameterError: unknown name.
 
         """
         for name in names or ():
@@ -170,12 +178,12 @@ def _fault(entry: Any, at: str) -> Fault:
 
 def load_faults(path: str | Path) -> list[Fault]:
     """
-    Read the faults of one flight: a list of what, at [s], duration [s] and numbers.
+    Read the faults of one flight, each with the keys what, at [s], duration [s] and numbers.
 
-    ``what`` is a name of the shipped list, or a kind with its numbers.
+    ``what`` is a name of the shipped list, or a kind.
 
     Raises:
-        ParameterError: naming file, key and what was expected.
+        ParameterError: unusable file; the message has file, key and the expected value.
 
     """
     given = schema.load_yaml(path)
@@ -212,7 +220,7 @@ def _placed(entry, at, named):
 
 
 def text(faults: list[Fault]) -> str:
-    """Write faults as :func:`parse_faults` reads them."""
+    """Text of faults in the format of :func:`parse_faults`."""
     return '; '.join(' '.join([fault.kind, f'at={fault.at!r}', *(
         f'{key}={float(value)!r}' for key, value in (
             *(() if fault.duration == inf else (('duration', fault.duration),)),
@@ -221,10 +229,10 @@ def text(faults: list[Fault]) -> str:
 
 def parse_faults(text: str) -> list[Fault]:
     """
-    Faults of a short text: 'rotor_stops rotor=2; mocap_lost duration=3'.
+    Parse a text such as 'rotor_stops rotor=2; mocap_lost duration=3'.
 
     Raises:
-        ParameterError: naming the part that cannot be used.
+        ParameterError: unusable part of the text.
 
     """
     faults = []

@@ -1,4 +1,4 @@
-"""Faults of the flight stack's processes, for a loop that runs them in one process."""
+"""Faults of the flight stack's processes, for the in-process loop."""
 
 from __future__ import annotations
 
@@ -7,35 +7,35 @@ from dataclasses import replace
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.sim.faults.base import Effect, kind, Late, Number, vector
+from beetle_omni_ros.sim.faults.base import Effect, Frozen, kind, Late, Number, vector
 
 
 class ProcessEffect(Effect):
-    """What a fault of a process does while it is on; the loop calls the hooks."""
+    """Effect of a fault of a process; the loop calls the hooks."""
 
     process = True
-    clock_step = 0.0                        # by which the flight computer's clock is off [s]
-    supervisor_waits = False                # the supervisor is not scheduled
-    bridges: dict[str, str] = {}            # bridge -> what it says of itself
+    clock_step = 0.0                        # [s] error of the flight computer's clock
+    supervisor_waits = False                # whether the supervisor is not scheduled
+    bridges: dict[str, str] = {}            # bridge -> its reported state
 
     def estimate(self, state):
-        """What the estimator tells; None: nothing."""
+        """Return the changed estimate, or None."""
         return state
 
     def request(self, command, now) -> list:
-        """Commands of the active controller that arrive now; also called with None."""
+        """Return the commands of the active controller that arrive now; also called with None."""
         return [] if command is None else [command]
 
     def target(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Position [m] and quaternion in world that somebody else asks for, or None."""
+        """Position [m] and quaternion in world of another target, or None."""
         return None
 
 
 @kind('clock_jumps')
 class ClockJumps(ProcessEffect):
-    """The flight computer's clock is set."""
+    """The clock of the flight computer jumps."""
 
-    numbers = {'step': Number('by which', 's', low=-100, high=100)}
+    numbers = {'step': Number('jump of the clock', 's', low=-100, high=100)}
 
     @property
     def clock_step(self):
@@ -44,7 +44,7 @@ class ClockJumps(ProcessEffect):
 
 @kind('estimator_dead')
 class EstimatorDead(ProcessEffect):
-    """The estimator gives nothing."""
+    """The estimator publishes nothing."""
 
     def estimate(self, state):
         return None
@@ -52,9 +52,9 @@ class EstimatorDead(ProcessEffect):
 
 @kind('estimator_diverges')
 class EstimatorDiverges(ProcessEffect):
-    """The estimated position and velocity run away along world x."""
+    """The errors of position and velocity grow along world x."""
 
-    numbers = {'acceleration': Number('of the error', 'm/s^2', 1.0, 0, 1000)}
+    numbers = {'acceleration': Number('acceleration of the error', 'm/s^2', 1.0, 0, 1000)}
     _time = 0.0
 
     def estimate(self, state):
@@ -67,7 +67,7 @@ class EstimatorDiverges(ProcessEffect):
 
 @kind('estimator_nan')
 class EstimatorNan(ProcessEffect):
-    """The estimator gives NaN."""
+    """The estimator publishes NaN."""
 
     def estimate(self, state):
         return replace(state, position=np.full(3, np.nan))
@@ -75,7 +75,7 @@ class EstimatorNan(ProcessEffect):
 
 @kind('estimator_rubbish')
 class EstimatorRubbish(ProcessEffect):
-    """The estimator gives a random state each time."""
+    """The estimator publishes random states."""
 
     def estimate(self, state):
         row = self._random.standard_normal(13)
@@ -84,25 +84,22 @@ class EstimatorRubbish(ProcessEffect):
 
 
 @kind('estimator_frozen')
-class EstimatorFrozen(ProcessEffect):
-    """The estimator gives the same state with new stamps."""
-
-    _first = None
+class EstimatorFrozen(Frozen, ProcessEffect):
+    """The estimator publishes the same state with new stamps."""
 
     def estimate(self, state):
-        self._first = self._first or state
-        return replace(self._first, stamp=state.stamp)
+        return self._change(state)
 
 
 @kind('controller_silent')
 class ControllerSilent(ProcessEffect):
-    """The active controller gives nothing."""
+    """The active controller publishes nothing."""
 
     def request(self, command, now):
         return []
 
 
-class _Answer(ProcessEffect):
+class _CommandEffect(ProcessEffect):
     """Changes each command of the active controller."""
 
     def request(self, command, now):
@@ -110,16 +107,16 @@ class _Answer(ProcessEffect):
 
 
 @kind('controller_nan')
-class ControllerNan(_Answer):
-    """The active controller gives NaN."""
+class ControllerNan(_CommandEffect):
+    """The active controller commands NaN."""
 
     def _change(self, command):
         return replace(command, thrust=np.full(4, np.nan))
 
 
 @kind('controller_rubbish')
-class ControllerRubbish(_Answer):
-    """The active controller gives random tilts within 3 rad and thrusts within 20 N."""
+class ControllerRubbish(_CommandEffect):
+    """The active controller commands random tilts within 3 rad and thrusts up to 20 N."""
 
     def _change(self, command):
         return replace(command, tilt=self._random.uniform(-3, 3, 4),
@@ -127,22 +124,16 @@ class ControllerRubbish(_Answer):
 
 
 @kind('controller_constant')
-class ControllerConstant(_Answer):
-    """The active controller gives the same command with new stamps."""
-
-    _first = None
-
-    def _change(self, command):
-        self._first = self._first or command
-        return replace(self._first, stamp=command.stamp)
+class ControllerConstant(Frozen, _CommandEffect):
+    """The active controller repeats one command with new stamps."""
 
 
 @kind('controller_noisy')
-class ControllerNoisy(_Answer):
-    """The active controller shakes: white noise on its commands, standard deviations."""
+class ControllerNoisy(_CommandEffect):
+    """The commands of the active controller have white noise."""
 
-    numbers = {'tilt': Number('noise', 'rad', 0.0, 0, 3),
-               'thrust': Number('noise', 'N', 0.0, 0, 20)}
+    numbers = {'tilt': Number('standard deviation', 'rad', 0.0, 0, 3),
+               'thrust': Number('standard deviation', 'N', 0.0, 0, 20)}
 
     def _change(self, command):
         tilt, thrust = self._random.standard_normal((2, 4))
@@ -152,12 +143,10 @@ class ControllerNoisy(_Answer):
 
 @kind('controller_slow')
 class ControllerSlow(Late, ProcessEffect):
-    """The active controller answers late, with the stamps of the states that it answers."""
-
-    numbers = {'delay': Number('of its answers', 's', low=0, high=5)}
+    """The commands of the active controller are late, with correct stamps."""
 
     def request(self, command, now):
-        return self._arrived(command, now)
+        return self._delayed(command, now)
 
 
 @kind('supervisor_waits')
@@ -169,7 +158,7 @@ class SupervisorWaits(ProcessEffect):
 
 @kind('target')
 class Target(ProcessEffect):
-    """Somebody asks for a pose in world."""
+    """Another program publishes a target pose in world."""
 
     numbers = {**vector('m', 'in world', x=0.0, y=0.0, z=1.0),
                **vector('rad', 'in world', roll=0.0, pitch=0.0, yaw=0.0)}
@@ -182,13 +171,13 @@ class Target(ProcessEffect):
 
 @kind('motor_board_lost')
 class MotorBoardLost(ProcessEffect):
-    """The rotor bridge says 'lost'."""
+    """The rotor bridge reports 'lost'."""
 
     bridges = {'rotor': 'lost: motor board silent'}
 
 
 @kind('servo_bus_lost')
 class ServoBusLost(ProcessEffect):
-    """The joint bridge says 'lost'."""
+    """The joint bridge reports 'lost'."""
 
     bridges = {'joint': 'lost: a servo is silent'}

@@ -1,4 +1,4 @@
-"""Faults in time: which are on now."""
+"""Starts and ends faults by their times."""
 
 from __future__ import annotations
 
@@ -12,24 +12,27 @@ from beetle_omni_ros.sim.faults.base import Effect, Fault, KINDS, ROUNDING
 
 class Schedule:
     """
-    A list of faults on a clock.
+    A list of faults and their effects.
 
-    The same faults, seed and calls give the same numbers. A fault that is in the list before and
-    after a change goes on as it was.
+    Equal faults, seeds and calls give equal results. A fault that is in the list before and after
+    a change continues unchanged.
+
+    Args:
+        tick: time between two updates [s].
+        seed: seed of the random numbers of all faults.
 
     Attributes:
-        active: effects that are on, in the order of the list.
+        active: active effects in the order of the list.
 
     """
 
     def __init__(self, tick: float, seed: np.random.SeedSequence):
-        """``tick`` between two updates [s]; ``seed`` of what is random in a fault."""
         self._tick, self._seed = tick, seed
         self._entries: list[list] = []      # fault, start time, effect or None, whether over
         self.active: list[Effect] = []
 
     def set(self, faults: Sequence[Fault], now: float, world=None) -> None:
-        """Fly with these faults; their ``at`` counts from ``now`` [s]."""
+        """Replace the faults; their ``at`` counts from ``now`` [s]."""
         before = list(self._entries)
         entries = []
         for fault in faults:
@@ -44,7 +47,7 @@ class Schedule:
         self._collect()
 
     def update(self, now: float, world=None) -> None:
-        """Start and end what is due at ``now``."""
+        """Start and end the effects that are due at ``now`` [s]."""
         changed = False
         for entry in self._entries:
             fault, start, effect, over = entry
@@ -67,11 +70,11 @@ class Schedule:
 
     @property
     def empty(self) -> bool:
-        """Whether there is nothing to switch on, now or later."""
+        """Whether the list is empty."""
         return not self._entries
 
     @property
     def names(self) -> list[str]:
-        """Kinds that are on."""
+        """Kinds of the active faults."""
         return [fault.kind for fault, _, effect, over in self._entries
                 if effect is not None and not over]

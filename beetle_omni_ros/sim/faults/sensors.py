@@ -7,76 +7,92 @@ from dataclasses import replace
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.sim.faults.base import Effect, kind, Late, Number, ROUNDING, share, vector
+from beetle_omni_ros.sim.faults.base import (
+    Effect,
+    Frozen,
+    kind,
+    Late,
+    Lost,
+    Number,
+    ROUNDING,
+    share,
+    vector,
+)
+
+
+class _MocapEffect(Effect):
+    """Changes each pose of the motion capture by ``_change``."""
+
+    def mocap(self, reading, now):
+        return reading and self._change(reading)
+
+
+class _ImuEffect(Effect):
+    """Changes each IMU sample by ``_change``."""
+
+    def imu(self, reading, now):
+        return reading and self._change(reading)
+
+
+class _ClockStep:
+    """Mixin: the stamps are wrong by a constant."""
+
+    numbers = {'step': Number('error of the stamps', 's', low=-100, high=100)}
+
+    def _change(self, reading):
+        return replace(reading, stamp=reading.stamp + self._numbers['step'])
 
 
 @kind('mocap_lost')
-class MocapLost(Effect):
+class MocapLost(Lost, _MocapEffect):
     """No pose arrives."""
-
-    def mocap(self, reading, now):
-        return None
 
 
 @kind('mocap_drops')
-class MocapDrops(Effect):
+class MocapDrops(_MocapEffect):
     """A share of the poses is lost."""
 
-    numbers = {'share': share('of the poses that are lost')}
+    numbers = {'share': share('share of lost poses')}
 
-    def mocap(self, reading, now):
-        if reading is None or self._random.uniform() < self._numbers['share']:
-            return None
-        return reading
+    def _change(self, reading):
+        return None if self._random.uniform() < self._numbers['share'] else reading
 
 
 @kind('mocap_frozen')
-class MocapFrozen(Effect):
+class MocapFrozen(Frozen, _MocapEffect):
     """The same pose arrives with new stamps."""
-
-    _first = None
-
-    def mocap(self, reading, now):
-        if reading is None:
-            return None
-        self._first = self._first or reading
-        return replace(self._first, stamp=reading.stamp)
 
 
 @kind('mocap_jumps')
-class MocapJumps(Effect):
-    """The position jumps and stays off."""
+class MocapJumps(_MocapEffect):
+    """The position jumps and keeps the offset."""
 
     numbers = vector('m', 'of the jump in world', x=0.0, y=0.0, z=0.0)
 
-    def mocap(self, reading, now):
-        return reading and replace(reading, position=reading.position + np.array(
+    def _change(self, reading):
+        return replace(reading, position=reading.position + np.array(
             [self._numbers[axis] for axis in 'xyz']))
 
 
 @kind('mocap_turned')
-class MocapTurned(Effect):
-    """The orientation jumps about base_link axes and stays off."""
+class MocapTurned(_MocapEffect):
+    """The orientation jumps about axes of base_link and keeps the offset."""
 
-    numbers = vector('rad', 'of the turn', roll=0.0, pitch=0.0, yaw=0.0)
+    numbers = vector('rad', 'of the rotation', roll=0.0, pitch=0.0, yaw=0.0)
 
-    def mocap(self, reading, now):
-        if reading is None:
-            return None
+    def _change(self, reading):
         turn = rotations.from_rpy(*(self._numbers[axis] for axis in ('roll', 'pitch', 'yaw')))
         return replace(reading, quaternion=rotations.multiply(reading.quaternion, turn))
 
 
 @kind('mocap_noisy')
-class MocapNoisy(Effect):
-    """More noise on the pose, standard deviations of an axis."""
+class MocapNoisy(_MocapEffect):
+    """The pose has additional noise; standard deviations of an axis."""
 
-    numbers = {'position': Number('noise', 'm', 0.0, 0, 10),
-               'orientation': Number('noise', 'rad', 0.0, 0, 3)}
+    numbers = {'position': Number('standard deviation', 'm', 0.0, 0, 10),
+               'orientation': Number('standard deviation', 'rad', 0.0, 0, 3)}
 
-    def mocap(self, reading, now):
-        if reading is None:
-            return None
+    def _change(self, reading):
         noise = self._random.standard_normal(6)
         turn = rotations.exp(self._numbers['orientation'] * noise[3:])
         return replace(reading, position=reading.position + self._numbers['position'] * noise[:3],
@@ -88,12 +104,12 @@ class MocapDelayed(Late):
     """Poses arrive late, stamped at capture."""
 
     def mocap(self, reading, now):
-        return next(iter(self._arrived(reading, now, 1)), None)
+        return next(iter(self._delayed(reading, now, 1)), None)
 
 
 @kind('mocap_lags')
 class MocapLags(MocapDelayed):
-    """Poses arrive late, and their stamps do not tell."""
+    """Poses arrive late, and their stamps do not contain the delay."""
 
     def mocap(self, reading, now):
         late = super().mocap(reading, now)
@@ -104,7 +120,7 @@ class MocapLags(MocapDelayed):
 class MocapSlow(Effect):
     """Poses arrive at a lower rate."""
 
-    numbers = {'period': Number('between two poses', 's', low=0.01, high=5)}
+    numbers = {'period': Number('time between two poses', 's', low=0.01, high=5)}
     _next = -np.inf
 
     def mocap(self, reading, now):
@@ -115,108 +131,85 @@ class MocapSlow(Effect):
 
 
 @kind('mocap_clock')
-class MocapClock(Effect):
-    """The stamps of the poses jump and stay off."""
-
-    numbers = {'step': Number('of the stamps', 's', low=-100, high=100)}
-
-    def mocap(self, reading, now):
-        return reading and replace(reading, stamp=reading.stamp + self._numbers['step'])
+class MocapClock(_ClockStep, _MocapEffect):
+    """The stamps of the poses jump and keep the offset."""
 
 
 @kind('imu_lost')
-class ImuLost(Effect):
+class ImuLost(Lost, _ImuEffect):
     """No IMU sample arrives."""
-
-    def imu(self, reading, now):
-        return None
 
 
 @kind('imu_frozen')
-class ImuFrozen(Effect):
+class ImuFrozen(Frozen, _ImuEffect):
     """The same IMU sample arrives with new stamps."""
-
-    _first = None
-
-    def imu(self, reading, now):
-        if reading is None:
-            return None
-        self._first = self._first or reading
-        return replace(self._first, stamp=reading.stamp)
 
 
 @kind('imu_clock')
-class ImuClock(Effect):
-    """The stamps of the IMU jump and stay off."""
-
-    numbers = {'step': Number('of the stamps', 's', low=-100, high=100)}
-
-    def imu(self, reading, now):
-        return reading and replace(reading, stamp=reading.stamp + self._numbers['step'])
+class ImuClock(_ClockStep, _ImuEffect):
+    """The stamps of the IMU jump and keep the offset."""
 
 
-class _Motion(Effect):
-    """Changes the six numbers of a sample."""
+class _MotionEffect(_ImuEffect):
+    """Changes the vector (6,) of specific force and angular velocity by ``_change_motion``."""
 
-    def imu(self, reading, now):
-        if reading is None:
-            return None
-        changed = self._change(np.concatenate([reading.specific_force, reading.angular_velocity]),
-                               now)
-        return replace(reading, specific_force=changed[:3], angular_velocity=changed[3:])
+    def _change(self, reading):
+        motion = self._change_motion(
+            np.concatenate([reading.specific_force, reading.angular_velocity]))
+        return replace(reading, specific_force=motion[:3], angular_velocity=motion[3:])
 
 
 @kind('gyroscope_bias')
-class GyroscopeBias(_Motion):
+class GyroscopeBias(_MotionEffect):
     """The gyroscope bias steps."""
 
     numbers = vector('rad/s', 'of the step', x=0.0, y=0.0, z=0.0)
 
-    def _change(self, motion, now):
+    def _change_motion(self, motion):
         motion[3:] += [self._numbers[axis] for axis in 'xyz']
         return motion
 
 
 @kind('accelerometer_bias')
-class AccelerometerBias(_Motion):
+class AccelerometerBias(_MotionEffect):
     """The accelerometer bias steps."""
 
     numbers = vector('m/s^2', 'of the step', x=0.0, y=0.0, z=0.0)
 
-    def _change(self, motion, now):
+    def _change_motion(self, motion):
         motion[:3] += [self._numbers[axis] for axis in 'xyz']
         return motion
 
 
 @kind('imu_saturated')
-class ImuSaturated(_Motion):
+class ImuSaturated(_MotionEffect):
     """The IMU saturates."""
 
     numbers = {'specific_force': Number('largest value', 'm/s^2', 1000.0, 0, 1000),
                'rate': Number('largest value', 'rad/s', 1000.0, 0, 1000)}
 
-    def _change(self, motion, now):
+    def _change_motion(self, motion):
         limit = np.repeat([self._numbers['specific_force'], self._numbers['rate']], 3)
         return np.clip(motion, -limit, limit)
 
 
 @kind('imu_nan')
-class ImuNan(_Motion):
-    """The IMU gives NaN."""
+class ImuNan(_MotionEffect):
+    """The IMU samples are NaN."""
 
-    def _change(self, motion, now):
+    def _change_motion(self, motion):
         return np.full(6, np.nan)
 
 
 @kind('imu_spikes')
-class ImuSpikes(_Motion):
-    """Single IMU samples are off, each in a random direction."""
+class ImuSpikes(_MotionEffect):
+    """Single IMU samples have an error in a random direction."""
 
-    numbers = {'period': Number('mean time between two', 's', 0.1, 0.005, 100),
-               'specific_force': Number('of a spike', 'm/s^2', 0.0, 0, 1000),
-               'rate': Number('of a spike', 'rad/s', 0.0, 0, 1000)}
+    numbers = {'period': Number('mean time between two spikes', 's', 0.1, 0.005, 100),
+               'specific_force': Number('error of an axis', 'm/s^2', 0.0, 0, 1000),
+               'rate': Number('error of an axis', 'rad/s', 0.0, 0, 1000)}
 
-    def _change(self, motion, now):
+    def _change_motion(self, motion):
         hit, *direction = self._random.uniform(-1, 1, 7)
         if abs(hit) < self._tick / self._numbers['period']:
             size = np.repeat([self._numbers['specific_force'], self._numbers['rate']], 3)
@@ -225,11 +218,11 @@ class ImuSpikes(_Motion):
 
 
 @kind('imu_axis_dead')
-class ImuAxisDead(_Motion):
+class ImuAxisDead(_MotionEffect):
     """One axis of the IMU reads zero: 1 to 3 specific force, 4 to 6 rate."""
 
-    numbers = {'axis': Number('of six', '', None, 1, 6, whole=True)}
+    numbers = {'axis': Number('number of the axis', '', None, 1, 6, whole=True)}
 
-    def _change(self, motion, now):
+    def _change_motion(self, motion):
         motion[int(self._numbers['axis']) - 1] = 0.0
         return motion

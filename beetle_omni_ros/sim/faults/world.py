@@ -1,4 +1,4 @@
-"""Faults of the command's way, the pack, and what comes from outside."""
+"""Faults of the commands and the battery, and external loads."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class CommandsLost(Effect):
 class CommandsDrop(Effect):
     """A share of the commands is lost."""
 
-    numbers = {'share': share('of the commands that are lost')}
+    numbers = {'share': share('share of lost commands')}
 
     def command(self, command, now):
         if command is None or self._random.uniform() < self._numbers['share']:
@@ -32,14 +32,14 @@ class CommandsDelayed(Late):
     """Commands reach the actuators late."""
 
     def command(self, command, now):
-        return self._arrived(command, now)
+        return self._delayed(command, now)
 
 
 @kind('battery_charge')
 class BatteryCharge(Effect):
-    """The charge of the pack drops to a fraction of a full one."""
+    """The charge of the battery drops to a fraction of a full one."""
 
-    numbers = {'charge': share('that is left')}
+    numbers = {'charge': share('remaining charge as a fraction of a full battery')}
 
     def start(self, world):
         world.battery.charge = min(world.battery.charge, self._numbers['charge'])
@@ -47,9 +47,9 @@ class BatteryCharge(Effect):
 
 @kind('battery_resistance')
 class BatteryResistance(Effect):
-    """The pack has more resistance."""
+    """The battery has additional resistance."""
 
-    numbers = {'resistance': Number('in addition', 'ohm', low=0, high=2)}
+    numbers = {'resistance': Number('additional resistance', 'ohm', low=0, high=2)}
 
     def start(self, world):
         world.battery.extra_resistance += self._numbers['resistance']
@@ -60,7 +60,7 @@ class BatteryResistance(Effect):
 
 @kind('battery_unread')
 class BatteryUnread(Effect):
-    """No reading of the pack arrives."""
+    """No reading of the battery arrives."""
 
     def battery(self, reading, now):
         return None
@@ -70,7 +70,7 @@ class BatteryUnread(Effect):
 class Payload(Effect):
     """A mass is attached below the body."""
 
-    numbers = {'mass': Number('attached', 'kg', low=0, high=10)}
+    numbers = {'mass': Number('attached mass', 'kg', low=0, high=10)}
 
     @property
     def payload(self):
