@@ -1,4 +1,4 @@
-"""The pack: rest voltage that falls with charge, resistance, and what thrust it still allows."""
+"""Model of the battery: rest voltage by charge, internal resistance, thrust limit."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from beetle_omni_ros.sim.parameters import PackParameters
 
 class Battery:
     """
-    Charge, voltage and current of one pack.
+    Charge, voltage and current of one battery.
 
     Attributes:
-        charge: what is left, as a fraction of a full pack.
-        voltage: under the present load [V].
-        extra_resistance: of a bad contact or cell, beside the pack's own [ohm].
-        current: drawn [A], positive.
+        charge: charge as a fraction of a full battery.
+        voltage: voltage under the present load [V].
+        extra_resistance: additional resistance of a bad contact or cell [ohm].
+        current: drawn current [A], positive.
 
     """
 
@@ -35,7 +35,7 @@ class Battery:
         self.reset()
 
     def reset(self) -> None:
-        """Put in a pack of the initial charge."""
+        """Set the initial charge and no load."""
         self.charge = self._pack.initial_charge
         self.extra_resistance = 0.0
         self.current = 0.0
@@ -47,12 +47,12 @@ class Battery:
         return _interpolate(self._levels, self._rest_voltages, min(1.0, max(0.0, self.charge)))
 
     def step(self, thrust: np.ndarray, duration: float) -> None:
-        """Draw what ``thrust`` (4,) [N] needs for ``duration`` [s]."""
+        """Supply the power for ``thrust`` (4,) [N] during ``duration`` [s]."""
         pack = self._pack
         power = pack.idle_power + pack.rotor_power * sum(
             f * sqrt(f) for f in thrust.tolist() if f > 0)
         rest = self.rest_voltage
-        # power = V (rest - V) / R; beyond the pack's largest power it gives that, at rest / 2
+        # power = V (rest - V) / R, limited to the largest power, which is at V = rest / 2
         resistance = self._resistance + self.extra_resistance
         self.voltage = 0.5 * (rest + sqrt(max(0.0, rest * rest - 4 * resistance * power)))
         self.current = power / self.voltage
@@ -65,8 +65,8 @@ class Battery:
         """
         Largest thrust of a rotor at the present voltage [N].
 
-        The rotor map's limits, linear between its voltages and beyond the lowest; without a
-        map the robot's own limit.
+        It is interpolated between the voltages of the rotor map, and extrapolated below the
+        lowest. Without a map it is the limit of the robot.
         """
         if not self._map_voltages:
             return self._thrust_max
@@ -78,6 +78,6 @@ class Battery:
 
 
 def _interpolate(xs, ys, x):
-    """Piecewise linear, continued along the first and last pieces."""
+    """Piecewise linear interpolation with linear extrapolation."""
     k = min(max(bisect_right(xs, x) - 1, 0), len(xs) - 2)
     return ys[k] + (ys[k + 1] - ys[k]) * (x - xs[k]) / (xs[k + 1] - xs[k])

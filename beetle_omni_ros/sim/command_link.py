@@ -1,4 +1,4 @@
-"""The way of a command to the actuators: checks, delay, timeout."""
+"""Link of the commands to the actuators: checks, delay, timeout."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.conditions import Conditions
 from beetle_omni_ros.sim.parameters import ActuatorTimingParameters
 
-ROUNDING = 1e-9                 # [s] sums of ticks differ from their product by less
+ROUNDING = 1e-9                 # [s] bound of the rounding error of sums of ticks
 
 
 class CommandLink:
     """
-    Holds commands until they act.
+    Delays commands.
 
     Attributes:
-        tilt: (4,) targets in force [rad].
-        thrust: (4,) targets in force [N].
-        accepted: number of commands taken.
-        rejected: reason -> number of commands refused.
+        tilt: (4,) present targets [rad].
+        thrust: (4,) present targets [N].
+        accepted: number of accepted commands.
+        rejected: reason -> number of refused commands.
 
     """
 
@@ -40,14 +40,14 @@ class CommandLink:
 
     def push(self, command, now: float) -> bool:
         """
-        Take a command, or refuse and count it.
+        Accept or refuse a command. A command with the stamp of the last one replaces it.
 
         Args:
             command: has ``stamp`` [s], ``tilt`` (4,) [rad], ``thrust`` (4,) [N].
             now: [s]; the command acts at its stamp plus the delay, or now if that has passed.
 
         Returns:
-            whether it was taken. A stamp as old as the last one replaces that command.
+            whether it was accepted.
 
         """
         reason = self._refusal(command, now)
@@ -80,21 +80,12 @@ class CommandLink:
         return None
 
     def update(self, now: float) -> None:
-        """Put in force what acts by ``now``; stop the rotors when commands have ceased."""
+        """Set the targets that are due at ``now``; stop the rotors after the timeout."""
         due = now + ROUNDING
         tilts, thrusts = self._pending
         while tilts and tilts[0][0] <= due:
             self.tilt = tilts.popleft()[1]
         while thrusts and thrusts[0][0] <= due:
             self.thrust = thrusts.popleft()[1]
-        if self.timed_out(now):
+        if now - self._last_arrival >= self._timing.command_timeout - ROUNDING:
             self.thrust = np.zeros(4)
-
-    def timed_out(self, now: float) -> bool:
-        """Whether the last command came so long ago that the rotors stop."""
-        return due_after(self._last_arrival, self._timing.command_timeout, now)
-
-
-def due_after(start: float, duration: float, now: float) -> bool:
-    """Whether ``duration`` has passed since ``start``, up to rounding."""
-    return now - start >= duration - ROUNDING

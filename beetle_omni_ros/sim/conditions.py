@@ -1,4 +1,4 @@
-"""The conditions of a flight: what one seed makes of the robot, its sensors and its delays."""
+"""Conditions of a flight: variation of the robot, biases and latencies, drawn from a seed."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ NAMES = ('nominal', 'published')
 
 
 def zeros(size: int):
-    """A dataclass field that defaults to ``size`` zeros."""
+    """Declare a dataclass field that defaults to ``size`` zeros."""
     return field(default_factory=lambda: np.zeros(size))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
     """
-    What stays the same through a flight.
+    Constants of one flight.
 
     Attributes:
-        variation: mass, inertia and centre of mass of the true robot.
-        position_bias: (3,) of the MoCap [m].
-        orientation_bias: (3,) rotation vector of the MoCap [rad].
-        imu_bias: (6,) specific force [m/s^2], angular velocity [rad/s].
+        variation: deviation of mass, inertia and centre of mass from the robot file.
+        position_bias: (3,) bias of the MoCap [m].
+        orientation_bias: (3,) bias of the MoCap, a rotation vector [rad].
+        imu_bias: (6,) biases of specific force [m/s^2] and angular velocity [rad/s].
         tilt_bias: (4,) encoder reading minus true tilt [rad].
-        imu_uniform_noise: (6,) half-widths.
-        mocap_uniform_noise: (6,) half-widths, position [m] and rotation vector [rad].
-        tilt_uniform_noise: half-width [rad].
-        imu_latency: age that the IMU's stamps hide [s].
+        imu_uniform_noise: (6,) half-widths of the IMU's uniform noise.
+        mocap_uniform_noise: (6,) half-widths for position [m] and rotation vector [rad].
+        tilt_uniform_noise: half-width of the encoders' uniform noise [rad].
+        imu_latency: latency of the IMU that its stamps do not contain [s].
         tilt_latency: age of joint feedback [s].
-        tilt_command_delay: from a command's stamp until it acts [s].
-        thrust_command_delay: the same for thrusts [s].
+        tilt_command_delay: time from the stamp of a command until its tilts act [s].
+        thrust_command_delay: time from the stamp of a command until its thrusts act [s].
 
     """
 
@@ -54,7 +54,7 @@ class Conditions:
     thrust_command_delay: float
 
     def command_delays(self, robot: RobotParameters) -> tuple[float, float]:
-        """Of tilts and of thrusts [s], with what the robot file's effects add."""
+        """Delays of tilt and thrust commands [s], with the effects of the robot file."""
         tilt, thrust = robot.command_delays
         return self.tilt_command_delay + tilt, self.thrust_command_delay + thrust
 
@@ -62,7 +62,7 @@ class Conditions:
 def draw(name: str, parameters: SimulatorParameters,
          generator: np.random.Generator) -> Conditions:
     """
-    The conditions called ``name``.
+    Draw the conditions ``name``, 'nominal' or 'published'.
 
     Raises:
         ParameterError: unknown name.

@@ -1,4 +1,4 @@
-"""Touchdowns, and what they break."""
+"""Detection of touchdowns and of crashes that break the robot."""
 
 from __future__ import annotations
 
@@ -11,35 +11,38 @@ from beetle_omni_ros.sim.readings import Impact, Truth
 
 class CrashWatch:
     """
-    Looks at every tick of the truth.
+    Checks the true state in every tick.
 
-    A robot that has flown breaks when it meets the floor too fast, or lies on it too inclined. One
-    that was put down on its side and has not flown does not.
+    A robot that has flown breaks if its first contact is too fast, or a contact too inclined. A
+    robot that has not flown does not break, so it may be placed on its side.
+
+    Args:
+        parameters: limits.
+        tick: time between two calls of :meth:`step` [s].
 
     Attributes:
-        impact: the last touchdown, None before the first.
-        broken: whether the robot broke.
+        impact: last touchdown, None before the first.
+        broken: whether the robot is broken.
 
     """
 
     def __init__(self, parameters: CrashParameters, tick: float):
-        """``tick`` between two calls of :meth:`step` [s]."""
         self._limits, self._tick = parameters, tick
         self.reset()
 
     def reset(self) -> None:
-        """A whole robot that has not flown."""
+        """Start with an intact robot that has not flown."""
         self.impact: Impact | None = None
         self.broken = False
         self._airborne, self._flown = 0.0, False
 
     def step(self, before: Truth, contact: bool) -> None:
         """
-        Take what a tick brought.
+        Update after a tick.
 
         Args:
-            before: the state before the tick: in it the floor has not yet slowed the robot.
-            contact: whether any part touches the floor after it.
+            before: state before the tick, in which the floor has not slowed the robot yet.
+            contact: whether any part touches the floor after the tick.
 
         """
         if not contact:
@@ -51,17 +54,12 @@ class CrashWatch:
             if self._airborne >= self._limits.airborne_time:
                 self.impact = touch
             self._break(touch.speed > self._limits.speed)
-        self._break(np.cos(self._limits.inclination) > _up(before))
+        x, y = before.quaternion[:2]
+        self._break(np.cos(self._limits.inclination) > 1 - 2 * (x * x + y * y))
         self._airborne = 0.0
 
     def _break(self, hard):
         self.broken = self.broken or bool(hard and self._flown)
-
-
-def _up(truth):
-    """Cosine of the inclination."""
-    x, y = truth.quaternion[0], truth.quaternion[1]
-    return 1 - 2 * (x * x + y * y)
 
 
 def _touch(truth):

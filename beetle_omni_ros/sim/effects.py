@@ -1,9 +1,10 @@
 """
-The forces of named effects as the plant feels them.
+Forces of the effects on the plant.
 
-Effects that only change a number of the model (mass, thrust and torque coefficients) are
-built into it by :mod:`beetle_omni_ros.sim.mjcf`. The common ones that depend on motion are
-written apart from the CasADi terms, in plain numpy; all others are the catalogue's equations.
+Effects that only change a number of the model (mass, thrust and torque coefficients) are built
+into the model by :mod:`beetle_omni_ros.sim.mjcf`. For common effects that depend on motion the
+equations are implemented again in numpy, independently of CasADi. All others use the equations of
+the catalogue.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 
 
 class MotionForces:
-    """Aerodynamic forces of one robot, to be added at its base_link."""
+    """Aerodynamic forces of one robot at base_link."""
 
     def __init__(self, robot: RobotParameters):
         effects = robot.effects
@@ -32,17 +33,17 @@ class MotionForces:
         self._reaction = -robot.rotors.spin * effects.get('torque_coefficient', {}).get(
             'torque_to_thrust_ratio', robot.rotors.torque_to_thrust_ratio)
         self._hover_thrust = robot.hover_thrust
-        # r x f for each rotor as a matrix, stacked (12, 3): np.cross is slow on small arrays.
+        # (12, 3), the matrices of r x f of the rotors: np.cross is slow on small arrays.
         self._levers = np.concatenate([rotations.skew(r) for r in robot.rotors.positions])
         axes = robot.tilt_axes
-        self._level = np.array([0.0, 0.0, 1.0])
-        self._sideways = np.cross(axes, self._level)   # where a rotor at +90 deg points
+        self._up = np.array([0.0, 0.0, 1.0])
+        self._sideways = np.cross(axes, self._up)   # direction of a rotor at +90 deg
 
     def __call__(self, rotation: np.ndarray, velocity: np.ndarray, angular_velocity: np.ndarray,
                  tilt: np.ndarray, thrust: np.ndarray,
                  height: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """
-        Forces of one instant.
+        Forces in one state.
 
         Args:
             rotation: (3, 3) base_link to world.
@@ -50,7 +51,7 @@ class MotionForces:
             angular_velocity: (3,) in base_link [rad/s].
             tilt: (4,) [rad].
             thrust: (4,) true thrusts [N].
-            height: of base_link above the floor [m].
+            height: height of base_link above the floor [m].
 
         Returns:
             force (3,) in world [N] and torque (3,) in base_link [N m].
@@ -61,15 +62,15 @@ class MotionForces:
         if self.body_drag:
             force -= self.body_drag * np.sqrt(velocity @ velocity) * velocity
         if self.rotor_drag:
-            normal = np.cos(tilt)[:, None] * self._level + np.sin(tilt)[:, None] * self._sideways
+            normal = np.cos(tilt)[:, None] * self._up + np.sin(tilt)[:, None] * self._sideways
             hub = rotation.T @ velocity - (self._levers @ angular_velocity).reshape(4, 3)
             in_plane = hub - (hub * normal).sum(axis=1)[:, None] * normal
             speed_ratio = np.sqrt(np.maximum(thrust, 0.0) / self._hover_thrust)
             drag = -0.25 * self.rotor_drag * speed_ratio[:, None] * in_plane
             force += rotation @ drag.sum(axis=0)
-            torque -= drag.ravel() @ self._levers      # sum of r x f: each lever is skew
+            torque -= drag.ravel() @ self._levers      # sum of r x f, with skew levers
         if self._changes_thrust:
-            normal = np.cos(tilt)[:, None] * self._level + np.sin(tilt)[:, None] * self._sideways
+            normal = np.cos(tilt)[:, None] * self._up + np.sin(tilt)[:, None] * self._sideways
             hub = rotation.T @ velocity - (self._levers @ angular_velocity).reshape(4, 3)
             along = self._thrust_change(rotation, hub, normal, tilt, thrust, height)
             change = along[:, None] * normal
@@ -78,7 +79,7 @@ class MotionForces:
         return force, torque
 
     def _thrust_change(self, rotation, hub, normal, tilt, thrust, height):
-        """(4,) what the effects add to each rotor's thrust [N]."""
+        """(4,) changes of the rotors' thrusts by the effects [N]."""
         part = np.ones(4)
         if self.ground:
             z = np.maximum(height + self._positions @ rotation[2], 0.08)
@@ -96,10 +97,10 @@ class MotionForces:
 
 class CatalogueForces:
     """
-    Forces of the effects that have no description of their own here, by the catalogue's equations.
+    Forces of the remaining effects by the equations of the catalogue.
 
     Attributes:
-        names: of those effects in the robot file.
+        names: names of those effects in the robot file.
 
     """
 

@@ -1,4 +1,4 @@
-"""Servo bus and motor board, emulated to the byte, as the actuators of a simulated robot."""
+"""Emulated servo bus and motor board as the actuators of a simulated robot."""
 
 from __future__ import annotations
 
@@ -19,29 +19,20 @@ from beetle_omni_ros.sim.simulator import Simulator
 
 class EmulatedActuators:
     """
-    Couples the devices with the simulator: their goals move it, they measure what it does.
+    Couples the devices with the simulator, which follows their goals and sets their sensors.
 
-    The devices live in real time, so :meth:`step` is called once a tick of real time. What they
-    tell at a call acts the conditions' command delay later. A command that answers the
-    IMU sample of one tick and reaches them before the next one so acts when it would on the
-    direct path.
+    The devices run in real time, so :meth:`step` is called once in each tick of real time. Their
+    outputs act after the command delay of the conditions. A command for the IMU sample of one
+    tick, received before the next tick, then acts at the same time as without devices.
 
-    Attributes:
-        bus: the servos, `gimbal1` to `gimbal4`.
-        board: the motor board.
+    Args:
+        simulator: simulator of the true robot.
+        bus: four servos without motion model; closed by :meth:`close`.
+        board: motor board; closed by :meth:`close`.
 
     """
 
     def __init__(self, simulator: Simulator, bus: EmulatedServoBus, board: EmulatedMotorBoard):
-        """
-        Take over.
-
-        Args:
-            simulator: of the true robot.
-            bus: four servos, without a motion of their own; closed by :meth:`close`.
-            board: likewise.
-
-        """
         self.bus, self.board = bus, board
         self._simulator = simulator
         tilt, thrust = simulator.command_delays
@@ -61,7 +52,7 @@ class EmulatedActuators:
         self.close()
 
     def close(self) -> None:
-        """Switch both devices off and remove their ports."""
+        """Stop both devices and remove their ports."""
         self.bus.close()
         self.board.close()
 
@@ -74,15 +65,14 @@ class EmulatedActuators:
         self._thrusts.append(self.board.thrust_targets)
         tilt, powered = self._tilts[0]
         frame = self._simulator.step(Drive(tilt, powered, self._thrusts[0]))
-        self._tell(frame, powered)
+        self._update_devices(frame, powered)
         return frame
 
     def _hold(self, goals, stopped):
         """
-        Let servos that their watchdog has stopped stay where they are.
+        Hold the true angle of servos that their watchdog has stopped.
 
-        By their own measure they would move to where that errs, and by their past goals
-        to where these are.
+        Their goal differs from it by the encoder error, and the delayed goals are old.
         """
         for joint, stop in enumerate(stopped):
             if not stop:
@@ -94,8 +84,8 @@ class EmulatedActuators:
                     tilt[joint] = held
             goals[joint] = self._held[joint]
 
-    def _tell(self, frame, powered):
-        """Let the devices measure; the current of a servo without torque is zero."""
+    def _update_devices(self, frame, powered):
+        """Set the sensors of the devices; the current of a servo without torque is zero."""
         joints, pack, simulator = frame.joints, frame.battery, self._simulator
         self.bus.set_state(joints.position, joints.velocity, joints.effort * powered)
         voltage, current = simulator.voltage, simulator.current
@@ -105,11 +95,11 @@ class EmulatedActuators:
 
     def set_faults(self, servo: ServoFaultSwitches, board: BoardFaultSwitches) -> None:
         """
-        Switch faults on and off; events that are set happen now.
+        Switch faults on and off, and trigger the events that are set.
 
         Raises:
-            ParameterError: a servo or rotor that is none, and nothing is changed then; or a port
-                whose path is taken when it is plugged in again.
+            ParameterError: unknown servo or rotor, without any change, or a port whose path is in
+                use when it is plugged in.
 
         """
         fault_switches.check_servo_faults(servo, self.bus)
@@ -123,13 +113,13 @@ class EmulatedActuators:
 
     @property
     def faults(self) -> list[str]:
-        """Faults that are on, as texts such as 'servo silent [2]'."""
+        """Active faults as texts such as 'servo silent [2]'."""
         return [f'{device} {text}' for device, faults in
                 (('servo', self._servo_faults), ('board', self._board_faults))
                 for text in fault_switches.switched_on(faults)]
 
     def status(self) -> dict[str, object]:
-        """What the devices are doing and have refused, for diagnostics."""
+        """States and refusals of the devices, for diagnostics."""
         bus, board = self.bus, self.board
         return {'servo_port': bus.port, 'board_port': board.port, 'armed': board.armed,
                 'torque': [bool(on) for on in bus.torque_enabled],
@@ -139,6 +129,6 @@ class EmulatedActuators:
 
 
 def _line(delay, tick, make):
-    """A queue whose first entry is ``delay`` [s], rounded up to ticks, older than its last."""
+    """Queue whose first entry is older than its last by ``delay`` [s], rounded up to ticks."""
     length = 1 + max(0, ceil(delay / tick - ROUNDING))
     return deque((make() for _ in range(length)), maxlen=length)

@@ -1,4 +1,4 @@
-"""The robot's looks: MuJoCo geometry for pictures, placed by the same numbers as the plant."""
+"""MuJoCo geometry of the robot for pictures, with the dimensions of the plant."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.mass_properties import mass_properties
 from beetle_omni_ros.sim.parameters import PlantParameters
 
-# Red, green, blue; and sizes [m] that only please the eye.
+# Colours (red, green, blue), and sizes [m] that only pictures use.
 CARBON, SHELL, METAL = (0.06, 0.065, 0.075), (0.82, 0.84, 0.87), (0.5, 0.52, 0.56)
 FRONT, REAR, SERVO = (0.88, 0.14, 0.10), (0.13, 0.15, 0.18), (0.10, 0.11, 0.13)
 BALL, LEG, BLADE = (0.97, 0.60, 0.08), (0.17, 0.18, 0.21), (0.05, 0.05, 0.06)
 DISC_FRONT, DISC_REAR = (0.95, 0.45, 0.35), (0.35, 0.62, 0.90)
 DISC_OPACITY = 0.22
 ARM, STALK, HUB = 0.011, 0.006, 0.070
-HUB_HEIGHT = 0.012              # of a propeller above its joint axis
+HUB_HEIGHT = 0.012              # height of a propeller above its joint axis
 BLADES = 3
-LIGHT = 'mass="0.001"'          # of anything: MuJoCo refuses a moving body without mass
+LIGHT = 'mass="0.001"'          # MuJoCo requires mass of a moving body
 
 
 def _numbers(*values):
@@ -30,11 +30,11 @@ def _numbers(*values):
 @dataclass(frozen=True)
 class Look:
     """
-    How a robot is drawn.
+    Appearance of a robot.
 
     Attributes:
-        opacity: 1 solid, less for a ghost.
-        tint: (3,) one colour for all of it, or None for its own.
+        opacity: 1 for a solid robot, less for a ghost.
+        tint: (3,) colour of the whole robot, or None for the colours of its parts.
 
     """
 
@@ -44,10 +44,10 @@ class Look:
 
 class Figure:
     """
-    MJCF text of one robot as a free body whose joints and propellers turn.
+    MJCF text of one robot as a free body with turning joints and propellers.
 
-    Generalised positions: base_link's place and attitude (7), then for each arm the tilt and
-    the turn of the propeller (8).
+    Generalised positions: pose of base_link (7), then for each arm the tilt and the angle of the
+    propeller (8).
     """
 
     def __init__(self, robot: RobotParameters, plant: PlantParameters):
@@ -56,7 +56,7 @@ class Figure:
         self._look = Look()
 
     def body(self, look: Look = Look()) -> str:
-        """Draw a robot of this look."""
+        """MJCF of a robot with this look."""
         self._look = look
         modules = ''.join(self._module(k) for k in range(4))
         return f'<body><freejoint/>{self._main_body()}{modules}</body>\n'

@@ -1,9 +1,9 @@
 """
-How the robot's totals divide into its parts.
+Mass properties of the robot's parts.
 
-A robot file states the totals (mass, inertia about the centre of gravity) and the parts
-that move or stick out; the main body is what is left. Frame: base_link, whose origin is
-the centre of gravity with all tilts at zero.
+A robot file contains the totals (mass, inertia about the centre of gravity), the tilting modules
+and the end-effector. The main body is the difference. The frame is base_link, whose origin is the
+centre of gravity with all tilts at zero.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from beetle_omni_ros.robot.schema import ParameterError
 @dataclass(frozen=True)
 class Variation:
     """
-    How one particular robot differs from its file.
+    Deviation of one robot from its file.
 
     Attributes:
-        mass_scale: factor on the total mass.
-        inertia_scale: (3,) factors on the total inertia.
-        centre_of_mass: (3,) of the whole robot, seen from base_link's origin [m].
+        mass_scale: factor of the total mass.
+        inertia_scale: (3,) factors of the total inertia.
+        centre_of_mass: (3,) centre of mass of the whole robot in base_link [m].
 
     """
 
@@ -53,11 +53,11 @@ class MassProperties:
     All parts of the robot with its tilts at zero.
 
     Attributes:
-        main_body: what is left of the totals.
+        main_body: totals minus the other parts.
         modules: the four tilting modules.
         end_effector: the ball.
         main_origin: (3,) origin of the main body's frame in base_link [m].
-        joint_origins: (4, 3) in base_link [m].
+        joint_origins: (4, 3) origins of the tilt joints in base_link [m].
         module_rotations: (4, 3, 3), columns outward, sideways, up, in base_link.
 
     """
@@ -71,27 +71,27 @@ class MassProperties:
 
 
 def combined(parts: list[RigidPart]) -> RigidPart:
-    """Several parts as one rigid part."""
+    """Combine parts into one rigid part."""
     mass = sum(part.mass for part in parts)
     centre = sum(part.mass * part.centre for part in parts) / mass
     return RigidPart(mass, centre, sum(part.inertia_about(centre) for part in parts))
 
 
 def total_mass(robot: RobotParameters, variation: Variation) -> float:
-    """Mass of the whole robot [kg], the effect ``mass`` and the variation included."""
+    """Mass of the whole robot [kg] with the effect ``mass`` and the variation."""
     return robot.effects.get('mass', {}).get('mass', robot.mass) * variation.mass_scale
 
 
 def mass_properties(robot: RobotParameters, variation: Variation | None = None) -> MassProperties:
     """
-    Divide the totals into parts.
+    Mass properties of all parts.
 
-    The tilt axes run through the rotor centres of ``robot.rotors.positions``. The main body
-    takes the mass, the place and the inertia that make the totals come true.
+    The tilt axes contain the rotor centres of ``robot.rotors.positions``. Mass, centre and inertia
+    of the main body follow from the totals.
 
     Raises:
-        ParameterError: the parts are heavier than the robot, or leave the main body an
-            inertia that no body can have.
+        ParameterError: the parts are heavier than the robot, or the inertia of the main body is
+            impossible.
 
     """
     variation = variation or Variation()
@@ -114,7 +114,7 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
     main_mass = mass - sum(part.mass for part in known)
     if main_mass <= 0:
         raise ParameterError(f'multibody: modules and end-effector weigh {mass - main_mass:g} kg, '
-                             f'the whole robot {mass:g} kg; nothing is left for the main body')
+                             f'the whole robot {mass:g} kg; expected a main body with mass')
     offset = robot.effects.get('centre_of_mass', {}).get('offset', (0.0,) * 3)
     total_inertia = np.array(robot.effects.get('inertia', {}).get('inertia', robot.inertia))
     centre = variation.centre_of_mass + np.array(offset)
@@ -124,7 +124,8 @@ def mass_properties(robot: RobotParameters, variation: Variation | None = None) 
         part.inertia_about(centre) for part in [point_mass, *known])
     moments = np.linalg.eigvalsh(inertia)
     if moments[0] <= 0 or moments[0] + moments[1] < moments[2]:
-        raise ParameterError('inertia: the parts leave the main body principal moments of '
-                             f'{np.array2string(moments, precision=4)} kg m^2, which no body has')
+        raise ParameterError('inertia: the main body would have the principal moments '
+                             f'{np.array2string(moments, precision=4)} kg m^2, which are '
+                             'impossible')
     return MassProperties(RigidPart(main_mass, main_centre, inertia), modules, end_effector,
                           main_origin, joint_origins, module_rotations)

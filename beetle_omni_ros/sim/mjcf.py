@@ -1,4 +1,4 @@
-"""The robot's parameters as a MuJoCo model: free base, four hinged modules, actuators, floor."""
+"""MuJoCo model of the robot: free base, four hinged modules, actuators, floor."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from beetle_omni_ros.sim.mass_properties import combined, mass_properties, Rigid
 from beetle_omni_ros.sim.parameters import PlantParameters
 
 BASE = 1                        # body index of base_link; 0 is the world
-TINY_MASS = 1e-12               # [kg] MuJoCo refuses a moving body without mass ...
-TINY_INERTIA = 1e-13            # [kg m^2] ... or inertia
-MOTOR_HEIGHT = 0.02             # [m] half height of the disc in which a propeller can touch
+TINY_MASS = 1e-12               # [kg] MuJoCo requires mass and inertia of a moving body
+TINY_INERTIA = 1e-13            # [kg m^2]
+MOTOR_HEIGHT = 0.02             # [m] half height of the contact disc of a propeller
 
-# The joint stops as hard as the step of 1 kHz bears; MuJoCo's solref and solimp.
+# solref and solimp of the joint stops, as stiff as is stable with steps of 1 ms.
 STOP_SOFTNESS = 0.002, 1.0
 STOP_IMPEDANCE = 0.99, 0.999, 0.001
 
 
 def build_model(robot: RobotParameters, plant: PlantParameters,
-                variation: Variation | None = None, scenery: str = '') -> mujoco.MjModel:
+                variation: Variation | None = None) -> mujoco.MjModel:
     """
     Compile the plant.
 
@@ -29,20 +29,19 @@ def build_model(robot: RobotParameters, plant: PlantParameters,
     targets [rad]; activations: the four lagged thrusts [N].
 
     Args:
-        robot: what is true in the simulation.
+        robot: the true robot.
         plant: time steps and ground.
-        variation: this robot's difference from its file.
-        scenery: further MJCF text for <worldbody>, for pictures.
+        variation: deviation of this robot from its file.
 
     """
-    model = mujoco.MjModel.from_xml_string(_mjcf(robot, plant, variation, scenery))
+    model = mujoco.MjModel.from_xml_string(_mjcf(robot, plant, variation))
     _reflect_servo_inertia(model, robot)
     return model
 
 
 def base_part(robot: RobotParameters, plant: PlantParameters, variation: Variation | None,
               payload: float) -> RigidPart:
-    """Everything rigid with base_link: main body, end-effector, ``payload`` [kg]."""
+    """All parts fixed to base_link: main body, end-effector, payload of ``payload`` [kg]."""
     parts = mass_properties(robot, variation)
     rigid = [parts.main_body, parts.end_effector]
     if payload:
@@ -61,18 +60,18 @@ def set_base_part(model: mujoco.MjModel, part: RigidPart) -> None:
     model.body_ipos[BASE] = part.centre
     model.body_inertia[BASE] = moments
     mujoco.mju_mat2Quat(model.body_iquat[BASE], axes.ravel())
-    model.body_sameframe[BASE] = 0      # the inertial frame is its own, whatever the compiler saw
+    model.body_sameframe[BASE] = 0      # the inertial frame may differ from the compiled one
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def _reflect_servo_inertia(model, robot):
     """
-    Make an unloaded joint answer as J q'' = Kp (q* - q) - Kd q' asks.
+    Give an unloaded joint the dynamics J q'' = Kp (q* - q) - Kd q'.
 
-    J is what a servo with its module showed in step responses, but the module's inertia
-    about the joint axis alone is already more. The difference (negative here) goes into the
-    joint's armature, an inner torque between module and body: response and stiffness are
-    then those identified, and momentum still balances.
+    J was identified from step responses of a servo with its module, but the module's own inertia
+    about the joint axis is larger. The negative difference is the armature of the joint, an
+    internal torque between module and body, so that the response is as identified and the
+    momentum is conserved.
     """
     module = robot.parts.module
     sideways, up = module.centre_of_mass[1:]
@@ -126,13 +125,13 @@ def _actuators(robot):
 
 
 def thrust_scale(robot: RobotParameters) -> np.ndarray:
-    """(4,) true thrust for each newton that the actuators believe to give."""
+    """(4,) true thrust relative to the commanded thrust."""
     effects = robot.effects
     return (effects.get('thrust_coefficient', {}).get('scale', 1.0)
             * np.array(effects.get('rotor_thrust_coefficient', {}).get('scale', (1.0,) * 4)))
 
 
-def _mjcf(robot, plant, variation, scenery):
+def _mjcf(robot, plant, variation):
     parts = mass_properties(robot, variation)
     foot_z = plant.foot_radius - plant.foot_depth
     feet = ''.join(f'<geom name="foot{k + 1}" type="sphere" size="{plant.foot_radius!r}" '
@@ -155,7 +154,6 @@ def _mjcf(robot, plant, variation, scenery):
   </default>
   <worldbody>
     <geom name="floor" type="plane" size="0 0 1" contype="0" conaffinity="1"/>
-    {scenery}
     <body name="base_link">
       <freejoint name="base"/>
       {_inertial(base_part(robot, plant, variation, 0.0))}

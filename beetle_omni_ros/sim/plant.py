@@ -1,4 +1,4 @@
-"""The multibody plant: MuJoCo's equations of motion, stepped one tick at a time."""
+"""The multibody plant: MuJoCo's equations of motion."""
 
 from __future__ import annotations
 
@@ -15,38 +15,40 @@ from beetle_omni_ros.sim.mass_properties import Variation
 from beetle_omni_ros.sim.mjcf import BASE, base_part, build_model, set_base_part, thrust_scale
 from beetle_omni_ros.sim.parameters import PlantParameters
 
-# MuJoCo would write its warnings into a file in the working directory; the plant checks its state.
+# MuJoCo would write warnings into a file in the working directory; step() checks the state.
 mujoco.set_mju_user_warning(lambda text: None)
 
 NO_CONSTRAINT = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-WXYZ = np.array([6, 3, 4, 5])       # where (w, x, y, z) stand in position + quaternion xyzw
-XYZW = np.array([4, 5, 6, 3])       # where (x, y, z, w) stand in qpos
-DIVERGED = 1e9                      # sum of accelerations that only a broken state has
+WXYZ = np.array([6, 3, 4, 5])       # indices of w, x, y, z in (position, quaternion xyzw)
+XYZW = np.array([4, 5, 6, 3])       # indices of x, y, z, w in qpos
+DIVERGED = 1e9                      # bound of the sum of accelerations in a valid state
 
 
 class Plant:
     """
     One true robot over a floor.
 
-    MuJoCo integrates with Runge-Kutta 4. The contact and joint-stop solver runs only in
-    ticks in which something could touch, and the tilt-rate limit is watched only in ticks in
-    which a joint could reach it: both bounds are conservative, and the plant costs half.
+    MuJoCo integrates by the Runge-Kutta method of order 4. To halve the computing time, the solver
+    of contacts and joint stops runs only in ticks in which a contact is possible, and the tilt
+    rate is limited only in ticks in which a joint could reach the limit. Both conditions are
+    conservative.
+
+    Attributes:
+        voltage_ratio: battery voltage relative to a full one, set by the owner of the battery.
+
+    Raises:
+        ParameterError: the plant lacks an effect, or impossible mass properties.
+
     """
 
     def __init__(self, robot: RobotParameters, parameters: PlantParameters,
                  variation: Variation | None = None):
-        """
-        Build the model.
-
-        Raises:
-            ParameterError: an effect that the plant lacks, or impossible mass properties.
-
-        """
         effects.check('plant', robot.effects)
         self._robot, self._parameters, self._variation = robot, parameters, variation
-        self._forces, self._others = MotionForces(robot), CatalogueForces(robot)
-        self._moved = self._forces.depends_on_motion or bool(self._others.names)
-        self._loaded = any(CATALOGUE[name].servo for name in robot.effects)
+        self._forces, self._catalogue_forces = MotionForces(robot), CatalogueForces(robot)
+        self._has_motion_forces = bool(self._forces.depends_on_motion
+                                       or self._catalogue_forces.names)
+        self._has_servo_loads = any(CATALOGUE[name].servo for name in robot.effects)
         self._scale = thrust_scale(robot)
         self.model = build_model(robot, parameters, variation)
         self.data = mujoco.MjData(self.model)
@@ -54,24 +56,24 @@ class Plant:
         self._floor_substeps = min(parameters.substeps, parameters.floor_substeps)
         self._flags = int(self.model.opt.disableflags)
         self._reach = _reach(self.model)
-        # A servo changes its rate by at most this in a tick, for each rad of error.
+        # Largest change of a servo's rate in a tick for each rad of error.
         self._rate_gain = robot.joints.kp * self._tick / robot.joints.inertia
-        # Views into MuJoCo's state, taken once because each look-up costs.
+        # Views of MuJoCo's state, stored because each access takes time.
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._tilt, self._rate, self._target = self._qpos[7:], self._qvel[6:], self.data.ctrl[4:]
         self._ground_height: float | None = None
-        self._asked = np.zeros(4)
-        self.voltage_ratio = 1.0    # of the pack to a full one; whoever has a battery sets it
+        self._commanded_tilt = np.zeros(4)
+        self.voltage_ratio = 1.0
         self._wrench = np.zeros(6)
         self._payload: float | None = None      # not yet set
         self._servos = (True,) * 4, (False,) * 4
-        self._powered = (True,) * 4     # by a motor with its limits
+        self._powered = (True,) * 4     # whether the motor and its limits act
         self.reset()
 
     def reset(self, position: np.ndarray | None = None,
               quaternion: np.ndarray | None = None) -> None:
         """
-        Put the robot at rest, tilts zero, rotors off, servos powered; wrench and payload go.
+        Place the robot at rest: tilts zero, rotors off, servos powered, no wrench, no payload.
 
         Args:
             position: (3,) of base_link in world [m]; by default standing at the origin.
@@ -96,7 +98,7 @@ class Plant:
     def set_body(self, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray,
                  angular_velocity: np.ndarray) -> None:
         """
-        Put base_link into a state of motion; joints and rotors stay in theirs.
+        Set pose and velocity of base_link; joints and rotors keep their states.
 
         Args:
             position: (3,) in world [m].
@@ -111,7 +113,7 @@ class Plant:
         self._update()
 
     def _standing_height(self):
-        """Where base_link comes to rest on its feet [m]; found once, by letting it settle."""
+        """Height of base_link at rest on its feet [m], simulated once."""
         if self._ground_height is None:
             self._place((0.0, 0.0, self._parameters.foot_depth), (0.0, 0.0, 0.0, 1.0))
             settle = 100 * self._parameters.contact_time_constant
@@ -120,19 +122,19 @@ class Plant:
         return self._ground_height
 
     def set_targets(self, tilt: np.ndarray, thrust: np.ndarray) -> None:
-        """Tilt targets (4,) [rad] and thrust commands (4,) [N], both within their limits."""
+        """Set tilt targets (4,) [rad] and thrust commands (4,) [N], both within their limits."""
         self.data.ctrl[:4] = thrust
         self.data.ctrl[4:] = tilt
-        self._asked = np.array(tilt)
+        self._commanded_tilt = np.array(tilt)
 
     def set_powered(self, powered: Sequence[bool],
                    jammed: Sequence[bool] = (False,) * 4) -> None:
         """
         Switch the torque of each servo (4,), or jam its joint at its target.
 
-        Without torque a joint is free but for the servo's damping, which neither the torque limit
-        nor the rate limit of the motor bounds. A jammed joint is a far stiffer spring without
-        such limits, critically damped, so its target must not jump.
+        A joint without torque has only the damping of the servo. A jammed joint is a much stiffer,
+        critically damped spring, so its target must not jump. The torque and rate limits of the
+        motor apply to neither.
         """
         powered, jammed = tuple(map(bool, powered)), tuple(map(bool, jammed))
         if (powered, jammed) == self._servos:
@@ -146,17 +148,16 @@ class Plant:
         model.actuator_gainprm[4:, 0] = stiffness
         model.actuator_biasprm[4:, 1] = -stiffness
         model.actuator_biasprm[4:, 2] = -damping
-        # What is limited is the motor's torque, which neither a free nor a jammed joint has.
         self._powered = tuple(on and not stop for on, stop in zip(powered, jammed))
         model.actuator_forcelimited[4:] = self._powered
 
     def set_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
-        """External force (3,) in world [N] and torque (3,) in base_link [N m] at base_link."""
+        """Set external force (3,) in world [N] and torque (3,) in base_link [N m] at base_link."""
         self._wrench[:3] = force
         self._wrench[3:] = torque
 
     def set_payload(self, mass: float) -> None:
-        """Attach a ball of ``mass`` [kg] below the body, in place of the one before."""
+        """Set the mass [kg] of the payload, a ball below the body."""
         if mass != self._payload:
             self._payload = mass
             set_base_part(self.model, base_part(self._robot, self._parameters, self._variation,
@@ -167,11 +168,11 @@ class Plant:
         Advance one tick with the present targets.
 
         Raises:
-            RuntimeError: forces beyond all reason have broken the state.
+            RuntimeError: the state has diverged.
 
         """
         model, data = self.model, self.data
-        if self._loaded:
+        if self._has_servo_loads:
             self._load_servos()
         touching = self._may_touch()
         model.opt.disableflags = self._flags if touching else self._flags | NO_CONSTRAINT
@@ -188,8 +189,8 @@ class Plant:
         if fast:
             self._update()
         else:
-            # The capped torque counts here too: at the rate limit the full one would accelerate
-            # a module by thousands of rad/s^2.
+            # The acceleration must also use the limited torque: the full one would give
+            # thousands of rad/s^2 at the rate limit.
             self._limit_rates()
             self._update()
             effort = self._robot.joints.effort_limit
@@ -199,7 +200,7 @@ class Plant:
                                f'velocity {self._qvel[:3]} m/s, tilts {self._tilt} rad')
 
     def _may_touch(self):
-        """Whether a contact or a joint stop is possible within the next tick."""
+        """Whether a contact with floor or joint stop is possible within the next tick."""
         drop = self._reach + 2 * self._tick * abs(self._qvel[2]) + 0.01
         if self._qpos[2] < drop:
             return True
@@ -208,7 +209,7 @@ class Plant:
                    for tilt, rate in zip(self._tilt.tolist(), self._rate.tolist()))
 
     def _may_reach_rate_limit(self):
-        """Whether a servo's torque could take its joint to the rate limit within the next tick."""
+        """Whether a servo could reach the rate limit within the next tick."""
         limit, gain = 0.9 * self._robot.joints.velocity_limit, self._rate_gain
         return any(powered and abs(rate) + gain * abs(target - tilt) > limit
                    for tilt, rate, target, powered in zip(
@@ -216,7 +217,7 @@ class Plant:
                        self._powered))
 
     def _limit_rates(self):
-        """Cap each servo's torque at what takes its joint to the rate limit, and no further."""
+        """Limit each servo's torque so that its joint does not exceed the rate limit."""
         joints = self._robot.joints
         gain = joints.inertia / self.model.opt.timestep
         rate = self._rate
@@ -227,14 +228,14 @@ class Plant:
 
     def _apply_forces(self, ahead=0.0):
         """
-        External wrench and the effects' forces, as they will be ``ahead`` [s] from now.
+        Apply the external wrench and the effects' forces, predicted ``ahead`` [s] from now.
 
-        Taken in the middle of a tick and held through it, forces that depend on the motion are
-        second-order accurate, for one evaluation.
+        Evaluated in the middle of a tick and held during it, forces that depend on the motion are
+        accurate to second order with a single evaluation.
         """
         data = self.data
         applied = data.qfrc_applied
-        if not self._moved:
+        if not self._has_motion_forces:
             applied[:6] = self._wrench
             applied[:3] += self._forces.wind
             return
@@ -247,28 +248,29 @@ class Plant:
         force, torque = self._forces(
             rotations.matrix(quaternion), motion[:3], motion[3:6], tilt, self._scale * thrust,
             float(self._qpos[2]))
-        if self._others.names:
-            beside = self._others(
+        if self._catalogue_forces.names:
+            catalogue = self._catalogue_forces(
                 quaternion, motion[:3], motion[3:6], tilt, motion[6:], data.qacc[6:],
                 self._scale * thrust, self._scale * (data.ctrl[:4] - thrust)
                 / self._robot.rotors.time_constant, self._qpos[:3], self.voltage_ratio)
-            force, torque = force + beside[0], torque + beside[1]
+            force, torque = force + catalogue[0], torque + catalogue[1]
         applied[:3] = self._wrench[:3] + force
         applied[3:6] = self._wrench[3:] + torque
 
     def _load_servos(self):
-        """Targets and joint torques as effects on the servos make them of what is asked."""
+        """Set servo targets and joint torques from the commands by the effects on servos."""
         thrust = self._scale * self.data.act
         for i in range(4):
             load = dynamics.gyroscopic_load(self._robot, self._qvel[3:6], self._tilt[i],
                                             thrust[i], i)
-            _, terms = dynamics.tilt_servo(self._robot, i, self._asked[i], thrust[i], float(load))
+            _, terms = dynamics.tilt_servo(self._robot, i, self._commanded_tilt[i], thrust[i],
+                                           float(load))
             self._target[i] = terms.target
             self.data.qfrc_applied[6 + i] = terms.load
 
     def _update(self):
-        """Accelerations and contacts of the state just reached."""
-        if self._moved:
+        """Compute accelerations and contacts of the present state."""
+        if self._has_motion_forces:
             self._apply_forces()
         mujoco.mj_forward(self.model, self.data)
 
@@ -294,12 +296,12 @@ class Plant:
 
     @property
     def gravity(self) -> float:
-        """Along world -z [m/s^2]."""
+        """Gravitational acceleration along world -z [m/s^2]."""
         return self._robot.gravity
 
     @property
     def specific_force(self) -> np.ndarray:
-        """(3,) acceleration of base_link less gravity, in base_link [m/s^2]."""
+        """(3,) acceleration of base_link minus gravity, in base_link [m/s^2]."""
         acceleration = self.data.qacc[:3].copy()
         acceleration[2] += self._robot.gravity
         return self.data.xmat[BASE].reshape(3, 3).T @ acceleration
@@ -308,7 +310,7 @@ class Plant:
                      angular_velocity: np.ndarray, tilt: np.ndarray, tilt_velocity: np.ndarray,
                      thrust: np.ndarray, tilt_target: np.ndarray | None = None) -> np.ndarray:
         """
-        Accelerations in any one state, away from the floor; the plant is left in it.
+        Accelerations in a given state away from the floor; the plant remains in it.
 
         Args:
             position: (3,) of base_link in world [m].
@@ -337,7 +339,7 @@ class Plant:
 
 
 def _reach(model):
-    """How far the robot's geometry extends from base_link in any posture [m]."""
+    """Largest distance of the robot's geometry from base_link with any tilts [m]."""
     reach = 0.0
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])

@@ -1,4 +1,4 @@
-"""What the simulator hands out in a tick: readings and the truth. Seconds since reset."""
+"""Inputs and outputs of the simulator in a tick. Times are seconds since reset."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from beetle_omni_ros.robot.readings import (
 @dataclass(frozen=True, slots=True)
 class Impact:
     """
-    A touchdown: how the robot moved when it first touched the floor after flight.
+    Motion at a touchdown, the first contact with the floor after flight.
 
     Attributes:
         stamp: [s].
-        speed: of base_link [m/s].
-        vertical_speed: downward part of it [m/s].
-        inclination: between base_link's z axis and up [rad].
+        speed: speed of base_link [m/s].
+        vertical_speed: downward component of the velocity [m/s].
+        inclination: angle between base_link's z axis and the vertical [rad].
 
     """
 
@@ -50,8 +50,8 @@ class Truth:
         tilt_velocity: (4,) [rad/s].
         thrust: (4,) present thrusts [N].
         contact: whether any part touches the floor.
-        impact: the last touchdown, None before the first.
-        broken: whether the robot broke; rotors and servos are dead then until reset.
+        impact: last touchdown, None before the first.
+        broken: whether the robot is broken; then rotors and servos do not work until reset.
 
     """
 
@@ -71,12 +71,12 @@ class Truth:
 @dataclass(frozen=True, slots=True)
 class Drive:
     """
-    What actuators outside the simulator do in one tick.
+    Inputs from actuators outside the simulator in one tick.
 
     Attributes:
-        tilt: (4,) angles that the servos drive to [rad].
+        tilt: (4,) targets of the servos [rad].
         powered: (4,) whether a servo has torque.
-        thrust: (4,) thrusts to which the rotors strive [N], as the battery allows.
+        thrust: (4,) targets of the rotors, within the limit of the battery [N].
 
     """
 
@@ -88,10 +88,10 @@ class Drive:
 @dataclass(frozen=True, slots=True)
 class Frame:
     """
-    What became available in one tick; None where nothing did.
+    Readings that arrive in one tick, or None, and the true state.
 
-    With a :class:`Drive`, joints and battery are what those devices measure: each tick, with bias
-    and noise, neither late nor rounded, because they do that themselves.
+    With a :class:`Drive`, joints and battery are inputs of the devices' sensors. They arrive in
+    each tick, with bias and noise, without latency and rounding, which the devices add.
     """
 
     time: float

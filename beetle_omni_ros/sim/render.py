@@ -1,7 +1,7 @@
 """
-Pictures of robots without a display; nothing that simulates imports this module.
+Pictures of robots without a display; the simulation does not use this module.
 
-Needs an off-screen OpenGL, see :func:`beetle_omni_ros.film.graphics.choose_backend`.
+It needs an off-screen OpenGL, see :func:`beetle_omni_ros.film.graphics.choose_backend`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.sim.figure import Figure, HUB_HEIGHT, Look
 from beetle_omni_ros.sim.parameters import PlantParameters, SimulatorParameters
 
-SAMPLES = 4                     # for smooth edges
+SAMPLES = 4                     # samples per pixel, for smooth edges
 JOINTS = 15                     # generalised positions of one robot
-SPIN = 47.0                     # [rad/s] drawn; a true propeller would only flicker
+SPIN = 47.0                     # [rad/s] drawn; true propellers would flicker
 THRUST = (0.02, 0.66, 0.42)
 THRUST_SCALE = 0.030            # [m/N] length of an arrow
 SHAFT, TRAIL_WIDTH = 0.011, 0.009
@@ -33,10 +33,10 @@ class Pose:
 
     Attributes:
         position: (3,) of base_link in world [m].
-        quaternion: (4,) xyzw.
+        quaternion: (4,) base_link to world, xyzw.
         tilt: (4,) [rad].
-        thrust: (4,) [N] drawn as arrows, or None.
-        time: [s] by which the propellers have turned.
+        thrust: (4,) thrusts drawn as arrows [N], or None.
+        time: time that determines the angles of the propellers [s].
 
     """
 
@@ -49,7 +49,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the picture is taken from: it looks at a point [m] from a distance [m], angles deg."""
+    """A camera that looks at a point [m] from a distance [m] along two angles [deg]."""
 
     lookat: tuple[float, float, float] = (0.1, 0.2, 0.62)
     distance: float = 3.85
@@ -59,7 +59,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Trail:
-    """A path: (N, 3) points [m] and its colour, which fades towards the start."""
+    """A path: (N, 3) points [m] and a colour, which fades towards the start."""
 
     points: np.ndarray
     colour: tuple[float, float, float]
@@ -67,18 +67,18 @@ class Trail:
 
 class Stage:
     """
-    Robots over a floor, drawn one picture at a time.
+    Draws pictures of robots over a floor.
 
     Args:
-        robot: its dimensions.
-        looks: of the robots, in the order of the poses; what is not drawn is below the floor.
-        width: [pixels].
-        height: [pixels].
-        field_of_view: vertical [deg].
+        robot: dimensions of the robots.
+        looks: appearance of each robot, in the order of the poses.
+        width: width of a picture [pixels].
+        height: height of a picture [pixels].
+        field_of_view: vertical field of view [deg].
         plant: sizes of feet and propellers; default: params/simulator.yaml.
 
     Raises:
-        RuntimeError: there is no off-screen OpenGL here.
+        RuntimeError: no off-screen OpenGL.
 
     """
 
@@ -99,7 +99,7 @@ class Stage:
         try:
             self._renderer = mujoco.Renderer(self._model, height, width, MOST_GEOMS)
         except Exception as error:
-            # Each OpenGL back end fails in its own way, with exceptions of its own.
+            # The OpenGL back ends raise exceptions of different types.
             raise RuntimeError(f'no off-screen OpenGL ({type(error).__name__}: {error})') \
                 from error
 
@@ -115,9 +115,9 @@ class Stage:
         Draw one picture.
 
         Args:
-            poses: of the robots; None hides one.
-            camera: the viewpoint.
-            trails: paths to mark.
+            poses: poses of the robots; None hides a robot.
+            camera: viewpoint.
+            trails: paths to draw.
 
         Returns:
             (height, width, 3) uint8.

@@ -1,4 +1,4 @@
-"""Sensors: what the truth looks like through noise, bias, resolution and latency."""
+"""Sensor models: noise, bias, resolution and latency."""
 
 from __future__ import annotations
 
@@ -22,15 +22,14 @@ from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.plant import Plant
 from beetle_omni_ros.sim.readings import Truth
 
-BLOCK = 1024            # noise is drawn this many readings at a time, because one by one is slow
+BLOCK = 1024            # readings whose noise is drawn at once, for speed
 
 
 class Noise:
-    """Rows of bias + normal + uniform noise from one generator, drawn in blocks."""
+    """Rows of bias + normal + uniform noise from one generator; arguments are arrays of a row."""
 
     def __init__(self, generator: np.random.Generator, bias: np.ndarray, deviation: np.ndarray,
                  half_width: np.ndarray | float):
-        """Describe one row: all arrays of its length."""
         self._generator = generator
         self._bias, self._deviation, self._half_width = bias, deviation, half_width
         self._rows = iter(())
@@ -47,31 +46,30 @@ class Noise:
 
 
 class Sensors:
-    """All sensors of one robot in one flight."""
+    """
+    All sensors of one robot in one flight.
+
+    Args:
+        parameters: noise and latencies.
+        conditions: biases and latencies of this flight.
+        seeds: five seeds, for IMU, MoCap, encoders, battery and rotor speeds, so that the noise of
+            a sensor does not depend on the rate of another one.
+        first: state at reset, in which the robot has been at rest.
+        effort: (4,) servo torques in this state [N m].
+        errors: effects of the robot file on the sensors.
+
+    Raises:
+        ParameterError: a period or latency is not a multiple of the tick.
+
+    """
 
     def __init__(self, parameters: SimulatorParameters, conditions: Conditions,
                  seeds: list[np.random.SeedSequence], first: Truth, effort: np.ndarray,
                  errors: SensorErrors = SensorErrors()):
-        """
-        Start with a robot that has been at rest in its ``first`` state.
-
-        Args:
-            parameters: noise and latencies.
-            conditions: this flight's biases and latencies.
-            seeds: five, for IMU, MoCap, encoders, battery and rotor speeds, so that a sensor's
-                noise does not depend on another's rate.
-            first: the state at reset.
-            effort: (4,) servo torques there [N m].
-            errors: what the robot file's effects say of the sensors.
-
-        Raises:
-            ParameterError: a period or latency is no multiple of the tick.
-
-        """
         self._tick, self._errors = parameters.plant.tick, errors
-        self._turned = rotations.matrix(rotations.exp(errors.imu_rotation)) \
+        self._to_imu = rotations.matrix(rotations.exp(errors.imu_rotation)) \
             if any(errors.imu_rotation) else None
-        self._arm = np.array(errors.imu_position) if any(errors.imu_position) else None
+        self._lever_arm = np.array(errors.imu_position) if any(errors.imu_position) else None
         generators = [np.random.Generator(np.random.PCG64(seed)) for seed in seeds]
         imu, mocap, pack = parameters.imu, parameters.mocap, parameters.battery
         self._imu_noise = Noise(
@@ -96,16 +94,16 @@ class Sensors:
         self._speed_at_1_newton = rotors.rpm_at_1_newton * np.pi / 30
         self._mocap_period = self._ticks('mocap.period', mocap.period, least=1)
         self._battery_period = self._ticks('battery.period', pack.period, least=1)
-        self._count = 2 * np.pi / parameters.encoders.counts_per_turn
+        self._resolution = 2 * np.pi / parameters.encoders.counts_per_turn
         self._velocity_step = parameters.encoders.velocity_step
         self._imu = _delay_line(self._ticks('imu latency', conditions.imu_latency)
-                                + self._late(errors.imu_delay))
+                                + self._hidden_ticks(errors.imu_delay))
         self._joints = _delay_line(self._ticks('encoder latency', conditions.tilt_latency)
-                                   + self._late(errors.encoder_delay))
+                                   + self._hidden_ticks(errors.encoder_delay))
         self._mocap = _delay_line(self._ticks('mocap.latency', mocap.latency)
-                                  + self._late(errors.mocap_delay))
-        # An IMU's readings are as old as whole ticks; their stamps make the rest of the delay.
-        self._imu_shift = errors.imu_delay - self._tick * self._late(errors.imu_delay)
+                                  + self._hidden_ticks(errors.mocap_delay))
+        # The delay of the IMU is realised in whole ticks and corrected by the stamps.
+        self._imu_shift = errors.imu_delay - self._tick * self._hidden_ticks(errors.imu_delay)
         at_rest = np.zeros(6)
         for _ in range(self._imu.maxlen):
             self._imu.append(at_rest)
@@ -123,44 +121,46 @@ class Sensors:
                                  f'{self._tick:g} s' + (', one or more' if least else ''))
         return ticks
 
-    def _late(self, delay):
-        """Ticks by which a reading arrives later whose stamp hides a delay [s]."""
+    def _hidden_ticks(self, delay):
+        """Additional latency in ticks of a reading whose stamp does not contain a delay [s]."""
         return max(0, int(np.ceil(delay / self._tick - 1e-9)))
 
     def _motion(self, before, truth, gravity):
-        """(6,) what the IMU shows: the motion of its place in its axes."""
+        """(6,) specific force and angular rate at the place of the IMU, in its axes."""
         motion = mean_motion(before, truth, gravity)
-        if self._arm is not None:
-            rate = motion[3:]
-            turning = (truth.angular_velocity - before.angular_velocity) / self._tick
-            motion[:3] += np.cross(turning, self._arm) + np.cross(rate, np.cross(rate, self._arm))
-        if self._turned is not None:
-            motion = np.concatenate([motion[:3] @ self._turned, motion[3:] @ self._turned])
-        return motion
+        if self._lever_arm is not None:
+            rate, arm = motion[3:], self._lever_arm
+            acceleration = (truth.angular_velocity - before.angular_velocity) / self._tick
+            motion[:3] += np.cross(acceleration, arm) + np.cross(rate, np.cross(rate, arm))
+        return self._in_imu_axes(motion)
+
+    def _in_imu_axes(self, motion):
+        if self._to_imu is None:
+            return motion
+        return np.concatenate([motion[:3] @ self._to_imu, motion[3:] @ self._to_imu])
 
     def start_imu(self, truth: Truth, specific_force: np.ndarray) -> None:
-        """Fill the IMU's latency with the reading at reset."""
+        """Fill the delay line of the IMU with the reading at reset."""
         self._before = truth
-        motion = np.concatenate([specific_force, truth.angular_velocity])
-        if self._turned is not None:
-            motion = np.concatenate([motion[:3] @ self._turned, motion[3:] @ self._turned])
+        motion = self._in_imu_axes(np.concatenate([specific_force, truth.angular_velocity]))
         for _ in range(self._imu.maxlen):
             self._imu.append(motion)
 
     def read(self, tick: int, truth: Truth, plant: Plant, battery: Battery,
              devices: bool = False) -> tuple:
         """
-        Readings that become available at ``truth.stamp``, the end of tick number ``tick``.
+        Readings that arrive at ``truth.stamp``, the end of tick number ``tick``.
 
         Args:
             tick: number of the tick.
-            truth: state at its end.
-            plant: for the servos' torques.
-            battery: at its end.
-            devices: whether joints and battery are for devices that measure them themselves.
+            truth: state at the end of the tick.
+            plant: plant, for the torques of the servos.
+            battery: battery at the end of the tick.
+            devices: whether joints and battery are inputs of emulated devices, see
+                :class:`.readings.Frame`.
 
         Returns:
-            (imu, mocap, joints, battery), None where there is none.
+            (imu, mocap, joints, battery), None for a reading that does not arrive.
 
         """
         self._imu.append(self._motion(self._before, truth, plant.gravity))
@@ -171,21 +171,21 @@ class Sensors:
         effort = plant.effort
         self._joints.append((truth.stamp, truth.tilt, truth.tilt_velocity, effort))
         if devices:
-            shown = truth.tilt + self._tilt_noise.next()
+            tilt = truth.tilt + self._tilt_noise.next()
             return (motion, self._mocap[0],
-                    JointReading(truth.stamp, shown, truth.tilt_velocity, effort),
+                    JointReading(truth.stamp, tilt, truth.tilt_velocity, effort),
                     self._pack_reading(truth.stamp, battery))
         return motion, self._mocap[0], self._joint_reading(), None if \
             tick % self._battery_period else self._pack_reading(truth.stamp, battery)
 
     def rotor_speeds(self, tick: int, truth: Truth, wear: np.ndarray) -> RotorReading | None:
         """
-        Rotor speeds that become available at the end of tick number ``tick``.
+        Rotor speeds that arrive at the end of tick number ``tick``.
 
         Args:
             tick: number of the tick.
-            truth: state at its end.
-            wear: (4,) share of the thrust that a propeller still gives at its speed.
+            truth: state at the end of the tick.
+            wear: (4,) thrust relative to that of an intact propeller at the same speed.
 
         """
         reading = None
@@ -202,7 +202,7 @@ class Sensors:
 
     def _joint_reading(self):
         stamp, tilt, velocity, effort = self._joints[0]
-        tilt = np.rint((tilt + self._tilt_noise.next()) / self._count) * self._count
+        tilt = np.rint((tilt + self._tilt_noise.next()) / self._resolution) * self._resolution
         if self._velocity_step:
             velocity = np.rint(velocity / self._velocity_step) * self._velocity_step
         return JointReading(stamp + self._errors.encoder_delay, tilt, velocity, effort)
@@ -216,8 +216,8 @@ def mean_motion(before: Truth, after: Truth, gravity: float) -> np.ndarray:
     """
     Mean specific force [m/s^2] and angular rate [rad/s] (6,) in base_link between two states.
 
-    A MEMS IMU samples at kilohertz and filters before it decimates to 200 Hz. A point sample
-    instead would alias the millisecond jolts of a tilting module into velocity errors.
+    A MEMS IMU samples at several kHz and filters before it decimates to 200 Hz. A sample of one
+    instant would alias the fast accelerations of a tilting module into velocity errors.
     """
     dt = after.stamp - before.stamp
     turn = rotations.log(rotations.multiply(rotations.conjugate(before.quaternion),
@@ -229,5 +229,5 @@ def mean_motion(before: Truth, after: Truth, gravity: float) -> np.ndarray:
 
 
 def _delay_line(ticks):
-    """A queue whose first element is ``ticks`` older than its last, once it is full."""
+    """Queue whose first element is ``ticks`` older than its last, once it is full."""
     return deque(maxlen=ticks + 1)

@@ -1,4 +1,4 @@
-"""The simulated robot as the flight stack meets it: commands in, sensor readings out."""
+"""The simulated robot with the interface of a real one: commands in, sensor readings out."""
 
 from __future__ import annotations
 
@@ -21,39 +21,35 @@ from beetle_omni_ros.sim.plant import Plant, XYZW
 from beetle_omni_ros.sim.readings import Drive, Frame, Truth
 from beetle_omni_ros.sim.sensors import Sensors
 
-SENSORS = ('imu', 'mocap', 'joints', 'rotors', 'battery')     # readings of a Frame
-POWERED, NEW = (True,) * 4, np.ones(4)
+SENSORS = ('imu', 'mocap', 'joints', 'rotors', 'battery')     # attributes of a Frame
+POWERED, INTACT = (True,) * 4, np.ones(4)
 
 
 class Simulator:
     """
     Plant, actuator timing, battery and sensors, advanced tick by tick.
 
-    The same robot, parameters, conditions, seed and calls give the same numbers.
+    Equal robots, parameters, conditions, seeds and calls give equal results.
+
+    Args:
+        robot: the true robot.
+        parameters: simulator parameters; default: params/simulator.yaml.
+        conditions: 'nominal' or 'published'.
+        seed: seed of all random numbers.
 
     Attributes:
-        time: since reset [s].
-        tick: of one step [s].
-        conditions: what the seed made of biases, latencies and the robot.
+        time: time since reset [s].
+        tick: duration of one step [s].
+        conditions: biases, latencies and variation of the robot, drawn from the seed.
+
+    Raises:
+        ParameterError: the plant lacks an effect, impossible mass properties, unknown conditions,
+            or a latency that is not a multiple of the tick.
 
     """
 
     def __init__(self, robot: RobotParameters, parameters: SimulatorParameters | None = None,
                  conditions: str = 'nominal', seed: int = 0):
-        """
-        Build the world and reset it.
-
-        Args:
-            robot: what is true in the simulation.
-            parameters: by default params/simulator.yaml.
-            conditions: 'nominal' or 'published'.
-            seed: of everything random.
-
-        Raises:
-            ParameterError: an effect that the plant lacks, impossible mass properties, unknown
-                conditions, a latency that is no multiple of the tick.
-
-        """
         self._robot = robot
         self._parameters = parameters or SimulatorParameters.load()
         if not isinstance(seed, (int, np.integer)) or seed < 0:
@@ -71,16 +67,14 @@ class Simulator:
     def reset(self, position: np.ndarray | None = None,
               quaternion: np.ndarray | None = None) -> None:
         """
-        Begin anew: at rest and whole, rotors off, full battery, the seed's noise from its start.
-
-        Faults are switched off.
+        Restart at rest: intact robot, rotors off, initial charge, first noise values, no faults.
 
         Args:
             position: (3,) of base_link in world [m]; by default standing on the floor.
             quaternion: (4,) base_link to world, xyzw; by default level.
 
         Raises:
-            ValueError: not finite numbers of these shapes, or a quaternion of length zero.
+            ValueError: not finite, of another shape, or a zero quaternion.
 
         """
         if position is not None:
@@ -105,37 +99,38 @@ class Simulator:
 
     def set_body(self, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray,
                  angular_velocity: np.ndarray) -> None:
-        """Put a whole robot into a state of motion, see :meth:`.plant.Plant.set_body`."""
+        """Repair the robot and set its motion, see :meth:`.plant.Plant.set_body`."""
         self._plant.set_body(position, quaternion, velocity, angular_velocity)
         self._crash.reset()
         self.truth = self._truth()
 
     def command(self, command) -> bool:
         """
-        Send a command (stamp, tilt (4,), thrust (4,)); it acts at its stamp plus the delay.
+        Send a command (stamp, tilt (4,), thrust (4,)), which acts at its stamp plus the delay.
 
         Returns:
-            whether it was taken; refusals are counted in :attr:`rejected`.
+            whether it was accepted; :attr:`rejected` counts refusals.
 
         """
-        taken = True
-        for one in self._passed_on(command):
-            taken = self._link.push(one, self.time)
-        return taken
+        accepted = True
+        for one in self._through_faults(command):
+            accepted = self._link.push(one, self.time)
+        return accepted
 
-    def _passed_on(self, command):
-        """Commands that faults let through now, in place of ``command`` (or of none)."""
-        passed = [] if command is None else [command]
+    def _through_faults(self, command):
+        """Commands that arrive now if ``command``, or None, is sent through the active faults."""
+        arriving = [] if command is None else [command]
         for effect in self._schedule.active:
-            passed = [out for one in passed or [None] for out in effect.command(one, self.time)]
-        return passed
+            arriving = [out for one in arriving or [None]
+                        for out in effect.command(one, self.time)]
+        return arriving
 
     def set_faults(self, faults: Sequence[Fault]) -> None:
         """
-        Fly with these faults from now on, in place of those before.
+        Replace the faults; a fault that is also in the present list continues.
 
         Args:
-            faults: of robot and devices; ``at`` counts from now. One that was there goes on.
+            faults: faults of robot and devices; ``at`` counts from now.
 
         Raises:
             ParameterError: a fault of a process, which is not simulated here.
@@ -150,17 +145,17 @@ class Simulator:
 
     @property
     def faults(self) -> list[str]:
-        """Kinds of the faults that are on."""
+        """Kinds of the active faults."""
         return self._schedule.names
 
     @property
     def thrust_command(self) -> np.ndarray:
-        """(4,) thrusts that the rotors are asked for [N]; zero once commands have ceased."""
+        """(4,) thrusts commanded to the rotors [N]; zero after the command timeout."""
         return self._link.thrust
 
     @property
     def command_delays(self) -> tuple[float, float]:
-        """From a command's stamp until tilts and until thrusts act [s], effects included."""
+        """Delays of tilt and thrust commands from their stamps [s], effects included."""
         return self.conditions.command_delays(self._robot)
 
     @property
@@ -172,7 +167,7 @@ class Simulator:
         return World(self.truth, self._battery, self._link.tilt)
 
     def _apply_wrench(self):
-        """Hand the plant what task and faults do to it from outside."""
+        """Set wrench and payload of the plant: those of the task and those of the faults."""
         wrench, payload = self._wrench.copy(), self._payload
         for effect in self._schedule.active:
             payload += effect.payload
@@ -183,12 +178,12 @@ class Simulator:
 
     @property
     def rejected(self) -> Counter:
-        """Reason -> number of commands refused since reset."""
+        """Reason -> number of refused commands since reset."""
         return self._link.rejected
 
     def set_wrench(self, force_world: np.ndarray, torque_body: np.ndarray) -> None:
         """
-        Apply an external wrench at base_link until changed.
+        Apply an external wrench at base_link.
 
         Args:
             force_world: (3,) [N].
@@ -204,7 +199,7 @@ class Simulator:
 
     def set_payload(self, mass: float) -> None:
         """
-        Attach a ball of ``mass`` [kg] rigidly below the body, in place of the one before.
+        Set the mass [kg] of the payload, a ball that is fixed below the body.
 
         Raises:
             ValueError: negative or not finite.
@@ -217,29 +212,29 @@ class Simulator:
 
     @property
     def charge(self) -> float:
-        """What is left in the pack, 1 is full."""
+        """Charge of the battery as a fraction of a full one."""
         return self._battery.charge
 
     @property
     def voltage(self) -> float:
-        """True pack voltage under load [V]."""
+        """True battery voltage under load [V]."""
         return self._battery.voltage
 
     @property
     def current(self) -> float:
-        """True current drawn from the pack [A], positive."""
+        """True current drawn from the battery [A], positive."""
         return self._battery.current
 
     def swap_battery(self) -> None:
-        """Put in a fresh pack, also in flight: a task may be longer than a charge."""
+        """Insert a new battery, also in flight, for tasks longer than one charge."""
         self._battery.reset()
 
     def step(self, drive: Drive | None = None) -> Frame:
         """
-        Advance one tick; return what became available in it.
+        Advance one tick; return the readings that arrive in it.
 
         Args:
-            drive: what actuators outside do, without further delay or timeout; by default
+            drive: inputs from external actuators, applied without delay or timeout; by default
                 servos and rotors follow :meth:`command`.
 
         """
@@ -262,24 +257,24 @@ class Simulator:
                                                         devices=drive is not None)
         frame = Frame(self.time, imu, mocap, joints, pack, truth,
                       self._sensors.rotor_speeds(self._ticks, truth, wear))
-        return self._as_sensed(frame) if self._schedule.active else frame
+        return self._with_sensor_faults(frame) if self._schedule.active else frame
 
     def _switch_faults(self):
-        """Start and end what is due, and release commands that faults hold."""
+        """Start and end faults, and send commands that faults have delayed."""
         before = self._schedule.active
         self._schedule.update(self.time, self._world())
         if self._schedule.active is not before:
             self._apply_wrench()
-        for command in self._passed_on(None):
+        for command in self._through_faults(None):
             self._link.push(command, self.time)
 
     def _actuate(self, tilt, thrust, powered):
-        """Let servos and rotors work as faults and damage allow; return the rotors' wear."""
+        """Set the inputs of servos and rotors with faults and damage; return the rotors' wear."""
         plant, broken = self._plant, self._crash.broken
         if not (self._schedule.active or broken):
             plant.set_powered(powered)
             plant.set_targets(tilt, thrust)
-            return NEW
+            return INTACT
         drive = Actuation(np.array(tilt), np.array(thrust), np.array(powered), np.zeros(4, bool),
                           np.ones(4))
         for effect in self._schedule.active:
@@ -291,8 +286,8 @@ class Simulator:
         plant.set_targets(np.clip(drive.tilt, -limit, limit), drive.thrust)
         return drive.wear
 
-    def _as_sensed(self, frame):
-        """The frame as faulty sensors tell it."""
+    def _with_sensor_faults(self, frame):
+        """Frame with the readings changed by sensor faults."""
         changed = {}
         for name in SENSORS:
             reading = getattr(frame, name)

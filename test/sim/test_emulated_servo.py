@@ -128,7 +128,7 @@ def test_the_watchdog_stops_the_servo_and_locks_its_goals_until_cleared(servo):
     write(servo, 'Bus Watchdog', 5)
     servo.advance(10.0)
     assert not servo.expired, 'it counts only while torque is on'
-    servo.hear(20.0)
+    servo.feed_watchdog(20.0)
     write(servo, 'Torque Enable', 1)
     write(servo, 'Goal Position', 4000)
     servo.move(0.5, 3.0, 0.1)

@@ -1,1 +1,1 @@
-"""Emulated devices on pseudo-terminals, to the byte; written without the drivers they judge."""
+"""Emulated devices on pseudo-terminals, independent of the drivers that they test."""

@@ -1,4 +1,4 @@
-"""Faults of the motor board and of its cable that can be switched on."""
+"""Faults of the emulated motor board and of its cable."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import random
 @dataclass
 class BoardFaults:
     """
-    What is wrong at present; may be changed at any time.
+    Present faults; may be changed at any time.
 
     Attributes:
         corrupt_out: probability that a packet of the board has a wrong bit.
-        corrupt_in: the same for a packet to the board.
+        corrupt_in: probability that a packet to the board has a wrong bit.
         drop_out: probability that a packet of the board is lost.
-        drop_in: the same for a packet to the board.
-        delay_out: packets of the board arrive this much later [s].
-        delay_in: packets to the board arrive this much later [s].
-        mute: the board works but nothing of it arrives.
-        voltage_sag: the pack gives this much less than the world says [V].
+        drop_in: probability that a packet to the board is lost.
+        delay_out: additional delay of packets of the board [s].
+        delay_in: additional delay of packets to the board [s].
+        mute: whether all packets of the working board are lost.
+        voltage_sag: drop of the battery voltage [V].
         failed_escs: rotors (1 to 4) that do not turn.
 
     """
@@ -37,7 +37,7 @@ class BoardFaults:
 
 
 class Line:
-    """One direction of a cable: loses, spoils and delays pieces, seeded, in order."""
+    """One direction of a cable, which loses, corrupts and delays frames by a seed."""
 
     def __init__(self, seed: int):
         self._random = random.Random(seed)
@@ -45,34 +45,34 @@ class Line:
         self._count = 0
 
     def put(self, data: bytes, now: float, corrupt: float, drop: float, delay: float) -> None:
-        """Take a piece at ``now`` [s] under these faults."""
+        """Send a frame at ``now`` [s] with these faults."""
         if drop and self._random.random() < drop:
             return
         if corrupt and self._random.random() < corrupt:
-            spoilt = bytearray(data)
-            spoilt[self._random.randrange(len(data))] ^= 1 << self._random.randrange(8)
-            data = bytes(spoilt)
+            corrupted = bytearray(data)
+            corrupted[self._random.randrange(len(data))] ^= 1 << self._random.randrange(8)
+            data = bytes(corrupted)
         self._count += 1
         heapq.heappush(self._waiting, (now + delay, self._count, data))
 
     def take(self, now: float) -> bytes:
-        """All that has arrived by ``now``."""
+        """Receive everything that has arrived by ``now`` [s]."""
         pieces = []
         while self._waiting and self._waiting[0][0] <= now:
             pieces.append(heapq.heappop(self._waiting)[2])
         return b''.join(pieces)
 
     def next(self) -> float:
-        """When the next piece arrives [s], inf for none."""
+        """Arrival of the next frame [s], inf without one."""
         return self._waiting[0][0] if self._waiting else float('inf')
 
     def clear(self) -> None:
-        """Lose what is on its way."""
+        """Lose all frames that have not arrived."""
         self._waiting.clear()
 
 
 def frames(data: bytes) -> list[bytes]:
-    """Split bytes of well-formed MAVLink 2 packets at their ends; a rest is a piece of its own."""
+    """Split a sequence of valid MAVLink 2 packets; an incomplete rest is one more piece."""
     pieces = []
     while data:
         size = 12 + data[1] if len(data) > 1 and data[0] == 0xFD else len(data)

@@ -1,8 +1,8 @@
 """
-The motor board's firmware as docs/reference/firmware.md demands it: a pure state machine.
+The firmware of the motor board by docs/reference/firmware.md, as a pure state machine.
 
-All times are passed in [s], on any clock that does not step. Every question brings the state up
-to its time first, so answers do not depend on how often somebody looks.
+All times are arguments [s] on a clock without steps. Each call first advances the state to its
+time, so that the results do not depend on the frequency of calls.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameter
 from beetle_omni_ros.sim.emulated.board_telemetry import BoardTelemetry
 
 BOOT, DISARMED, ARMED, RUNNING = range(4)
-NONE, ASKED, HEARTBEAT_LOST, IDLE, WATCHDOG = range(5)      # why it disarmed last
+NONE, ASKED, HEARTBEAT_LOST, IDLE, WATCHDOG = range(5)      # reasons of the last disarming
 (BOOTING, NO_HEARTBEAT, THROTTLE, BATTERY_LOW, ESC_FAILURE, TIMED_OUT,
  SATURATED) = (1 << bit for bit in range(7))
 BLOCKS_ARMING = BOOTING | NO_HEARTBEAT | THROTTLE | BATTERY_LOW | ESC_FAILURE
@@ -26,17 +26,21 @@ STOP = (0.0, 0.0, 0.0, 0.0)
 
 class BoardFirmware:
     """
-    What the board does with what it receives.
+    State machine of the board.
+
+    Args:
+        parameters: parameters of the contract.
+        cells: number of battery cells in series.
+        now: time of power-up [s].
 
     Attributes:
-        telemetry: what it measures; the world writes it.
-        refused: targets not followed since the start, by reason.
-        timeouts: how often targets ceased while the rotors ran.
+        telemetry: measurements, set from outside.
+        refused: reason -> number of refused targets since the start.
+        timeouts: number of target timeouts with turning rotors.
 
     """
 
     def __init__(self, parameters: EmulatedBoardParameters, cells: int, now: float):
-        """Power on at ``now`` [s]; ``cells`` of the battery in series."""
         self._parameters = parameters
         self._clock_zero = now - parameters.clock_start
         self.telemetry = BoardTelemetry(parameters, cells)
@@ -48,28 +52,28 @@ class BoardFirmware:
         self._announced = False
         self._armed_at = -math.inf              # finite while armed
         self._stop_reason = reason
-        self._heard_at = self._thrust_asked_at = self._target_at = -math.inf
+        self._heartbeat_at = self._nonzero_target_at = self._target_at = -math.inf
         self._target, self._target_stamp, self._saturated = STOP, -math.inf, False
         self.refused: dict[str, int] = {}
         self.timeouts = 0
         self.telemetry.restart(self._booted_at)
 
     def reboot(self, now: float, reason: int = NONE) -> None:
-        """Reset: outputs off at once, everything forgotten, the clock begins at zero."""
+        """Reset the board: outputs off, initial state, clock at zero."""
         self._clock_zero = now
         self._start(now, reason)
 
     def hang(self, now: float) -> None:
-        """Stop executing; the outputs stay as they are until the watchdog resets the board."""
+        """Stop the execution; the outputs are constant until the watchdog resets the board."""
         self._advance(now)
         self._hung_at = min(self._hung_at, now)
 
     def clock(self, now: float) -> float:
-        """The board's own clock [s since its start]."""
+        """Clock of the board [s since its start]."""
         return (now - self._clock_zero) * (1 + self._parameters.clock_drift)
 
     def runs(self, now: float) -> bool:
-        """Whether the firmware executes: neither booting nor hung."""
+        """Whether the firmware is executed, neither booting nor hung."""
         self._advance(now)
         return now >= self._booted_at and self._hung_at == math.inf
 
@@ -83,18 +87,18 @@ class BoardFirmware:
         return RUNNING if self._fresh(min(now, self._hung_at)) else ARMED
 
     def outputs(self, now: float) -> tuple[float, ...]:
-        """Normalised commands, 0 to 1, that the four PWM outputs carry."""
+        """Normalised commands of the four PWM outputs, 0 to 1."""
         if self.state(now) != RUNNING:
             return STOP
         return self._target
 
     def conditions(self, now: float) -> int:
-        """Bits of what keeps it from arming, and of timed-out and saturated targets."""
+        """Bits of the conditions that prevent arming, and of timed-out and saturated targets."""
         parameters, bits = self._parameters, 0
         bits |= BOOTING * (now < self._booted_at)
-        bits |= NO_HEARTBEAT * (now - self._heard_at >= parameters.heartbeat_timeout)
+        bits |= NO_HEARTBEAT * (now - self._heartbeat_at >= parameters.heartbeat_timeout)
         bits |= THROTTLE * (self._armed_at == -math.inf and
-                            now - self._thrust_asked_at < parameters.throttle_low_time)
+                            now - self._nonzero_target_at < parameters.throttle_low_time)
         bits |= BATTERY_LOW * self.telemetry.battery_low
         bits |= ESC_FAILURE * bool(self.telemetry.failed)
         bits |= TIMED_OUT * (self._armed_at > -math.inf and self._target_at > -math.inf
@@ -103,13 +107,13 @@ class BoardFirmware:
         return bits
 
     def receive(self, message: mavlink.Message, now: float) -> list[tuple[int, tuple]]:
-        """Take a message of the computer; return the answers to send (number, values)."""
+        """Handle a message of the computer; return the answers (number, values)."""
         parameters = self._parameters
         if not self.runs(now) or (message.system, message.component) != (
                 parameters.host_system, parameters.host_component):
             return []
         if message.number == mavlink.HEARTBEAT:
-            self._heard_at = now
+            self._heartbeat_at = now
         elif message.number == mavlink.TIMESYNC:
             remote, sent = message.values
             if remote == 0:
@@ -121,7 +125,7 @@ class BoardFirmware:
         return []
 
     def due(self, now: float, received) -> list[tuple[int, tuple]]:
-        """Messages to send of its own accord by ``now``; ``received`` has the parser's counts."""
+        """Periodic messages due at ``now``; ``received`` has the counts of the parser."""
         if not self.runs(now):
             return []
         if not self._announced:
@@ -148,13 +152,13 @@ class BoardFirmware:
         return now - self._target_at < self._parameters.target_timeout
 
     def _advance(self, now):
-        """Let happen what was due before ``now``."""
+        """Advance the state to ``now``."""
         parameters = self._parameters
         if now >= self._hung_at + parameters.watchdog_time:
             self.reboot(self._hung_at + parameters.watchdog_time, WATCHDOG)
         if self._hung_at < math.inf or self._armed_at == -math.inf:
             return
-        if now - self._heard_at >= parameters.heartbeat_timeout:
+        if now - self._heartbeat_at >= parameters.heartbeat_timeout:
             self._disarm(HEARTBEAT_LOST)
         elif now - max(self._target_at, self._armed_at) >= parameters.idle_timeout:
             self._disarm(IDLE)
@@ -174,13 +178,13 @@ class BoardFirmware:
             return
         newer, self._target_stamp = stamp > self._target_stamp, stamp
         if max(controls) > 0:
-            self._thrust_asked_at = now
+            self._nonzero_target_at = now
         if self._armed_at == -math.inf:
             self.refused['not armed'] = self.refused.get('not armed', 0) + 1
             return
         self._saturated = min(controls) < 0 or max(controls) > 1
         self._target = tuple(min(1.0, max(0.0, control)) for control in controls[:4])
-        if newer:       # a target that is only repeated does not keep the rotors alive
+        if newer:       # a repeated target does not prevent the timeout
             self._target_at = now
 
     def _refusal(self, stamp, controls, group, system, component, now):

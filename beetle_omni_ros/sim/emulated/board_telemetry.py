@@ -1,4 +1,4 @@
-"""What the emulated motor board measures, and when it tells."""
+"""Measurements of the emulated motor board and the rates of their messages."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameter
 UNKNOWN_CELL, UNKNOWN_CURRENT = 65535, -1       # of BATTERY_STATUS
 GENERIC_FAILURE = 64                            # ESC_FAILURE_GENERIC
 PWM = 0                                         # ESC_CONNECTION_TYPE_PPM
-CHANGES_APART = 0.02                            # [s] least time between heartbeats
+MIN_HEARTBEAT_PERIOD = 0.02                     # [s]
 
 
 class Timer:
-    """Falls due at a fixed rate, without drift, and once after a pause of any length."""
+    """Is due at a fixed rate without drift, and once after a pause."""
 
     def __init__(self, rate: float):
-        """Prepare for ``rate`` [Hz]."""
         self._period = 1 / rate
         self.next = 0.0
 
     def due(self, now: float) -> bool:
-        """Whether it fell due by ``now`` since it was asked last."""
+        """Whether it is due at ``now`` [s]; then set the next time."""
         if now < self.next:
             return False
         self.next += self._period * (1 + math.floor((now - self.next) / self._period))
@@ -31,14 +30,14 @@ class Timer:
 
 class BoardTelemetry:
     """
-    Sensors and the rates of their messages.
+    Measurements and the rates of their messages.
 
     Attributes:
-        voltage: of the pack [V]; nan as long as nothing is measured.
-        current: drawn from the pack [A]; nan not measured.
-        rpm: of the four rotors [1/min].
-        rotor_current: [A] each.
-        temperature: of the four ESCs [C].
+        voltage: battery voltage [V]; NaN without a measurement.
+        current: current drawn from the battery [A]; NaN without a measurement.
+        rpm: speeds of the four rotors [1/min].
+        rotor_current: currents of the four rotors [A].
+        temperature: temperatures of the four ESCs [C].
         failed: rotors (0 to 3) whose ESC has failed.
 
     """
@@ -56,10 +55,10 @@ class BoardTelemetry:
         self.failed: frozenset[int] = frozenset()
 
     def restart(self, at: float) -> None:
-        """Begin to tell at time ``at`` [s]."""
+        """Restart all messages at time ``at`` [s]."""
         for timer in (self._heartbeat, self._reception, self._battery, self._rotors, self._info):
             timer.next = at
-        self._told_mode, self._told_at, self._told_failed = None, -math.inf, None
+        self._sent_mode, self._sent_at, self._sent_failed = None, -math.inf, None
         self._errors, self._packets = [0] * 4, 0
 
     @property
@@ -68,17 +67,17 @@ class BoardTelemetry:
         return not self.voltage >= self._arm_voltage
 
     def next(self) -> float:
-        """When the next message falls due [s]."""
+        """Time of the next message [s]."""
         return min(self._heartbeat.next, self._reception.next, self._battery.next,
                    self._rotors.next, self._info.next)
 
     def heartbeat_due(self, now: float, beat: tuple[int, tuple]) -> bool:
-        """Whether to send the heartbeat: it is time, or what it tells has changed."""
+        """Whether to send the heartbeat, because it is due or its content has changed."""
         mode = beat[1][0]
-        changed = mode != self._told_mode and now - self._told_at >= CHANGES_APART
+        changed = mode != self._sent_mode and now - self._sent_at >= MIN_HEARTBEAT_PERIOD
         if not self._heartbeat.due(now) and not changed:
             return False
-        self._told_mode, self._told_at = mode, now
+        self._sent_mode, self._sent_at = mode, now
         return True
 
     def reception_due(self, now: float) -> bool:
@@ -86,10 +85,10 @@ class BoardTelemetry:
         return self._reception.due(now)
 
     def due(self, now: float, stamp: int) -> list[tuple[int, tuple]]:
-        """Telemetry that is due; ``stamp`` [us] is the board's clock."""
+        """Telemetry messages that are due; ``stamp`` [us] is the clock of the board."""
         messages = []
-        if self._info.due(now) or self.failed != self._told_failed:
-            self._told_failed = self.failed
+        if self._info.due(now) or self.failed != self._sent_failed:
+            self._sent_failed = self.failed
             messages.append(self._esc_info(stamp))
         if self._rotors.due(now):
             messages.append(self._esc_status(stamp))

@@ -1,12 +1,12 @@
 """
-Packets of DYNAMIXEL Protocol 2.0, as the servo sees them.
+Packets of DYNAMIXEL Protocol 2.0 on the side of the servo.
 
-Written from the protocol's document (emanual.robotis.com/docs/en/dxl/protocol2) and free of the
-maker's SDK, which judges it in the tests.
+The source is emanual.robotis.com/docs/en/dxl/protocol2. The maker's SDK is not used, so that tests
+can compare both.
 
-A packet is ``FF FF FD 00 | ID | length (2 B) | instruction | parameters | CRC (2 B)``; the length
-counts everything after itself. ``FF FF FD`` among instruction and parameters is followed by a
-stuffed ``FD``, so that the header is unique.
+A packet is ``FF FF FD 00 | ID | length (2 B) | instruction | parameters | CRC (2 B)``. The length
+is that of the rest of the packet. In instruction and parameters an ``FD`` is stuffed after each
+``FF FF FD``, so that the header is unique.
 """
 
 from __future__ import annotations
@@ -17,13 +17,12 @@ from enum import IntEnum
 
 HEADER = b'\xff\xff\xfd\x00'
 BROADCAST = 0xFE
-LAST_ID = 0xFC
 HEAD_SIZE = 7       # [B] header, ID and length
-LENGTH_LIMIT = 1024  # [B] more than any instruction for a bus of 253 servos that the SDK sends
+LENGTH_LIMIT = 1024  # [B] larger than any instruction of the SDK for 253 servos
 
 
 class Instruction(IntEnum):
-    """What a packet asks for; STATUS marks an answer."""
+    """Instruction of a packet; STATUS is an answer."""
 
     PING = 0x01
     READ = 0x02
@@ -43,7 +42,7 @@ class Instruction(IntEnum):
 
 
 class Error(IntEnum):
-    """Lower seven bits of a status packet's error byte; ALERT is its eighth."""
+    """Lower seven bits of the error byte in a status packet; ALERT is the eighth."""
 
     NONE = 0
     RESULT_FAIL = 1
@@ -79,7 +78,7 @@ def crc16(data: bytes, start: int = 0) -> int:
 
 
 def stuffed(body: bytes) -> bytes:
-    """Instruction and parameters with ``FD`` put behind each ``FF FF FD``."""
+    """Instruction and parameters with ``FD`` after each ``FF FF FD``."""
     return body.replace(b'\xff\xff\xfd', b'\xff\xff\xfd\xfd')
 
 
@@ -89,7 +88,7 @@ def unstuffed(body: bytes) -> bytes:
 
 
 def packet(identifier: int, instruction: int, parameters: bytes = b'') -> bytes:
-    """Build a whole packet; a status packet's first parameter is its error byte."""
+    """Build a packet; the first parameter of a status packet is its error byte."""
     body = stuffed(bytes((instruction,)) + parameters)
     head = HEADER + bytes((identifier,)) + (len(body) + 2).to_bytes(2, 'little')
     return _sealed(head + body)
@@ -102,14 +101,14 @@ def status(identifier: int, error: int, data: bytes = b'') -> bytes:
 
 def fast_status(blocks: list[tuple[int, int, bytes]], length: int) -> list[bytes]:
     """
-    Build the one answer that several servos send together, not stuffed.
+    Build the common answer of several servos, without stuffing.
 
     Args:
         blocks: (ID, error, data) of the servos that answer, in order.
-        length: bytes of data plus four (error, ID, CRC) over all servos asked.
+        length: sum of the bytes of data plus four (error, ID, CRC) over all addressed servos.
 
     Returns:
-        what each servo contributes; each ends with the CRC of all that was sent so far.
+        parts of the servos; each ends with the CRC of all bytes before.
 
     """
     sent = HEADER + bytes((BROADCAST,)) + (length + 1).to_bytes(2, 'little') \
@@ -129,7 +128,7 @@ def _sealed(data: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """A received packet without stuffing; ``valid`` tells whether its CRC matched."""
+    """A received packet without stuffing; ``valid``: whether its CRC is correct."""
 
     identifier: int
     instruction: int
@@ -139,10 +138,10 @@ class Packet:
 
 class Receiver:
     """
-    Finds packets in a stream of bytes, however it is cut.
+    Finds packets in a stream of bytes.
 
-    A header inside an unfinished packet starts a new one: stuffing keeps it out of a packet's
-    own bytes. The last bytes before a packet's end are exempt, its CRC may look like a header.
+    A header inside an incomplete packet starts a new one, because stuffing excludes it inside a
+    packet. The last bytes of a packet are exempt, because its CRC may look like a header.
     """
 
     def __init__(self):
@@ -150,12 +149,12 @@ class Receiver:
         self.skipped = 0
 
     def forget(self):
-        """Drop an unfinished packet, as a servo does after a pause on the line."""
+        """Drop an incomplete packet, as a servo does after a pause on the line."""
         self.skipped += len(self._buffer)
         self._buffer.clear()
 
     def feed(self, data: bytes) -> Iterator[Packet]:
-        """Take bytes as they arrive; yield each packet that they complete."""
+        """Parse further bytes; yield each packet that they complete."""
         self._buffer += data
         while self._align():
             if len(self._buffer) < HEAD_SIZE:
@@ -178,13 +177,13 @@ class Receiver:
             if valid:
                 del self._buffer[:end]
             else:
-                # The start of the next packet may have been taken for its end.
+                # Its end may be the start of the next packet.
                 self._drop(len(HEADER))
             body = unstuffed(raw[HEAD_SIZE:-2])
             yield Packet(raw[4], body[0], body[1:], valid)
 
     def _align(self) -> bool:
-        """Drop bytes before a header; tell whether a whole header stands in front."""
+        """Drop bytes before a header; return whether the buffer starts with a header."""
         start = self._buffer.find(HEADER)
         if start < 0:
             keep = next((n for n in (3, 2, 1) if self._buffer.endswith(HEADER[:n])), 0)

@@ -1,4 +1,4 @@
-"""Faults of the emulated devices as parameters: levels that last, and events that act once."""
+"""Faults of the emulated devices as parameters: permanent levels, and single events."""
 
 from __future__ import annotations
 
@@ -19,36 +19,40 @@ class ServoFaultSwitches:
     """Faults of the servo bus."""
 
     bad_crc: float = parameter(0.0, doc='share of answers with a flipped bit', **SHARE)
-    dropped: float = parameter(0.0, doc='share of answers that are lost', **SHARE)
-    delayed: float = parameter(0.0, doc='share of answers that come late', **SHARE)
-    delay: float = parameter(0.02, doc='by which they are late', unit='s', low=0, high=10)
-    silent: np.ndarray = parameter([], doc='ids that neither hear nor answer', **LISTED)
-    overload: np.ndarray = parameter([], doc='ids with a lasting overload', **LISTED)
-    overheated: np.ndarray = parameter([], doc='ids above their temperature limit', **LISTED)
-    supply_voltage: float = parameter(12.0, doc='of the servos', unit='V', low=0, high=30)
-    unplugged: bool = parameter(False, doc='the cable of the adapter is out')
-    reboot: int = parameter(0, doc='id to restart once', low=0, high=252)
-    expire_watchdog: int = parameter(0, doc='id whose watchdog expires once', low=0, high=252)
+    dropped: float = parameter(0.0, doc='share of lost answers', **SHARE)
+    delayed: float = parameter(0.0, doc='share of late answers', **SHARE)
+    delay: float = parameter(0.02, doc='delay of late answers', unit='s', low=0, high=10)
+    silent: np.ndarray = parameter([], doc='IDs that receive and answer nothing', **LISTED)
+    overload: np.ndarray = parameter([], doc='IDs with a permanent overload', **LISTED)
+    overheated: np.ndarray = parameter([], doc='IDs above their temperature limit', **LISTED)
+    supply_voltage: float = parameter(12.0, doc='supply voltage of the servos', unit='V', low=0,
+                                      high=30)
+    unplugged: bool = parameter(False, doc='whether the cable of the adapter is unplugged')
+    reboot: int = parameter(0, doc='ID to restart once', low=0, high=252)
+    expire_watchdog: int = parameter(0, doc='ID whose watchdog expires once', low=0, high=252)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BoardFaultSwitches:
-    """Faults of the motor board, its pack, its rotors and its cable."""
+    """Faults of the motor board, its battery, its rotors and its cable."""
 
-    corrupt_out: float = parameter(0.0, doc='share of its packets with a flipped bit', **SHARE)
-    corrupt_in: float = parameter(0.0, doc='share of packets to it with a flipped bit', **SHARE)
-    drop_out: float = parameter(0.0, doc='share of its packets that are lost', **SHARE)
-    drop_in: float = parameter(0.0, doc='share of packets to it that are lost', **SHARE)
-    delay_out: float = parameter(0.0, doc='by which its packets are late', unit='s', low=0,
+    corrupt_out: float = parameter(0.0, doc='share of packets of the board with a flipped bit',
+                                   **SHARE)
+    corrupt_in: float = parameter(0.0, doc='share of packets to the board with a flipped bit',
+                                  **SHARE)
+    drop_out: float = parameter(0.0, doc='share of lost packets of the board', **SHARE)
+    drop_in: float = parameter(0.0, doc='share of lost packets to the board', **SHARE)
+    delay_out: float = parameter(0.0, doc='delay of packets of the board', unit='s', low=0,
                                  high=10)
-    delay_in: float = parameter(0.0, doc='by which packets to it are late', unit='s', low=0,
+    delay_in: float = parameter(0.0, doc='delay of packets to the board', unit='s', low=0,
                                 high=10)
-    mute: bool = parameter(False, doc='it works but nothing of it arrives')
-    voltage_sag: float = parameter(0.0, doc='that the pack gives less', unit='V', low=0, high=30)
-    failed_escs: np.ndarray = parameter([], doc='rotors 1 to 4 that do not turn', low=1, high=4)
-    unplugged: bool = parameter(False, doc='its cable is out')
-    reboot: bool = parameter(False, doc='resets once')
-    hang: bool = parameter(False, doc='hangs once, until its watchdog')
+    mute: bool = parameter(False, doc='whether all packets of the board are lost')
+    voltage_sag: float = parameter(0.0, doc='drop of the battery voltage', unit='V', low=0,
+                                   high=30)
+    failed_escs: np.ndarray = parameter([], doc='rotors (1 to 4) that do not turn', low=1, high=4)
+    unplugged: bool = parameter(False, doc='whether the cable of the board is unplugged')
+    reboot: bool = parameter(False, doc='reset once')
+    hang: bool = parameter(False, doc='hang once, until the reset by the watchdog')
 
 
 SERVO_EVENTS, BOARD_EVENTS = ('reboot', 'expire_watchdog'), ('reboot', 'hang')
@@ -57,10 +61,10 @@ SERVO_LISTS = ('silent', 'overload', 'overheated')
 
 def check_servo_faults(faults: ServoFaultSwitches, bus: EmulatedServoBus) -> None:
     """
-    Refuse IDs that the bus does not have.
+    Check that the bus has the IDs.
 
     Raises:
-        ParameterError: naming key and IDs.
+        ParameterError: unknown ID; the message has key and IDs.
 
     """
     known = [servo['ID'] for servo in bus.servos]
@@ -73,10 +77,10 @@ def check_servo_faults(faults: ServoFaultSwitches, bus: EmulatedServoBus) -> Non
 
 def check_board_faults(faults: BoardFaultSwitches) -> None:
     """
-    Refuse rotors that are none.
+    Check the numbers of rotors.
 
     Raises:
-        ParameterError: naming key and value.
+        ParameterError: not a whole number; the message has key and value.
 
     """
     if np.any(faults.failed_escs != np.round(faults.failed_escs)):
@@ -85,7 +89,7 @@ def check_board_faults(faults: BoardFaultSwitches) -> None:
 
 
 def set_servo_faults(faults: ServoFaultSwitches, bus: EmulatedServoBus) -> None:
-    """Put levels in force and let the events happen."""
+    """Apply the levels and trigger the events."""
     for name in ('bad_crc', 'dropped', 'delayed', 'delay', 'supply_voltage'):
         setattr(bus.faults, name, getattr(faults, name))
     for name in SERVO_LISTS:
@@ -99,7 +103,7 @@ def set_servo_faults(faults: ServoFaultSwitches, bus: EmulatedServoBus) -> None:
 
 
 def set_board_faults(faults: BoardFaultSwitches, board: EmulatedMotorBoard) -> None:
-    """Put levels in force and let the events happen."""
+    """Apply the levels and trigger the events."""
     for name in ('corrupt_out', 'corrupt_in', 'drop_out', 'drop_in', 'delay_out', 'delay_in',
                  'mute', 'voltage_sag'):
         setattr(board.faults, name, getattr(faults, name))
@@ -112,7 +116,7 @@ def set_board_faults(faults: BoardFaultSwitches, board: EmulatedMotorBoard) -> N
 
 
 def switched_on(faults: ServoFaultSwitches | BoardFaultSwitches) -> list[str]:
-    """Levels that differ from health, as texts such as 'silent [2]'."""
+    """Levels that differ from their defaults, as texts such as 'silent [2]'."""
     healthy, found = type(faults)(), []
     events = SERVO_EVENTS if isinstance(faults, ServoFaultSwitches) else BOARD_EVENTS
     for entry in fields(faults):

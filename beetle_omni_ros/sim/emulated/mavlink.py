@@ -1,8 +1,8 @@
 """
-The nine MAVLink 2 messages of the firmware contract, packed and unpacked.
+Packing and unpacking of the nine MAVLink 2 messages of the firmware contract.
 
-Written from the protocol's documents (mavlink.io: packet serialization, common message set)
-and not with the library that the driver uses, so that each judges the other.
+The source is mavlink.io (packet serialization, common message set). The library of the driver is
+not used, so that tests can compare both.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ POLYNOMIAL = 0x8408                     # CRC-16/MCRF4XX: x^16 + x^12 + x^5 + 1,
 HEARTBEAT, SYS_STATUS, COMMAND_LONG, COMMAND_ACK = 0, 1, 76, 77
 TIMESYNC, ACTUATOR_TARGET, BATTERY_STATUS, ESC_INFO, ESC_STATUS = 111, 139, 147, 290, 291
 
-# Message id -> checksum seed and payload in wire order: large types first.
+# Message ID -> checksum seed and payload in wire order, larger types first.
 MESSAGES = {
     HEARTBEAT: (50, struct.Struct('<IBBBBB')),
     SYS_STATUS: (124, struct.Struct('<IIIHHhHHHHHHb')),
@@ -43,7 +43,7 @@ _TABLE = _table()
 
 
 def checksum(data: bytes, seed: int) -> int:
-    """CRC-16/MCRF4XX of ``data`` (without the marker) and the message's ``seed``."""
+    """CRC-16/MCRF4XX of ``data``, without the marker, and of the message's ``seed``."""
     crc = 0xFFFF
     for byte in data:
         crc = crc >> 8 ^ _TABLE[(crc ^ byte) & 0xFF]
@@ -51,7 +51,7 @@ def checksum(data: bytes, seed: int) -> int:
 
 
 def pack(number: int, values: tuple, sequence: int, system: int, component: int) -> bytes:
-    """Frame of message ``number`` with ``values`` in wire order; zeros at the end are left out."""
+    """Frame of message ``number`` with ``values`` in wire order, without trailing zeros."""
     seed, layout = MESSAGES[number]
     payload = layout.pack(*values).rstrip(b'\0') or b'\0'
     body = bytes([len(payload), 0, 0, sequence, system, component]) \
@@ -75,8 +75,8 @@ class Parser:
     Splits bytes into messages.
 
     Attributes:
-        bad_crc: frames whose checksum was wrong.
-        lost: gaps in the sequence numbers, all senders taken as one.
+        bad_crc: number of frames with a wrong checksum.
+        lost: number of missing sequence numbers, over all senders.
 
     """
 
@@ -86,7 +86,7 @@ class Parser:
         self.bad_crc = self.lost = 0
 
     def feed(self, data: bytes) -> list[Message]:
-        """Take bytes; return the messages that are complete, unknown ones left out."""
+        """Parse further bytes; return complete messages of known types."""
         self._buffer += data
         messages = []
         while True:
@@ -103,7 +103,7 @@ class Parser:
                 messages.append(message)
 
     def _frame(self):
-        """Bytes to take from the buffer (0: wait for more) and the message in them, or None."""
+        """Number of bytes to consume (0: wait for more), and the message in them or None."""
         head = self._buffer
         if len(head) < HEADER:
             return 0, None

@@ -1,4 +1,4 @@
-"""The emulated motor board: firmware, sensors and faults behind a pseudo-terminal."""
+"""The emulated motor board: firmware, sensors and faults on a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -25,33 +25,29 @@ class EmulatedMotorBoard:
     """
     A motor board that a driver can open by :attr:`port`.
 
-    A thread serves the port in real time. The world asks :attr:`commands` or
-    :attr:`thrust_targets` and tells what the sensors measure; both from any thread.
-    Until the world tells a battery it is full and the rotors follow at once.
+    A thread serves the port in real time. A plant reads :attr:`commands` or
+    :attr:`thrust_targets` and sets the sensors, from any thread. Before :meth:`set_battery` the
+    battery is full, and before :meth:`set_rotors` the rotors follow their targets without lag.
+
+    Args:
+        robot: the true robot, whose rotor map converts PWM to thrust.
+        parameters: parameters of the board; default: params/emulated_board.yaml.
+        seed: seed of random faults.
+        port: path of the created port; by default a temporary one.
 
     Attributes:
-        faults: what is wrong; set its attributes at any time.
-        on_target: called in the board's thread after each target that arrives, with its
-            arrival [s, monotonic] and its wire values; for measurements.
+        faults: present faults; their attributes may be set at any time.
+        on_target: called in the board's thread after each target with its arrival
+            [s, monotonic] and its wire values, for measurements.
+
+    Raises:
+        OSError: the port cannot be created.
 
     """
 
     def __init__(self, robot: RobotParameters | None = None,
                  parameters: EmulatedBoardParameters | None = None, seed: int = 0,
                  port: str | Path | None = None):
-        """
-        Power on.
-
-        Args:
-            robot: the true one: its rotor map turns PWM into thrust.
-            parameters: by default params/emulated_board.yaml.
-            seed: of random faults.
-            port: path of the port to make; a temporary one by default.
-
-        Raises:
-            OSError: the port cannot be made.
-
-        """
         robot = robot or RobotParameters.load()
         self._parameters = parameters or EmulatedBoardParameters.load()
         self._map = ThrustMap(robot.rotors)
@@ -72,11 +68,11 @@ class EmulatedMotorBoard:
 
     @property
     def port(self) -> str:
-        """Path of the serial port to open; the same after unplugging and plugging in."""
+        """Path of the serial port, which does not change when it is unplugged."""
         return self._terminal.port
 
     def close(self) -> None:
-        """Power off."""
+        """Stop the thread and remove the port."""
         if self._stop:
             return
         self._stop = True
@@ -92,22 +88,22 @@ class EmulatedMotorBoard:
 
     @property
     def armed(self) -> bool:
-        """Whether rotors may turn at present."""
+        """Whether the board is armed."""
         with self._lock:
             return self._firmware.state(time.monotonic()) >= 2
 
     @property
     def commands(self) -> np.ndarray:
-        """(4,) normalised PWM commands at this moment, 0 (stop) to 1, also of failed ESCs."""
+        """(4,) present normalised PWM commands, 0 (stop) to 1, also of failed ESCs."""
         with self._lock:
-            # What has arrived counts, also where the thread had no turn on a busy computer.
+            # Handle received bytes, because the thread may not have been scheduled.
             now = time.monotonic()
             self._step(now)
             return np.array(self._firmware.outputs(now))
 
     @property
     def thrust_targets(self) -> np.ndarray:
-        """(4,) thrusts [N] to which the rotors strive: the PWM at the true voltage."""
+        """(4,) targets of the rotors [N] for the PWM commands at the true voltage."""
         with self._lock:
             return self._thrusts(self.commands)
 
@@ -119,80 +115,80 @@ class EmulatedMotorBoard:
 
     @property
     def voltage(self) -> float:
-        """True pack voltage [V], the sag fault included."""
+        """True battery voltage with the sag fault [V]."""
         return self._voltage - self.faults.voltage_sag
 
     @property
     def refused(self) -> dict[str, int]:
-        """Reason -> targets not followed since the board's start."""
+        """Reason -> number of refused targets since the start of the board."""
         return dict(self._firmware.refused)
 
     def set_battery(self, voltage: float, current: float,
                     error: tuple[float, float] = (0.0, 0.0)) -> None:
         """
-        Tell the pack's state.
+        Set the state of the battery.
 
         Args:
-            voltage: true one under load [V].
-            current: true one drawn [A, positive].
-            error: what the board measures more than these [V, A].
+            voltage: true voltage under load [V].
+            current: true drawn current [A, positive].
+            error: errors of the measured voltage and current [V, A].
 
         """
         self._voltage, self._current, self._error = float(voltage), float(current), error
 
     def set_rotors(self, thrust: np.ndarray, temperature: np.ndarray | None = None) -> None:
-        """Tell the rotors' present thrusts (4,) [N] and, if known, ESC temperatures (4,) [C]."""
+        """Set present thrusts (4,) [N] and ESC temperatures (4,) [C] of the rotors."""
         self._thrust = np.array(thrust, dtype=float)
         if temperature is not None:
             self._firmware.telemetry.temperature = [float(value) for value in temperature]
 
     def reboot(self) -> None:
-        """Reset the board now, as a brown-out does."""
+        """Reset the board, as a brown-out does."""
         with self._lock:
             self._firmware.reboot(time.monotonic())
-            self._forget()
+            self._clear_stream()
 
     def hang(self) -> None:
-        """Hang the firmware; its watchdog resets it."""
+        """Hang the firmware until its watchdog resets it."""
         with self._lock:
             self._firmware.hang(time.monotonic())
 
     def unplug(self) -> None:
-        """Pull the cable."""
+        """Unplug the cable."""
         with self._lock:
             self._terminal.unplug()
             self._incoming.clear()
             self._outgoing.clear()
 
     def plug(self) -> None:
-        """Put the cable back in; the port has its old name."""
+        """Plug the cable in; the port has its old path."""
         with self._lock:
             self._terminal.plug()
 
-    def _forget(self):
+    def _clear_stream(self):
         self._parser, self._sequence = mavlink.Parser(), 0
 
     def _run(self):
         while not self._stop:
-            self._terminal.wait(self._patience())
+            self._terminal.wait(self._wait_time())
             with self._lock:
                 self._step(time.monotonic())
 
-    def _patience(self):
-        """How long nothing will be due [s]."""
+    def _wait_time(self):
+        """Time until something is due [s]."""
         now = time.monotonic()
         telemetry = self._firmware.telemetry.next()
         return min(telemetry if telemetry > now else now + TICK, self._incoming.next(),
                    self._outgoing.next(), now + TICK) - now
 
     def _step(self, now):
-        """Do all that is due: receive, execute, send."""
+        """Receive, execute and send."""
         faults, executed = self.faults, self._executes
         self._executes = executes = self._firmware.runs(now)
         if executed and not executes:
-            self._forget()
+            self._clear_stream()
         received = self._terminal.read()
-        # A board reads its clock after the question; this thread may have waited in between.
+        # Read the clock after the bytes, as a board does, because this thread may have waited.
         now = time.monotonic()
         for frame in frames(received):
             self._incoming.put(frame, now, faults.corrupt_in, faults.drop_in, faults.delay_in)
@@ -218,7 +214,7 @@ class EmulatedMotorBoard:
                                else faults.drop_out, faults.delay_out)
 
     def _measure(self, now):
-        """Write into the sensors what the world is like."""
+        """Set the measurements of the telemetry."""
         telemetry = self._firmware.telemetry
         telemetry.voltage = self.voltage + self._error[0]
         telemetry.current = self._current + self._error[1]
@@ -230,6 +226,6 @@ class EmulatedMotorBoard:
         total = sum(powers)
         telemetry.rpm = [self._parameters.rpm_at_1_newton * math.sqrt(max(0.0, f))
                          for f in thrust.tolist()]
-        # Each rotor's part of the pack's current, by its aerodynamic power.
+        # The battery current is divided among the rotors by aerodynamic power.
         telemetry.rotor_current = [self._current * power / total if total else 0.0
                                    for power in powers]

@@ -1,4 +1,4 @@
-"""A serial port without hardware: a pseudo-terminal under a name that stays, to be unplugged."""
+"""A serial port without hardware: a pseudo-terminal with a fixed path, which can be unplugged."""
 
 from __future__ import annotations
 
@@ -12,34 +12,29 @@ import tty
 
 SPEEDS = {getattr(termios, name): int(name[1:]) for name in dir(termios)
           if name[0] == 'B' and name[1:].isdigit()}
-CHUNK = 4096    # [B] the size of the kernel's buffer
+CHUNK = 4096    # [B] size of the kernel's buffer
 
 
 class PseudoTerminal:
     """
     The device's end of a serial cable.
 
-    One thread waits; reading, writing and pulling the cable may happen in any thread, under a
-    lock of the owner.
+    One thread calls :meth:`wait`. Any thread may call the other methods, under a lock of the
+    owner.
+
+    Args:
+        port: path of the created link; an existing link is replaced.
+        name: name of the link in a temporary folder, used without ``port``.
 
     Attributes:
-        port: path that a driver opens; a link, because another terminal may be behind it after
-            the cable was out. It exists only while plugged in.
+        port: path for the driver, a link to the present terminal; it exists only while plugged in.
+
+    Raises:
+        OSError: the path cannot be created; the message has the path.
 
     """
 
     def __init__(self, port: str | Path | None = None, name: str = 'port'):
-        """
-        Plug in.
-
-        Args:
-            port: path of the link to make; a link that is there already is replaced.
-            name: of the link in a temporary folder, where no ``port`` is given.
-
-        Raises:
-            OSError: the path cannot be made; one line that names it.
-
-        """
         self._folder = None if port else tempfile.mkdtemp(prefix='emulated_')
         self.port = str(port or Path(self._folder) / name)
         self._device = self._line = -1
@@ -59,15 +54,15 @@ class PseudoTerminal:
 
     @property
     def baud_rate(self) -> int:
-        """Speed that the driver has set [bit/s]; 0 while unplugged."""
+        """Baud rate set by the driver [bit/s]; 0 while unplugged."""
         return SPEEDS.get(termios.tcgetattr(self._line)[5], 0) if self.plugged else 0
 
     def plug(self) -> None:
         """
-        Make the port; nothing if it is there.
+        Create the port if it does not exist.
 
         Raises:
-            OSError: the path is taken by something else than a link, or cannot be made.
+            OSError: the path exists and is not a link, or cannot be created.
 
         """
         if self.plugged:
@@ -75,7 +70,7 @@ class PseudoTerminal:
         link = Path(self.port)
         if os.path.lexists(link) and not link.is_symlink():
             raise OSError(f'{link}: cannot be made a port, it exists and is no link')
-        # The driver's end is kept open too: a serial device does not notice who listens.
+        # The driver's end is kept open, because a serial device cannot detect its driver.
         device, line = os.openpty()
         try:
             tty.setraw(line)
@@ -92,50 +87,50 @@ class PseudoTerminal:
         self.interrupt()
 
     def unplug(self) -> None:
-        """Pull the cable: whoever has the port open gets an error or an end of file."""
+        """Remove the port; a driver that has it open gets an error or an end of file."""
         if not self.plugged:
             return
         device, line, self._device, self._line = self._device, self._line, -1, -1
         link = Path(self.port)
         if link.is_symlink() and os.readlink(link) == os.ttyname(line):
-            link.unlink()       # if it is still ours
+            link.unlink()       # another device may have replaced it
         os.close(line)
         os.close(device)
         self.interrupt()
 
     def wait(self, timeout: float) -> None:
-        """Return when bytes have come, after ``timeout`` seconds, or on :meth:`interrupt`."""
+        """Return when bytes arrive, after ``timeout`` [s], or on :meth:`interrupt`."""
         device = self._device
         watched = [self._waker, device] if device >= 0 else [self._waker]
         try:
             if self._waker in select.select(watched, [], [], max(0.0, timeout))[0]:
                 os.read(self._waker, CHUNK)
         except OSError:
-            pass        # the cable was pulled at this moment
+            pass        # the port was unplugged during the call
 
     def read(self) -> bytes:
-        """What has come; empty if nothing, or if unplugged."""
+        """Received bytes; empty without any, or if unplugged."""
         try:
             return os.read(self._device, CHUNK)
         except OSError:
             return b''
 
     def write(self, data: bytes) -> None:
-        """Send; what finds no room is lost, as on a wire where nobody listens."""
+        """Send bytes; they are lost if the buffer is full or the port unplugged."""
         try:
             os.write(self._device, data)
         except OSError:
             pass
 
     def interrupt(self) -> None:
-        """Let :meth:`wait` return in its thread."""
+        """Let :meth:`wait` return."""
         try:
             os.write(self._wake, b'\0')
         except OSError:
             pass
 
     def close(self) -> None:
-        """Remove port and folder, for good."""
+        """Remove port and folder."""
         self.unplug()
         for descriptor in (self._waker, self._wake):
             os.close(descriptor)

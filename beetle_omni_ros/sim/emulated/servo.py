@@ -1,9 +1,9 @@
 """
-One XC330-T181-T: its control table, what it refuses, and how it protects itself.
+One emulated XC330-T181-T: control table, checks of writes, and protections.
 
-The shaft is moved from outside (:meth:`EmulatedServo.move`); angles are those of the robot's
-joint, [rad], which ``sign`` and ``zero`` tie to the servo's counts. Where the manual leaves open
-what happens, the servo here does what is worse for a driver; comments name these places.
+:meth:`EmulatedServo.move` sets the state of the shaft. Angles are those of the robot's joint
+[rad]; ``sign`` and ``zero`` convert them to counts. If the manual does not define a behaviour, the
+servo has the one that is worse for a driver, and a comment states it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class EmulatedServo:
         self._memory = bytearray(table.SIZE)
         self._turns = 0
         self._registered = None
-        self._heard = 0.0
+        self._last_packet = 0.0
         self._boots_at = -inf
         for register in table.REGISTERS:
             self[register.name] = register.initial
@@ -42,7 +42,7 @@ class EmulatedServo:
         return int.from_bytes(raw, 'little', signed=register.signed)
 
     def __setitem__(self, name: str, value: int):
-        """Set a register from inside, unchecked."""
+        """Set a register without checks."""
         register = table.BY_NAME[name]
         self._memory[register.address:register.address + register.size] = \
             value.to_bytes(register.size, 'little', signed=register.signed)
@@ -59,12 +59,12 @@ class EmulatedServo:
 
     @property
     def baud_rate(self) -> int:
-        """Speed at which it listens [bit/s]."""
+        """Baud rate [bit/s]."""
         return table.BAUD_RATES[self['Baud Rate']]
 
     @property
     def goal(self) -> float:
-        """Joint angle that it drives to [rad]; the present one where it does not drive."""
+        """Goal angle of the joint [rad]; the present angle in modes without position control."""
         if self['Operating Mode'] not in (table.POSITION_MODE, table.EXTENDED_MODE,
                                           table.CURRENT_POSITION_MODE):
             return self.angle
@@ -74,10 +74,10 @@ class EmulatedServo:
 
     @property
     def alert(self) -> int:
-        """Bit 7 of its error bytes."""
+        """Alert bit of its error bytes."""
         return Error.ALERT if self['Hardware Error Status'] else 0
 
-    def listens(self, now: float) -> bool:
+    def booted(self, now: float) -> bool:
         """Whether it has booted."""
         return now >= self._boots_at
 
@@ -85,14 +85,14 @@ class EmulatedServo:
         """Set the shaft's state: [rad], [rad/s], [N m]."""
         self.angle, self.velocity, self.effort = float(angle), float(velocity), float(effort)
 
-    # --- what instructions do ---------------------------------------------------------------
+    # --- instructions -------------------------------------------------------------------------
 
-    def hear(self, now: float):
-        """Note that an instruction packet went over the bus; that resets the watchdog."""
-        self._heard = now
+    def feed_watchdog(self, now: float):
+        """Restart the watchdog, because an instruction packet was on the bus."""
+        self._last_packet = now
 
     def read(self, address: int, length: int, now: float) -> tuple[Error, bytes]:
-        """Bytes of the control table; the error is ACCESS where it has a gap."""
+        """Read bytes of the control table; error ACCESS for undefined addresses."""
         end = address + length
         if not length or not all(place in table.DEFINED for place in range(address, end)):
             return Error.ACCESS, b''
@@ -101,38 +101,38 @@ class EmulatedServo:
         return Error.NONE, bytes(self._memory[address:end])
 
     def write(self, address: int, data: bytes) -> Error:
-        """Write whole registers, all or none of them."""
-        error, values = self._understood(address, data)
+        """Write complete registers, all or none of them."""
+        error, values = self._parsed(address, data)
         if error is Error.NONE:
             for register, value in values:
                 self._apply(register.name, value)
         return error
 
     def register(self, address: int, data: bytes) -> Error:
-        """Keep a write until :meth:`action`."""
-        error, _ = self._understood(address, data)
+        """Store a write until :meth:`action`."""
+        error, _ = self._parsed(address, data)
         if error is Error.NONE:
             self._registered = (address, data)
             self['Registered Instruction'] = 1
         return error
 
     def action(self) -> Error:
-        """Execute the kept write."""
+        """Execute the stored write."""
         if self._registered is None:
             return Error.INSTRUCTION
-        kept, self._registered = self._registered, None
+        stored, self._registered = self._registered, None
         self['Registered Instruction'] = 0
-        return self.write(*kept)
+        return self.write(*stored)
 
     def clear_turns(self) -> Error:
-        """Instruction Clear: forget the turn count, at rest only."""
+        """Clear the turn count; only at rest."""
         if abs(self.velocity) > self['Moving Threshold'] * table.VELOCITY_UNIT:
             return Error.RESULT_FAIL
         self._to_one_turn()
         return Error.NONE
 
     def reboot(self, now: float):
-        """Restart: RAM as after power-up, torque off, position within one turn, silent a while."""
+        """Restart with initial RAM, torque off, position within one turn; silent until booted."""
         for register in table.REGISTERS:
             if register.address >= table.EEPROM_END:
                 self[register.name] = register.initial
@@ -145,9 +145,10 @@ class EmulatedServo:
     # --- protection ---------------------------------------------------------------------------
 
     def advance(self, now: float):
-        """Look at the watchdog, temperature and voltage."""
+        """Check watchdog, temperature and voltage."""
         limit = self['Bus Watchdog']
-        if self.torque and 0 < limit < 255 and now - self._heard > limit * table.WATCHDOG_UNIT:
+        silence = now - self._last_packet
+        if self.torque and 0 < limit < 255 and silence > limit * table.WATCHDOG_UNIT:
             self.expire()
         self['Present Temperature'] = round(35 if self.temperature is None else self.temperature)
         if self['Present Temperature'] > self['Temperature Limit']:
@@ -159,21 +160,21 @@ class EmulatedServo:
             self.trip(table.VOLTAGE_ERROR)
 
     def expire(self):
-        """Stop where it is: the bus was silent. The manual says no more than "stop"."""
+        """Expire the watchdog: hold the present position (the manual has only "stop")."""
         self['Bus Watchdog'] = 255
         self['Goal Position'] = self._present()
         self['Profile Acceleration'] = self['Profile Velocity'] = 0
 
     def trip(self, error: int):
-        """Note a hardware error; those that Shutdown (63) names take the torque away."""
+        """Set a hardware error; the errors in Shutdown (63) switch the torque off."""
         self['Hardware Error Status'] |= error
         if error & self['Shutdown']:
             self['Torque Enable'] = 0
 
     # --- inside -------------------------------------------------------------------------------
 
-    def _understood(self, address, data):
-        """Cut a write into registers and values, or say why it is refused."""
+    def _parsed(self, address, data):
+        """Parse a write into registers and values, or return the error of a refusal."""
         values, place, end = [], address, address + len(data)
         if not data:
             return Error.DATA_LENGTH, ()
@@ -188,21 +189,21 @@ class EmulatedServo:
                 return Error.DATA_LENGTH, ()
             raw = data[register.address - address:place - address]
             value = int.from_bytes(raw, 'little', signed=register.signed)
-            error = self._verdict(register, value)
+            error = self._error_of(register, value)
             if error is not Error.NONE:
                 return error, ()
             values.append((register, value))
         return Error.NONE, values
 
-    def _verdict(self, register, value):
-        """Judge one value."""
+    def _error_of(self, register, value):
+        """Error of writing a value to a register."""
         name = register.name
         if not register.low <= value <= register.high \
                 or (register.choices and value not in register.choices):
             return Error.DATA_RANGE
         if self.expired and (name in table.GOALS or (name == 'Bus Watchdog' and value)):
             return Error.DATA_RANGE
-        # Refused it is for sure, with which error the manual leaves open.
+        # The manual defines the refusal, but not its error.
         if name == 'Torque Enable' and value \
                 and self['Hardware Error Status'] & self['Shutdown']:
             return Error.RESULT_FAIL
@@ -225,7 +226,7 @@ class EmulatedServo:
             if value == table.POSITION_MODE:
                 self._to_one_turn()
         elif name == 'Torque Enable' and value and changed:
-            # A goal from before stays: a driver that forgot it would see a jump.
+            # The old goal remains, so a driver that does not set it causes a jump.
             if self['Operating Mode'] == table.POSITION_MODE:
                 self._to_one_turn()
         elif name in table.GOALS and self['Drive Mode'] & 8:

@@ -1,4 +1,4 @@
-"""The emulated servo bus: servos behind a pseudo-terminal, with faults that can be switched on."""
+"""The emulated servo bus: servos and faults on a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from beetle_omni_ros.sim.emulated.pseudo_terminal import PseudoTerminal
 from beetle_omni_ros.sim.emulated.servo import EmulatedServo
 from beetle_omni_ros.sim.emulated.servo_network import ServoNetwork
 
-STEP = 0.001  # [s] far below the period of the servo's 11 Hz
-WATCH = 0.01       # [s] how often watchdogs and temperatures are looked at
-PAUSE = 0.05       # [s] silence after which an unfinished packet is forgotten
+STEP = 0.001        # [s] of the motion, small against the servo's natural frequency of 11 Hz
+CHECK_PERIOD = 0.01 # [s] between checks of watchdog, temperature and voltage
+PAUSE = 0.05        # [s] silence after which an incomplete packet is dropped
 BITS_PER_BYTE = 10  # start, eight data, stop
 
 
 class SecondOrderMotion:
     """
-    Free servos, without load.
+    Motion of ``count`` servos without load.
 
     Attributes:
         position: (n,) [rad].
@@ -44,7 +44,7 @@ class SecondOrderMotion:
         self._time = None
 
     def advance(self, now: float, goals: np.ndarray, powered: np.ndarray):
-        """Move until ``now`` [s] towards ``goals`` [rad]; without power a servo stays put."""
+        """Advance to ``now`` [s] with ``goals`` [rad]; a servo without power does not move."""
         if self._time is None or now - self._time > 1.0:
             self._time = now
         while self._time + STEP <= now:
@@ -59,16 +59,16 @@ class SecondOrderMotion:
 @dataclass
 class ServoFaults:
     """
-    Faults of the bus; set and reset them at any time.
+    Present faults of the bus; may be changed at any time.
 
     Attributes:
         bad_crc: share of answers with a flipped bit.
-        dropped: share of answers that are lost.
-        delayed: share of answers that come ``delay`` [s] late.
-        silent: IDs that neither hear nor answer.
-        overload: IDs with a lasting overload: they shut down, again after each reboot.
+        dropped: share of lost answers.
+        delayed: share of answers that are late by ``delay`` [s].
+        silent: IDs that receive and answer nothing.
+        overload: IDs with a permanent overload, which shut down also after a reboot.
         overheated: IDs above their temperature limit.
-        supply_voltage: [V] instead of 12.
+        supply_voltage: supply voltage [V]; None: 12 V.
 
     """
 
@@ -84,22 +84,22 @@ class ServoFaults:
 
 class EmulatedServoBus:
     """
-    XC330 servos on one serial port; use as a context manager.
+    XC330 servos on one serial port, as a context manager.
 
-    A plant moves them: it reads :attr:`goals` and :attr:`torque_enabled` and calls
-    :meth:`set_state`. With ``motion`` they move by themselves.
+    A plant reads :meth:`drive` and calls :meth:`set_state`. With ``motion`` the servos move
+    without a plant.
 
     Args:
         identifiers: IDs in the order of the joints.
-        port: path of the port to make; a temporary one by default.
-        firmware: version that the servos report; below 46 without fast sync read.
-        baud_rate: that the servos are set to [bit/s].
-        signs: +1 or -1 for each servo: sense of its counts against the joint's angle.
-        zeros: counts at which each joint's angle is zero.
-        motion: servo model to move by, or None.
-        timing: whether answers take the time of the wire and the return delay.
-        reboot_time: silence after a reboot [s].
-        seed: of the faults.
+        port: path of the created port; by default a temporary one.
+        firmware: firmware version of the servos; below 46 without fast sync read.
+        baud_rate: baud rate of the servos [bit/s].
+        signs: +1 or -1 for each servo: counts rise or fall with the joint's angle.
+        zeros: counts at which the angle of each joint is zero.
+        motion: parameters of the servo model, or None for servos moved by a plant.
+        timing: whether answers take the time on the wire and the return delay.
+        reboot_time: time without answers after a reboot [s].
+        seed: seed of the faults.
 
     """
 
@@ -123,7 +123,7 @@ class EmulatedServoBus:
         self._late: list[tuple[float, int, bytes]] = []
         self._order = itertools.count()
         self._lock = Lock()
-        self._heard = self._watched = time.monotonic()
+        self._last_data = self._last_check = time.monotonic()
         self._running = True
         self._thread = Thread(target=self._run, name='emulated servo bus', daemon=True)
         self._thread.start()
@@ -136,7 +136,7 @@ class EmulatedServoBus:
 
     @property
     def port(self) -> str:
-        """Path that a driver opens."""
+        """Path of the serial port."""
         return self._terminal.port
 
     @property
@@ -148,14 +148,14 @@ class EmulatedServoBus:
 
     def drive(self) -> tuple[list[float], list[bool], list[bool]]:
         """
-        All that a plant needs to know, of one moment.
+        Inputs of a plant at one time.
 
         Returns:
-            what :attr:`goals`, :attr:`torque_enabled` and :attr:`stopped` tell.
+            values of :attr:`goals`, :attr:`torque_enabled` and :attr:`stopped`.
 
         """
         with self._lock:
-            # What has arrived counts, also where the thread had no turn on a busy computer.
+            # Handle received bytes, because the thread may not have been scheduled.
             self._serve(time.monotonic())
             servos = self.servos
             return ([servo.goal for servo in servos], [servo.torque for servo in servos],
@@ -163,19 +163,19 @@ class EmulatedServoBus:
 
     @property
     def goals(self) -> np.ndarray:
-        """(n,) joint angles that the servos drive to [rad]."""
+        """(n,) goal angles of the joints [rad]."""
         with self._lock:
             return np.array([servo.goal for servo in self.servos])
 
     @property
     def torque_enabled(self) -> np.ndarray:
-        """(n,) bool: whether a servo's motor is powered; without power the joint is free."""
+        """(n,) bool: whether a motor is powered; without power the joint is free."""
         with self._lock:
             return np.array([servo.torque for servo in self.servos])
 
     @property
     def stopped(self) -> np.ndarray:
-        """(n,) bool: stopped by the bus watchdog, goals refused."""
+        """(n,) bool: whether the bus watchdog has stopped a servo, which then refuses goals."""
         with self._lock:
             return np.array([servo.expired for servo in self.servos])
 
@@ -191,24 +191,24 @@ class EmulatedServoBus:
     # --- events -------------------------------------------------------------------------------
 
     def reboot(self, index: int):
-        """Restart servo ``index`` as a brown-out does: torque off, turns forgotten."""
+        """Restart servo ``index`` as a brown-out does: torque off, turn count lost."""
         with self._lock:
             self.servos[index].reboot(time.monotonic())
 
     def expire_watchdog(self, index: int):
-        """Let the watchdog of servo ``index`` expire now."""
+        """Expire the watchdog of servo ``index``."""
         with self._lock:
             if self.servos[index].torque:
                 self.servos[index].expire()
 
     def unplug(self):
-        """Pull the cable of the adapter; the servos keep their power."""
+        """Unplug the adapter; the servos keep their power."""
         with self._lock:
             self._terminal.unplug()
             self._forget()
 
     def replug(self):
-        """Put the cable back."""
+        """Plug the adapter in."""
         with self._lock:
             if not self._terminal.plugged:
                 self._terminal.plug()
@@ -230,31 +230,31 @@ class EmulatedServoBus:
 
     def _run(self):
         while self._running:
-            self._terminal.wait(self._patience())
+            self._terminal.wait(self._wait_time())
             with self._lock:
                 self._serve(time.monotonic())
 
     def _serve(self, now):
-        """Do all that is due."""
+        """Handle received packets, check the servos, send due answers."""
         data = self._terminal.read()
         if data:
-            if now - self._heard > PAUSE:
+            if now - self._last_data > PAUSE:
                 self._receiver.forget()
-            self._heard = now
+            self._last_data = now
             self._take(data, now)
-        # After the data: a late thread must not take waiting packets for silence.
-        if now - self._watched >= WATCH:
-            self._watched = now
-            self._watch(now)
+        # After the data, so that waiting packets restart the watchdogs of a late thread.
+        if now - self._last_check >= CHECK_PERIOD:
+            self._last_check = now
+            self._check_servos(now)
         while self._late and self._late[0][0] <= now:
             self._terminal.write(heapq.heappop(self._late)[2])
 
-    def _patience(self):
+    def _wait_time(self):
         if not self._late:
-            return WATCH
-        return min(WATCH, max(0.0, self._late[0][0] - time.monotonic()))
+            return CHECK_PERIOD
+        return min(CHECK_PERIOD, max(0.0, self._late[0][0] - time.monotonic()))
 
-    def _watch(self, now):
+    def _check_servos(self, now):
         faults = self.faults
         self.network.silent = set(faults.silent)
         for servo in self.servos:

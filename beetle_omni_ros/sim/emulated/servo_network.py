@@ -1,4 +1,4 @@
-"""Servos that share one line: who answers which packet with which bytes. No input or output."""
+"""Answers of the servos on one line to packets; without input and output."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from beetle_omni_ros.sim.emulated.dynamixel import (
 )
 from beetle_omni_ros.sim.emulated.servo import EmulatedServo
 
-CLEAR_KEY = b'\x01\x44\x58\x4c\x22'  # Clear: "multi-turn information", with its safety bytes
+CLEAR_KEY = b'\x01\x44\x58\x4c\x22'  # Clear "multi-turn information", with its safety bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """An instruction that a servo refused; broadcast ones are refused without an answer."""
+    """A refused instruction; a servo does not answer a refused broadcast."""
 
     identifier: int
     instruction: int
@@ -32,7 +32,7 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """Bytes that a servo puts on the line ``delay`` seconds after its turn has come."""
+    """Bytes of an answer, sent ``delay`` [s] after the previous one."""
 
     data: bytes
     delay: float = 0.0
@@ -43,10 +43,10 @@ class ServoNetwork:
     The servos of one line.
 
     Attributes:
-        servos: in the order of the robot's joints.
-        silent: IDs that neither hear nor answer.
+        servos: servos in the order of the robot's joints.
+        silent: IDs that receive and answer nothing.
         refused: the last refusals, for tests and diagnosis.
-        refusals: how many there were.
+        refusals: number of refusals.
 
     """
 
@@ -58,39 +58,38 @@ class ServoNetwork:
 
     def handle(self, packet: Packet, baud_rate: int, now: float) -> list[Reply]:
         """
-        Let every servo that hears this packet act on it.
+        Execute a packet in every servo that receives it.
 
         Args:
-            packet: as received.
-            baud_rate: of the line; servos at another one hear noise.
-            now: [s] of any steady clock.
+            packet: received packet.
+            baud_rate: baud rate of the line; servos at another one receive nothing.
+            now: time on a monotonic clock [s].
 
         Returns:
-            the answers in the order in which they are sent.
+            answers in the order in which they are sent.
 
         """
-        hearing = {}
+        listening = {}
         for servo in self.servos:
-            if servo['ID'] not in self.silent and servo.listens(now) \
+            if servo['ID'] not in self.silent and servo.booted(now) \
                     and servo.baud_rate == baud_rate:
-                hearing[servo['ID']] = servo
+                listening[servo['ID']] = servo
         if not packet.valid:
-            # Nobody knows whom a broken broadcast was for.
-            servo = hearing.get(packet.identifier)
+            servo = listening.get(packet.identifier)
             return [self._answer(servo, Error.CRC, packet)] if servo else []
-        for servo in hearing.values():
-            servo.hear(now)
+        for servo in listening.values():
+            servo.feed_watchdog(now)
         group = {
             Instruction.SYNC_READ: self._sync_read, Instruction.SYNC_WRITE: self._sync_write,
             Instruction.FAST_SYNC_READ: self._sync_read, Instruction.BULK_READ: self._bulk_read,
             Instruction.FAST_BULK_READ: self._bulk_read,
             Instruction.BULK_WRITE: self._bulk_write}.get(packet.instruction)
         if group:
-            return group(packet, hearing, now) if packet.identifier == BROADCAST else []
+            return group(packet, listening, now) if packet.identifier == BROADCAST else []
         if packet.identifier == BROADCAST:
-            replies = [self._single(servo, packet, now) for _, servo in sorted(hearing.items())]
+            replies = [self._single(servo, packet, now) for _, servo in sorted(listening.items())]
             return replies if packet.instruction == Instruction.PING else []
-        servo = hearing.get(packet.identifier)
+        servo = listening.get(packet.identifier)
         if servo is None or packet.instruction == Instruction.STATUS:
             return []
         level = servo['Status Return Level']
@@ -101,7 +100,7 @@ class ServoNetwork:
     # --- one servo ----------------------------------------------------------------------------
 
     def _single(self, servo, packet, now):
-        """Execute an instruction for one servo; its answer, sent or not."""
+        """Execute an instruction in one servo; return its answer, even if it is not sent."""
         code, given = packet.instruction, packet.parameters
         address = int.from_bytes(given[:2], 'little') if len(given) >= 2 else None
         data = b''
@@ -126,20 +125,20 @@ class ServoNetwork:
         elif code == Instruction.CLEAR and given == CLEAR_KEY:
             error = servo.clear_turns()
         elif code == Instruction.FACTORY_RESET:
-            # The real one would lose ID and baud rate; nothing here may ask for that.
+            # A real servo would lose ID and baud rate; no driver may request that.
             error = Error.RESULT_FAIL
         else:
             error = Error.INSTRUCTION
         return self._answer(servo, error, packet, data, address)
 
     def _answer(self, servo, error, packet, data=b'', address=None, delay=None):
-        self._note(servo, error, packet, address)
-        # The ID may just have changed: the servo answers under the one that was called.
+        self._record_refusal(servo, error, packet, address)
+        # A servo whose ID has just changed answers with the old one.
         name = servo['ID'] if packet.identifier == BROADCAST else packet.identifier
         wait = servo['Return Delay Time'] if delay is None else delay
         return Reply(status(name, error | servo.alert, data), wait * table.DELAY_UNIT)
 
-    def _note(self, servo, error, packet, address=None):
+    def _record_refusal(self, servo, error, packet, address=None):
         if error:
             self.refusals += 1
             self.refused.append(Refusal(servo['ID'], int(packet.instruction), int(error),
@@ -147,22 +146,22 @@ class ServoNetwork:
 
     # --- several servos -----------------------------------------------------------------------
 
-    def _sync_read(self, packet, hearing, now):
+    def _sync_read(self, packet, listening, now):
         given = packet.parameters
         address, length = (int.from_bytes(given[k:k + 2], 'little') for k in (0, 2))
         asked = [(name, address, length) for name in given[4:]]
-        return self._chain(packet, asked, hearing, now)
+        return self._chain(packet, asked, listening, now)
 
-    def _bulk_read(self, packet, hearing, now):
+    def _bulk_read(self, packet, listening, now):
         given = packet.parameters
         if len(given) % 5:
             return []
         asked = [(given[k], int.from_bytes(given[k + 1:k + 3], 'little'),
                   int.from_bytes(given[k + 3:k + 5], 'little')) for k in range(0, len(given), 5)]
-        return self._chain(packet, asked, hearing, now)
+        return self._chain(packet, asked, listening, now)
 
-    def _chain(self, packet, asked, hearing, now):
-        """Answer one after another; each waits for the one before, so a silent one ends it."""
+    def _chain(self, packet, asked, listening, now):
+        """Answers in sequence; each servo waits for the previous one, so a silent one ends it."""
         names = [name for name, _, _ in asked]
         total = sum(4 + length for _, _, length in asked)
         if not asked or len(set(names)) != len(names) or total > LENGTH_LIMIT:
@@ -170,12 +169,12 @@ class ServoNetwork:
         fast = packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
         blocks, delays = [], []
         for name, address, length in asked:
-            servo = hearing.get(name)
+            servo = listening.get(name)
             if servo is None or servo['Status Return Level'] < 1 \
                     or (fast and servo['Firmware Version'] < table.FIRST_FAST_FIRMWARE):
                 break
             error, data = servo.read(address, length, now)
-            self._note(servo, error, packet, address)
+            self._record_refusal(servo, error, packet, address)
             if fast:
                 data = data.ljust(length, b'\0')
             blocks.append((name, error | servo.alert, data))
@@ -186,20 +185,20 @@ class ServoNetwork:
         if not blocks:
             return []
         pieces = fast_status(blocks, total)
-        # They join one packet without a pause; only the first waits.
+        # The parts form one packet without pauses; only the first one has a delay.
         return [Reply(b''.join(pieces), delays[0])]
 
-    def _sync_write(self, packet, hearing, now):
+    def _sync_write(self, packet, listening, now):
         given = packet.parameters
         address, length = (int.from_bytes(given[k:k + 2], 'little') for k in (0, 2))
         rest = given[4:]
         if not length or len(rest) % (length + 1):
             return []
         for k in range(0, len(rest), length + 1):
-            self._silent_write(packet, hearing, rest[k], address, rest[k + 1:k + 1 + length])
+            self._write_unanswered(packet, listening, rest[k], address, rest[k + 1:k + 1 + length])
         return []
 
-    def _bulk_write(self, packet, hearing, now):
+    def _bulk_write(self, packet, listening, now):
         given, place, writes = packet.parameters, 0, []
         while place + 5 <= len(given):
             address, length = (int.from_bytes(given[k:k + 2], 'little')
@@ -208,10 +207,10 @@ class ServoNetwork:
             place += 5 + length
         if place == len(given):
             for name, address, data in writes:
-                self._silent_write(packet, hearing, name, address, data)
+                self._write_unanswered(packet, listening, name, address, data)
         return []
 
-    def _silent_write(self, packet, hearing, name, address, data):
-        servo = hearing.get(name)
+    def _write_unanswered(self, packet, listening, name, address, data):
+        servo = listening.get(name)
         if servo is not None:
-            self._note(servo, servo.write(address, data), packet, address)
+            self._record_refusal(servo, servo.write(address, data), packet, address)

@@ -1,8 +1,8 @@
 """
-Control table of the XC330-T181-T as data.
+Control table of the XC330-T181-T.
 
 Source: emanual.robotis.com/docs/en/dxl/x/xc330-t181, control tables of the EEPROM and RAM areas.
-Indirect addresses (168 on) are left out: their place differs between firmware versions.
+Indirect addresses (168 on) are left out, because they depend on the firmware version.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from math import pi
 
 MODEL_NUMBER = 1210
 EEPROM_END = 64         # registers below it keep their value without power
-FIRST_FAST_FIRMWARE = 46  # fast sync read, startup configuration
+FIRST_FAST_FIRMWARE = 46  # first version with fast sync read and startup configuration
 FIRMWARE = 52
 
 COUNTS_PER_TURN = 4096
@@ -27,8 +27,7 @@ TORQUE_UNIT = 0.000670947
 MULTI_TURN_LIMIT = 1_048_575  # goal positions in modes 4 and 5
 BAUD_RATES = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 
-CURRENT_MODE, VELOCITY_MODE, POSITION_MODE = 0, 1, 3
-EXTENDED_MODE, CURRENT_POSITION_MODE, PWM_MODE = 4, 5, 16
+POSITION_MODE, EXTENDED_MODE, CURRENT_POSITION_MODE = 3, 4, 5   # Operating Mode (11)
 
 # Hardware Error Status (70) and Shutdown (63)
 VOLTAGE_ERROR, OVERHEATING, ENCODER_ERROR, SHOCK, OVERLOAD = 0x01, 0x04, 0x08, 0x10, 0x20
@@ -40,14 +39,14 @@ class Register:
     One entry of the control table.
 
     Attributes:
-        address: of its first byte.
-        size: [B].
-        writable: whether a write is legal at all.
+        address: address of the first byte.
+        size: number of bytes.
+        writable: whether it can be written.
         initial: value of a new servo, or after power-up in the RAM area.
         low: smallest legal value.
-        high: largest legal value; values between are all legal unless ``choices`` is given.
+        high: largest legal value.
         signed: whether it is in two's complement.
-        choices: the legal values, where they have gaps.
+        choices: legal values, if not all between ``low`` and ``high`` are.
 
     """
 
@@ -134,7 +133,7 @@ SIZE = max(register.address + register.size for register in REGISTERS)
 DEFINED = frozenset(address for register in REGISTERS
                     for address in range(register.address, register.address + register.size))
 GOALS = frozenset(('Goal PWM', 'Goal Current', 'Goal Velocity', 'Goal Position'))
-# What a change of the operating mode resets.
+# Registers that a change of the operating mode resets.
 RESET_BY_MODE = ('Velocity I Gain', 'Velocity P Gain', 'Position D Gain', 'Position I Gain',
                  'Position P Gain', 'Feedforward 2nd Gain', 'Feedforward 1st Gain',
                  'Profile Acceleration', 'Profile Velocity')

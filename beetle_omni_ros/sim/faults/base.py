@@ -41,7 +41,7 @@ class Number:
     whole: bool = False
 
     def checked(self, value: Any, at: str) -> float:
-        """Return a legal value as a float; otherwise raise ParameterError, with ``at`` in front."""
+        """Return a legal value as a float, else raise a ParameterError that starts with ``at``."""
         unit = f' {self.unit}' if self.unit else ''
         if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) \
                 or not -inf < value < inf or (self.whole and value != int(value)):
