@@ -194,7 +194,7 @@ class MotorBoard:
             return (f'firmware follows contract {status.contract}, '
                     f'this driver {CONTRACT_VERSION}')
         if NO_HOST_HEARTBEAT in status.conditions:
-            return 'the board does not hear our heartbeat'
+            return 'the board receives no heartbeat of this computer'
         if self._watch.voltage is None:
             return 'battery voltage unknown'
         if not self._watch.clock.known:

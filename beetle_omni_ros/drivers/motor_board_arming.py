@@ -130,8 +130,8 @@ class Arming:
 
 def _disarm_cause(status):
     """Reason why an armed board is not armed any more."""
-    if status is None or status.state == 'boot' or status.stop_reason in ('none',
-                                                                        'watchdog reset'):
+    if status is None or status.state == 'boot' \
+            or status.stop_reason in ('none', 'watchdog reset'):
         return 'restarted' + (' (watchdog reset)' if status and status.stop_reason != 'none'
                               else '')
     return f'{status.state} ({status.stop_reason})'

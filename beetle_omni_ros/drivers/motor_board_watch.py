@@ -91,14 +91,14 @@ class BoardWatch:
         if silent != self._was_silent and connected:
             self._was_silent = silent
             self._event('error' if silent else 'info',
-                      f'nothing heard for {self._parameters.silence:g} s' if silent
-                      else 'heard again')
+                        f'nothing heard for {self._parameters.silence:g} s' if silent
+                        else 'heard again')
         uncertainty = self.clock.uncertainty(now)
         uncertain = self.clock.known and uncertainty > self._parameters.clock_uncertainty_limit
         if uncertain != self._was_uncertain:
             self._was_uncertain = uncertain
             self._event('warning' if uncertain else 'info',
-                      f'offset of its clock known to {1e3 * uncertainty:.1f} ms')
+                        f'offset of its clock known to {1e3 * uncertainty:.1f} ms')
 
     def acknowledged(self, arm: bool) -> None:
         """Update the status after an acknowledged command, before the next heartbeat."""
@@ -113,7 +113,7 @@ class BoardWatch:
         """Record that the port was opened, or lost with the reason ``text``."""
         self._opened = time.monotonic()
         self._event('info' if connected else 'error',
-                  'port opened again' if connected else text)
+                    'port opened again' if connected else text)
 
     def take(self) -> dict:
         """Return what is new since the last call: ``battery``, ``rotors``, ``events``."""
@@ -148,7 +148,7 @@ class BoardWatch:
         if old.armed != new.armed:
             asked = new.stop_reason == 'asked by the host'
             self._event('info' if new.armed or asked else 'error',
-                      'armed' if new.armed else f'disarmed ({new.stop_reason})')
+                        'armed' if new.armed else f'disarmed ({new.stop_reason})')
         for condition in new.conditions if new.armed else ():
             if condition not in old.conditions:
                 self._event('error' if condition in SEVERE else 'warning', condition)
@@ -158,7 +158,7 @@ class BoardWatch:
             return
         self._requests.remove(message.ts1)
         if self.clock.add(message.ts1 / 1e9, message.tc1 / 1e9, now) and self.status is not None:
-            self._event('warning', 'its clock was set anew: restarted?')
+            self._event('warning', 'its clock jumped, perhaps by a restart')
 
     def _on_battery(self, message, now):
         battery = battery_of(message, self._host_clock())
@@ -167,9 +167,9 @@ class BoardWatch:
         if plausible == self._was_implausible:
             self._was_implausible = not plausible
             self._event('info' if plausible else 'warning',
-                      'battery voltage plausible again' if plausible else
-                      f'battery voltage {battery.voltage if battery else math.nan:.1f} V not '
-                      'believed, the last good one is used')
+                        'battery voltage plausible again' if plausible else
+                        f'battery voltage {battery.voltage if battery else math.nan:.1f} V not '
+                        'plausible, the last good one is used')
         if not plausible:
             return
         self._battery = battery
@@ -192,7 +192,7 @@ class BoardWatch:
             online = bool(message.info >> k & 1)
             if online != before:
                 self._event('info' if online else 'error',
-                          f"ESC of rotor {k + 1} {'online again' if online else 'offline'}")
+                            f"ESC of rotor {k + 1} {'online again' if online else 'offline'}")
 
     def _on_rotors(self, message, now):
         self._rotors = rotors_of(message, self._info, self._stamp(message, now))

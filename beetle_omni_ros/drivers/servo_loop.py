@@ -215,7 +215,7 @@ class ServoLoop:
             self._last_obeying = [now] * len(self._last_obeying)
         else:
             self._last_obeying = [now if obeys else seen
-                            for obeys, seen in zip(obeying, self._last_obeying, strict=True)]
+                                  for obeys, seen in zip(obeying, self._last_obeying, strict=True)]
 
     def _write_pending(self):
         """Write new goals if the bus is free; otherwise the holder of the lock does it later."""

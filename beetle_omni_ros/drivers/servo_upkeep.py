@@ -110,7 +110,7 @@ class ServoUpkeep:
     # --- servos -------------------------------------------------------------------------------
 
     def handle_feedback(self, asked: list[Servo], answers: dict[int, tuple[int, bytes]],
-             enabled: bool) -> set[int]:
+                        enabled: bool) -> set[int]:
         """Update the servos; return the IDs that answered. The first without answer is missed."""
         missing, answered, now = None, set(), time.monotonic()
         for servo in asked:

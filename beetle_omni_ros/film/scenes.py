@@ -71,9 +71,9 @@ def model_scene(log: FlightLog, label: str, colour: str, times: np.ndarray,
     """Scene of a flight and the motion that :func:`.free_runs.free_runs` predicts."""
     body, model = _at(motion(log), times), _at(expected, times)
     poses = _flown(log, body)
-    ghosts: list[Pose | None] = [Pose(position, quaternion, pose.tilt, time=pose.time)
-              for position, quaternion, pose in zip(model.position, model.quaternion, poses,
-                                                    strict=True)]
+    ghosts: list[Pose | None] = [
+        Pose(position, quaternion, pose.tilt, time=pose.time) for position, quaternion, pose
+        in zip(model.position, model.quaternion, poses, strict=True)]
     return Scene(label, colour, poses, ghosts,
                  np.linalg.norm(model.position - body.position, axis=1),
                  np.degrees(geodesic_angles(model.quaternion, body.quaternion)),

@@ -49,21 +49,13 @@ class CrashWatch:
             self._airborne += self._tick
             self._flown = self._flown or self._airborne >= self._limits.airborne_time
             return
+        vertical = rotations.up(before.quaternion)[2]   # cosine of the inclination
+        breaks = vertical < np.cos(self._limits.inclination)
         if self._airborne > 0:
-            touch = _touch(before)
+            speed = float(np.linalg.norm(before.velocity))
+            breaks = breaks or speed > self._limits.speed
             if self._airborne >= self._limits.airborne_time:
-                self.impact = touch
-            self._break(touch.speed > self._limits.speed)
-        x, y = before.quaternion[:2]
-        self._break(np.cos(self._limits.inclination) > 1 - 2 * (x * x + y * y))
+                self.impact = Impact(before.stamp, speed, max(0.0, -float(before.velocity[2])),
+                                     float(np.arccos(np.clip(vertical, -1.0, 1.0))))
+        self.broken = self.broken or bool(self._flown and breaks)
         self._airborne = 0.0
-
-    def _break(self, hard):
-        self.broken = self.broken or bool(hard and self._flown)
-
-
-def _touch(truth):
-    speed = float(np.linalg.norm(truth.velocity))
-    up = rotations.matrix(truth.quaternion)[2, 2]
-    return Impact(truth.stamp, speed, max(0.0, -float(truth.velocity[2])),
-                  float(np.arccos(np.clip(up, -1.0, 1.0))))

@@ -128,7 +128,7 @@ class Plant:
         self._commanded_tilt = np.array(tilt)
 
     def set_powered(self, powered: Sequence[bool],
-                   jammed: Sequence[bool] = (False,) * 4) -> None:
+                    jammed: Sequence[bool] = (False,) * 4) -> None:
         """
         Switch the torque of each servo (4,), or jam its joint at its target.
 

@@ -1,4 +1,4 @@
-"""What the tests of bring-up share: limits, quick looks, findings by name."""
+"""Helpers of the bring-up tests: limits, quick checks, findings by item."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ __all__ = ['QUICK', 'LIMITS', 'ROBOT']
 
 
 def named(findings):
-    """Item -> finding; every item stands there once, and what is not well has a remedy."""
+    """Item -> finding; each item is unique, and each finding that is not ok has a remedy."""
     found = {finding.item: finding for finding in findings}
     assert len(found) == len(findings), [finding.item for finding in findings]
     for finding in findings:
@@ -41,7 +41,7 @@ def patiently(look, condition, attempts=8):
 
 
 def levels(found, *, without='ok'):
-    """Item -> level, of what is not well."""
+    """Item -> level of the findings that are not ok."""
     return {item: finding.level for item, finding in found.items() if finding.level != without}
 
 

@@ -1,4 +1,4 @@
-"""Bring-up of the motor board finds each fault, says what to do, and arms nothing."""
+"""The check of the motor board finds each fault, with a remedy, and arms nothing."""
 
 import sys
 
@@ -27,7 +27,7 @@ def emulated():
 
 
 def board_with(emulated, bad, **changes):
-    """Look until exactly ``bad`` is told, item -> level; return the findings."""
+    """Check until exactly the items of ``bad`` (item -> level) are not ok; return the findings."""
     found = patiently(lambda: board(emulated.port, **changes), lambda f: levels(f) == bad)
     assert levels(found) == bad
     return found

@@ -32,7 +32,7 @@ PATIENT = """/**/joint_bridge_node:
 
 @pytest.fixture
 def robot(tmp_path):
-    """Servo bus, motor board, and the arguments that lead to them."""
+    """Servo bus, motor board, and the arguments with their ports."""
     file = tmp_path / 'bus.yaml'
     file.write_text(PATIENT)
     with EmulatedServoBus(motion=JOINTS) as bus, EmulatedMotorBoard(parameters=QUICK) as board:

@@ -1,4 +1,4 @@
-"""A port is judged before it is opened: absent, forbidden, taken, slow, or well."""
+"""Check of a closed port: absent, not permitted, in use, slow, or ok."""
 
 import grp
 import os
@@ -25,7 +25,7 @@ def terminal(tmp_path):
 
 @pytest.fixture
 def sys_root(tmp_path):
-    """A sysfs with one FTDI adapter, ttyUSB0, laid out as the kernel does."""
+    """A sysfs with one FTDI adapter, ttyUSB0."""
     usb = tmp_path / 'sys/devices/usb1/1-2'
     tty = usb / '1-2:1.0/ttyUSB0'
     tty.mkdir(parents=True)
@@ -64,7 +64,7 @@ def test_a_link_to_nothing_and_a_file_are_no_ports(tmp_path):
 
 
 def as_group(monkeypatch, name, members, mode):
-    """Let a port belong to group ``name`` with these members, and not let us use it."""
+    """Make a port inaccessible; it belongs to group ``name`` with these members."""
     real = os.stat
     monkeypatch.setattr(room.os, 'access', lambda *_: False)
     monkeypatch.setattr(room.grp, 'getgrgid', lambda _: (name, 'x', 20, members))
@@ -92,7 +92,7 @@ def test_a_port_without_permission_says_how_to_get_it(terminal, monkeypatch, gro
 
 
 def as_nobody(function):
-    """Run in a child that is not root; return the text that it made."""
+    """Run in a child process that is not root; return its text."""
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
@@ -118,7 +118,7 @@ def test_a_port_that_the_system_forbids_is_refused(terminal):
 
 
 def other_process(program, *arguments):
-    """Start Python on a program that says a line once it is ready and waits."""
+    """Start a Python program that prints a line when it is ready, and waits."""
     process = subprocess.Popen([sys.executable, '-c', program, *arguments], text=True,
                                stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     return process, process.stdout.readline().strip()

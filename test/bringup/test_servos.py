@@ -1,4 +1,4 @@
-"""Bring-up of the servo bus finds each fault, says what to do, and changes nothing."""
+"""The check of the servo bus finds each fault, with a remedy, and changes nothing."""
 
 import sys
 
@@ -21,7 +21,7 @@ NAMES = [f'gimbal{k}' for k in (1, 2, 3, 4)]
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    """Few reads and few ids are enough here."""
+    """Use few reads and few IDs."""
     monkeypatch.setattr(room, 'ROUNDS', 5)
     monkeypatch.setattr(room, 'OTHER_IDS', (1, 7))
 

@@ -1,4 +1,4 @@
-"""Observations of ROS are judged: rates, ages, clocks, units, twins, bridges."""
+"""Check of the topics: rates, ages, clocks, units, several publishers, bridges."""
 
 from looks import levels, LIMITS, named, ROBOT
 import numpy as np
@@ -10,7 +10,7 @@ from beetle_omni_ros.bringup.topics import check_topics
 
 
 def stream(rate, age, jitter=0.001, size=9.81, seconds=3.0, seed=0):
-    """A topic at an even rate."""
+    """A topic at a constant rate."""
     rng = np.random.default_rng(seed)
     arrivals = 100.0 + np.arange(0, seconds, 1 / rate)
     return Stream(arrivals=list(arrivals), ages=list(age + jitter * rng.random(len(arrivals))),
@@ -18,7 +18,7 @@ def stream(rate, age, jitter=0.001, size=9.81, seconds=3.0, seed=0):
 
 
 def graph(**streams):
-    """Both sensors as they should be, or replaced by name."""
+    """A graph with two good sensors, or with the given streams."""
     made = {'mocap': stream(100, 0.010), 'imu': stream(200, 0.001)} | streams
     names = {'mocap': 'mocap/pose', 'imu': 'imu/data_raw', 'joints': 'joint_states',
              'battery': 'battery_state'}

@@ -1,4 +1,4 @@
-"""Keys, sticks and words become shifts, goals and orders; what is none is refused in one line."""
+"""Keys, joystick axes and typed commands give shifts and goals; other input is refused."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The target moves within its limits, keeps its leash and never goes where it may not."""
+"""The target moves within its limits and only to permitted poses."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""An emulated motor board, a driver on it, and a loop that flies."""
+"""An emulated motor board, its driver, and a loop that sends targets."""
 
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,13 +18,13 @@ HOVER = np.array([7.0, 7.5, 8.0, 8.5])
 
 
 def driver(port, **changes):
-    """Driver for a port, quick to reconnect."""
+    """Driver with a short reconnect period."""
     return MotorBoard(replace(MotorBoardParameters.load(), port=port, reconnect_period=0.05,
                               **changes))
 
 
 def until(condition, timeout=3.0):
-    """Wait for a condition; tell whether it came."""
+    """Wait for a condition; return whether it became true."""
     end = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > end:
@@ -34,7 +34,7 @@ def until(condition, timeout=3.0):
 
 
 class Pilot:
-    """Sends thrusts at 200 Hz from a thread of its own, as a bridge does."""
+    """Sends thrusts at 200 Hz in a thread, as a bridge does."""
 
     def __init__(self, board):
         self.board, self.thrust, self.results, self.events = board, HOVER, [], []
@@ -49,12 +49,12 @@ class Pilot:
             time.sleep(max(0.0, due - time.monotonic()))
 
     def heard(self, text):
-        """Whether an event with this text has come."""
+        """Whether an event with this text arrived."""
         self.events += self.board.poll().events
         return any(text in event for _, event in self.events)
 
     def __enter__(self):
-        """Begin."""
+        """Start to send."""
         self._thread.start()
         return self
 

@@ -92,7 +92,7 @@ BY_BOARD = (TIME_ANSWER, ACCEPTED, REFUSED, BOARD_HEARTBEAT, BATTERY, ESC_STATUS
 
 
 def crc(data):
-    """CRC-16/MCRF4XX, one bit after the other."""
+    """CRC-16/MCRF4XX, bit by bit."""
     value = 0xFFFF
     for byte in data:
         for k in range(8):
@@ -145,7 +145,7 @@ def parse(frame):
 
 
 def split(data):
-    """Frames of a stream that holds nothing else."""
+    """Frames of a stream without other bytes."""
     frames = []
     while data:
         frames.append(data[:12 + data[1]])

@@ -1,4 +1,4 @@
-"""A driver and the emulated servos that it cannot tell from real ones, as in the bridge's loop."""
+"""A driver with emulated servos, in a loop as in the bridge."""
 
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,7 +21,7 @@ COUNT = 2 * np.pi / 4096  # [rad]
 
 @contextmanager
 def bench(guard=False, timing=PATIENT, servos=None, **parameters):
-    """Open a bus of emulated servos that move by themselves; nothing is configured yet."""
+    """Open a bus of emulated servos with a motion model, not configured."""
     with EmulatedServoBus(**{'motion': JOINTS, 'reboot_time': 0.05, **(servos or {})}) as emulated:
         bus = ServoBus(replace(SHIPPED, port=emulated.port, guard=guard, timing=timing,
                                **parameters), JOINTS)
@@ -34,7 +34,7 @@ def bench(guard=False, timing=PATIENT, servos=None, **parameters):
 
 @contextmanager
 def running(**options):
-    """The same, configured and with torque on."""
+    """As :func:`bench`, configured and with torque on."""
     with bench(**options) as (bus, emulated):
         bus.configure()
         bus.enable()
@@ -43,7 +43,7 @@ def running(**options):
 
 
 def tick(bus, goal):
-    """Do what the bridge does each 5 ms; return the readings and reports."""
+    """Run one cycle of the bridge; return readings and reports."""
     bus.write_goals(goal)
     return bus.read(), bus.poll_health()
 
@@ -60,6 +60,6 @@ def until(condition, bus, goal, limit=5.0):
 
 
 def arrived(goal):
-    """Condition: all servos answer and stand at the goal."""
+    """Condition: all servos answer and are at the goal."""
     return lambda readings, _: (readings.valid.all() and np.allclose(readings.position, goal,
                                                                      atol=2 * COUNT))

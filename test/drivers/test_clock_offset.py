@@ -1,4 +1,4 @@
-"""The offset estimate: its bound holds whatever the delays, and a restart is noticed."""
+"""Offset of clocks: the bound is valid for any delays, and a restart is detected."""
 
 import math
 
@@ -13,7 +13,7 @@ DELAYS = strategies.floats(1e-5, 0.2)
 @given(strategies.floats(-1e4, 1e4), strategies.floats(-1e-4, 1e-4),
        strategies.lists(strategies.tuples(DELAYS, DELAYS), min_size=1, max_size=50))
 def test_the_truth_lies_within_the_bound(start, drift, delays):
-    """With delays of 10 us to 0.2 s, however unequal there and back, and drift within bounds."""
+    """With unequal delays of 10 us to 0.2 s, and drift within its bound."""
     clock, now = ClockOffset(1e-4), 100.0
 
     def truth(time):

@@ -1,4 +1,4 @@
-"""Framing: any bytes, in any pieces, never a crash, always in step again at once."""
+"""Framing: any bytes in any pieces raise nothing, and the next valid frame is found."""
 
 from hypothesis import given, settings, strategies
 import pytest
@@ -53,7 +53,7 @@ def test_cuts_between_reads_do_not_matter(frames, cuts):
 @settings(max_examples=300, deadline=None)
 @given(NOISE, strategies.lists(FRAMES, min_size=1, max_size=4))
 def test_good_frames_behind_noise_are_all_found(noise, frames):
-    """As soon as no broken header can still wait for its end."""
+    """Once no corrupt header can still wait for the end of its frame."""
     for receiver in receivers():
         receiver.feed(noise)
         found = receiver.feed(b''.join(frames) + bytes(300))
@@ -107,7 +107,7 @@ def test_a_restart_of_the_sender_is_no_loss():
 
 
 def test_signed_frames_are_refused():
-    """The contract has none; their extra bytes must not be taken for data."""
+    """The contract excludes them; their additional bytes are not data."""
     frame = bytearray(reference.ACCEPTED)
     frame[2] = 1
     for receiver in receivers():
@@ -115,7 +115,7 @@ def test_signed_frames_are_refused():
 
 
 def test_pymavlinks_framing_would_lose_good_packets():
-    """Why the driver frames by itself; when this fails, pymavlink has learnt it."""
+    """Reason for the framing in the driver; if this fails, pymavlink has improved."""
     spoilt = bytearray(reference.BATTERY)
     spoilt[1] = 200
     stream = bytes(spoilt) + 3 * reference.ESC_STATUS + bytes(300)

@@ -1,4 +1,4 @@
-"""When the board is armed, disarmed and given up: the rule alone, on a board of cardboard."""
+"""Rules of arming, disarming and loss of the board, on a simple substitute of the board."""
 
 from dataclasses import dataclass
 
@@ -19,14 +19,14 @@ ARMED = BoardStatus(0.0, 'armed', 'none', (), 1)
 
 @dataclass
 class Command:
-    """An arm or disarm command; ``result`` is None as long as nobody has answered."""
+    """An arm or disarm command; ``result`` is None until it is answered."""
 
     arm: bool
     result: CommandResult | None = None
 
 
 class Cardboard:
-    """A board that answers when the test says so."""
+    """A board whose answers are set by the test."""
 
     def __init__(self):
         self.ready, self.status, self.commands = '', DISARMED, []
@@ -51,7 +51,7 @@ class Cardboard:
 
     @property
     def asked(self):
-        """What was asked last: True arm, False disarm."""
+        """Last command: True to arm, False to disarm."""
         return self.commands[-1].arm if self.commands else None
 
 
@@ -62,7 +62,7 @@ def bench():
 
 
 def in_flight(bench):
-    """Let it arm and fly."""
+    """Arm the board and enter 'flies'."""
     board, arming = bench
     arming.follow('disarmed')
     board.answer()

@@ -1,4 +1,4 @@
-"""Every fault of the motor board in flight: its outcome and what is said about it."""
+"""Outcome and events of every fault of the motor board in flight."""
 
 import time
 
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.real_time
 
 
 def keeps_flying(emulated, seconds=0.6):
-    """Whether the rotors never stop for this long."""
+    """Whether the rotors run during this time."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if not emulated.commands.all():
@@ -24,7 +24,7 @@ def keeps_flying(emulated, seconds=0.6):
 
 
 def stays_stopped(emulated, seconds=0.5):
-    """Whether no rotor turns for this long, though the pilot goes on sending."""
+    """Whether no rotor turns during this time, although targets are sent."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if emulated.commands.any():
@@ -115,7 +115,7 @@ def test_an_impossible_voltage_is_not_believed():
     with flying() as (emulated, board, pilot):
         before = emulated.commands
         emulated.set_battery(3.0, 0.0)
-        assert until(lambda: pilot.heard('3.0 V not believed'))
+        assert until(lambda: pilot.heard('3.0 V not plausible'))
         np.testing.assert_array_equal(emulated.commands, before)
 
 

@@ -1,4 +1,4 @@
-"""Stamps of targets on the board's clock: rising, repeating, free of steps of our clock."""
+"""Stamps of targets on the board's clock: rising, repeating, without steps of the host clock."""
 
 import time
 
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.real_time
 
 
 def test_a_step_of_our_clock_does_not_stop_the_rotors():
-    """Stamps and clock step together; the board's clock is told by the stamps' age."""
+    """Stamps and clock step together; the age of a stamp gives the board's clock."""
     shift = [0.0]
     with connected() as (emulated, board):
         board._clock = lambda: time.time() + shift[0]

@@ -1,4 +1,4 @@
-"""What is made of the board's messages, whatever numbers they hold."""
+"""State from the board's messages, for any numbers in them."""
 
 import time
 
@@ -22,12 +22,12 @@ PAYLOADS = strategies.sampled_from(sorted(emulated.MESSAGES)).flatmap(
 
 
 def watch():
-    """One that has heard nothing."""
+    """A BoardWatch without messages."""
     return BoardWatch(PARAMETERS, ROBOT, time.time)
 
 
 def received(number, values):
-    """A message of the board as the receiver hands it out."""
+    """A decoded message of the board."""
     (message,) = MavlinkReceiver(1, 1).feed(emulated.pack(number, values, 0, 1, 1))
     return message
 
@@ -35,7 +35,7 @@ def received(number, values):
 @settings(max_examples=400, deadline=None)
 @given(strategies.lists(PAYLOADS, max_size=8))
 def test_good_frames_with_any_content_do_no_harm(payloads):
-    """The voltage for the thrust map stays one that a pack can have."""
+    """The voltage for the thrust map remains plausible."""
     board = watch()
     for number, payload in payloads:
         message = received(number, emulated.MESSAGES[number][1].unpack(payload))

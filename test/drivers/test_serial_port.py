@@ -1,4 +1,4 @@
-"""The serial port never blocks, and says what is wrong with it."""
+"""The serial port does not block, and its errors name the cause."""
 
 import os
 import pty
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.real_time
 
 @pytest.fixture
 def ends():
-    """A port's other end, and the port's name."""
+    """Other end and path of a port."""
     device, other = pty.openpty()
     tty.setraw(other)
     yield device, os.ttyname(other)
@@ -41,7 +41,7 @@ def test_bytes_arrive_unchanged_both_ways(ends):
 
 
 def test_a_full_buffer_drops_whole_frames_without_waiting(ends):
-    """Nobody reads at the other end; pyserial's own write would never return."""
+    """Without a reader at the other end, pyserial's write would not return."""
     device, name = ends
     port = SerialPort(name, 921600)
     frames = [bytes([k % 256]) * 55 for k in range(2000)]

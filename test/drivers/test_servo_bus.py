@@ -1,4 +1,4 @@
-"""The driver's ordinary life: settings, angles, torque, and what it refuses."""
+"""The driver without faults: settings, angles, torque, refusals."""
 
 from dataclasses import replace
 

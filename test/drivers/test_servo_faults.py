@@ -1,4 +1,4 @@
-"""Every fault of the bus, switched on while the loop runs, has its outcome."""
+"""Outcome of every fault of the bus in the running loop."""
 
 import time
 
@@ -21,7 +21,7 @@ BRISK = {'timing': PATIENT.__class__(**{**{name: getattr(PATIENT, name)
 
 
 def powered(readings, reports):
-    """All answer, have torque, and nothing is wrong."""
+    """Condition: all servos answer and have torque and no error."""
     return readings.valid.all() and all(
         one.torque and one.responding and not one.recovering and not one.message
         for one in reports)
@@ -62,7 +62,7 @@ def test_silent_servos_are_left_out_and_the_others_fly_on(silent, firmware):
             unheard += not (readings.valid == others).all()
             missing += not readings.valid[others].all()
         assert (readings.valid == others).all()
-        # The suspect is asked last: it costs the others one reading.
+        # The missing servo is last in the request, so the others lose one reading only.
         assert missing <= len(silent)
         assert unheard <= PATIENT.silent_after * len(silent)
         for one, other in zip(reports, others, strict=True):
@@ -93,7 +93,7 @@ def test_a_brief_overload_ends_in_a_restart_with_torque():
         emulated.faults.overload = set()
         readings, _ = until(powered, bus, GOAL)
         assert emulated.torque_enabled.all()
-        # It stood beyond half a turn: the turn count survived the restart.
+        # It was beyond half a turn, so the turn count was restored after the restart.
         assert readings.position[2] == pytest.approx(GOAL[2], abs=0.05)
         assert any('restarting it' in line for line in bus.take_events())
 

@@ -1,4 +1,4 @@
-"""No servo keeps its torque when the driver's process is gone, however it went."""
+"""No servo keeps its torque after any end of the driver's process."""
 
 import os
 from pathlib import Path
@@ -71,7 +71,7 @@ def test_the_servos_own_watchdog_stops_them_when_nobody_is_left():
             process.kill()
             process.wait(5)
             wait_for(lambda: emulated.stopped.all())
-            # They hold where they are: the angle that the plant gave them.
+            # They hold the angle set by the plant.
             assert emulated.goals == pytest.approx([0, 0, 0, 0], abs=0.001)
         finally:
             process.kill()

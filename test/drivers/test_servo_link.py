@@ -1,4 +1,4 @@
-"""Answers on the wire against what is made of them: late, cut off, damaged."""
+"""Late, truncated and corrupt answers."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,7 +14,7 @@ DATA = {name: bytes(range(name, name + 10)) for name in IDS}
 
 
 class Wire(ServoPort):
-    """A port that plays back answers and keeps what was sent."""
+    """A port with prepared answers, which stores sent packets."""
 
     def __init__(self, *answers):
         super().__init__('wire', 1_000_000, 0.001)
@@ -42,7 +42,7 @@ def linked(*answers, fast=True):
 
 
 def joint(data, error=0):
-    """The one answer to a fast sync read."""
+    """The common answer to a fast sync read."""
     length = len(next(iter(data.values()))) + 4
     return b''.join(fast_status([(name, error, part) for name, part in data.items()],
                                 length * len(data)))
@@ -147,7 +147,7 @@ def test_a_closed_link_says_so():
 
 
 def sealed(name, length, rest):
-    """Bytes with a header and a CRC that fits, though little else may."""
+    """Bytes with a header and a correct CRC, and otherwise any content."""
     raw = b'\xff\xff\xfd\0' + bytes((name,)) + length.to_bytes(2, 'little') + b'\x55' + rest
     return raw + crc16(raw).to_bytes(2, 'little')
 

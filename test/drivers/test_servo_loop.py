@@ -1,4 +1,4 @@
-"""The bus's thread: goals at once, never two transactions at a time, an even pace."""
+"""The loop of the bus: goals without delay, one transaction at a time, constant rate."""
 
 from threading import Event, Lock, Thread
 import time
@@ -14,7 +14,7 @@ VALID = np.ones(4, bool)
 
 
 class FakeBus:
-    """Keeps what was written; checks that it is never used by two at a time."""
+    """Stores goals; checks that only one thread uses it at a time."""
 
     def __init__(self):
         self.parameters = SimpleNamespace(port='/dev/none')
@@ -55,7 +55,7 @@ class FakeBus:
 
 
 class Clock:
-    """A clock that tests move."""
+    """A clock set by tests."""
 
     def __init__(self):
         self.now = 100.0
@@ -187,7 +187,7 @@ def test_a_mistake_in_the_thread_closes_the_bus_and_is_told():
 # --- the pace ---------------------------------------------------------------------------------
 
 def run(pace, now, cycles, goals=None, late=lambda k: 0.0):
-    """Run cycles on a made-up clock; return when each began."""
+    """Run cycles on a simulated clock; return their start times."""
     began = []
     for k in range(cycles):
         due = now + pace.wait(now)

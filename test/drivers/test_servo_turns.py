@@ -1,4 +1,4 @@
-"""The lost turn count: what is certain, what is refused, and how it is settled."""
+"""Lost turn counts: unambiguous angles, refusals, confirmation by the operator."""
 
 from dataclasses import replace
 from math import pi
@@ -16,7 +16,7 @@ TRAVEL = JOINTS.position_limit
 
 
 def place(emulated, angles):
-    """Put the servos somewhere and switch their power off and on: they forget the turns."""
+    """Move the servos to angles and switch their power off and on, which clears the turns."""
     emulated.set_state(angles, np.zeros(4), np.zeros(4))
     for index in range(4):
         emulated.servos[index].reboot(-1.0)
@@ -97,7 +97,7 @@ def test_turns_are_kept_over_disable_while_the_servo_has_power():
         goal = np.array([3.9, -3.9, 0.0, 0.0])
         until(arrived(goal), bus, goal)
         bus.disable()
-        # By hand, without anybody reading, by more than half a turn.
+        # By hand, without readings, by more than half a turn.
         emulated.set_state([-0.5, 0.5, 0.0, 0.0], np.zeros(4), np.zeros(4))
         bus.configure()
         bus.enable()

@@ -1,4 +1,4 @@
-"""Films: the flight is in the picture, models drift where they are wrong, files play."""
+"""Films: the flight is in the picture, wrong models drift, files can be played."""
 
 import os
 import subprocess
@@ -26,7 +26,7 @@ POSES = np.array([[0, 0, 1.0, 0, 0, 0], [0.6, 0.3, 1.2, 0, 30, 40]])
 
 
 def film(*arguments, **environment):
-    """Run `beetle_omni film` in a process of its own: MuJoCo chooses its OpenGL once."""
+    """Run `beetle_omni film` in a new process, because MuJoCo selects its OpenGL once."""
     return subprocess.run(
         [sys.executable, '-m', 'beetle_omni_ros.cli', 'film', *map(str, arguments)], timeout=240,
         capture_output=True, text=True, env={**os.environ, **environment})
@@ -48,7 +48,7 @@ def test_a_still_camera_sees_all_of_a_flight(seed):
     points = random.uniform(-1, 1, (40, 3)) * random.uniform(0.01, 3, 3) + random.uniform(-2, 2, 3)
     camera = framing(points)
     azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
-    # As MuJoCo defines them: the eye looks along these angles, from a distance.
+    # Definition of MuJoCo: the camera looks along these angles from a distance.
     look = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
                      np.sin(elevation)])
     side = np.cross(look, [0, 0, 1.0])
@@ -127,8 +127,8 @@ def test_a_film_shows_the_robot_move(bag, tmp_path):
                 frame[3 * size // 10:17 * size // 20, size * panel:size * (panel + 1)]
                 for frame in (frames[0], frames[-1]))
             assert (np.abs(first - last).max(axis=2) > 60).sum() > 80
-            # Sky and floor are blue; the front rotors and arms alone are reddish. How bright
-            # they are depends on the computer's OpenGL, their hue does not.
+            # Sky and floor are blue; only the front rotors and arms are reddish. Their
+            # brightness depends on the OpenGL, their hue does not.
             reddish = first[..., 0] - first[..., 1:].max(axis=2) > 20
             assert reddish.sum() > 80
 

@@ -1,4 +1,4 @@
-"""Variants of the shipped robot, and small measurements on a plant, for the simulator's tests."""
+"""Variants of the shipped robot, and measurements on a plant."""
 
 from dataclasses import replace
 
@@ -16,14 +16,14 @@ HIGH = np.array([0.0, 0.0, 20.0])
 
 
 def massless_modules(**changes):
-    """The robot with modules that neither weigh nor resist: one rigid body."""
+    """The robot with modules without mass and inertia, a single rigid body."""
     module = replace(ROBOT.multibody.module, mass=0.0, inertia=np.zeros(3),
                      centre_of_mass=np.zeros(3))
     return replace(ROBOT, multibody=replace(ROBOT.multibody, module=module), **changes)
 
 
 def immovable():
-    """The robot with so heavy a main body that its joints turn as on a bench, without gravity."""
+    """The robot with a very heavy main body and without gravity, as on a test bench."""
     return replace(ROBOT, mass=190.0, inertia=np.full(3, 90.0), gravity=0.0)
 
 
@@ -35,7 +35,7 @@ def plant(robot=ROBOT, position=HIGH, quaternion=LEVEL, variation=None):
 
 
 def momenta(made):
-    """Linear momentum, angular momentum about the world's origin, centre of mass: by bodies."""
+    """Linear momentum, angular momentum about the world's origin, centre of mass."""
     model, data = made.model, made.data
     mujoco.mj_forward(model, data)
     linear, angular, first = np.zeros(3), np.zeros(3), np.zeros(3)

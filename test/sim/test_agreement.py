@@ -44,7 +44,7 @@ def difference(found, expected):
 
 
 def module_reaction():
-    """What the described modules are as an effect, by Steiner's theorem."""
+    """The effect that is equivalent to the modules, by Steiner's theorem."""
     module = ROBOT.multibody.module
     depth = -module.centre_of_mass[2]
     return {'module_inertia': module.inertia[0] + module.mass * depth ** 2,
@@ -64,7 +64,7 @@ def test_plant_without_module_inertia_agrees_with_casadi(robot):
 
 
 def test_modules_known_by_their_effect_alone_act_as_the_described_ones():
-    """From a file without parts but with the effect, the plant moves like the whole one."""
+    """The plant with the effect instead of modules has the same motion."""
     described = plant(ROBOT)
     by_effect, rigid = (plant(replace(ROBOT, multibody=None, effects=e))
                         for e in ({'module_reaction': module_reaction()}, {}))
@@ -118,7 +118,7 @@ def test_plant_without_module_inertia_agrees_with_newton_euler():
 
 
 def test_true_modules_shift_the_centre_of_gravity():
-    """All modules at 90 deg: their centres of mass, beside the axes, pull as weight does."""
+    """With all modules at 90 deg, gravity acts on their eccentric centres of mass."""
     made, rigid = plant(), plant(massless_modules())
     tilt = np.array([1, 1, -1, -1]) * np.pi / 2
     state = ([0, 0, 10], [0, 0, 0, 1], np.zeros(3), np.zeros(3), tilt, np.zeros(4),

@@ -1,4 +1,4 @@
-"""The pack: sag under load, voltage falling with charge, thrust limit."""
+"""The battery: sag under load, voltage by charge, thrust limit."""
 
 from dataclasses import replace
 

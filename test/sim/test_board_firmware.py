@@ -13,7 +13,7 @@ BOOTED = 100.0
 
 
 class Bench:
-    """A board on the table, and hands that send to it."""
+    """A board and functions that send messages to it."""
 
     def __init__(self, voltage=25.0):
         self.now = BOOTED

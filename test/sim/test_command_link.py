@@ -1,4 +1,4 @@
-"""Commands reach the actuators checked, delayed and not after they have ceased."""
+"""Commands to the actuators: checks, delay, timeout."""
 
 from types import SimpleNamespace
 

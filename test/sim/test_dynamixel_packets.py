@@ -1,4 +1,4 @@
-"""Packets against the bytes printed in the protocol's document, and the stream they come in."""
+"""Packets against the examples in the protocol's document; streams of packets."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -57,7 +57,7 @@ payloads = st.tuples(
 
 
 def test_crc_has_the_published_generator():
-    # By definition: dividing the message, with its CRC behind it, leaves nothing.
+    # By definition, the remainder of the message with its CRC is zero.
     message = bytes(range(37))
     assert crc16(message + crc16(message).to_bytes(2, 'big')) == 0
     assert crc16(b'\x01') == 0x8005

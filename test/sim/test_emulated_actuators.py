@@ -1,4 +1,4 @@
-"""Devices and simulator, coupled: commands arrive as on the direct path, faults are felt."""
+"""Coupled devices and simulator: timing as without devices, effects of faults."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ HOVER = ROBOT.hover_thrust
 
 
 class Bus:
-    """Servos that do at once what they are told, and keep what they are shown."""
+    """Servos that take their goals without delay, and store their sensor values."""
 
     def __init__(self):
         self.goals, self.powered, self.stopped = [0.0] * 4, [True] * 4, [False] * 4
@@ -38,7 +38,7 @@ class Bus:
 
 
 class Board:
-    """A board that gives the thrusts that it is told."""
+    """A board with prescribed thrusts."""
 
     def __init__(self):
         self.thrust_targets = np.zeros(4)

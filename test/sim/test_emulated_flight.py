@@ -1,4 +1,4 @@
-"""The real robot's drivers fly the simulated one through the emulated devices, in real time."""
+"""The drivers fly the simulated robot through the emulated devices in real time."""
 
 from dataclasses import replace
 import time
@@ -30,7 +30,7 @@ TICK = 0.005
 
 
 class Flight:
-    """Simulator, devices, drivers and a bridge's loop, all in one thread but the devices'."""
+    """Simulator, devices, drivers and the loop of a bridge in one thread, without the devices."""
 
     def __init__(self):
         self.simulator = Simulator(ROBOT, WORLD)
@@ -46,7 +46,7 @@ class Flight:
         self.told = {}
 
     def __enter__(self):
-        """Torque on and armed."""
+        """Switch the torque on and arm."""
         self.bus.open()
         self.bus.configure()
         self.bus.enable()
@@ -57,13 +57,13 @@ class Flight:
         return self
 
     def __exit__(self, *_):
-        """Off."""
+        """Disarm and switch the torque off."""
         self.bus.close()
         self.board.close()
         self.actuators.close()
 
     def cycle(self):
-        """Do what happens in 5 ms."""
+        """Run one cycle of 5 ms."""
         began = time.monotonic()
         self.frame = self.actuators.step()
         self.bus.write_goals(self.tilt)
@@ -78,13 +78,13 @@ class Flight:
         time.sleep(max(0.0, began + TICK - time.monotonic()))
 
     def run(self, seconds):
-        """Fly so many seconds."""
+        """Fly for a time [s]."""
         for _ in range(round(seconds / TICK)):
             self.cycle()
         return self
 
     def until(self, condition, seconds=3.0):
-        """Fly until something is so."""
+        """Fly until a condition is true."""
         for _ in range(round(seconds / TICK)):
             self.cycle()
             if condition():

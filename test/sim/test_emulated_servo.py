@@ -1,4 +1,4 @@
-"""What an emulated servo refuses, and how it protects itself, as the manual has it."""
+"""Refusals and protections of an emulated servo by the manual."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st

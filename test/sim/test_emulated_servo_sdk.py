@@ -1,4 +1,4 @@
-"""The maker's SDK talks to the emulated bus through a real pseudo-terminal: it is the judge."""
+"""The maker's SDK as a reference for the emulated bus, through a pseudo-terminal."""
 
 from pathlib import Path
 from random import Random
@@ -19,7 +19,7 @@ ALL = (1, 2, 3, 4)
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
-    """Let the SDK wait as long as it does out of the box; the driver shortens it globally."""
+    """Restore the default time limit of the SDK, which the driver changes globally."""
     monkeypatch.setattr(sdk.port_handler, 'LATENCY_TIMER', 16)
 
 

@@ -1,4 +1,4 @@
-"""Faults of the simulated robot: each changes what it says, when it says, and nothing else."""
+"""Faults of the simulated robot: each has its stated effect at its time, and no other."""
 
 from dataclasses import replace
 from math import inf
@@ -31,7 +31,7 @@ GIVEN = {'rotor': 2, 'servo': 3, 'share': 0.5, 'time_constant': 0.1, 'rate': 1.0
 
 
 def some(kind, **times):
-    """A fault of a kind, strong enough to be seen."""
+    """A fault of a kind with a measurable effect."""
     numbers = {key: GIVEN[key] for key, number in KINDS[kind].numbers.items()
                if number.default is None}
     return Fault(kind, **{**numbers, **GIVEN.get(kind, {}), **times})
@@ -52,7 +52,7 @@ def flight(*faults, ticks=160, seed=3, conditions='nominal'):
 
 
 def flat(reading):
-    """All numbers of a reading; () where there is none."""
+    """All numbers of a reading; () for None."""
     if reading is None:
         return ()
     values = [getattr(reading, name) for name in reading.__slots__ if name != 'names']

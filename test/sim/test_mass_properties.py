@@ -1,4 +1,4 @@
-"""The parts add up to the totals of the robot file."""
+"""The parts have the totals of the robot file."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Servos and rotors of the plant answer as their parameters say."""
+"""Servos and rotors of the plant have the response of their parameters."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def test_unloaded_servo_answers_as_the_second_order_system():
 
 
 def test_servo_sags_by_load_over_stiffness():
-    """Accelerated upward, a module at 90 deg hangs on its servo as it would in gravity."""
+    """Upward acceleration loads the servo of a module at 90 deg like gravity."""
     made = plant(immovable())
     made.set_targets(np.full(4, np.pi / 2), np.zeros(4))
     acceleration = 9.8
@@ -129,7 +129,7 @@ def test_torque_that_returns_takes_the_joint_to_its_target_again():
 
 
 def test_a_joint_without_torque_lets_its_module_hang():
-    """Accelerated upward as in gravity, the module swings to below its axis."""
+    """With upward acceleration, as with gravity, the module swings below its axis."""
     made = plant(immovable())
     made.set_targets(np.ones(4), np.zeros(4))
     for k in range(800):

@@ -1,4 +1,4 @@
-"""The multibody plant obeys mechanics: free fall, momentum, energy, ground, payload."""
+"""Mechanics of the multibody plant: free fall, momentum, energy, ground, payload."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Pictures are optional, and right where graphics exist."""
+"""Pictures are optional, and correct if graphics are available."""
 
 import os
 import subprocess

@@ -92,7 +92,7 @@ def test_readings_are_the_truth_of_their_stamps():
 
 
 def test_imu_readings_sum_to_the_motion_even_through_jolts():
-    """Strapdown integration of the readings follows the truth while modules slam about."""
+    """Strapdown integration of the readings follows the truth during fast tilt motion."""
     quiet = replace(WORLD, imu=replace(WORLD.imu, specific_force_noise=0.0,
                                        angular_velocity_noise=0.0))
     simulator = Simulator(ROBOT, quiet)

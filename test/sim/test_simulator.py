@@ -1,4 +1,4 @@
-"""The simulator as the flight stack meets it."""
+"""The interface of the simulator."""
 
 from dataclasses import replace
 
