@@ -1,4 +1,4 @@
-"""`beetle_omni identify`: measured logs in, numbers, a page and a robot file out."""
+"""`beetle_omni identify`: from measured logs to numbers, a page and a robot file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from beetle_omni_ros.identify import joint_results as of_joints
 from beetle_omni_ros.identify import rotor_results as of_rotor
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import read_joint_log
-from beetle_omni_ros.identify.joint_page import grids, joint_page
 from beetle_omni_ros.identify.joint_servos import file_servos
 from beetle_omni_ros.identify.robot_file import check_not_base, write_text
 from beetle_omni_ros.identify.rotor import identify_rotor
@@ -30,10 +29,10 @@ def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path
     Arguments are those of `beetle_omni identify joint`.
 
     Returns:
-        the results as in INTERFACES: ``joints``, and ``meta``.
+        results with the keys of INTERFACES: ``joints`` and ``meta``.
 
     Raises:
-        LogError, ParameterError: unusable input, in one line.
+        LogError, ParameterError: unusable input.
 
     """
     console = console or Console()
@@ -48,12 +47,12 @@ def run_identify_joint(path: Path, *, validate: Sequence[Path] = (), robot: Path
     results = of_joints.joint_results(log, validations, models, published, servos)
     if robot:
         results['meta']['robot'] = str(robot)
-    _print(console, grids(results, brief=True), results['text'])
+    _print(console, of_joints.grids(results, brief=True), results['text'])
     if json_path:
         write_json(json_path, results)
     if report:
-        write_text(report, joint_page(log, validations, models, servos, results),
-                             'report')
+        write_text(report, of_joints.joint_page(log, validations, models, servos, results),
+                   'report')
     if params:
         of_joints.write_joint_file(params, results, robot)
     return results
@@ -71,7 +70,7 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
         ``plateaus``, ``torque_to_thrust_ratio``, ``warnings`` and ``meta``.
 
     Raises:
-        LogError, ParameterError: unusable input, in one line.
+        LogError, ParameterError: unusable input.
 
     """
     console = console or Console()
@@ -87,7 +86,7 @@ def run_identify_rotor(path: Path, *, robot: Path | None = None, json_path: Path
         write_json(json_path, results)
     if report:
         write_text(report, of_rotor.rotor_page(log, rows, ratio, robot_parameters, results),
-                             'report')
+                   'report')
     if params:
         of_rotor.write_rotor_file(params, results, robot)
     return results

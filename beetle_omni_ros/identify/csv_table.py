@@ -1,4 +1,4 @@
-"""Measured tables: CSV with units in the column names, and errors that name row and column."""
+"""CSV tables with units in the column names, and errors with row and column."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 
 class LogError(ParameterError):
-    """A measured log cannot be used; the text names file, row or column, and expectation."""
+    """A measured log is unusable; the text states file, row or column, and expectation."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class Table:
     Columns of numbers.
 
     Attributes:
-        path: the file.
-        columns: name -> (N,) values; only those of the header.
-        rows: (N,) line of each row in the file.
+        path: path of the file.
+        columns: name -> (N,) values of the read columns.
+        rows: (N,) line number of each row in the file.
 
     """
 
@@ -39,15 +39,16 @@ class Table:
 
 def read_table(path: str | Path, wanted: Callable[[list[str]], list[str]], expected: str) -> Table:
     """
-    Read the wanted columns of a CSV file; blank lines, other columns and their order are free.
+    Read columns of a CSV file; blank lines, comments and further columns are ignored.
 
     Args:
-        path: the file.
+        path: path of the file.
         wanted: header -> names of the columns to read; may raise LogError without the path.
-        expected: what a header looks like, for messages.
+        expected: example of a header, for messages.
 
     Raises:
-        LogError: no such file, no header, a column missing or doubled, a field that is no number.
+        LogError: no such file, no header, a missing or repeated column, or a field without a
+        number.
 
     """
     path = Path(path)
@@ -100,7 +101,7 @@ def _is_number(text):
 
 
 def missing(name: str, header: list[str]) -> LogError:
-    """Say that a column is missing, and point to one that has its name but another unit."""
+    """Error about a missing column; it mentions a column of the same name with another unit."""
     stem = name.rpartition('_')[0]
     other = [cell for cell in header if stem and cell.rpartition('_')[0] == stem]
     hint = f" ('{other[0]}' has another unit)" if other else ''

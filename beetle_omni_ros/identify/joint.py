@@ -1,4 +1,4 @@
-"""Identification of the tilt servos from one response log, judged on what was not fitted."""
+"""Identification of the tilt servos from the first part of a response log."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.parameters import shipped
-from beetle_omni_ros.identify.selection import CANDIDATES, Choice, free_mask, LINEAR, Selector
 from beetle_omni_ros.identify.servo_fit import (
     decode,
     encode,
@@ -20,35 +19,36 @@ from beetle_omni_ros.identify.servo_fit import (
     ServoFitter,
 )
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, published_set, simulate
+from beetle_omni_ros.identify.servo_terms import CANDIDATES, Choice, free_mask, Selector
 from beetle_omni_ros.identify.uncertainty import (
     Experiment,
+    inseparable_pairs,
     separating_experiments,
-    traded,
     uncertainties,
     Uncertainty,
 )
 from beetle_omni_ros.robot.parameters import JointParameters
 
-MOST_PASSES = 3         # of selection, while the noise falls
+MOST_PASSES = 3         # of selection, while the noise decreases
 P = shipped().servo
-MOST_ROUNDS, RESTING = 10, 0.2    # of refits; change of the median, in scales, that ends them
-CERTAIN = ('delay', 'coulomb_friction')   # in the model that estimates the noise
+MOST_ROUNDS, RESTING = 10, 0.2    # of refits; they end at this change of the median, in scales
+CERTAIN = ('delay', 'coulomb_friction')   # terms of the model that estimates the noise
 
 
 @dataclass(frozen=True)
 class JointModel:
     """
-    What one servo turned out to be.
+    Identified model of one servo.
 
     Attributes:
-        joint: number, 1 to 4.
-        kept: candidates in the model.
-        values: (n,) parameter set that predicts; where the log says nothing, as published.
-        estimates: (n,) also of numbers that are not in the model.
-        uncertainty: of the estimates.
-        traded: pairs that the log cannot separate.
-        experiment: that would separate delay and bandwidth.
-        gain: candidate -> chi2 gained on unseen blocks.
+        joint: number of the joint, 1 to 4.
+        kept: accepted candidates.
+        values: (n,) parameter set for predictions; limits that the log did not reach as published.
+        estimates: (n,) also estimates of rejected candidates.
+        uncertainty: uncertainty of the estimates.
+        inseparable: pairs that the log does not separate.
+        experiment: experiment that would separate delay and bandwidth.
+        gain: candidate -> gain in chi2 on held-out blocks.
 
     """
 
@@ -57,22 +57,14 @@ class JointModel:
     values: np.ndarray
     estimates: np.ndarray
     uncertainty: Uncertainty
-    traded: list[list[str]]
+    inseparable: list[list[str]]
     experiment: Experiment
     gain: dict[str, float]
 
 
 def identify_joints(log: JointLog, published: JointParameters,
                     fitted: float = P.fitted) -> list[JointModel]:
-    """
-    Identify every joint of a log from its first part.
-
-    Args:
-        log: commands and positions.
-        published: the servo as the robot file has it.
-        fitted: part of the log that may be looked at.
-
-    """
+    """Identify every joint of a log from its first part (share ``fitted``)."""
     log = log.first(fitted)
     start = published_set(published)
     weight = np.tile(fitted_samples(log), (len(log.joints), 1))
@@ -81,19 +73,19 @@ def identify_joints(log: JointLog, published: JointParameters,
     for _ in range(MOST_PASSES):
         fitter = ServoFitter(log, noise, prior=prior)
         choices = Selector(fitter, weight[0]).run(_unlimited(start))
-        problems = Problems.apart(
+        problems = Problems.single_joints(
             np.arange(len(log.joints)), np.array([choice.values for choice in choices]),
             np.array([free_mask(choice.kept) for choice in choices]), weight)
         points = _best(fitter, problems)
         before, noise = noise, noise_around(log, decode(points), weight[0])
         if (noise.sigma > P.nearly * before.sigma).all():
-            break       # else the terms found let see more than the first model did
-    sets = decode(_alike(log, noise, problems, points))
+            break       # with less noise, further terms may become significant
+    sets = decode(_with_common_prior(log, noise, problems, points))
     return _models(log, noise, choices, sets, weight, start)
 
 
 def _best(fitter, problems):
-    """Fit each joint from several starts, for chi2 may have more than one valley."""
+    """Fit each joint from several starts, because chi2 may have several minima."""
     count, starts = len(problems.joints), [problems]
     for frequency, delay in P.restarts:
         sets = decode(problems.points)
@@ -105,11 +97,11 @@ def _best(fitter, problems):
     return fits.points[choice]
 
 
-def _alike(log, noise, problems, points):
+def _with_common_prior(log, noise, problems, points):
     """
-    Fit again, each joint with the median of all as a prior, until the median rests.
+    Repeat the fit with a prior about the median of all joints, until the median converges.
 
-    A joint whose log decides stays where it is; one whose log does not, follows.
+    The prior matters only for joints whose log is not informative.
     """
     if len(points) < P.least_common:
         return points
@@ -128,22 +120,22 @@ def _unlimited(start):
 
 
 def _first_noise(log, start, weight):
-    """Noise around the model whose terms are certain, and a speed limit where one may be."""
+    """Noise around a model with the certain terms, and with a speed limit if one is possible."""
     joints = np.arange(len(log.joints))
     sets = np.tile(_unlimited(start), (len(joints), 1))
     sets[:, INDEX['delay']], sets[:, INDEX['coulomb_friction']] = 0.01, 0.01
     free = np.tile(free_mask((*CERTAIN, 'offset')), (len(joints), 1))
-    beyond = log.asked_speed() > P.beyond * log.speed()
+    beyond = log.command_speed() > P.beyond * log.speed()
     limit = INDEX['velocity_limit']
     sets[beyond, limit], free[beyond, limit] = log.speed()[beyond], True
     fitter = ServoFitter(log, first_noise(log),
                          prior=prior_of(encode(start), P.published))
-    fits = fitter.solve(Problems.apart(joints, sets, free, weight))
+    fits = fitter.solve(Problems.single_joints(joints, sets, free, weight))
     return noise_around(log, decode(fits.points), weight[0])
 
 
 def _models(log, noise, choices: list[Choice], sets, weight, start):
-    """Intervals of the kept numbers together, and of each other one if it joined them."""
+    """Models with intervals: of accepted terms jointly, of each other term if it joined them."""
     rows, owner = [], []
     for j, choice in enumerate(choices):
         for name in (None, *(n for n in CANDIDATES if n not in choice.kept)):
@@ -154,8 +146,8 @@ def _models(log, noise, choices: list[Choice], sets, weight, start):
             if name is not None:
                 for member in CANDIDATES[name].members:
                     values[INDEX[member]] = choice.tried[name][INDEX[member]]
-            rows.append(Problems.apart([j], values[None], free_mask(kept)[None],
-                                       weight[j:j + 1]))
+            rows.append(Problems.single_joints([j], values[None], free_mask(kept)[None],
+                                               weight[j:j + 1]))
             owner.append((j, name))
     problems = Problems.join(rows)
     profiled = np.array([name in (None, 'delay') for _, name in owner])
@@ -175,14 +167,14 @@ def _models(log, noise, choices: list[Choice], sets, weight, start):
         values = _with_published_limits(log, j, choice, sets[j], start, estimates, main)
         names = [n for n in NAMES if free_mask(choice.kept)[INDEX[n]]]
         judge = judged.get((j, 'delay'), main)
-        pairs = traded(judge, names if 'delay' in names else [*names, 'delay'])
+        pairs = inseparable_pairs(judge, names if 'delay' in names else [*names, 'delay'])
         models.append(JointModel(
             log.joints[j], choice.kept, values, estimates, main, pairs, plans[j], choice.gain))
     return models
 
 
 def _with_published_limits(log, j, choice: Choice, values, start, estimates, uncertainty):
-    """Limits that the log never reaches stay as published, unless the log went beyond them."""
+    """Values with limits that the log did not reach as published, or above the reached value."""
     values = values.copy()
     seen = {'velocity_limit': log.speed()[j],
             'torque_limit': np.abs(log.command[j] - log.measured[j]).max()}
@@ -201,6 +193,3 @@ def error_rms(log: JointLog, joint: int, values: np.ndarray, held: bool = True,
     """RMS of prediction minus measurement [rad] of the joint with this index."""
     error = simulate(log, joint, values[None], held)[0] - log.measured[joint]
     return float(np.sqrt(np.mean(error[part]**2)))
-
-
-__all__ = ['error_rms', 'identify_joints', 'JointModel', 'LINEAR']

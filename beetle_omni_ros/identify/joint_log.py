@@ -1,4 +1,4 @@
-"""Response logs of the tilt servos: what was commanded and what the encoders read."""
+"""Response logs of the tilt servos: commands and encoder readings."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class JointLog:
     Commands and positions of several joints over time.
 
     Attributes:
-        name: of the file.
-        t: (N,) [s], increasing.
+        name: name of the file.
+        t: (N,) increasing times [s].
         joints: (n,) numbers of the joints, 1 to 4.
         measured: (n, N) encoder positions [rad].
         command: (n, N) commanded positions [rad].
@@ -53,7 +53,7 @@ class JointLog:
         before = self.command[:, :1] + slope[:, None] * back
         command_t = np.concatenate([self.t[0] + back, self.t])
         command = np.concatenate([before, self.command], axis=1)
-        # Integrals of the held command: once, and once more.
+        # First and second integral of the held command.
         steps = np.diff(command_t)
         once = np.cumsum(command[:, :-1] * steps, axis=1)
         once = np.concatenate([np.zeros((len(command), 1)), once], axis=1)
@@ -66,20 +66,20 @@ class JointLog:
             object.__setattr__(self, name, value)
 
     def command_at(self, joint: int, times: np.ndarray) -> np.ndarray:
-        """Command of the joint with this index [rad], interpolated; straight before the log."""
+        """Command of a joint (index) by linear interpolation [rad]; linear before the log."""
         return np.interp(times, self._command_t, self._command[joint])
 
     def held_command(self, joint: int, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Command that is held from each row to the next, over equal steps.
+        Command held between rows, over equal steps.
 
         Args:
             joint: index of the joint.
-            edges: (K + 1,) times [s], evenly spaced.
+            edges: (K + 1,) evenly spaced times [s].
 
         Returns:
-            (K,) its mean over each step, and (K,) how far what comes before the middle of the
-            step outweighs the rest: the mean of (command - mean) (1/2 - place in the step) [rad].
+            (K,) mean over each step; (K,) first moment: the mean of (command - mean) (1/2 -
+            relative time in the step) [rad].
 
         """
         row = np.maximum(np.searchsorted(self._command_t, edges, side='right') - 1, 0)
@@ -91,28 +91,28 @@ class JointLog:
         return mean, (np.diff(twice) - step * once[:-1]) / step**2 - mean / 2
 
     def first(self, part: float) -> JointLog:
-        """Its beginning, alone."""
+        """The first ``part`` of the log."""
         end = self.end_of(part)
         return JointLog(self.name, self.t[:end], self.joints, self.measured[:, :end],
                         self.command[:, :end])
 
     def end_of(self, part: float) -> int:
-        """Count the samples in a part of it."""
+        """Number of samples in the first ``part``."""
         return int(round(part * len(self.t)))
 
     @property
     def quantum(self) -> float:
-        """The encoder's step [rad]: the smallest change of a reading that occurs."""
+        """Step of the encoder [rad]: the smallest change of a reading."""
         steps = np.abs(np.diff(self.measured, axis=1))
         steps = steps[steps > 1e-5]
         return float(np.quantile(steps, 0.01)) if steps.size else 0.0
 
-    def asked_speed(self) -> np.ndarray:
-        """(n,) Speed of each command [rad/s] that 1 % of the samples exceed."""
+    def command_speed(self) -> np.ndarray:
+        """(n,) speed of each command that 1 % of the samples exceed [rad/s]."""
         return np.quantile(np.abs(np.gradient(self.command, self.t, axis=1)), 0.99, axis=1)
 
     def speed(self) -> np.ndarray:
-        """(n,) Largest speed of each joint [rad/s], over 50 ms so that steps do not count."""
+        """(n,) largest mean speed of each joint over 50 ms [rad/s]."""
         span = max(1, int(round(0.05 / self.period)))
         travel = np.abs(self.measured[:, span:] - self.measured[:, :-span])
         return (travel / (self.t[span:] - self.t[:-span])).max(axis=1)
@@ -120,10 +120,10 @@ class JointLog:
 
 def read_joint_log(path: str | Path) -> JointLog:
     """
-    Read a response log, CSV or recorded run, and refuse what cannot be identified from.
+    Read a response log from CSV or a bag, and check it.
 
     Raises:
-        LogError: naming the file, the row or column, and what was expected.
+        LogError: with file, row or column, and expectation.
 
     """
     if is_bag(Path(path)):
@@ -195,7 +195,7 @@ def _check_angles(path, joint, position, command):
                            f'within +-{LIMITS.largest_angle:g} (degrees or encoder counts?)')
         if np.ptp(values) < LIMITS.least_travel:
             raise LogError(f'{path}: {name} moves by {np.ptp(values):.4f} rad only; expected at '
-                           f'least {LIMITS.least_travel:g} rad (a constant says nothing about a '
+                           f'least {LIMITS.least_travel:g} rad (a constant does not identify a '
                            'servo)')
     ratio = np.ptp(position) / np.ptp(command)
     if not 0.1 < ratio < 10:
@@ -213,14 +213,15 @@ def is_bag(path: Path) -> bool:
 
 def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Read joint positions with the command that was received last before each.
+    Read joint positions with the last command before each.
 
     Returns:
-        (N,) times [s] from the first, (4, N) positions [rad], (4, N) commands [rad]: of the
-        longest stretch in which commands came, at most half a minute, where they move most.
+        (N,) times from the first [s], (4, N) positions [rad], (4, N) commands [rad], of the
+        longest interval with commands; of a long one, the part of ``longest_bag`` with most
+        motion.
 
     Raises:
-        LogError: no bag, or one without joint_states or command; one line.
+        LogError: no bag, or one without joint_states or command.
 
     """
     try:
@@ -242,13 +243,13 @@ def read_bag_response(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise LogError(f'{path}: no joint_states while commands came; were stamps and clock those '
                        'of one computer?')
     first, end = stretches[np.argmax(stretches[:, 1] - stretches[:, 0])]
-    first, end = _liveliest(t, tilt[last], first, end)
+    first, end = _most_motion(t, tilt[last], first, end)
     chosen = slice(first, end)
     return t[chosen] - t[first], position[chosen].T, tilt[last[chosen]].T
 
 
-def _liveliest(t, command, first, end):
-    """Narrow a stretch to the longest part that is taken, in which all commands travel most."""
+def _most_motion(t, command, first, end):
+    """The part of an interval, at most ``longest_bag`` long, in which the commands travel most."""
     ends = np.minimum(np.searchsorted(t, t[first:end] + LIMITS.longest_bag, side='right'), end)
     travel = np.cumsum(np.r_[0.0, np.abs(np.diff(command[:end], axis=0)).sum(axis=1)])
     gain = travel[ends - 1] - travel[first:end]

@@ -1,8 +1,8 @@
 """
-The four tilt servos of a robot file as one point: numbers that they share and numbers of each.
+The four tilt servos of a robot file as one point of a fit.
 
-A robot file has one stiffness, damping, delay and limit for all joints, and friction and zero of
-each joint. A fit of these numbers is therefore a fit of what can be written to the file.
+A robot file has one stiffness, damping, delay and limit for all joints, but friction and zero of
+each joint. A fit with these parameters can be written to the file.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from beetle_omni_ros.robot.effects_actuator import per_joint
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.servo import SLIDING_RATE
 
-# Entries of the catalogue that a response log shows, with those of their parameters.
+# Catalogue entry -> parameters that a response log can determine.
 GROUPS = {name: parameters for name, effect in CATALOGUE.items() if (parameters := tuple(
     parameter for parameter, spec in effect.parameters.items() if spec.log))}
 
@@ -30,11 +30,11 @@ class Number:
 
     Attributes:
         name: parameter of the catalogue, or 'stiction' and 'dead_band_held'.
-        joint: index in the log, None where all joints share it.
-        scale: a change that matters; of the logarithm where ``logarithmic``.
+        joint: index in the log, None if shared by all joints.
+        scale: relevant change; of the logarithm if ``logarithmic``.
         low: smallest value.
         high: largest value.
-        logarithmic: whether the point holds its logarithm.
+        logarithmic: whether the point contains the logarithm.
 
     """
 
@@ -63,19 +63,20 @@ def _numbers(count):
 
 class Servos:
     """
-    A robot file's servos and their deviations.
+    Servos of a robot file and deviations from them.
 
-    Friction and stiction of a point are dead bands [rad] at the stiffness of the file: without a
-    torque in the log only ratios to the stiffness show. ``dead_band_held`` says what stays where
-    the stiffness changes and friction is not fitted: the torque (0) or the dead band (1).
+    Friction and stiction of a point are dead bands [rad] at the stiffness of the file, because a
+    log without torque determines only ratios to the stiffness. If the stiffness changes and
+    friction is not fitted, ``dead_band_held`` selects what is constant: torque (0) or dead band
+    (1).
 
     Args:
-        robot: as the file has it, effects included.
+        robot: parameters of the robot file with effects.
         joints: numbers of the log's joints, 1 to 4.
 
     """
 
-    # Numbers that all joints share are stiff against those of each: shorter steps, more damping.
+    # Shared parameters are much better determined than others: shorter steps, more damping.
     steps = Steps(2e-4, 8.0, (0.2, 20.0), 5.0, 50.0)
 
     def __init__(self, robot: RobotParameters, joints: tuple[int, ...]):
@@ -108,17 +109,17 @@ class Servos:
 
     @property
     def delays(self) -> float:
-        """Delays of all commands and of the encoders [s]: a log cannot tell them from it."""
+        """Sum of the other delays [s], which a log does not separate from it."""
         effects = self.robot.effects
         return sum(effects.get(name, {}).get('delay', 0.0)
                    for name in ('command_latency', 'joint_feedback_delay'))
 
     def index(self, name: str, joint: int | None = None) -> int:
-        """Where a number stands in a point."""
+        """Index of a parameter in a point."""
         return next(k for k, n in enumerate(self.numbers) if (n.name, n.joint) == (name, joint))
 
     def mask(self, group: str, joint: int | None = None) -> np.ndarray:
-        """(P,) numbers of a catalogue entry, of one joint where given."""
+        """(P,) parameters of a catalogue entry, optionally of one joint only."""
         return np.array([n.name in GROUPS[group] and joint in (None, n.joint)
                          for n in self.numbers])
 
@@ -131,7 +132,7 @@ class Servos:
         coulomb, offset = (values[:, [self.index(name, j) for j in range(count)]]
                            for name in ('coulomb', 'offset'))
         softer = (joint.kp / shared['kp'])**(1 - shared['dead_band_held'])
-        made = {'natural_frequency': np.sqrt(shared['kp'] / joint.inertia),
+        result = {'natural_frequency': np.sqrt(shared['kp'] / joint.inertia),
                 'damping_ratio': shared['kd'] / (2 * np.sqrt(shared['kp'] * joint.inertia)),
                 'delay': shared['delay'], 'offset': -offset, 'coulomb_friction': coulomb * softer,
                 'stiction': shared['stiction'] * softer,
@@ -139,7 +140,7 @@ class Servos:
                 'backlash': shared['gap'] / 2, 'velocity_limit': shared['velocity_limit'],
                 'torque_limit': shared['effort_limit'] / shared['kp']}
         sets = np.tile(OFF, (len(points), count, 1))
-        for name, value in made.items():
+        for name, value in result.items():
             sets[:, :, INDEX[name]] = np.clip(value, TERMS[name].low, TERMS[name].high)
         return sets
 
@@ -151,11 +152,11 @@ class Servos:
 
 def file_sets(robot: RobotParameters, joints: tuple[int, ...]) -> np.ndarray:
     """
-    Parameter sets (J, len(NAMES)) of the complete servos of a robot file, effects included.
+    Parameter sets (J, len(NAMES)) of the servos of a robot file with effects.
 
-    The zero's sign is the catalogue's: the true tilt is the encoder's plus ``joint_offset``, and
-    a servo at rest stands where it is told to, so that its encoder reads the target minus it.
-    Deflection needs a thrust, which a response log does not have.
+    Sign of the zero: the true tilt is the encoder's plus ``joint_offset``. A servo at rest has the
+    commanded true tilt, so its encoder reads the command minus ``joint_offset``. Deflection is not
+    included, because it needs a thrust.
     """
     servos = Servos(robot, joints)
     return servos.sets(servos.file_point[None])[0]
@@ -164,12 +165,12 @@ def file_sets(robot: RobotParameters, joints: tuple[int, ...]) -> np.ndarray:
 @dataclass(frozen=True)
 class FileServos:
     """
-    What a robot file says of a log's joints.
+    Servos of a robot file for the joints of a log.
 
     Attributes:
         sets: (J, len(NAMES)) parameter sets.
-        held: whether each command is held until the next. The shipped gains come from logs with
-            interpolated commands; delays that `gap` and `identify` find count from held ones.
+        held: whether a command is held until the next one. The shipped gains come from logs with
+            interpolated commands; delays from `gap` and `identify` hold for held ones.
 
     """
 
@@ -178,7 +179,7 @@ class FileServos:
 
 
 def file_servos(robot: RobotParameters, joints: tuple[int, ...]) -> FileServos:
-    """Servos of a robot file for the joints of a log, as they are replayed."""
+    """Servos of a robot file for the joints of a log."""
     return FileServos(file_sets(robot, joints),
                       any(name in robot.effects for name in (*GROUPS, 'command_latency',
                                                              'joint_feedback_delay')))

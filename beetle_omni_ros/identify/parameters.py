@@ -1,4 +1,4 @@
-"""Numbers of the identification; params/identify.yaml holds their values and their sources."""
+"""Parameters of the identification; params/identify.yaml has their values and sources."""
 
 from __future__ import annotations
 
@@ -15,57 +15,58 @@ from beetle_omni_ros.robot.schema import parameter
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JointLogLimits:
-    """What a response log of the joints must be."""
+    """Requirements for a response log of the joints."""
 
     periods: np.ndarray = parameter(doc='Range of the time between samples.', unit='s',
                                     shape=(2,), low=1e-6, high=10)
     longest_gap: float = parameter(doc='Longest gap.', unit='s', low=0.001, high=10)
     least_duration: float = parameter(doc='Least duration.', unit='s', low=0.1, high=600)
-    least_samples: int = parameter(doc='Least samples.', low=10, high=10**6)
+    least_samples: int = parameter(doc='Least number of samples.', low=10, high=10**6)
     least_travel: float = parameter(doc='Least travel of command and joints.', unit='rad', low=0,
                                     high=10)
     largest_angle: float = parameter(doc='Largest angle.', unit='rad', low=1, high=1000)
-    history: float = parameter(doc='Time for which the command goes on before the log.',
+    history: float = parameter(doc='Time before the log with an extrapolated command.',
                                unit='s', low=0, high=10)
-    longest_bag: float = parameter(doc='Longest stretch of a bag.', unit='s', low=2, high=3600)
-    last_command: float = parameter(doc='Time for which a last command is followed.', unit='s',
+    longest_bag: float = parameter(doc='Longest used part of a bag.', unit='s', low=2, high=3600)
+    last_command: float = parameter(doc='Time for which the last command is followed.', unit='s',
                                     low=0.001, high=10)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ServoFitParameters:
-    """The fit of a servo model to such a log."""
+    """Fit of a servo model to a response log."""
 
-    fitted: float = parameter(doc='Part of a log that is fitted.', unit='1', low=0.1, high=0.9)
-    settling: float = parameter(doc='Time at the begin that is not fitted.', unit='s', low=0,
+    fitted: float = parameter(doc='Fitted share of a log.', unit='1', low=0.1, high=0.9)
+    settling: float = parameter(doc='Time at the beginning that is not fitted.', unit='s', low=0,
                                 high=10)
     first_noise: float = parameter(doc='White noise of the first fit.', unit='rad', low=1e-6,
                                    high=1)
-    nearly: float = parameter(doc='Part of the noise that ends the passes.', unit='1', low=0,
-                              high=1)
+    nearly: float = parameter(doc='Ratio of the noise of two passes that ends the passes.',
+                              unit='1', low=0, high=1)
     memory: float = parameter(doc='Memory of the whitening filter.', unit='s', low=0.01, high=10)
-    beyond: float = parameter(doc='Factor by which a command must exceed a limit that counts.',
+    beyond: float = parameter(doc='Least ratio of a command and a limit that it identifies.',
                               unit='1', low=1, high=10)
-    blocks: int = parameter(doc='Blocks that are left out in turn.', low=2, high=100)
-    least_gain: float = parameter(doc='Least gain on blocks left out, for each number.',
+    blocks: int = parameter(doc='Number of blocks of the cross-validation.', low=2, high=100)
+    least_gain: float = parameter(doc='Least gain on held-out blocks for each parameter.',
                                   unit='chi2', low=0, high=1e4)
     least_delay: float = parameter(doc='Least delay.', unit='s', low=0, high=1)
     published_deviation: float = parameter(
-        doc='Prior of published frequency and damping, of the logarithm.', unit='1', low=0.01,
-        high=10)
+        doc='Prior deviation (logarithm) of frequency and damping about published values.',
+        unit='1', low=0.01, high=10)
     common_gains: float = parameter(
-        doc='Prior of frequency and damping about the median of all joints, of the logarithm.',
+        doc='Prior deviation (logarithm) of frequency and damping about the median of the joints.',
         unit='1', low=0.001, high=10)
-    common_delay: float = parameter(doc='Prior of a delay about the median of all joints.',
-                                    unit='s', low=1e-5, high=1)
-    least_common: int = parameter(doc='Joints that have a median.', low=2, high=4)
+    common_delay: float = parameter(
+        doc='Prior deviation of a delay about the median of the joints.', unit='s', low=1e-5,
+        high=1)
+    least_common: int = parameter(doc='Least number of joints for a median.', low=2, high=4)
     restarts: np.ndarray = parameter(doc='Frequency [rad/s] and delay [s] of further starts.',
                                      shape=(3, 2), low=0, high=1000)
-    traded: float = parameter(doc='Part of an interval that another drags it through.', unit='1',
-                              low=0, high=1)
-    loose: float = parameter(doc='Half width in scales below which nothing is traded.', unit='1',
-                             low=0, high=100)
-    sines: np.ndarray = parameter(doc='Frequencies of sines that are weighed.', unit='Hz',
+    traded: float = parameter(doc='Least correlation of a pair that the log does not separate.',
+                              unit='1', low=0, high=1)
+    loose: float = parameter(doc='Least half width in scales of a member of such a pair.',
+                             unit='1', low=0, high=100)
+    sines: np.ndarray = parameter(doc='Frequencies of proposed sines.', unit='Hz',
                                   shape=(8,), low=0.01, high=100)
     sine_time: float = parameter(doc='Length of a sine.', unit='s', low=2, high=600)
     sine_amplitude: float = parameter(doc='Largest amplitude of a sine.', unit='rad', low=0.01,
@@ -74,33 +75,34 @@ class ServoFitParameters:
 
     @property
     def published(self) -> dict[str, float]:
-        """Deviations about the published servo."""
+        """Prior deviations about the published servo."""
         return dict.fromkeys(('natural_frequency', 'damping_ratio'), self.published_deviation)
 
     @property
     def common(self) -> dict[str, float]:
-        """Deviations about the median of all joints."""
+        """Prior deviations about the median of all joints."""
         return {'natural_frequency': self.common_gains, 'damping_ratio': self.common_gains,
                 'delay': self.common_delay}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RotorLogParameters:
-    """A bench log of a rotor and its map."""
+    """Bench log of a rotor, and its map."""
 
     duty: np.ndarray = parameter(doc='Range of the duty.', unit='%', shape=(2,), low=0, high=200)
     largest_force: float = parameter(doc='Largest thrust.', unit='N', low=1, high=1e4)
     largest_torque: float = parameter(doc='Largest torque.', unit='N m', low=0.1, high=1e4)
     voltage: np.ndarray = parameter(doc='Range of the voltage.', unit='V', shape=(2,), low=0,
                                     high=1000)
-    least_rows: int = parameter(doc='Least rows of a plateau.', low=5, high=10**6)
-    settling: float = parameter(doc='Time after a change of PWM that is left out.', unit='s',
-                                low=0, high=60)
-    plateau_width: float = parameter(doc='Deviation by which voltages are smoothed.', unit='V',
-                                     low=0.001, high=10)
-    valley: float = parameter(doc='Depth of a dip that parts two plateaus.', unit='1', low=0,
-                              high=1)
-    stop_duty: float = parameter(doc='Duty up to which the rotor stands.', unit='%', low=0,
+    least_rows: int = parameter(doc='Least number of rows of a plateau.', low=5, high=10**6)
+    settling: float = parameter(doc='Unused time after a change of PWM.', unit='s', low=0, high=60)
+    plateau_width: float = parameter(
+        doc='Standard deviation of the smoothing of the voltage density.', unit='V', low=0.001,
+        high=10)
+    valley: float = parameter(
+        doc='Largest ratio of a minimum between two plateaus and the lower maximum.', unit='1',
+        low=0, high=1)
+    stop_duty: float = parameter(doc='Duty up to which the rotor does not turn.', unit='%', low=0,
                                  high=100)
     least_slope: float = parameter(doc='Least slope of the map, for 10 N.', unit='%', low=0.01,
                                    high=100)
@@ -120,7 +122,7 @@ class IdentifyParameters:
         Read a file; default the shipped one.
 
         Raises:
-            ParameterError: naming file and key.
+            ParameterError: with file and key.
 
         """
         return schema.load(cls, path or share_path('params/identify.yaml'))
@@ -128,5 +130,5 @@ class IdentifyParameters:
 
 @cache
 def shipped() -> IdentifyParameters:
-    """Return the numbers of the package."""
+    """Parameters of the package."""
     return IdentifyParameters.load()

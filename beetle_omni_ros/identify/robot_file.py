@@ -1,4 +1,4 @@
-"""Writing robot files that extend the one that was believed."""
+"""Robot files that extend another one."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ SHIPPED = 'robot.yaml'
 
 def check_not_base(path: Path, base: Path | None) -> None:
     """
-    Refuse to overwrite the file that the new one is to extend.
+    Refuse to overwrite the file that the new one extends.
 
     Raises:
-        ParameterError: they are the same.
+        ParameterError: both are the same file.
 
     """
     if base and path.resolve() == base.resolve():
@@ -27,13 +27,13 @@ def check_not_base(path: Path, base: Path | None) -> None:
 
 def write_robot_file(path: Path, head: str, content: dict, base: Path | None) -> None:
     """
-    Write what differs from ``base``, the shipped robot file where None.
+    Write a robot file that extends ``base``.
 
     Args:
-        path: to write.
+        path: output file.
         head: comment lines.
-        content: keys of a robot file.
-        base: that it extends; by name where it lies beside.
+        content: changed keys.
+        base: extended file, by name if it is in the same folder; None: the shipped one.
 
     Raises:
         ParameterError: the file cannot be written.
@@ -43,7 +43,7 @@ def write_robot_file(path: Path, head: str, content: dict, base: Path | None) ->
         together = base.resolve().parent == path.resolve().parent
         extends = base.name if together else str(base.resolve())
     else:
-        # A file of that name beside would win over the shipped one.
+        # A file of that name in the same folder would take precedence over the shipped one.
         beside = path.with_name(SHIPPED)
         hidden = beside.is_file() and beside.resolve() != path.resolve()
         extends = str(share_path(f'params/{SHIPPED}')) if hidden else SHIPPED
@@ -54,7 +54,7 @@ def write_robot_file(path: Path, head: str, content: dict, base: Path | None) ->
 
 def write_text(path: Path, text: str, what: str) -> None:
     """
-    Replace a file at once.
+    Write a file atomically.
 
     Raises:
         ParameterError: it cannot be written.
@@ -69,5 +69,5 @@ def write_text(path: Path, text: str, what: str) -> None:
 
 
 def rounded(value: float, digits: int = 5) -> float:
-    """A number with so many significant digits."""
+    """``value`` with so many significant digits."""
     return float(f'{value:.{digits}g}')

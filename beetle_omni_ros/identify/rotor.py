@@ -1,8 +1,8 @@
 """
 Rotor map from bench data: duty = c0 + c1 g + c2 g^2 + c3 g^3 with g = thrust / 10 N.
 
-The stand's noise is in the thrust, the duty is exact. Regressing duty on noisy thrust would bend
-the curve, so the polynomial is fitted through its inverse: what remains is in newtons.
+The measured thrust is noisy, the duty is exact. A regression of duty on noisy thrust would be
+biased, so the inverse of the polynomial is fitted and residuals are thrusts.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from beetle_omni_ros.identify.inference.prior import UNKNOWN
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.rotor_log import Plateau, RotorLog
 
-UNIT_THRUST = 10.0      # [N] of g
+UNIT_THRUST = 10.0      # [N] for g = 1
 P = shipped().rotor
 NORMAL_95 = 1.96
 GRID = 400
@@ -31,18 +31,18 @@ GRID = 400
 @dataclass(frozen=True)
 class MapRow:
     """
-    One fitted row.
+    One fitted row of the map.
 
     Attributes:
-        voltage: [V].
-        thrust_max: largest thrust measured [N].
+        voltage: voltage [V].
+        thrust_max: largest measured thrust [N].
         coefficients: (4,) c0 to c3 [%].
-        intervals: (4, 2) 95 %.
-        rms: thrust minus fit [N].
-        half_width: of the fitted curve's 95 % band, the largest between 1 N and the maximum [N].
-        inverse_error: largest error of thrust -> duty -> thrust over the range, relative.
-        rows: fitted.
-        held: whether the slope had to be held positive.
+        intervals: (4, 2) 95 % intervals.
+        rms: RMS of thrust minus fit [N].
+        half_width: largest half width of the curve's 95 % band between 1 N and the maximum [N].
+        inverse_error: largest relative error of thrust -> duty -> thrust over the range.
+        rows: number of fitted rows.
+        held: whether the bound on the slope was active.
 
     """
 
@@ -61,13 +61,13 @@ class MapRow:
         return np.polyval(self.coefficients[::-1], np.asarray(thrust) / UNIT_THRUST)
 
     def thrust(self, duty: np.ndarray) -> np.ndarray:
-        """Thrust [N] at a duty [%], within 0 and the largest measured."""
+        """Thrust [N] at a duty [%], between 0 and the largest measured one."""
         return inverse(self.coefficients, duty, self.thrust_max)
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """Torque for each newton [m], its 95 % interval, the stand's offset [N m] and RMS [N m]."""
+    """Torque over thrust [m], its 95 % interval, offset of the stand [N m] and RMS [N m]."""
 
     value: float
     interval: tuple[float, float]
@@ -93,7 +93,7 @@ def fit_row(name: str, plateau: Plateau) -> MapRow:
     Fit the map at one voltage.
 
     Raises:
-        LogError: the sweep is too small, or thrust does not rise with duty.
+        LogError: the sweep is too small, or thrust does not increase with duty.
 
     """
     used = plateau.duty > P.stop_duty
@@ -118,7 +118,7 @@ def fit_row(name: str, plateau: Plateau) -> MapRow:
     residual = fitted - g
     covariance = _covariance(coefficients, fitted, residual * weight, weight)
     size = NORMAL_95 * np.sqrt(np.diag(covariance))
-    # The row ends where the data end: at the largest duty, not at the largest noisy force.
+    # The row ends at the largest duty, not at the largest noisy force.
     last = float(UNIT_THRUST * fitted.max())
     thrust = np.linspace(min(1.0, last / 2), last, GRID)
     band = _band(coefficients, covariance, thrust / UNIT_THRUST)
@@ -132,7 +132,7 @@ def fit_row(name: str, plateau: Plateau) -> MapRow:
 
 
 def _start(g, duty):
-    """Coefficients of a rising polynomial near the data."""
+    """Coefficients of an increasing polynomial near the data."""
     run = g > 0.02
     start = np.polyfit(g[run], duty[run], 3)[::-1]
     if np.polyval(np.polyder(start[::-1]), np.linspace(0, g.max(), 60)).min() < P.least_slope:
@@ -141,7 +141,7 @@ def _start(g, duty):
 
 
 def _fitted(start, g, duty, weight, scale):
-    """Coefficients whose error is least, in a loss that is linear beyond ``scale``."""
+    """Coefficients of a fit with a soft L1 loss of this ``scale``."""
     def residual(points, _):
         return np.array([soft_l1(_error(point, g, duty, weight), scale) for point in points])
 
@@ -151,14 +151,14 @@ def _fitted(start, g, duty, weight, scale):
 
 
 def _error(coefficients, g, duty, weight):
-    """Weighted error of thrust / 10 N, then what is missing of a rising slope."""
+    """Weighted error of g, then the violation of the least slope."""
     slope = np.polyval(np.polyder(coefficients[::-1]), np.linspace(0, 1.05 * g.max(), 60))
     fitted = inverse(coefficients, duty, UNIT_THRUST * 1.3 * g.max()) / UNIT_THRUST
     return np.concatenate([weight * (fitted - g), 0.3 * np.minimum(slope - P.least_slope, 0)])
 
 
 def _weights(g, residual):
-    """Weights for noise that may grow with thrust: its size as a line through the residuals."""
+    """Weights for noise that is linear in thrust, from the residuals."""
     size = np.minimum(np.abs(residual), 4 * np.median(np.abs(residual)))
     slope, level = np.polyfit(g, size, 1)
     spread = np.maximum(level + slope * g, 0.15 * size.mean() + 1e-6)
@@ -166,7 +166,7 @@ def _weights(g, residual):
 
 
 def _slopes(coefficients, g):
-    """(N, 4) change of g with each coefficient at a given duty."""
+    """(N, 4) derivative of g by each coefficient at constant duty."""
     slope = np.maximum(np.polyval(np.polyder(coefficients[::-1]), g), P.least_slope / 10)
     return -np.stack([g**k for k in range(4)], axis=1) / slope[:, None]
 
@@ -186,7 +186,7 @@ def fit_ratio(plateaus: list[Plateau]) -> Ratio:
     """
     Torque-to-thrust ratio of all plateaus together.
 
-    The interval covers noise and, with several plateaus, their disagreement.
+    The interval includes noise and the scatter between plateaus.
     """
     force = np.concatenate([plateau.force for plateau in plateaus])
     torque = np.concatenate([plateau.torque for plateau in plateaus])
@@ -199,7 +199,7 @@ def fit_ratio(plateaus: list[Plateau]) -> Ratio:
 
 
 def _line(x, y):
-    """Slope, offset, the slope's standard error and RMS of a line, without outliers."""
+    """Slope, offset, standard error of the slope and RMS of a line, without outliers."""
     keep = np.ones(len(x), dtype=bool)
     for _ in range(4):
         slope, offset = np.polyfit(x[keep], y[keep], 1)
@@ -212,7 +212,7 @@ def _line(x, y):
 
 
 def crossings(rows: list[MapRow]) -> list[str]:
-    """Where a lower voltage would need less duty for the same thrust, which cannot be."""
+    """Thrusts at which a lower voltage would need less duty, which is impossible."""
     found = []
     for high, low in zip(rows[:-1], rows[1:], strict=True):
         thrust = np.linspace(1.0, min(high.thrust_max, low.thrust_max), 100)
@@ -224,5 +224,5 @@ def crossings(rows: list[MapRow]) -> list[str]:
 
 
 def identify_rotor(log: RotorLog) -> tuple[list[MapRow], Ratio]:
-    """Fit every plateau, and the torque ratio."""
+    """Map rows of every plateau, and the torque ratio."""
     return [fit_row(log.name, plateau) for plateau in log.plateaus], fit_ratio(log.plateaus)

@@ -1,4 +1,4 @@
-"""Bench logs of one rotor on a force-torque stand, and the voltage plateaus in them."""
+"""Bench logs of one rotor on a force-torque stand, and their voltage plateaus."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Plateau:
     Rows at one voltage.
 
     Attributes:
-        voltage: median [V].
-        duty: (N,) [% of 2000 us].
+        voltage: median voltage [V].
+        duty: (N,) duty [% of 2000 us].
         force: (N,) thrust [N].
-        torque: (N,) reaction torque [N m], positive.
+        torque: (N,) reaction torque, positive [N m].
 
     """
 
@@ -42,9 +42,9 @@ class RotorLog:
     One bench log.
 
     Attributes:
-        name: of the file.
-        plateaus: with falling voltage.
-        warnings: what is odd but usable.
+        name: name of the file.
+        plateaus: plateaus with decreasing voltage.
+        warnings: remarks about usable data.
 
     """
 
@@ -55,14 +55,14 @@ class RotorLog:
 
 def read_rotor_log(path: str | Path) -> RotorLog:
     """
-    Read a bench log and part it into voltage plateaus.
+    Read a bench log and divide it into voltage plateaus.
 
     Raises:
-        LogError: naming the file, the row or column, and what was expected.
+        LogError: with file, row or column, and expectation.
 
     """
     table = read_table(path, _wanted, HEADER)
-    # All are there: the table was refused where one had none of its names.
+    # read_table has checked that each column exists.
     column = {wanted: next(table.columns[name] for name in names if name in table.columns)
               for wanted, names in ALTERNATIVES.items()}
     duty = column['pwm'] if 'duty_percent' in table.columns else 100 * column['pwm'] / FULL_PULSE
@@ -115,12 +115,12 @@ def _check(table, name, values, bounds, expected):
 
 
 def _positive(path, torque, force):
-    """Torque with the sign that grows with thrust; a stand may count it either way."""
+    """Torque with the sign that increases with thrust; conventions of stands differ."""
     if np.std(torque) == 0 or np.std(force) == 0:
         raise LogError(f'{path}: force or torque never changes; is the stand connected?')
     correlation = np.corrcoef(torque, force)[0, 1]
     if abs(correlation) < 0.5:
-        raise LogError(f'{path}: torque does not go with thrust (correlation {correlation:.2f}); '
+        raise LogError(f'{path}: torque does not follow thrust (correlation {correlation:.2f}); '
                        'expected nearly proportional columns')
     return torque * np.sign(correlation)
 
@@ -139,13 +139,13 @@ def _settled(table, duty, warnings):
                      np.inf)
     settled = since >= P.settling
     if settled.mean() < 0.2:
-        warnings.append('PWM changes all the time: every row is used, though the rotor lags')
+        warnings.append('PWM changes all the time: all rows are used in spite of the rotor lag')
         return np.ones(len(duty), dtype=bool)
     return settled
 
 
 def _plateaus(path, voltage, duty, force, torque, warnings):
-    """Part the rows where the density of voltages has valleys."""
+    """Divide the rows at minima of the voltage density."""
     grid = np.arange(voltage.min() - 0.5, voltage.max() + 0.5, P.plateau_width / 4)
     counts, _ = np.histogram(voltage, np.append(grid, grid[-1] + P.plateau_width / 4))
     kernel = np.exp(-0.5 * (np.arange(-16, 17) / 4.0)**2)
@@ -168,7 +168,7 @@ def _plateaus(path, voltage, duty, force, torque, warnings):
         middle = float(np.median(voltage[rows]))
         if rows.sum() < P.least_rows or np.ptp(force[rows]) < 0.3 * np.ptp(force):
             warnings.append(f'{rows.sum()} rows at {middle:.2f} V are too few, or too short a '
-                            'sweep, for a row of the map: left out')
+                            'sweep, for a row of the map: not used')
             continue
         found.append(Plateau(middle, duty[rows], force[rows], torque[rows]))
     if not found:

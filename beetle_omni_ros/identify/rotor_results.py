@@ -19,9 +19,9 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 
 
 def rotor_results(log: RotorLog, rows: list[MapRow], ratio: Ratio) -> dict:
-    """All numbers of an identification."""
+    """Results as plain data."""
     warnings = [*log.warnings, *crossings(rows)]
-    warnings += [f'at {row.voltage:.2f} V the slope had to be held positive: the sweep does not '
+    warnings += [f'at {row.voltage:.2f} V the slope is at its lower bound: the sweep does not '
                  'determine a cubic' for row in rows if row.held]
     if abs(ratio.tare) > 0.05 * ratio.value * max(row.thrust_max for row in rows):
         warnings.append(f'without thrust the stand reads {ratio.tare:.3f} N m: tare it')
@@ -33,14 +33,14 @@ def rotor_results(log: RotorLog, rows: list[MapRow], ratio: Ratio) -> dict:
                                  for k, value in enumerate(row.coefficients)},
                 'rms_N': row.rms, 'thrust_half_width_N': row.half_width,
                 'round_trip_error': row.inverse_error, 'monotone': True}
-                for row in rows],
+                         for row in rows],
             'torque_to_thrust_ratio': {'value': ratio.value, 'unit': 'm',
                                        'interval': list(ratio.interval), 'rms_N_m': ratio.rms},
             'warnings': warnings}
 
 
 def grids(results: dict) -> list[Grid]:
-    """One table."""
+    """Tables of the map and the torque ratio."""
     header = ['V', 'max N', 'c3', 'c2', 'c1', 'c0', 'rows', 'RMS [N]', '95 % band [N]']
     rows = [[f'{p["voltage_V"]:.2f}', f'{p["thrust_max_N"]:.2f}',
              *(f'{p["coefficients"][f"c{k}"]["value"]:.4f}' for k in (3, 2, 1, 0)),
@@ -61,9 +61,9 @@ def rotor_page(log: RotorLog, rows: list[MapRow], ratio: Ratio, robot: RobotPara
         sections = [
             section('Map', 'Dots: measured; lines: fitted; dashed: the robot file.',
                     svg(_maps(log, rows, robot), 'thrust over duty')),
-            section('Residuals', 'Measured thrust minus the map at the duty sent.',
+            section('Residuals', 'Measured thrust minus the map at the commanded duty.',
                     svg(_residuals(log, rows), 'residual over thrust')),
-            section('Torque', 'Reaction torque over thrust, and what the ratio leaves.',
+            section('Torque', 'Reaction torque over thrust, and its residual.',
                     svg(_torque(log, ratio), 'torque over thrust'))]
     return page('Rotor', f'identified from {log.name}', grids(results), results['warnings'],
                 sections)
@@ -120,7 +120,7 @@ def _torque(log, ratio) -> Figure:
 
 def write_rotor_file(path: Path, results: dict, base: Path | None) -> None:
     """
-    Write a robot file with the identified map on top of the one that was believed.
+    Write a robot file that extends ``base`` by the identified map.
 
     Raises:
         ParameterError: the file cannot be written.

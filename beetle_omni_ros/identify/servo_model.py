@@ -1,12 +1,11 @@
 """
-The tilt servo as it answers a command, for many parameter sets at a time.
+Simulation of a tilt servo for many parameter sets at once.
 
     q'' = limit(wn^2 (q*(t - delay) + offset - q) - 2 zeta wn q') - wn^2 (load(q) + friction)
 
-The step is that of :mod:`beetle_omni_ros.robot.servo` for an inertia of 1. Without a torque in
-the log only ratios to the stiffness Kp show. Friction, load and the torque limit are therefore
-angles: the position error at which the servo pushes as hard. Every step is vectorised over
-parameter sets, so that many starts, terms and blocks are fitted at once.
+The step is that of :mod:`beetle_omni_ros.robot.servo` for an inertia of 1. A log without torque
+determines only ratios to the stiffness Kp, so friction, load and torque limit are angles: the
+position error at which the servo has this torque.
 """
 
 from __future__ import annotations
@@ -25,24 +24,25 @@ from beetle_omni_ros.robot.native import built, CompilerError, EXACT, generated
 from beetle_omni_ros.robot.parameters import JointParameters
 from beetle_omni_ros.robot.servo import CASADI, NUMPY, play, Servo, Step
 
-LONGEST_STEP = 0.0025   # [s]; with (wn step)^2 / 24 the frequency is true to 0.3 % at 100 rad/s
-NEVER = 1e3             # a limit that is never reached
+LONGEST_STEP = 0.0025   # [s]; relative error of the frequency (wn step)^2 / 24: 0.3 % at 100 rad/s
+NEVER = 1e3             # value of a limit without effect
 
 
 @dataclass(frozen=True)
 class Term:
     """
-    One number of a parameter set.
+    One parameter of a parameter set.
 
     Attributes:
-        unit: of its value.
-        off: without effect.
+        unit: unit of its value.
+        off: value without effect.
         low: smallest value of a fit.
-        high: largest.
-        scale: a change that matters; of the logarithm where ``logarithmic``.
-        logarithmic: whether it is fitted as its logarithm.
-        words: in a sentence; by default its name.
-        moving: whether it acts in a step, neither before (delay, offset) nor after it (play).
+        high: largest value of a fit.
+        scale: relevant change; of the logarithm if ``logarithmic``.
+        logarithmic: whether its logarithm is fitted.
+        words: name in a sentence; default its name.
+        in_step: whether it is in the integration step, not before (delay, offset) or after it
+            (play).
 
     """
 
@@ -53,32 +53,32 @@ class Term:
     scale: float
     logarithmic: bool = False
     words: str = ''
-    moving: bool = True
+    in_step: bool = True
 
 
 TERMS = {
     'natural_frequency': Term('rad/s', 60.0, 8.0, 400.0, 0.05, True, 'bandwidth'),  # sqrt(Kp / J)
     'damping_ratio': Term('1', 0.9, 0.05, 20.0, 0.05, True, 'damping'),   # Kd / (2 sqrt(Kp J))
-    'delay': Term('s', 0.0, 0.0, 0.12, 0.002, moving=False),
-    'offset': Term('rad', 0.0, -0.5, 0.5, 0.002, moving=False),   # measured minus commanded
+    'delay': Term('s', 0.0, 0.0, 0.12, 0.002, in_step=False),
+    'offset': Term('rad', 0.0, -0.5, 0.5, 0.002, in_step=False),   # measured minus commanded
     'coulomb_friction': Term('rad', 0.0, 0.0, 0.4, 0.002, words='friction'),  # half a dead band
     'stiction': Term('rad', 0.0, 0.0, 0.4, 0.002),                # breakaway above that
-    # at which stiction fades
+    # of the decay of stiction
     'stribeck_velocity': Term('rad/s', 0.1, 0.02, 3.0, 0.2, True, 'Stribeck velocity'),
     # play to each side, before the encoder
-    'backlash': Term('rad', 0.0, 0.0, 0.3, 0.002, moving=False),
+    'backlash': Term('rad', 0.0, 0.0, 0.3, 0.002, in_step=False),
     'velocity_limit': Term('rad/s', NEVER, 0.2, NEVER, 0.05, True, 'speed limit'),
     'torque_limit': Term('rad', NEVER, 0.005, NEVER, 0.05, True,
                          'torque limit (an error of position)'),
-    # sag ~ sin(q): a weight on the joint
+    # deflection ~ sin(q): a weight on the joint
     'load_sine': Term('rad', 0.0, -0.3, 0.3, 0.002, words='load (sine)'),
     'load_cosine': Term('rad', 0.0, -0.3, 0.3, 0.002, words='load (cosine)'),
 }
 NAMES = tuple(TERMS)
 INDEX = {name: k for k, name in enumerate(NAMES)}
 OFF = np.array([term.off for term in TERMS.values()])
-MOVING = tuple(name for name, term in TERMS.items() if term.moving)
-# Arrays of (steps, sets), of states one row more; numbers: (NUMBERS, sets).
+STEP_TERMS = tuple(name for name, term in TERMS.items() if term.in_step)
+# Arrays (steps, sets), states (steps + 1, sets), numbers (NUMBERS, sets).
 LOOP = """
 void servo_run(long steps, long sets, double step, const double *command, const double *early,
          const double *numbers, double *middle, double *velocity) {
@@ -101,7 +101,7 @@ void servo_run(long steps, long sets, double step, const double *command, const 
 
 
 def published_set(joint: JointParameters) -> np.ndarray:
-    """Parameter set of a robot file's joint: second order, with its limits."""
+    """Parameter set of a robot file's joint: second order with limits."""
     values = OFF.copy()
     values[INDEX['natural_frequency']] = joint.natural_frequency
     values[INDEX['damping_ratio']] = joint.damping_ratio
@@ -113,17 +113,16 @@ def published_set(joint: JointParameters) -> np.ndarray:
 def simulate(log: JointLog, joint: np.ndarray | int, sets: np.ndarray,
              held: bool = True) -> np.ndarray:
     """
-    Free run over a whole log, from its first position and velocity.
+    Simulation over a whole log, from its first position and velocity.
 
-    Leapfrog steps with implicit damping and friction: a joint that friction can hold stands
-    exactly still.
+    Leapfrog steps with implicit damping and friction, so that static friction holds a joint
+    exactly.
 
     Args:
-        log: gives commands, times and the first state.
+        log: commands, times and initial state.
         joint: (B,) index of the log's joint for each set, or one for all.
         sets: (B, len(NAMES)) parameter sets.
-        held: a command acts until the next sample; else it is taken as the curve through its
-            samples.
+        held: whether a command acts until the next sample; else it is interpolated.
 
     Returns:
         (B, N) positions at the log's times [rad].
@@ -143,7 +142,7 @@ def simulate(log: JointLog, joint: np.ndarray | int, sets: np.ndarray,
 
 
 def _commands(log, joint, delay, edges, held):
-    """Two (K, B): delayed commands and their moment, for which equal joints and delays share."""
+    """Mean and first moment (K, B) of delayed commands, computed once for equal delays."""
     keys, which = np.unique(np.stack([joint, delay]), axis=1, return_inverse=True)
     if held:
         parts = [log.held_command(int(j), edges - d) for j, d in keys.T]
@@ -155,16 +154,16 @@ def _commands(log, joint, delay, edges, held):
 
 
 def _integrate(value, command, early, q, v, step):
-    """Positions (K + 1, B); ``early``: where within a step the command changes."""
-    # Positions half a step ahead of their velocities: one addition moves both halves.
+    """Positions (K + 1, B); ``early``: first moment of the command in each step."""
+    # Leapfrog: positions are half a step ahead of velocities.
     middle, velocity = np.empty((2, len(command) + 1, len(q)))
     middle[0], velocity[0] = q + 0.5 * step * v, v
     if (run := _compiled()) is not None:
         run(*command.shape, step, *(np.ascontiguousarray(x) for x in (
-            command, early, [value[name] for name in MOVING])), middle, velocity)
+            command, early, [value[name] for name in STEP_TERMS])), middle, velocity)
     else:
         acting = {name: value[name] if (value[name] != TERMS[name].off).any() else None
-                  for name in MOVING}
+                  for name in STEP_TERMS}
         advance = _advance(NUMPY, acting, step)
         for k, (target, part) in enumerate(zip(command, early, strict=True)):
             middle[k + 1], velocity[k + 1] = advance(target, part, middle[k], velocity[k])
@@ -173,19 +172,19 @@ def _integrate(value, command, early, q, v, step):
 
 
 def _advance(space, value, step):
-    """Motion over one step; of ``value`` what is None has no effect."""
+    """Function of one step; a ``value`` of None has no effect."""
     stiffness = value['natural_frequency']**2
     damping = 2 * value['damping_ratio'] * value['natural_frequency']
     torque, speed = value['torque_limit'], value['velocity_limit']
     coulomb, above, sine, cosine = (
         0.0 if value[name] is None else value[name] * stiffness
         for name in ('coulomb_friction', 'stiction', 'load_sine', 'load_cosine'))
-    rubs = value['coulomb_friction'] is not None or value['stiction'] is not None
+    has_friction = value['coulomb_friction'] is not None or value['stiction'] is not None
     loaded = value['load_sine'] is not None or value['load_cosine'] is not None
     fading = value['stribeck_velocity']
     move = Step(space, Servo(
         1.0, stiffness, damping, speed, None if torque is None else torque * stiffness,
-        coulomb=coulomb if rubs else None, stiction=coulomb + above,
+        coulomb=coulomb if has_friction else None, stiction=coulomb + above,
         fading_rate=TERMS['stribeck_velocity'].off if fading is None else fading,
         gaussian=False), step)
     jump = move.gain * stiffness * step
@@ -193,7 +192,7 @@ def _advance(space, value, step):
     def advance(target, early, here, before):
         load = -sine * space.sin(here) - cosine * space.cos(here) if loaded else None
         after = move.kick(target, here, before, load)
-        # A joint that friction or a limit holds does not feel when the command changed.
+        # The first moment has no effect on a joint held by friction or at a limit.
         free = after != 0
         if speed is not None:
             free = free * (space.maximum(after, -after) < speed)
@@ -206,13 +205,13 @@ def _advance(space, value, step):
 
 @cache
 def _compiled() -> Callable | None:
-    """All steps of all sets in C; None where nothing compiles, and numpy takes its place."""
+    """All steps of all sets in C; None without a compiler, then numpy is used."""
     step, *state = (ca.SX.sym(name) for name in ('step', 'target', 'early', 'here', 'before'))
-    numbers = [ca.SX.sym(name) for name in MOVING]
+    numbers = [ca.SX.sym(name) for name in STEP_TERMS]
     advance = ca.Function('servo_step', [*state, step, *numbers], list(
-        _advance(CASADI, dict(zip(MOVING, numbers, strict=True)), step)(*state)))
+        _advance(CASADI, dict(zip(STEP_TERMS, numbers, strict=True)), step)(*state)))
     sizes = {'ARGUMENTS': advance.sz_arg(), 'RESULTS': advance.sz_res(),
-             'WORK': max(advance.sz_w(), 1), 'NUMBERS': len(MOVING)}
+             'WORK': max(advance.sz_w(), 1), 'NUMBERS': len(STEP_TERMS)}
     source = '\n'.join([generated([advance]), *(
         f'#define {name} {size}' for name, size in sizes.items()), LOOP])
     try:

@@ -1,10 +1,9 @@
 """
-How well a log determines a servo model: intervals, trades, and the log that would separate them.
+Uncertainty of a servo model: intervals, inseparable pairs, and a separating experiment.
 
-Intervals are profile likelihoods of the whitened residuals, without any prior: each number is
-moved and held while all others are refitted, until chi2 has risen by that of 95 %. The rise is
-scaled by how much the gradient of chi2 scatters over blocks of the log, which would be
-1 if the residuals were as independent as the whitening assumes.
+Intervals are profile likelihoods of the whitened residuals without prior. Each parameter is moved
+and held, all others are fitted, until the increase of chi2 is that of 95 %. The increase is
+divided by the scatter of the gradient of chi2 between blocks, which is 1 for white residuals.
 """
 
 from __future__ import annotations
@@ -17,25 +16,25 @@ from beetle_omni_ros.identify.inference.least_squares import covariance
 from beetle_omni_ros.identify.inference.noise import Noise
 from beetle_omni_ros.identify.joint_log import JointLog
 from beetle_omni_ros.identify.parameters import shipped
-from beetle_omni_ros.identify.servo_fit import APART, decode, encode, Problems, ServoFitter
+from beetle_omni_ros.identify.servo_fit import decode, encode, Problems, ServoFitter, SINGLE_JOINT
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, simulate, TERMS
 
-RISE = 3.84             # of chi2 with one degree of freedom, 95 %
+RISE = 3.84             # 95 % quantile of chi2 with one degree of freedom
 PROFILED = ('natural_frequency', 'damping_ratio', 'delay')
 LADDER = np.array([0.5, 1.2, 2.2, 3.6, 5.5, 8.0, 12.0, 18.0])  # in scales of a term
 P = shipped().servo
-LOW, HIGH = APART.coordinates.low, APART.coordinates.high
+LOW, HIGH = SINGLE_JOINT.coordinates.low, SINGLE_JOINT.coordinates.high
 
 
 @dataclass(frozen=True)
 class Uncertainty:
     """
-    For one joint.
+    Uncertainty of one joint's parameters.
 
     Attributes:
-        intervals: (n, 2) of each number, 95 %; NaN where it was not free.
-        correlation: (n, n) of the numbers that were free, in fitted units.
-        scatter: by which chi2 was divided.
+        intervals: (n, 2) 95 % intervals; NaN if not free.
+        correlation: (n, n) correlation of the free parameters, in fitted units.
+        scatter: divisor of chi2.
 
     """
 
@@ -44,7 +43,7 @@ class Uncertainty:
     scatter: float
 
     def half_width(self, name: str) -> float:
-        """Half of an interval, in the number's scale."""
+        """Half width of an interval in scales of the parameter."""
         index, term = INDEX[name], TERMS[name]
         low, high = self.intervals[index]
         if term.logarithmic:
@@ -55,18 +54,13 @@ class Uncertainty:
 def uncertainties(log: JointLog, noise: Noise, problems: Problems,
                   profiled: np.ndarray) -> list[Uncertainty]:
     """
-    Judge fitted parameter sets, one for each row of ``problems``.
+    Uncertainties of fitted parameter sets, one for each row of ``problems``.
 
-    Args:
-        log: what they were fitted to.
-        noise: its whitening.
-        problems: fitted; only ``free`` numbers are judged.
-        profiled: (B,) rows whose curved numbers are wanted; the others' have their local width.
-
+    Rows of the mask ``profiled`` (B,) get profile likelihoods, the others linear intervals.
     """
     fitter, results = ServoFitter(log, noise), []
     for point, free, (own, scatter) in zip(problems.points, problems.free,
-                                           fitter.certainty(problems), strict=True):
+                                           fitter.covariances(problems), strict=True):
         size = np.sqrt(np.maximum(scatter * np.diag(own), 1e-30))
         width = np.sqrt(RISE) * np.where(free, size, np.nan)
         intervals = np.stack([decode(np.clip(point + side * width, LOW, HIGH))
@@ -78,7 +72,7 @@ def uncertainties(log: JointLog, noise: Noise, problems: Problems,
 
 
 def _profile(fitter, problems, results):
-    """Replace the intervals of curved numbers by where the refitted chi2 has risen."""
+    """Replace the intervals of nonlinear parameters by profile likelihoods."""
     parts, owner = [], []
     for k in range(len(problems.joints)):
         for name in PROFILED:
@@ -99,7 +93,7 @@ def _profile(fitter, problems, results):
         rows = [k] + [count + i for i, entry in enumerate(owner)
                       if entry[:3] == (k, index, side)]
         rise = np.maximum((fits.chi2[rows] - best[k]) / results[k].scatter, 0.0)
-        if (rise > RISE).all():     # a better fit lies elsewhere: the local width must do
+        if (rise > RISE).all():     # a better fit is elsewhere: keep the linear interval
             continue
         place = _crossing(rise)
         centre = problems.points[k]
@@ -113,7 +107,7 @@ def _profile(fitter, problems, results):
 
 
 def _correlate(paths, results):
-    """Correlation of profiled pairs: how far along its own interval one drags the other."""
+    """Set correlations of profiled pairs: motion of one along the interval of the other."""
     for k, result in enumerate(results):
         profiled = [index for row, index, side in paths
                     if row == k and side > 0 and (k, index, -1) in paths]
@@ -127,7 +121,7 @@ def _correlate(paths, results):
 
 
 def _held(problem, index, move):
-    """The problem with one number moved and held, the delay giving way to the servo's lag."""
+    """The problem with one parameter moved and held, and the total lag of servo and delay kept."""
     point = problem.points.copy()
     point[0, index] = np.clip(point[0, index] + move, LOW[index], HIGH[index])
     free = problem.free.copy()
@@ -144,38 +138,38 @@ def _held(problem, index, move):
 
 
 def _crossing(rise):
-    """Fractional index at which the rise reaches that of 95 %; the last where it never does."""
+    """Fractional index at which the rise reaches that of 95 %; the last one if it never does."""
     last = np.flatnonzero(rise <= RISE)[-1]
     if last == len(rise) - 1:
         return float(last)
     k = last + 1
-    # chi2 rises with the square of a move: straight in its root
+    # Linear interpolation of the square root, because chi2 is nearly quadratic.
     a, b = np.sqrt(rise[[k - 1, k]])
     return k - 1 + (np.sqrt(RISE) - a) / max(b - a, 1e-9)
 
 
-def traded(result: Uncertainty, names: list[str]) -> list[list[str]]:
-    """Pairs of these numbers that the log cannot separate, the closest first."""
+def inseparable_pairs(result: Uncertainty, names: list[str]) -> list[list[str]]:
+    """Pairs of parameters that the log does not separate, largest correlation first."""
     loose = [name for name in names if result.half_width(name) > P.loose]
     pairs = [(abs(result.correlation[INDEX[a], INDEX[b]]), a, b)
              for k, a in enumerate(loose) for b in loose[:k]]
     return [sorted([a, b]) for r, a, b in sorted(pairs, reverse=True) if r >= P.traded]
 
 
-SINE_PERIOD = 0.01      # [s] between its samples
+SINE_PERIOD = 0.01      # [s] sampling period
 
 
 @dataclass(frozen=True)
 class Experiment:
     """
-    A log that would tell the delay from the bandwidth.
+    A sine log that separates delay and bandwidth.
 
     Attributes:
-        frequency: of a sine [Hz].
-        amplitude: of the sine [rad].
-        duration: [s].
-        delay_width: half of the 95 % interval that it would give [s].
-        frequency_width: the same of the natural frequency [rad/s].
+        frequency: frequency [Hz].
+        amplitude: amplitude [rad].
+        duration: duration [s].
+        delay_width: half width of the delay's 95 % interval with it [s].
+        frequency_width: half width of that of the natural frequency [rad/s].
 
     """
 
@@ -189,17 +183,17 @@ class Experiment:
 def separating_experiments(sets: np.ndarray, free: np.ndarray, noise: Noise, scatter: np.ndarray,
                            wanted: float = 0.001) -> list[Experiment]:
     """
-    The slowest sine that determines every joint's delay, from the model's sensitivities.
+    The slowest sine that determines every joint's delay, from the sensitivities of the model.
 
     Args:
         sets: (n, m) fitted parameter sets, one for each joint.
-        free: (n, m) their free numbers; the delay is added.
-        noise: of the log they were fitted to; the same is assumed again.
-        scatter: (n,) inflation of chi2, see :class:`Uncertainty`.
+        free: (n, m) free parameters; the delay is added.
+        noise: noise of the fitted log, also assumed for the experiment.
+        scatter: (n,) divisor of chi2, see :class:`Uncertainty`.
         wanted: half width of the delay's interval [s].
 
     Returns:
-        what it would give, joint by joint; if no sine reaches ``wanted``, the best.
+        the experiment for each joint; if no sine reaches ``wanted``, the best.
 
     """
     free = free.copy()
@@ -215,7 +209,7 @@ def separating_experiments(sets: np.ndarray, free: np.ndarray, noise: Noise, sca
 
 
 def _plans(sets, free, noise, scatter):
-    """For each frequency, what its sine would tell about each joint; all in one simulation."""
+    """Experiments of all joints for each frequency, in one simulation."""
     count, many = len(sets), len(P.sines)
     t = np.arange(0.0, P.sine_time, SINE_PERIOD)
     omega = 2 * np.pi * np.repeat(P.sines, count)
@@ -227,7 +221,7 @@ def _plans(sets, free, noise, scatter):
     blank = JointLog('', t, tuple(rows.tolist()), np.zeros_like(command), command)
     log = JointLog('', t, blank.joints, simulate(blank, rows, sets), command)
     weight = np.tile((t >= 1.0).astype(float), (len(rows), 1))
-    fitter, problems = ServoFitter(log, noise), Problems.apart(rows, sets, free, weight)
+    fitter, problems = ServoFitter(log, noise), Problems.single_joints(rows, sets, free, weight)
     slopes = fitter.jacobian(problems, fitter.residuals(problems.points, problems.joints, weight))
     information = slopes @ slopes.transpose(0, 2, 1)
     f, d = INDEX['natural_frequency'], INDEX['delay']
@@ -239,7 +233,3 @@ def _plans(sets, free, noise, scatter):
                                 P.sine_time, float(width[d]),
                                 float(width[f] * sets[row, f])))
     return [plans[k:k + count] for k in range(0, len(plans), count)]
-
-
-__all__ = ['Experiment', 'NAMES', 'separating_experiments', 'traded',
-           'uncertainties', 'Uncertainty']

@@ -109,7 +109,7 @@ def test_stiction_is_found_from_below_and_from_above(fading, start):
     (0.0058, [0.0036, 0.008], (0.006, [0.005, 0.008])),
     (0.009, [0.008, 0.010], (0.009, [0.008, 0.010]))])
 def test_what_is_said_of_stiction_is_at_least_what_is_said_of_coulomb(stiction, interval,
-                                                                     expected):
+                                                                      expected):
     said = {'value': stiction, 'interval': interval}
     at_least(said, {'value': 0.006, 'interval': [0.005, 0.007]})
     assert (said['value'], said['interval']) == expected

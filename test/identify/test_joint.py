@@ -72,8 +72,8 @@ def test_intervals_cover_the_truth_but_say_something(models, name):
 
 def test_a_slow_log_trades_delay_against_bandwidth_and_a_fast_one_does_not(models):
     pair = ['delay', 'natural_frequency']
-    assert any(pair in model.traded for model in models['slow'])
-    assert not any(pair in model.traded for model in models['fast'])
+    assert any(pair in model.inseparable for model in models['slow'])
+    assert not any(pair in model.inseparable for model in models['fast'])
     for slow, fast in zip(models['slow'], models['fast'], strict=True):
         widths = [np.ptp(model.uncertainty.intervals[INDEX['delay']]) for model in (slow, fast)]
         assert widths[0] > 2 * widths[1]

@@ -79,7 +79,7 @@ def against_shipped():
 
 def test_the_files_servos_move_as_a_plain_simulation_with_its_effects():
     file_robot = robot(joint_offset={'offset': (0.02, -0.01, 0.0, 0.0)},
-                     joint_backlash={'gap': 0.024}, joint_feedback_delay={'delay': 0.006})
+                       joint_backlash={'gap': 0.024}, joint_feedback_delay={'delay': 0.006})
     shown = np.array([servo(T, COMMAND, frequency=FREQUENCY, damping=DAMPING,
                             delay=DELAY + 0.006, coulomb=band, backlash=0.012, offset=-zero)
                       for band, zero in zip(BANDS, (0.02, -0.01), strict=True)])
@@ -184,7 +184,7 @@ def test_after_its_own_correction_a_log_has_no_gap(against_shipped):
 def test_everything_accepted_and_every_member_of_a_set_has_evidence_of_its_own(against_shipped):
     _, result = against_shipped
     members = [*result['effects'], *(r for e in result['effects']
-                                      for r in e.get('rivals', []))]
+                                     for r in e.get('rivals', []))]
     members += [row for row in result['candidates'] if row['accepted']]
     named = {name for effect in result['effects'] for name in effect['names']}
     assert {'joint_friction', 'joint_bandwidth'} <= named

@@ -144,7 +144,7 @@ CASES = {
     'thrust falls': (lambda r: np.stack([3000 - r[:, 0], *r.T[1:]], axis=1)[r[:, 0] > 1100],
                      HEADER, 'thrust does not rise with duty'),
     'torque of noise': (lambda r: np.stack([r[:, 0], r[:, 1], np.random.default_rng(0).normal(
-        size=len(r)), r[:, 3]], axis=1), HEADER, 'torque does not go with thrust'),
+        size=len(r)), r[:, 3]], axis=1), HEADER, 'torque does not follow thrust'),
     'no plateau': (lambda r: np.stack([*r[:90:5].T[:3], np.linspace(15, 25, 18)], axis=1).repeat(
         2, axis=0), HEADER, 'no voltage plateau'),
     'both': (lambda r: np.concatenate([r, r[:, :1]], axis=1), (*HEADER, 'duty_percent'),

@@ -119,13 +119,8 @@ def analyse(fitted: list[Flight], judging: list[Flight], robot: RobotParameters,
     """
     Find the effects that explain the difference between flights and model.
 
-    Args:
-        fitted: flights that are fitted.
-        judging: held-out flights; empty: the fitted flights also judge.
-        robot: parameters of the robot file.
-        p: parameters (params/gap.yaml).
-        progress: callback with a short text at each stage.
-
+    Without held-out flights (``judging``), the fitted ones also judge. ``progress`` gets a short
+    text at each stage.
     """
     a = Analysis(held_out=bool(judging))
     a.keys = {**all_keys(robot), **extra_keys()}
@@ -237,7 +232,7 @@ def _falsify(a, wide):
     if not found.accepted:
         points = {name: points[name] for name in ('before', 'file')}
     flown = iter(a.problem.parallel(_flown, [(theta, k) for theta in points.values()
-                                          for k in judging], noise))
+                                             for k in judging], noise))
     for name in points:
         a.runs[name] = [next(flown) for _ in judges]
     for name, same in (('after', 'before'), ('placebo', 'before'), ('effects_alone', 'file')):
@@ -319,7 +314,7 @@ def _plain(a, theta, named):
     """The robot file, with delays and mounting of the sensors and of the bus as fitted."""
     return {name: x for name, x in theta.items() if not a.keys[name].body
             and a.keys[name].effect not in ('rotor_lag', 'joint_bandwidth', 'modules', 'swing',
-                                             'rotor', 'servo')
+                                            'rotor', 'servo')
             and name in a.problem.priors and name not in named}
 
 

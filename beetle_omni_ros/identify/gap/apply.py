@@ -20,14 +20,7 @@ MEMBERS = 4     # length of a list with one value for each rotor or joint
 
 
 def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
-    """
-    The file's effects and the first member of each named set.
-
-    Args:
-        robot: parameters of the robot file.
-        named: ``effects`` of the results.
-
-    """
+    """The file's effects and the first member of each of the ``named`` sets of the results."""
     effects = {name: dict(values) for name, values in robot.effects.items()}
     parts = [(effect, effect['names'][0], effect['parameters']) for effect in named]
     parts += [(effect, name, found) for effect in named
@@ -54,30 +47,27 @@ def effects_with(robot: RobotParameters, named: list[dict]) -> dict[str, dict]:
 def own_numbers(robot: RobotParameters, tolerances: dict[str, dict],
                 named: Iterable[str] = ()) -> dict:
     """
-    Values of the robot file, corrected by the fitted tolerances.
+    Values of the robot file, corrected by the fitted ``tolerances`` of the results.
 
-    Args:
-        robot: parameters of the robot file.
-        tolerances: ``tolerances`` of the results.
-        named: effects that replace a value and have priority.
+    An effect in ``named`` that replaces a value has priority.
 
     Returns:
         mass, inertia, gains, lags and rotor positions, nested as in a robot file.
 
     """
-    made: dict = {}
+    result: dict = {}
     for name, effect in CATALOGUE.items():
         for parameter, spec in effect.parameters.items():
             found = [tolerances[key]['deviation'] for key in names_of(name, parameter)
                      if key in tolerances]
             if spec.number and found and name not in {*robot.effects, *named}:
-                _put(made, spec.number, number_of(robot, spec.number) * np.exp(
+                _put(result, spec.number, number_of(robot, spec.number) * np.exp(
                     found if len(found) > 1 else found[0]))
     moved = [tolerances.get(f'position.offset[{k}]', {'deviation': 0.0})['deviation']
              for k in range(12)]
     if any(moved):
-        _put(made, 'rotors.positions', robot.rotors.positions + np.reshape(moved, (4, 3)))
-    return made
+        _put(result, 'rotors.positions', robot.rotors.positions + np.reshape(moved, (4, 3)))
+    return result
 
 
 def _put(content, key, value):

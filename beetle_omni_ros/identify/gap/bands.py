@@ -23,16 +23,9 @@ from beetle_omni_ros.identify.inference.prior import together
 def by_band(problem: Problem, x: np.ndarray, r: np.ndarray,
             groups: str = 'B') -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """
-    Scores (K,) and information (K, K) of each frequency band of each group of channels.
+    Scores (K,) and information (K, K) of each frequency band of each of the groups of channels.
 
-    Their sums are ``x.T @ r`` and ``x.T @ x`` of these channels.
-
-    Args:
-        problem: channel and flight of each sample.
-        x: (n, K) whitened slopes.
-        r: (n,) whitened residual.
-        groups: groups of channels.
-
+    Their sums are ``x.T @ r`` and ``x.T @ x`` for whitened slopes x and whitened residual r.
     """
     p, first = problem.p, 0
     edges = [0.0, *p.band_edges, np.inf]
@@ -58,10 +51,7 @@ def gain_by_part(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float,
     """
     Gains in chi2 of body parameters for all bands together and for a part of them.
 
-    Args:
-        problem: see :func:`by_band`.
-        x: (n, K) whitened slopes, other keys projected out.
-        r: (n,) whitened residual without the parameters, other keys projected out.
+    Other keys are projected out of the whitened slopes x (n, K) and the residual r (n,).
 
     Returns:
         gain of one set of values for all bands; larger gain of one set for the bands below or for
@@ -78,15 +68,10 @@ def gain_by_part(problem: Problem, x: np.ndarray, r: np.ndarray) -> tuple[float,
 def differs_between_bands(problem: Problem, x: np.ndarray, r: np.ndarray,
                           gain: float = 0.0) -> bool:
     """
-    Whether parameters explain far more in a part of the bands than in all.
+    Whether parameters explain far more in a part of the bands than in all; see gain_by_part.
 
-    Args:
-        problem: see :func:`by_band`.
-        x: see :func:`gain_by_part`.
-        r: see :func:`gain_by_part`.
-        gain: total gain of the objective with the priors. An effect that implausible tolerances
-            could absorb gains in the priors and not in the bands.
-
+    ``gain`` is the total gain of the objective with the priors. An effect that implausible
+    tolerances could absorb gains in the priors and not in the bands.
     """
     everywhere, part = gain_by_part(problem, x, r)
     return part > problem.p.part_share * max(everywhere, gain) + problem.p.part_free * x.shape[1]
@@ -106,18 +91,8 @@ def _spectrum(x, r, period):
 
 
 def project_out(problem: Problem, state: State, names: list[str], columns: np.ndarray,
-          free: frozenset[str]) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Columns (n, K) and residual (n,) of a fit without what the named keys explain.
-
-    Args:
-        problem: priors.
-        state: the fit, with slopes.
-        names: keys to project out.
-        columns: (n, K) whitened columns.
-        free: keys whose priors are ignored.
-
-    """
+                free: frozenset[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Columns (n, K) and residual (n,) of a fit without what the named keys explain."""
     s = state.slopes[:, [state.index[name] for name in names]]
     slope, _ = together(problem.priors, state.theta, names, free)
     left = np.column_stack([columns, state.r])

@@ -64,11 +64,11 @@ class BodyModel:
     def _symbol(self, keys, name, parameter):
         found = [key for key in keys.values() if key.effect == name
                  and key.parameter == parameter]
-        made = []
+        result = []
         for key in found:
             symbol = self._p[self._index[key.name]]
-            made.append(key.base * ca.exp(symbol) if key.relative else key.base + symbol)
-        return made[0] if found[0].index is None else tuple(made)
+            result.append(key.base * ca.exp(symbol) if key.relative else key.base + symbol)
+        return result[0] if found[0].index is None else tuple(result)
 
     @cached_property
     def _function(self):
@@ -110,12 +110,8 @@ def _called(function, inputs, vector, result):
     """
     Evaluate in place; CasADi's conversion of arrays would take longer than the equations.
 
-    Args:
-        function: buffer and evaluation of a mapped function.
-        inputs: name -> (N, width). Memory order equals CasADi's (width, N).
-        vector: parameter vector.
-        result: (N, ...) output array.
-
+    ``function`` is a pair of buffer and evaluation. The memory order of inputs (N, width) equals
+    CasADi's (width, N).
     """
     buffer, evaluate = function
     arrays = [np.ascontiguousarray(inputs[name], dtype=float) for name in WIDTHS]

@@ -55,27 +55,27 @@ class Candidate:
 
 def candidates(keys: dict[str, Key], models: list[FlightModel]) -> list[Candidate]:
     """All candidates; starts of limits depend on the flights."""
-    made = []
+    result = []
     for name, effect in CATALOGUE.items():
         own = tuple(key.name for key in keys.values() if key.effect == name
                     and not key.form)
         if not own:
             continue
         if effect.each:
-            made += [Candidate(name, (key,), label=f'{name}[{k + 1}]', member=k + 1)
-                     for k, key in enumerate(own)]
+            result += [Candidate(name, (key,), label=f'{name}[{k + 1}]', member=k + 1)
+                       for k, key in enumerate(own)]
         elif name == MODULES:
-            made += [Candidate(name, own[:1], label=f'{name} (inertia)'),
-                     Candidate(name, own, label=name)]
+            result += [Candidate(name, own[:1], label=f'{name} (inertia)'),
+                       Candidate(name, own, label=name)]
         else:
             starts = _limit_starts(keys[own[0]], effect.starts, models) \
                 if isinstance(effect.starts, LimitStarts) else effect.starts
             if effect.starts and not starts:
                 continue
-            made += [Candidate(name, own, {f'{name}.{part}': x for part, x in form.items()},
-                               starts, name + (f' ({k + 1})' if k else ''))
-                     for k, form in enumerate(effect.forms)]
-    return made
+            result += [Candidate(name, own, {f'{name}.{part}': x for part, x in form.items()},
+                                 starts, name + (f' ({k + 1})' if k else ''))
+                       for k, form in enumerate(effect.forms)]
+    return result
 
 
 def _limit_starts(key, limit, models):

@@ -28,13 +28,6 @@ def deviations(problem: Problem, state: State, names: list[str],
     The last three need no noise model. The last two detect errors that are equal in all flights,
     such as closed-loop bias or a wrong form of an equation. A share for the error of the form is
     added.
-
-    Args:
-        problem: flights, priors, noise.
-        state: the final fit.
-        names: fitted keys.
-        free: keys whose priors are ignored.
-
     """
     columns, p = [state.index[name] for name in names], problem.p
     s = state.slopes[:, columns]
@@ -71,11 +64,7 @@ def _by_excitation(weight, r, groups):
     """
     Contributions (groups,) of weakly to strongly excited samples to the change of a key.
 
-    Args:
-        weight: (n,) weight of each sample's residual in the key.
-        r: (n,) whitened residual.
-        groups: number of groups of equal information.
-
+    ``weight`` (n,) is the weight of each residual in the key. Groups have equal information.
     """
     order = np.argsort(np.abs(weight))
     part = np.cumsum(weight[order]**2)
@@ -154,14 +143,14 @@ def visibility(problem: Problem, state: State, always: list[str],
         return np.sqrt(max(float(np.max(size**2 * np.diag(schur))), 0.0))
 
     smooth = [c for c in candidates if not c.starts and not any(c.fixed.values())]
-    made = {}
+    result = {}
     for c in smooth:
         rivals = {}
         for o in smooth:
             if o.name in CATALOGUE[c.name].confused_with and o.label != c.label:
                 rivals[o.label] = left(c.keys, o.keys)
-        made[c.label] = Visibility(left(c.keys, ()), rivals)
-    return made
+        result[c.label] = Visibility(left(c.keys, ()), rivals)
+    return result
 
 
 def undetectable_limits(problem: Problem, state: State) -> list[str]:

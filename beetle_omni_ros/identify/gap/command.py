@@ -50,9 +50,9 @@ def run_gap(runs: list[Path], holdout: Sequence[Path] = (), robot: Path | None =
         ParameterError, LogError: unusable robot file, log or output, or the same run twice.
 
     """
-    made = gap_results(runs, holdout, robot, apply, json_path, page, console, parameters, fix,
-                       tolerances)
-    return BAD_DATA if made['verdict'] == 'bad_data' else 0
+    result = gap_results(runs, holdout, robot, apply, json_path, page, console, parameters, fix,
+                         tolerances)
+    return BAD_DATA if result['verdict'] == 'bad_data' else 0
 
 
 def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=None,
@@ -64,7 +64,7 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
     check_apart([*runs, *holdout])
     robot_parameters, p = RobotParameters.load(robot), GapParameters.load(parameters)
     if any(run.suffix.lower() == '.csv' for run in runs):
-        made, html = analyse_joint_log(runs, holdout, robot_parameters, robot, p)
+        result, html = analyse_joint_log(runs, holdout, robot_parameters, robot, p)
     else:
         meta = {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
                 'robot': str(robot) if robot else 'params/robot.yaml'}
@@ -73,24 +73,24 @@ def gap_results(runs, holdout=(), robot=None, apply=None, json_path=None, page=N
             bar = bars.add_task('reading')
             a = _analysed(runs, holdout, robot_parameters, p, fix,
                           lambda text: bars.update(bar, description=text))
-        made = results(a, robot_parameters, p, meta)
+        result = results(a, robot_parameters, p, meta)
         if page and a.damages:      # workers return only the damages, so the bag is read again
             given = [*runs, *holdout]
             path = given[names_of(given).index(a.damages[0].run)]
             a.damaged = read_recording(path), a.damages[0]
-        html = gap_page(a, made) if page else ''
-    _print(console, made)
+        html = gap_page(a, result) if page else ''
+    _print(console, result)
     if json_path:
-        write_json(json_path, made)
+        write_json(json_path, result)
     if page:
         write_text(page, html, 'page')
     if apply:
-        if made['effects']:
-            write_corrected(apply, made, robot_parameters, robot, tolerances)
+        if result['effects']:
+            write_corrected(apply, result, robot_parameters, robot, tolerances)
             console.print(f'corrected robot: {apply}', highlight=False)
         else:
             console.print('no effect is named: no robot file is written', highlight=False)
-    return made
+    return result
 
 
 def _analysed(runs, holdout, robot, p, fix, progress):
@@ -130,11 +130,11 @@ def _check_outputs(apply, robot, json_path, page):
             check_writable(path, what)
 
 
-def _print(console, made):
-    console.print(headline(made), style='bold', highlight=False, markup=False)
-    console.print(made['summary'], highlight=False, markup=False)
-    for finding in dict.fromkeys(made['findings']):
+def _print(console, result):
+    console.print(headline(result), style='bold', highlight=False, markup=False)
+    console.print(result['summary'], highlight=False, markup=False)
+    for finding in dict.fromkeys(result['findings']):
         console.print(finding, style='dim', highlight=False, markup=False)
-    print_grids([*grids(made), *change_grids(made.get('changes', []))], console)
-    if made['next_experiment']:
-        console.print(f"Next: {made['next_experiment']}", highlight=False, markup=False)
+    print_grids([*grids(result), *change_grids(result.get('changes', []))], console)
+    if result['next_experiment']:
+        console.print(f"Next: {result['next_experiment']}", highlight=False, markup=False)

@@ -171,13 +171,8 @@ class Problem:
         """
         Estimate the noise around a fit of all keys, linear from the last state.
 
-        Args:
-            wide: key -> standard deviation of the search range of a key without prior.
-            rounds: alternations of noise and fit.
-
-        Returns:
-            the last state, whitened with the new noise.
-
+        Noise and fit alternate. Keys without prior get the standard deviations ``wide`` by name.
+        Returns the last state, whitened with the new noise.
         """
         names = self._raw[0][2]
         state = self._whitened()
@@ -196,15 +191,8 @@ class Problem:
         """
         Noise of each flight, around a fit of all keys to this flight alone.
 
-        Gusts differ between flights. The fit removes what any known effect explains.
-
-        Args:
-            theta: point of linearisation for flights that were not fitted.
-            wide: see :meth:`learn_noise`.
-
-        Returns:
-            noise of each fitted flight, then of each held-out flight.
-
+        Gusts differ between flights. The fit removes what any known effect explains. ``theta`` is
+        the point of linearisation for held-out flights. Fitted flights come first in the result.
         """
         raw = [*self._raw, *[None] * (len(self.all_models) - len(self.models))]
         return self.parallel(_noise_of, enumerate(raw), self._raw[0][2], theta, wide)
@@ -222,28 +210,11 @@ class Problem:
         return sum(prior.residual(theta.get(name, 0.0))**2
                    for name, prior in self.priors.items() if name not in free)
 
-    def linear_step(self, state: State, names: list[str], free: frozenset[str],
-                    rows: np.ndarray | None = None) -> tuple[np.ndarray, float, np.ndarray]:
-        """
-        Gauss-Newton step of the named keys.
-
-        Args:
-            state: point of linearisation.
-            names: keys that may change.
-            free: keys whose priors are ignored.
-            rows: samples to use; default all.
-
-        Returns:
-            (K,) step, expected objective after it, (K, K) normal matrix.
-
-        """
-        columns = [state.index[name] for name in names]
-        s = state.slopes[:, columns]
-        r = state.r
-        if rows is not None:
-            s, r = s[rows], r[rows]
-        h, g = s.T @ s, s.T @ r
-        return self.solve(state.theta, names, free, h, g, float(r @ r))
+    def linear_step(self, state: State, names: list[str],
+                    free: frozenset[str]) -> tuple[np.ndarray, float]:
+        """Gauss-Newton step (K,) of the named keys, and expected objective after it."""
+        s, r = state.slopes[:, [state.index[name] for name in names]], state.r
+        return self.solve(state.theta, names, free, s.T @ s, s.T @ r, float(r @ r))
 
     def solve(self, theta, names, free, h, g, chi2):
         """Complete :meth:`linear_step` from the normal equations of the data."""
@@ -251,26 +222,15 @@ class Problem:
         h, g = h + np.diag(slope**2), g + slope * off
         step = -solved(h, g)
         cost = chi2 + self.prior_cost(theta, free) + 2 * g @ step + step @ h @ step
-        return step, float(cost), h
+        return step, float(cost)
 
     def refine(self, state: State, names: list[str], free: frozenset[str],
                iterations: int = 3, split: bool = False) -> tuple[State, float]:
         """
-        Fit the named keys.
+        Fit the named keys in a few ``iterations``; return the fitted state and its objective.
 
-        Only slopes of curved keys are renewed after a step.
-
-        Args:
-            state: start.
-            names: keys that may change.
-            free: keys whose priors are ignored.
-            iterations: largest number of steps.
-            split: whether a failed step of all keys is retried without keys of friction, play and
-                limits, whose slopes are not smooth.
-
-        Returns:
-            the fitted state and its objective.
-
+        Only slopes of curved keys are renewed after a step. With ``split``, a failed step of all
+        keys is retried without keys of friction, play and limits, whose slopes are not smooth.
         """
         theta, r = dict(state.theta), state.r
         slopes, cost = state.slopes, float(r @ r) + self.prior_cost(theta, free)
@@ -300,7 +260,7 @@ class Problem:
 
     def _line_search(self, now, names, free, cost):
         """Keys, residual and objective of the first halved step that decreases the objective."""
-        step, _, _ = self.linear_step(now, names, free)
+        step, _ = self.linear_step(now, names, free)
         for halving in range(HALVINGS):
             trial = self.moved(now.theta, names, 0.5**halving * step)
             r = self.residual(trial)

@@ -19,12 +19,7 @@ def significant(p: GapParameters, gain: float, prior_gain: float, price: float =
     """
     Whether a gain is too large to be chance.
 
-    Args:
-        p: parameters (params/gap.yaml).
-        gain: decrease of the objective.
-        prior_gain: part of it in the priors.
-        price: further required gain for keys beyond the first.
-
+    ``prior_gain`` is the part of the gain in the priors. Keys beyond the first have a ``price``.
     """
     return gain >= p.least_gain + price or significant_in_prior(p, gain, prior_gain, price)
 
@@ -46,14 +41,8 @@ def at_bound(keys: dict[str, Key], trial: Trial, delays: tuple[float, ...] = (),
     Whether a value is at its bound or physically impossible.
 
     Zero is a valid bound of an effect of one sign: the robot lacks an effect of the robot file.
-    A reading must not be younger than its stamp, and a command must not act before its stamp.
-
-    Args:
-        keys: all keys by name.
-        trial: trial with its deviations.
-        delays: delays of tilt and thrust commands with these deviations [s].
-        early: accepted lead of a command on its stamp [s].
-
+    A reading must not be younger than its stamp. A command must not act before its stamp: its
+    ``delays`` [s] with these deviations must exceed ``-early`` [s].
     """
     if any(name in COMMANDS for name in trial.candidate.keys) \
             and min(delays, default=0.0) < -early:
@@ -85,14 +74,8 @@ def same_response(found: Found, own: str, other: str, least: float) -> bool:
     Whether two entries approximate one response that neither describes completely.
 
     Example: a lag of second order, if the catalogue has only dead time and a lag of first order.
-    Then one entry still gains beside the other, and the data do not determine which one is wrong.
-
-    Args:
-        found: search result with the trials beside the accepted entries.
-        own: name of an accepted entry.
-        other: name of the possible alternative.
-        least: required gain in chi2 of the alternative beside the accepted entry.
-
+    Then ``other`` still gains beside the accepted ``own``, at least ``least`` in chi2, and the
+    data do not determine which one is wrong.
     """
     beside = found.trials.get(other)
     return CATALOGUE[own].same_response == other and beside is not None and beside.gain > least \
@@ -100,17 +83,11 @@ def same_response(found: Found, own: str, other: str, least: float) -> bool:
 
 
 def closed_loop_bias(problem: Problem, trial: Trial, point: State, involved: list[str],
-           free: frozenset[str]) -> bool:
+                     free: frozenset[str]) -> bool:
     """
     Whether a trial that acts on body forces alone may be closed-loop bias by gusts.
 
-    Args:
-        problem: flights, priors, noise.
-        trial: fitted trial.
-        point: state of its fit.
-        involved: keys of the fit without the entry.
-        free: keys whose priors are ignored in that fit.
-
+    ``point`` is its fit; ``involved`` and ``free`` are those of the fit without the entry.
     """
     c = trial.candidate
     if not c.acts_on_body_only(problem.keys):
@@ -127,15 +104,9 @@ def cross_validate(problem: Problem, trial: Trial, point: State, without: State,
     """
     Set ``trial.held``: gains on each block, with all keys fitted to the other blocks.
 
-    Args:
-        problem: flights, priors, noise.
-        trial: fitted trial.
-        point: state of its fit.
-        without: best fit without the entry. ``point`` with the candidate's keys at zero would be
-            too far from its own fit for a linear prediction.
-        involved: keys of that fit.
-        free: keys whose priors are ignored in that fit.
-
+    ``point`` is the trial's fit, ``without`` the best fit without the entry, with the keys
+    ``involved``. ``point`` with the candidate's keys at zero would be too far from its own fit for
+    a linear prediction.
     """
     c = trial.candidate
     with_it = list(dict.fromkeys([*involved, *c.keys]))
@@ -153,8 +124,8 @@ def _held_out_costs(problem, at, names, free, nonlinear=False):
     total = [sum(part[k] for part in parts) for k in range(3)]
     costs = []
     for block, (h, g, chi2) in enumerate(parts):
-        step, _, _ = problem.solve(at.theta, names, free, total[0] - h, total[1] - g,
-                                   total[2] - chi2)
+        step, _ = problem.solve(at.theta, names, free, total[0] - h, total[1] - g,
+                                total[2] - chi2)
         if nonlinear:
             costs.append(_cost_after_step(problem, at, names, free, step, problem.block == block))
             continue

@@ -79,12 +79,8 @@ def load_flight(path: str | Path, robot: RobotParameters, p: GapParameters,
     """
     Read and check one recording.
 
-    Args:
-        path: path of the bag.
-        robot: parameters of the robot file.
-        p: parameters (params/gap.yaml).
-        fix: whether certain corrections are applied to the data.
-        name: name in messages; default: that of the folder.
+    With ``fix``, certain corrections are applied to the data. ``name`` replaces the folder's name
+    in messages.
 
     Raises:
         BagError: no such bag, or no recording of this robot.
@@ -260,10 +256,7 @@ def check_flights(runs: list[Path], flights: list[Flight], same: float) -> None:
     """
     Refuse one flight in two different files: cut, converted or recorded twice.
 
-    Args:
-        runs: paths, for the message.
-        flights: flights that were read there.
-        same: share of equal IMU readings from which two flights are the same.
+    Two flights are the same from this share of equal IMU readings.
 
     Raises:
         ParameterError: with both paths.

@@ -45,13 +45,7 @@ MILLI = {'rad': ('mrad', 1e3), 's': ('ms', 1e3), 'N m': ('mN m', 1e3)}
 def changes(before: JointLog, after: JointLog, robot: RobotParameters,
             p: GapParameters | None = None) -> list[dict]:
     """
-    Compare the servos of two logs.
-
-    Args:
-        before: first log.
-        after: second log.
-        robot: parameters of the robot file; start of both fits.
-        p: parameters (params/gap.yaml); default the shipped ones.
+    Compare the servos of two logs; the robot file is the start of both fits.
 
     Returns:
         a row for each joint of both logs and each of ``ROWS``: second ``log``, ``joint``, ``name``
@@ -95,7 +89,7 @@ def estimate(log: JointLog, robot: RobotParameters,
     start[:, INDEX['coulomb_friction']] = np.maximum(start[:, INDEX['coulomb_friction']], 0.005)
     start[:, INDEX['delay']] = np.maximum(start[:, INDEX['delay']], 0.008)
     noise = first_noise(log)
-    problems = Problems.apart(np.arange(count), start, np.tile(free, (count, 1)), weight)
+    problems = Problems.single_joints(np.arange(count), start, np.tile(free, (count, 1)), weight)
     for _ in range(2):
         # A weak prior of frequency and damping about the median joint regularises the fit.
         prior = prior_of(np.median(problems.points, axis=0), dict.fromkeys(
@@ -111,7 +105,7 @@ def _pooled(fitter, problems, free):
     """(J, n) encoded values with the prior about the mean of the joints, (J n, J n) covariance."""
     count, size = len(problems.points), int(free.sum())
     precision = np.zeros((count * size, count * size))
-    for j, (own, scatter) in enumerate(fitter.certainty(problems)):
+    for j, (own, scatter) in enumerate(fitter.covariances(problems)):
         part = slice(j * size, (j + 1) * size)
         precision[part, part] = np.linalg.inv(scatter * own[np.ix_(free, free)])
     own = problems.points[:, free].ravel()
@@ -136,18 +130,18 @@ def _physical(points, covariance, free, servos):
         frequency, damping = (np.exp(chosen[n]) for n in ('natural_frequency', 'damping_ratio'))
         kp = servos.robot.joints.inertia * frequency**2
         band, delay = chosen['coulomb_friction'], chosen['delay'] - servos.delays
-        made = {'offset': -chosen['offset'], 'kp': kp, 'kd': 2 * damping * kp / frequency,
+        result = {'offset': -chosen['offset'], 'kp': kp, 'kd': 2 * damping * kp / frequency,
                 'coulomb': kp * band, 'dead_band': band, 'delay': delay,
                 'ramp_lag': delay + 2 * damping / frequency}
-        return np.array([made[parameter] for _, parameter, _ in ROWS])
+        return np.array([result[parameter] for _, parameter, _ in ROWS])
 
-    made = np.array([values(point) for point in points])
+    result = np.array([values(point) for point in points])
     for j in range(count):
         slope = np.array([(values(points[j] + step) - values(points[j] - step)) / 0.02
                           for step in 0.01 * np.eye(size)])
         own = covariance[j * size:(j + 1) * size, j * size:(j + 1) * size]
         errors[j] = np.sqrt(np.diag(slope.T @ own @ slope))
-    return made, errors
+    return result, errors
 
 
 def sentences(rows: list[dict], log: str) -> list[str]:
@@ -160,7 +154,7 @@ def sentences(rows: list[dict], log: str) -> list[str]:
 
 def change_grids(rows: list[dict]) -> list[Grid]:
     """One table for each further log: before, after and difference."""
-    made = []
+    result = []
     for log in dict.fromkeys(row['log'] for row in rows):
         cells = []
         for row in (r for r in rows if r['log'] == log):
@@ -170,12 +164,12 @@ def change_grids(rows: list[dict]) -> list[Grid]:
             cells.append([str(row['joint']), f"{row['parameter']} [{unit}]", f'{old:.3g}',
                           f'{new:.3g}', f'{difference:+.3g}', f'{low:.3g}..{high:.3g}',
                           'yes' if row['significant'] else ''])
-        made.append(Grid(f'Changes to {log}', ['joint', 'parameter', 'before', 'after',
-                                               'difference', '95 %', 'significant'], cells,
-                         note='dead_band: friction over stiffness. ramp_lag: lag behind a ramp, '
-                              'from delay and damping. significant: two logs without a change '
-                              'have any such row in at most 5 of 100 cases.'))
-    return made
+        result.append(Grid(f'Changes to {log}', ['joint', 'parameter', 'before', 'after',
+                                                 'difference', '95 %', 'significant'], cells,
+                           note='dead_band: friction over stiffness. ramp_lag: lag behind a ramp, '
+                                'from delay and damping. significant: two logs without a change '
+                                'have any such row in at most 5 of 100 cases.'))
+    return result
 
 
 def line(row: dict) -> str:

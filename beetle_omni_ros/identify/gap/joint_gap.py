@@ -16,8 +16,7 @@ from beetle_omni_ros.identify.gap.parameters import GapParameters
 from beetle_omni_ros.identify.gap.results import grids, summary
 from beetle_omni_ros.identify.joint import identify_joints
 from beetle_omni_ros.identify.joint_log import JointLog, read_joint_log
-from beetle_omni_ros.identify.joint_page import joint_page
-from beetle_omni_ros.identify.joint_results import joint_results
+from beetle_omni_ros.identify.joint_results import joint_page, joint_results
 from beetle_omni_ros.identify.joint_servos import file_servos
 from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo_model import simulate
@@ -29,14 +28,9 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParameters,
                       base: Path | None, p: GapParameters | None = None) -> tuple[dict, str]:
     """
-    Analyse a response log, and compare it with others.
+    Analyse the first log, and compare it with further ones and with those of ``holdout``.
 
-    Args:
-        runs: the log; it is compared with further ones and with those of ``holdout``.
-        holdout: further logs.
-        robot: parameters of the robot file.
-        base: path of the robot file, for the record.
-        p: parameters (params/gap.yaml).
+    ``base`` is the path of the robot file, for the record.
 
     Returns:
         results with the keys of flights, and an HTML page.
@@ -51,23 +45,23 @@ def analyse_joint_log(runs: list[Path], holdout: list[Path], robot: RobotParamet
     models = identify_joints(log, robot.joints)
     identified = joint_results(log, others, models, robot.joints, file_servos(robot, log.joints))
     joints = identified['joints']
-    made = gap_of(found, log, joints)
+    result = gap_of(found, log, joints)
     for k, joint in enumerate(joints):
         joint['file_heldout_rms_rad'] = float(found.errors['file'][k])
         joint['corrected_heldout_rms_rad'] = float(found.errors['corrected'][k])
-    made['changes'] = [row for other in others for row in changes(log, other, robot, p)]
-    made['findings'] = [text for other in others for text in sentences(
-        [row for row in made['changes'] if row['log'] == other.name], other.name)]
-    identified['text'] = [*identified['text'], *made['findings']]
-    sets = any(len(effect['names']) > 1 for effect in made['effects'])
-    made |= {'next_experiment': _experiment(joints) if sets else None, 'joints': joints,
-             'meta': {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
-                      'robot': str(base) if base else 'params/robot.yaml',
-                      'version': __version__}}
-    made['summary'] = summary(made)
-    tables = [*grids(made), *change_grids(made['changes'])]
-    return made, joint_page(log, others, models, file_servos(robot, log.joints), identified,
-                            head(made, _picture(found, log)), tables)
+    result['changes'] = [row for other in others for row in changes(log, other, robot, p)]
+    result['findings'] = [text for other in others for text in sentences(
+        [row for row in result['changes'] if row['log'] == other.name], other.name)]
+    identified['text'] = [*identified['text'], *result['findings']]
+    sets = any(len(effect['names']) > 1 for effect in result['effects'])
+    result |= {'next_experiment': _experiment(joints) if sets else None, 'joints': joints,
+               'meta': {'runs': [str(r) for r in runs], 'holdout': [str(h) for h in holdout],
+                        'robot': str(base) if base else 'params/robot.yaml',
+                        'version': __version__}}
+    result['summary'] = summary(result)
+    tables = [*grids(result), *change_grids(result['changes'])]
+    return result, joint_page(log, others, models, file_servos(robot, log.joints), identified,
+                              head(result, _picture(found, log)), tables)
 
 
 def _picture(found, log):
@@ -96,12 +90,8 @@ def gap_of(found: Found, log: JointLog, apart: list[dict] | tuple = ()) -> dict:
     """
     Verdict, effects and errors of a search, with the keys of INTERFACES.
 
-    Args:
-        found: result of the search.
-        log: the log.
-        apart: results of `identify joint` for each joint alone, for a joint that differs from the
-            others.
-
+    ``apart`` has the results of `identify joint` for each joint alone, for a joint that differs
+    from the others.
     """
     effects = _effects(found)
     best = np.minimum(found.errors['free'], found.errors['corrected'])
@@ -185,8 +175,8 @@ def _evidence(trial: Trial):
 
 def _effects(found: Found):
     """Accepted entries, largest gain first; friction of several joints is one effect."""
-    made, friction = [], [t for t in found.accepted if t.entry.name == 'joint_friction'
-                          and t.entry in found.sets]
+    result, friction = [], [t for t in found.accepted if t.entry.name == 'joint_friction'
+                            and t.entry in found.sets]
     for trial in found.accepted:
         if trial.entry not in found.sets or trial in friction[1:]:
             continue
@@ -208,8 +198,8 @@ def _effects(found: Found):
         also = _also(found, members)
         if also:
             effect['also'] = also
-        made.append(effect)
-    return made
+        result.append(effect)
+    return result
 
 
 def _joints(found, trials):
@@ -236,7 +226,7 @@ def _parameters(found: Found, entry: Entry, point=None):
     point = found.point if point is None else point
     if entry.name == 'joint_friction':
         return _friction(found, point)
-    made, values, file_values = {}, servos.values(point), servos.values(found.file_point)
+    result, values, file_values = {}, servos.values(point), servos.values(found.file_point)
     for k in np.flatnonzero(servos.mask(entry.name, entry.joint)):
         number, width = servos.numbers[k], 0.0 if other else found.widths[k] * servos.scale[k]
         ends = [values[k] * np.exp(s * width) if number.logarithmic else values[k] + s * width
@@ -244,13 +234,13 @@ def _parameters(found: Found, entry: Entry, point=None):
         less = servos.delays if number.name == 'delay' else 0.0
         spec = CATALOGUE[entry.name].parameters[number.name]
         value = float(values[k] - less)
-        made[number.name] = {'value': value, 'unit': spec.unit,
-                             'file': float(file_values[k] - less)}
+        result[number.name] = {'value': value, 'unit': spec.unit,
+                               'file': float(file_values[k] - less)}
         if not other:
             low, high = (float(end - less) for end in ends)
-            made[number.name]['interval'] = [max(low, min(value, spec.low)),
-                                             min(high, max(value, spec.high))]
-    return made
+            result[number.name]['interval'] = [max(low, min(value, spec.low)),
+                                               min(high, max(value, spec.high))]
+    return result
 
 
 def _friction(found, point):
@@ -265,28 +255,28 @@ def _friction(found, point):
     own = dict(zip(('coulomb', 'stiction'), (float(np.median(
         [value[joint - 1] for joint in servos.joints])) for value in friction(servos.robot)),
                    strict=True))
-    made = {}
+    result = {}
     for name, value in (('coulomb', force), ('stiction', force + extra)):
-        made[name] = {'value': float(np.median(value)), 'unit': unit, 'file': own[name],
-                      'interval': [max(float(np.median(value + s * width)), 0.0)
-                                   for s in (-1, 1)],
-                      'each': {str(servos.joints[j]): float(value[j]) for j in range(count)}}
-    return made
+        result[name] = {'value': float(np.median(value)), 'unit': unit, 'file': own[name],
+                        'interval': [max(float(np.median(value + s * width)), 0.0)
+                                     for s in (-1, 1)],
+                        'each': {str(servos.joints[j]): float(value[j]) for j in range(count)}}
+    return result
 
 
 def _candidates(found: Found):
     """One row for each entry with its evidence, largest gain first."""
     members = {t.entry: t for group in found.sets.values() for t in group}
     rows = [(t, True) for t in members.values()] + [(t, False) for t in found.rejected]
-    made = []
+    result = []
     for trial, accepted in sorted(rows, key=lambda row: (-row[1], -row[0].gain)):
         row = {'name': trial.entry.name, 'accepted': accepted, 'evidence': _evidence(trial),
                'sigma_of_realistic_size': None, 'sigma_beside_rivals': {},
                'reason': '' if accepted else trial.reason}
         if trial.entry.joint is not None:
             row['joint'] = found.servos.joints[trial.entry.joint]
-        made.append(row)
-    return made
+        result.append(row)
+    return result
 
 
 def _experiment(joints):

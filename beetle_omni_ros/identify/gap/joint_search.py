@@ -128,15 +128,7 @@ class Found:
 
 
 class Search:
-    """
-    Forward selection from the servos of the file.
-
-    Args:
-        log: the whole log; only its first part is fitted.
-        robot: parameters of the robot file.
-        p: parameters (params/gap.yaml); default the shipped ones.
-
-    """
+    """Forward selection from the servos of the file; only the first part of the log is fitted."""
 
     def __init__(self, log: JointLog, robot: RobotParameters, p: GapParameters | None = None):
         self.p = p or GapParameters.load()
@@ -149,12 +141,12 @@ class Search:
         self._estimate_noise()
 
     def _entries(self):
-        made = [Entry(name, j) for name in ('joint_offset', 'joint_friction')
+        result = [Entry(name, j) for name in ('joint_offset', 'joint_friction')
                 for j in range(len(self.log.joints))]
-        made += [Entry(name) for name in GROUPS if name != 'joint_offset']
+        result += [Entry(name) for name in GROUPS if name != 'joint_offset']
         # A speed limit shows only if the command asks for that speed.
-        slow = (self.log.asked_speed() < FIT.beyond * 0.95 * self.log.speed()).all()
-        return [e for e in made if not (e.name == 'joint_velocity_limit' and slow)]
+        slow = (self.log.command_speed() < FIT.beyond * 0.95 * self.log.speed()).all()
+        return [e for e in result if not (e.name == 'joint_velocity_limit' and slow)]
 
     def _estimate_noise(self):
         """Noise around the best servos that a robot file can describe, from two starts."""
@@ -169,7 +161,7 @@ class Search:
             starts, noise = [self.full], self._noise(self.full)
         self.noise = noise
         self.fitter = self._fitter(self.noise)
-        self.scatter = self.fitter.certainty(self._problems([self.full], [usual]))[0][1]
+        self.scatter = self.fitter.covariances(self._problems([self.full], [usual]))[0][1]
 
     def _fitter(self, noise):
         return ServoFitter(self.log, noise, self.servos)
@@ -315,15 +307,7 @@ class Search:
         return np.where(free, point, self.servos.file_point)
 
     def _trials_without(self, accepted, point, each=None):
-        """
-        A trial of each accepted entry: loss of the model without it, fitted and held out.
-
-        Args:
-            accepted: entries of the model.
-            point: its fitted parameters.
-            each: entries to judge, default all of them.
-
-        """
+        """Trials of accepted entries (``each``): loss without it, fitted and held out."""
         each = accepted if each is None else each
         models = [accepted, *([o for o in accepted if o != e] for e in each)]
         points = [point, *(self._restricted(m, point) for m in models[1:])]
@@ -396,7 +380,7 @@ class Search:
         free = self._free(accepted)
         if not free.any():
             return np.zeros(len(free))
-        own, _ = self.fitter.certainty(self._problems([point], [accepted]))[0]
+        own, _ = self.fitter.covariances(self._problems([point], [accepted]))[0]
         return 1.96 * np.sqrt(self.scatter * np.diag(own))
 
     def _sets(self, accepted, point, trials, widths):

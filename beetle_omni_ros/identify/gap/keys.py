@@ -139,22 +139,19 @@ def tolerances(p: GapParameters, coarse: bool = False,
     """
     Priors of the keys by which every robot differs from the robot file.
 
-    Args:
-        p: parameters (params/gap.yaml).
-        coarse: whether the sensors are noisy, so that their latency is unknown.
-        swing: logarithm of the factor by which a servo's inertia may exceed that of the file.
-
+    Sensors with ``coarse`` noise have an unknown latency. ``swing`` is the logarithm of the factor
+    by which a servo's inertia may exceed that of the file.
     """
-    made = {key: getattr(p, f'tolerance_{spec.tolerance}')
+    result = {key: getattr(p, f'tolerance_{spec.tolerance}')
             for name, effect in CATALOGUE.items() for parameter, spec in effect.parameters.items()
             if spec.tolerance for key in names_of(name, parameter)}
-    made['modules.share'] = p.modules_tolerance
+    result['modules.share'] = p.modules_tolerance
     for k in range(4):
-        made |= {f'rotor.lag[{k}]': p.tolerance_lag, f'servo.kp[{k}]': p.tolerance_lag,
-                 f'servo.kd[{k}]': p.tolerance_lag}
+        result |= {f'rotor.lag[{k}]': p.tolerance_lag, f'servo.kp[{k}]': p.tolerance_lag,
+                   f'servo.kd[{k}]': p.tolerance_lag}
     for k in range(12):
-        made[f'position.offset[{k}]'] = p.tolerance_position
-    priors = {name: Prior(deviation) for name, deviation in made.items()}
+        result[f'position.offset[{k}]'] = p.tolerance_position
+    priors = {name: Prior(deviation) for name, deviation in result.items()}
     priors['imu_filter_lag.delay'] = Prior(p.tolerance_delay, 0.0, p.imu_averaging, 0.002)
     reach, nominal = p.command_delay_range, p.command_delay
     for bus in (TILT_BUS, THRUST_BUS):

@@ -60,13 +60,7 @@ class Noise:
         return cls(taps, sigma, seen)
 
     def bounded(self, ceilings: dict[str, np.ndarray]) -> Noise:
-        """
-        The same noise with each channel at most at its ceiling.
-
-        Args:
-            ceilings: group -> (channels,) RMS of a valid residual.
-
-        """
+        """The same noise with each channel at most at its RMS ceiling (group -> (channels,))."""
         shares = {group: np.minimum(1.0, ceilings[group] / np.maximum(size, 1e-12))
                   for group, size in self.spread.items()}
         return Noise(self.taps, {g: x * shares[g] for g, x in self.sigma.items()},
@@ -88,11 +82,11 @@ class Noise:
 
     def places(self, counts: dict[str, int]) -> list[tuple[str, int, np.ndarray]]:
         """(group, channel, sample indices) in the order of :meth:`whiten`."""
-        made = []
+        result = []
         for group, taps in self.taps.items():
             for k in range(len(taps)):
-                made.append((group, k, np.arange(taps.shape[1] - 1, counts[group])))
-        return made
+                result.append((group, k, np.arange(taps.shape[1] - 1, counts[group])))
+        return result
 
 
 def _floors(p):
@@ -162,27 +156,27 @@ def ceilings(model: FlightModel, p: GapParameters) -> dict[str, np.ndarray]:
     seen = sensor_noise(model)
     force, torque = p.gust_ceiling
     limits = dict(zip('AWJ', p.model_ceiling, strict=True))
-    made = {'B': np.array([force] * 3 + [torque] * 3)}
+    result = {'B': np.array([force] * 3 + [torque] * 3)}
     for group, size in seen.items():
-        made[group] = np.full(len(CHANNELS[group]), np.hypot(p.noise_ceiling * size,
-                                                             limits[group]))
-    return made
+        result[group] = np.full(len(CHANNELS[group]), np.hypot(p.noise_ceiling * size,
+                                                               limits[group]))
+    return result
 
 
 def channels_above_ceiling(models: list[FlightModel], theta: dict[str, float],
-             p: GapParameters) -> list[ExcessNoise]:
+                           p: GapParameters) -> list[ExcessNoise]:
     """
     Channels whose residual exceeds its ceiling, largest ratio first.
 
     The noise model of a fit adapts to any unexplained residual. The ceiling comes from the scatter
     of the readings instead, so a large residual is a gap whatever its spectrum.
     """
-    made = []
+    result = []
     for model in models:
         residual, limits = model.residual(theta), ceilings(model, p)
         for group, names in CHANNELS.items():
             size = np.sqrt((residual[group]**2).mean(axis=0))
-            made += [ExcessNoise(name, float(s), float(limit), model.flight.name)
-                     for name, s, limit in zip(names, size, limits[group], strict=True)
-                     if s > limit]
-    return sorted(made, key=lambda loud: -loud.size / loud.ceiling)
+            result += [ExcessNoise(name, float(s), float(limit), model.flight.name)
+                       for name, s, limit in zip(names, size, limits[group], strict=True)
+                       if s > limit]
+    return sorted(result, key=lambda loud: -loud.size / loud.ceiling)

@@ -23,20 +23,13 @@ VERDICT_COLOURS = {'no_gap': '#2b7a3d', 'named': '#1f5fa8', 'named_set': '#1f5fa
 SHOWN = ('position', 'orientation')     # states of the first picture
 
 
-def gap_page(a: Analysis, made: dict) -> str:
-    """
-    One self-contained page.
-
-    Args:
-        a: the analysis.
-        made: its results.
-
-    """
-    reason = made['reason'][:1].upper() + made['reason'][1:]
-    notes = [*([] if made['reason'] in made['summary'] else [f'{reason}.']),
-             *([f'Next experiment: {made["next_experiment"]}.']
-               if made['next_experiment'] else []),
-             *made['findings']]
+def gap_page(a: Analysis, result: dict) -> str:
+    """One self-contained page."""
+    reason = result['reason'][:1].upper() + result['reason'][1:]
+    notes = [*([] if result['reason'] in result['summary'] else [f'{reason}.']),
+             *([f'Next experiment: {result["next_experiment"]}.']
+               if result['next_experiment'] else []),
+             *result['findings']]
     sections = []
     if a.problem is not None:
         with matplotlib.rc_context(STYLE):
@@ -49,17 +42,18 @@ def gap_page(a: Analysis, made: dict) -> str:
                         svg(_runs(a), 'free runs')),
                 section('Evidence', 'Decrease of chi2 (squared residual over noise) by each entry '
                         'beside the accepted ones; blue: accepted.', svg(_bars(a), 'evidence')
-                        + html(_evidence(made['candidates'], 60))),
+                        + html(_evidence(result['candidates'], 60))),
                 section('Detectability', 'Standard deviations that an effect of typical size '
                         'would show, alone and beside the most similar entry. Below '
                         f'{a.problem.p.decidable:g} it would not be named.',
-                        html(_visible(made))),
+                        html(_visible(result))),
                 section('Tolerances', 'Deviations of this robot from the robot file within '
                         'manufacturing tolerance. They are fitted and not named; --tolerances '
                         'writes masses, gains, lags and rotor positions to the robot file.',
-                        html(_tolerances(made)))]
-    tables = [grid for grid in grids(made) if grid.title != CANDIDATES]
-    return page('Gap', _about(a, made['meta']), tables, notes, sections, head(made, _picture(a)))
+                        html(_tolerances(result)))]
+    tables = [grid for grid in grids(result) if grid.title != CANDIDATES]
+    return page('Gap', _about(a, result['meta']), tables, notes, sections,
+                head(result, _picture(a)))
 
 
 def _about(a, meta):
@@ -77,9 +71,9 @@ def _lines(a, *texts):
     return list(zip(('before', 'after'), (BEFORE, AFTER), texts, strict=True))
 
 
-def head(made: dict, picture: str = '') -> str:
+def head(result: dict, picture: str = '') -> str:
     """Head of the page: verdict, sentence and picture, as HTML."""
-    return verdict_head(headline(made), VERDICT_COLOURS[made['verdict']], made['summary'],
+    return verdict_head(headline(result), VERDICT_COLOURS[result['verdict']], result['summary'],
                         picture)
 
 
@@ -153,9 +147,9 @@ def _bars(a) -> Figure:
     return figure
 
 
-def _visible(made):
+def _visible(result):
     rows, seen = [], set()
-    for row in sorted(made['candidates'], key=lambda r: r['sigma_of_realistic_size'] or 1e9):
+    for row in sorted(result['candidates'], key=lambda r: r['sigma_of_realistic_size'] or 1e9):
         sigma = row['sigma_of_realistic_size']
         member = row.get('rotor') or row.get('joint')
         key = row['name'], member
@@ -169,7 +163,7 @@ def _visible(made):
     return Grid('', ['entry', 'alone', 'beside the most similar entry'], rows)
 
 
-def _tolerances(made):
+def _tolerances(result):
     rows = [[name, f'{100 * e["deviation"]:.2f} %' if e['relative'] else f'{e["deviation"]:.2g}']
-            for name, e in made['tolerances'].items()]
+            for name, e in result['tolerances'].items()]
     return Grid('', ['number', 'deviation'], rows)

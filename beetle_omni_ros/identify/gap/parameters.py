@@ -262,10 +262,6 @@ class GapParameters:
         """
         Read the shipped file, then another file, then single values.
 
-        Args:
-            path: file with values that replace shipped ones, or None.
-            changed: single values that replace those of the files.
-
         Raises:
             ParameterError: with file and key; an unknown key, wrong type or value out of range.
 

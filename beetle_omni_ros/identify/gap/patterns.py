@@ -53,15 +53,7 @@ class Pattern:
 
 
 def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:
-    """
-    Tests of all hypotheses, largest gain first.
-
-    Args:
-        problem: flights and noise.
-        state: the final fit.
-        names: fitted keys, which are projected out first.
-
-    """
+    """Tests of all hypotheses, largest gain first; the fitted keys are projected out."""
     asked = [hypotheses(model, state.theta) for model in problem.models]
     rows = problem.where < 6
     fitted = state.slopes[rows][:, [state.index[name] for name in names]]
@@ -71,7 +63,7 @@ def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:
     raw = [slopes['B'][:, :, index] for _, slopes, *_ in problem._raw]
     r = state.r[rows]
     r = r - fitted @ np.linalg.lstsq(fitted, r, rcond=None)[0]
-    made = []
+    result = []
     for text in asked[0]:
         white, plain = zip(*(_in_residual(problem, model, each[text])
                              for model, each in zip(problem.models, asked, strict=True)),
@@ -84,9 +76,9 @@ def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:
         # The part that fitted keys absorb, such as a constant wind, is subtracted.
         size = np.sqrt(np.mean([((each @ weights - slopes @ (known @ weights))**2).mean(axis=0)
                                 for each, slopes in zip(plain, raw, strict=True)], axis=0))
-        made.append(Pattern(text, held.total, held.error, held.positive,
-                            (float(np.linalg.norm(size[:3])), float(np.linalg.norm(size[3:])))))
-    return sorted(made, key=lambda p: -p.gain)
+        result.append(Pattern(text, held.total, held.error, held.positive,
+                              (float(np.linalg.norm(size[:3])), float(np.linalg.norm(size[3:])))))
+    return sorted(result, key=lambda p: -p.gain)
 
 
 def hypotheses(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarray]:
@@ -133,11 +125,8 @@ def _swinging_masses(force, period, p):
     """
     (N, 6, K) forces on the body of masses on weak springs.
 
-    Args:
-        force: (N, 3) specific force of the model. The measured one would contain the gusts.
-        period: period of the samples [s].
-        p: parameters (params/gap.yaml).
-
+    ``force`` (N, 3) is the specific force of the model, sampled with ``period`` [s]. The measured
+    one would contain the gusts.
     """
     size, twice = np.zeros((len(force), 6, 3 * len(p.swings))), 2 * p.swing_damping
     for j, frequency in enumerate(p.swings):
@@ -214,4 +203,4 @@ def _line(frequency, power, p):
     ratio = power[inside] / np.maximum(beside, 1e-30)
     top = int(np.argmax(ratio))
     return SpectralLine(float(frequency[inside[top]]), float(ratio[top]),
-                  float(np.sqrt(power[inside[top]])))
+                        float(np.sqrt(power[inside[top]])))

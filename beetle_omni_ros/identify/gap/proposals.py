@@ -16,14 +16,6 @@ class Proposals:
     """
     Trials of all candidates beside the present fit, in several processes.
 
-    Args:
-        problem: flights, priors, noise.
-        candidates: candidates to try.
-        state: present fit, with slopes of all keys.
-        cost: its objective.
-        involved: keys of the present fit.
-        free: keys whose priors are ignored.
-
     Attributes:
         trials: one for each candidate, largest gain first.
         points: label -> state of the trial.
@@ -36,10 +28,10 @@ class Proposals:
         self.involved, self.free = involved, free
         normal = (state.slopes.T @ state.slopes, state.slopes.T @ state.r,
                   float(state.r @ state.r))
-        made = problem.parallel(_estimated, candidates, state, cost, involved, free, normal)
+        result = problem.parallel(_estimated, candidates, state, cost, involved, free, normal)
         self.trials: list[Trial] = []
         self.points: dict[str, State] = {}
-        for c, (trial, difference) in zip(candidates, made, strict=True):
+        for c, (trial, difference) in zip(candidates, result, strict=True):
             self.trials.append(trial)
             self.points[c.label] = state.with_difference(difference) if difference else state
         self.trials.sort(key=lambda t: -t.gain)
@@ -66,9 +58,9 @@ class Proposals:
     def _fit(self, chosen):
         problem, state, trials, points = self.problem, self.state, self.trials, self.points
         starts = [(trials[k].candidate, points[trials[k].candidate.label].difference_to(state))
-                 for k in chosen]
-        made = problem.parallel(_refined, starts, state, self.involved, self.free)
-        for k, (difference, reached) in zip(chosen, made, strict=True):
+                  for k in chosen]
+        result = problem.parallel(_refined, starts, state, self.involved, self.free)
+        for k, (difference, reached) in zip(chosen, result, strict=True):
             c = trials[k].candidate
             points[c.label] = state.with_difference(difference)
             theta = dict(points[c.label].theta)
@@ -91,8 +83,8 @@ def _estimated(problem, c, state, cost, involved, free, normal):
         return trial, point.difference_to(state)
     (h, g, chi2), index = normal, [state.index[name] for name in names]
     theta = delays_handed_over(state.theta, c)
-    step, reached, _ = problem.solve(theta, names, released, h[np.ix_(index, index)], g[index],
-                                     chi2)
+    step, reached = problem.solve(theta, names, released, h[np.ix_(index, index)], g[index],
+                                  chi2)
     trial = Trial(c, cost - reached, problem.moved(theta, names, step))
     return trial, None if theta is state.theta else State(
         theta, problem.residual(theta), state.slopes, state.names).difference_to(state)
@@ -130,7 +122,7 @@ def _elsewhere(problem, state, cost, c, names, released):
         slopes = state.slopes.copy()
         slopes[:, [state.index[name] for name in c.keys]] = problem.slopes(theta, list(c.keys))
         point = State(theta, r, slopes, state.names)
-        step, reached, _ = problem.linear_step(point, names, released)
+        step, reached = problem.linear_step(point, names, released)
         # A linear estimate of a limit is bounded by the actual gain at the start.
         actual = cost - float(r @ r) - problem.prior_cost(theta, released)
         gain = cost - reached
@@ -147,18 +139,13 @@ def delays_handed_over(theta, candidate):
 
     The data do not separate the two. A fit that starts with half of the delay in the bus would
     stay there, because the prior allows it.
-
-    Args:
-        theta: deviations by key.
-        candidate: candidate that joins the model.
-
     """
     key, late = f'{candidate.name}.delay', CATALOGUE[candidate.name].delays
     if not {'tilt', 'thrust'} & set(late) or theta.get(key):
         return theta
     # Only differences count: all sensors late by dt equals all commands early by dt.
     common = float(np.mean([theta.get(name, 0.0) for name in SENSORS]))
-    made = {**theta, **{name: theta.get(name, 0.0) - common for name in SENSORS}}
+    result = {**theta, **{name: theta.get(name, 0.0) - common for name in SENSORS}}
     tilt, thrust = (theta.get(name, 0.0) + common for name in (TILT_BUS, THRUST_BUS))
     if len(late) == 2:
         own = (tilt + thrust) / 2
@@ -167,4 +154,4 @@ def delays_handed_over(theta, candidate):
         own, tilt = tilt - thrust, thrust
     else:
         own, thrust = thrust - tilt, tilt
-    return {**made, key: own, TILT_BUS: tilt, THRUST_BUS: thrust}
+    return {**result, key: own, TILT_BUS: tilt, THRUST_BUS: thrust}

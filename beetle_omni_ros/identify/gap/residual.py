@@ -37,14 +37,7 @@ BOTH_SIDES = 'delay'
 
 class FlightModel:
     """
-    Residuals of one flight at any deviations.
-
-    Args:
-        flight: measurements.
-        robot: parameters of the robot file.
-        body: body equations, shared by all flights.
-        keys: all keys by name.
-        p: parameters (params/gap.yaml).
+    Residuals of one flight at any deviations; all flights share the body equations.
 
     Attributes:
         modules: share of the file's tilting modules in the model, 0 or 1; fits vary it around
@@ -115,25 +108,25 @@ class FlightModel:
         point = (self.modules, theta)
         if self._last[0] != point:
             self._last = (self.modules, dict(theta)), {}
-        made = self._last[1]
-        made.update(self._residual(theta, ''.join(g for g in groups if g not in made)))
-        return {group: made[group] for group in groups}
+        result = self._last[1]
+        result.update(self._residual(theta, ''.join(g for g in groups if g not in result)))
+        return {group: result[group] for group in groups}
 
     def _residual(self, theta, groups):
         """As :meth:`residual`, without the cache."""
-        made = {}
+        result = {}
         if 'B' in groups:
             force, _, turning = self.signals.imu(theta)
             expected = self._body(self._thinned(theta), theta)
-            made['B'] = self._mask[:, None] * self.filters['B'](
+            result['B'] = self._mask[:, None] * self.filters['B'](
                 np.concatenate([force, turning], axis=1)[::THIN] - expected)
         if 'A' in groups:
-            made['A'] = self._world(theta)
+            result['A'] = self._world(theta)
         if 'W' in groups:
-            made['W'] = self._rates(theta)
+            result['W'] = self._rates(theta)
         if 'J' in groups:
-            made['J'] = self._joints([theta])[0]
-        return made
+            result['J'] = self._joints([theta])[0]
+        return result
 
     def _world(self, theta):
         """IMU's acceleration in world less MoCap's (M, 3)."""
@@ -245,14 +238,14 @@ class FlightModel:
 
     def slopes(self, theta: dict[str, float], names: list[str]) -> dict[str, np.ndarray]:
         """Group -> (M, channels, len(names)): derivative of the residual by each key."""
-        made = {group: np.zeros((len(self.times(group)), len(channels), len(names)))
+        result = {group: np.zeros((len(self.times(group)), len(channels), len(names)))
                 for group, channels in CHANNELS.items()}
         body = [name for name in names if self.keys[name].body]
         if body:
             exact = self._body.derivatives(self._thinned(theta), theta, tuple(body))
             smooth = -self._mask[:, None, None] * self.filters['B'](exact)
             for k, name in enumerate(body):
-                made['B'][:, :, names.index(name)] = smooth[:, :, k]
+                result['B'][:, :, names.index(name)] = smooth[:, :, k]
         signal = {name: self.keys[name].groups.replace('J', '') for name in names
                   if not self.keys[name].body}
         now = self.residual(theta, ''.join(dict.fromkeys(''.join(signal.values()))))
@@ -265,9 +258,9 @@ class FlightModel:
                     other, width = self._residual({**theta, name: here - h}, groups), 2 * h
                 moved = self._residual({**theta, name: here + h}, groups)
                 for group, values in moved.items():
-                    made[group][:, :, names.index(name)] = (values - other[group]) / width
+                    result[group][:, :, names.index(name)] = (values - other[group]) / width
         turning = [name for name in names if 'J' in self.keys[name].groups]
         if turning:
             for name, slope in zip(turning, self._joint_slopes(theta, turning), strict=True):
-                made['J'][:, :, names.index(name)] = slope
-        return made
+                result['J'][:, :, names.index(name)] = slope
+        return result

@@ -29,7 +29,7 @@ SPELLED = {'imu': 'IMU', 'mocap': 'MoCap'}
 def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -> dict:
     """Results as plain data with the keys of INTERFACES."""
     judged = a.gaps.get(HORIZONS[JUDGED], {})
-    made = {
+    result = {
         'verdict': a.verdict, 'reason': a.reason, 'closure': judged.get('closure'),
         'gap_before': judged.get('before'), 'gap_after': judged.get('after'),
         'noise_floor': 1.0 if judged else None,
@@ -47,23 +47,23 @@ def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -
     if a.problem is not None:
         count = len(a.problem.time)
         before, after, floor = a.found.cost
-        made |= {'explained': a.found.explained if a.found.accepted else None,
-                 'excess': {'samples': count, 'before': before, 'after': after,
-                            'everything': floor},
-                 'hidden': [*hidden(a, p), *a.unseen], 'tolerances': _tolerances(a),
-                 'remainder': {'gain': a.rest.gain, 'positive': a.rest.positive,
-                               'frame': a.rest.frame, 'channels': dict(a.rest.channels),
-                               'terms': dict(a.rest.terms)},
-                 'patterns': [asdict(pattern) for pattern in a.patterns],
-                 'rhythm': asdict(a.spectral_line)}
-    made['summary'] = summary(made)
-    return made
+        result |= {'explained': a.found.explained if a.found.accepted else None,
+                   'excess': {'samples': count, 'before': before, 'after': after,
+                              'everything': floor},
+                   'hidden': [*hidden(a, p), *a.unseen], 'tolerances': _tolerances(a),
+                   'remainder': {'gain': a.rest.gain, 'positive': a.rest.positive,
+                                 'frame': a.rest.frame, 'channels': dict(a.rest.channels),
+                                 'terms': dict(a.rest.terms)},
+                   'patterns': [asdict(pattern) for pattern in a.patterns],
+                   'rhythm': asdict(a.spectral_line)}
+    result['summary'] = summary(result)
+    return result
 
 
-def headline(made: dict) -> str:
+def headline(result: dict) -> str:
     """Verdict and named effects."""
-    names = ', '.join(_label(effect) for effect in made['effects'])
-    return f"{WORDS[made['verdict']]}{': ' + names if names else ''}"
+    names = ', '.join(_label(effect) for effect in result['effects'])
+    return f"{WORDS[result['verdict']]}{': ' + names if names else ''}"
 
 
 def _label(effect):
@@ -77,25 +77,25 @@ def _effect(a, trial, robot):
     c = trial.candidate
     rivals = a.found.rivals.get(c.label, [])
     names = list(dict.fromkeys([c.name, *(t.candidate.name for t in rivals)]))
-    made = {'names': names, 'parameters': parameters(a, c.name, c.keys, a.found.theta, robot),
+    result = {'names': names, 'parameters': parameters(a, c.name, c.keys, a.found.theta, robot),
             'evidence': evidence(a, trial), 'layer': CATALOGUE[c.name].layer}
     if c.member is not None:
-        made[CATALOGUE[c.name].each] = c.member
+        result[CATALOGUE[c.name].each] = c.member
     if rivals:
-        made['rivals'] = [{
+        result['rivals'] = [{
             'name': t.candidate.name, 'gain': t.gain,
             **({CATALOGUE[t.candidate.name].each: t.candidate.member}
                if t.candidate.member else {}),
             'parameters': parameters(a, t.candidate.name, t.candidate.keys, t.theta, robot,
                                      with_intervals=False)} for t in rivals]
-        made['separated_by'] = separating_experiment(names)
-    return made
+        result['separated_by'] = separating_experiment(names)
+    return result
 
 
 def parameters(a: Analysis, name: str, free: tuple[str, ...], theta: dict[str, float],
                robot: RobotParameters, with_intervals: bool = True) -> dict:
     """Parameter -> value, unit, 95 % interval of one effect."""
-    made = {}
+    result = {}
     own = [key for key in a.keys.values() if key.effect == name]
     member = bool(CATALOGUE[name].each)
     for parameter, spec in CATALOGUE[name].parameters.items():
@@ -104,7 +104,7 @@ def parameters(a: Analysis, name: str, free: tuple[str, ...], theta: dict[str, f
         values = [key.value(theta.get(key.name, 0.0)) for key in keys]
         bases = [key.base for key in keys]
         entry: dict = {'value': values if len(values) > 1 else values[0], 'unit': spec.unit,
-                 'file': bases if len(bases) > 1 else bases[0]}
+                       'file': bases if len(bases) > 1 else bases[0]}
         if with_intervals:
             widths = [key.width(theta.get(key.name, 0.0), a.widths.get(key.name, 0.0))
                       if key.name in free else 0.0 for key in keys]
@@ -112,10 +112,10 @@ def parameters(a: Analysis, name: str, free: tuple[str, ...], theta: dict[str, f
             spans = [[max(v - w, min(v, spec.low)), min(v + w, max(v, spec.high))]
                      for v, w in zip(values, widths, strict=True)]
             entry['interval'] = spans if len(spans) > 1 else spans[0]
-        made[parameter] = entry
+        result[parameter] = entry
     if name == 'joint_friction':
-        at_least(made['stiction'], made['coulomb'])
-    return made
+        at_least(result['stiction'], result['coulomb'])
+    return result
 
 
 def at_least(stiction: dict, coulomb: dict) -> None:
@@ -138,7 +138,7 @@ def evidence(a: Analysis, trial: Trial) -> dict:
 
 
 def _candidates(a):
-    made = []
+    result = []
     taken = {t.candidate.label for t in a.found.accepted}
     for label, trial in sorted(a.found.trials.items(), key=lambda lt: -lt[1].gain):
         seen = a.visible.get(label)
@@ -150,8 +150,8 @@ def _candidates(a):
             row['form'] = label.partition(' (')[2].rstrip(')')
         if trial.candidate.member is not None:
             row[CATALOGUE[trial.candidate.name].each] = trial.candidate.member
-        made.append(row)
-    return made
+        result.append(row)
+    return result
 
 
 def _tolerances(a):
@@ -161,14 +161,14 @@ def _tolerances(a):
             for name in a.problem.priors if abs(theta.get(name, 0.0)) > 0}
 
 
-def grids(made: dict) -> list[Grid]:
+def grids(result: dict) -> list[Grid]:
     """Tables: effects, free runs, largest residuals and best candidates."""
     tables = []
-    if made.get('bad_data'):
-        tables.append(_damages(made['bad_data']))
-    if made['effects'] or made['partial']:
+    if result.get('bad_data'):
+        tables.append(_damages(result['bad_data']))
+    if result['effects'] or result['partial']:
         rows = []
-        for effect in made['effects'] or made['partial']:
+        for effect in result['effects'] or result['partial']:
             name = _label(effect)
             for k, (parameter, entry) in enumerate(effect['parameters'].items()):
                 rows.append([name if k == 0 else '', f"{parameter} [{entry['unit']}]",
@@ -179,27 +179,27 @@ def grids(made: dict) -> list[Grid]:
                       _numbers(entry['value']), '', _numbers(entry['file']), '']
                      for rival in effect.get('rivals', [])
                      for k, (parameter, entry) in enumerate(rival['parameters'].items())]
-        title = 'Effects' if made['effects'] else 'Partial explanation, not accepted'
+        title = 'Effects' if result['effects'] else 'Partial explanation, not accepted'
         tables.append(Grid(
             title, ['effect', 'parameter', 'value', '95 %', 'in the file', 'delta BIC'], rows,
             note='95 %: interval that contains the true value in 95 of 100 cases. delta BIC: '
                  'gain minus the price of each parameter; 10 is strong evidence.'))
-    if made['horizons']:
-        tables.append(_horizons(made))
-    if made['where']:
-        named = bool(made['effects'])
+    if result['horizons']:
+        tables.append(_horizons(result))
+    if result['where']:
+        named = bool(result['effects'])
         rows = [[w['channel'], w['regime'], _cell(w['excess']),
-                 *([_cell(w['excess_after'])] if named else [])] for w in made['where'][:6]]
+                 *([_cell(w['excess_after'])] if named else [])] for w in result['where'][:6]]
         tables.append(Grid('Largest residuals',
                            ['channel', 'regime', *(['before', 'after'] if named else ['RMS'])],
                            rows, note='RMS of measured minus expected, in standard deviations of '
                                       'the noise.'))
-    if made['candidates']:
-        tables.append(_evidence(made['candidates'], 8))
+    if result['candidates']:
+        tables.append(_evidence(result['candidates'], 8))
     return tables
 
 
-def _horizons(made):
+def _horizons(result):
     """Errors of free runs; columns about effects only if an effect is named."""
     columns = {'before': ('before', 'before: without the named effects, tolerances as fitted.'),
                'after': ('after', 'after: with them.'),
@@ -207,20 +207,20 @@ def _horizons(made):
                                  'effects and without fitted tolerances.'),
                'placebo': ('sign reversed', 'sign reversed: a control that must not help.'),
                'closure': ('closure', 'closure: closed share of the gap.')}
-    rows = made['horizons']
+    rows = result['horizons']
     what = 'Simulation from measured states and commands; 1 is pure noise. '
-    if 'joints' in made:
+    if 'joints' in result:
         what = 'Simulation of the servos over the log; 1 is the error of the most flexible fit. '
         columns['before'] = ('before', 'before: the robot file.')
         del columns['effects_alone']        # the same as after
-    if made['effects']:
+    if result['effects']:
         columns = {k: v for k, v in columns.items()
                    if any(row[k] is not None for row in rows.values())}
     else:
-        columns = {'before': ('error', '' if 'joints' in made else
+        columns = {'before': ('error', '' if 'joints' in result else
                               'Tolerances of this robot as fitted.')}
-    where = 'the held-out part' if 'joints' in made else \
-        'held-out flights' if made['held_out'] else 'the fitted flights'
+    where = 'the held-out part' if 'joints' in result else \
+        'held-out flights' if result['held_out'] else 'the fitted flights'
     return Grid(f'Free runs on {where}: error over noise floor',
                 ['horizon', *(head for head, _ in columns.values())],
                 [[h, *(_cell(row[k]) for k in columns)] for h, row in rows.items()],
@@ -270,27 +270,21 @@ def _spans(interval):
     return f'{interval[0]:.4g}..{interval[1]:.4g}'
 
 
-def summary(made: dict) -> str:
-    """
-    The verdict as one or two sentences.
-
-    Args:
-        made: results with the keys of INTERFACES.
-
-    """
-    return _SENTENCES[made['verdict']](made)
+def summary(result: dict) -> str:
+    """The verdict as one or two sentences."""
+    return _SENTENCES[result['verdict']](result)
 
 
-def _bad_data(made):
-    text = made['reason'] if made['reason'].endswith('?') else f'{made["reason"]}.'
-    further = len(made['bad_data']) - 1
+def _bad_data(result):
+    text = result['reason'] if result['reason'].endswith('?') else f'{result["reason"]}.'
+    further = len(result['bad_data']) - 1
     if further > 0:
         text += f' {further} more {"fault is" if further == 1 else "faults are"} listed below.'
     return text
 
 
-def _no_gap(made):
-    unseen = made.get('hidden') or []
+def _no_gap(result):
+    unseen = result.get('hidden') or []
     text = 'Model and measurement agree to within noise and manufacturing tolerance.'
     if not unseen:
         return f'{text} Every known effect of typical size would have been detected.'
@@ -298,21 +292,21 @@ def _no_gap(made):
             'detected in these data.')
 
 
-def _named(made):
-    parts = [_effect_text(effect) for effect in made['effects']]
+def _named(result):
+    parts = [_effect_text(effect) for effect in result['effects']]
     explain = 'explain' if len(parts) > 1 else 'explains'
-    return f'{_capital(listed(parts))} {explain} the disagreement. {_closing(made)}'
+    return f'{_capital(listed(parts))} {explain} the disagreement. {_closing(result)}'
 
 
-def _unknown(made):
-    partial = [' or '.join(e['names']) for e in made.get('partial') or []
-               if e['names'][0] not in made['reason']]
+def _unknown(result):
+    partial = [' or '.join(e['names']) for e in result.get('partial') or []
+               if e['names'][0] not in result['reason']]
     tried = f' {_capital(listed(partial))} would explain a part.' if partial else ''
-    return f'No known effect explains the disagreement: {made["reason"]}.{tried}'
+    return f'No known effect explains the disagreement: {result["reason"]}.{tried}'
 
 
-def _not_decidable(made):
-    return f'These data cannot decide: {made["reason"]}.'
+def _not_decidable(result):
+    return f'These data cannot decide: {result["reason"]}.'
 
 
 _SENTENCES = {'bad_data': _bad_data, 'no_gap': _no_gap, 'named': _named, 'named_set': _named,
@@ -366,12 +360,12 @@ def _size(value, span):
     return f'{value:.3g} +- {(below + above) / 2:.2g}'
 
 
-def _closing(made):
-    if made.get('closure') is None:
+def _closing(result):
+    if result.get('closure') is None:
         return 'The gap in free runs is at its noise floor before and after.'
-    flights = 'the held-out part of the log' if 'joints' in made else \
-        'the held-out flight' if made.get('held_out') else 'the fitted flights'
-    return f'Adding it closes {made["closure"]:.0%} of the gap on {flights}.'
+    flights = 'the held-out part of the log' if 'joints' in result else \
+        'the held-out flight' if result.get('held_out') else 'the fitted flights'
+    return f'Adding it closes {result["closure"]:.0%} of the gap on {flights}.'
 
 
 def _capital(text):

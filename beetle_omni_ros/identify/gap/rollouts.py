@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from beetle_omni_ros.identify.gap.noise import Noise
+from beetle_omni_ros.identify.gap.noise import Noise, white_noise
 from beetle_omni_ros.identify.gap.residual import FlightModel, THIN
 from beetle_omni_ros.identify.gap.series import low_pass
 from beetle_omni_ros.identify.gap.servo import simulate, targets_at, windows_at
@@ -125,9 +125,9 @@ def _turned(quaternion, vector):
     half = 0.5 * vector
     x, y, z, w = quaternion.T
     a, b, c = half.T
-    made = np.stack([x + w * a + y * c - z * b, y + w * b - x * c + z * a,
-                     z + w * c + x * b - y * a, w - x * a - y * b - z * c], axis=1)
-    return made / np.linalg.norm(made, axis=1, keepdims=True)
+    result = np.stack([x + w * a + y * c - z * b, y + w * b - x * c + z * a,
+                       z + w * c + x * b - y * a, w - x * a - y * b - z * c], axis=1)
+    return result / np.linalg.norm(result, axis=1, keepdims=True)
 
 
 def _regimes(inputs, grid):
@@ -154,11 +154,10 @@ def regimes_at(model: FlightModel, times: np.ndarray) -> np.ndarray:
 
 def noise_floor(model: FlightModel, noise: Noise) -> np.ndarray:
     """(H, 5) RMS errors of a perfect model."""
-    pose, gravity, p = model.flight.pose, model.robot.gravity, model.p
-    third = np.diff(pose, 3, axis=0)
-    seen = np.median(np.abs(third), axis=0) / 0.6745 / np.sqrt(20)
-    position = float(np.sqrt((seen[:3]**2).sum()))
-    angle = 2 * float(np.sqrt((seen[3:]**2).sum()))
+    gravity, p = model.robot.gravity, model.p
+    pose = white_noise(model.flight.pose)
+    position = float(np.sqrt((pose[:3]**2).sum()))
+    angle = 2 * float(np.sqrt((pose[3:]**2).sum()))
     rate = model.flight.imu[:, 3:]
     gyro = float(np.sqrt(((np.median(np.abs(np.diff(rate, 3, axis=0)), axis=0) / 0.6745)**2
                           / 20).sum()))
@@ -207,12 +206,12 @@ def _gust_errors(noise, p, gravity):
     # Rotations about two of three axes tilt the thrust.
     lean = [np.sqrt(2 / 3) * gravity * h * np.cumsum(angle, axis=1) for angle in twice[3:]]
     speeds, places = [*once[:3], *lean], [*twice[:3], *(h * np.cumsum(x, axis=1) for x in lean)]
-    made = []
+    result = []
     for horizon in HORIZONS:
         k = round(horizon / h) - 1
-        made.append([float(np.sqrt(sum((x[:, k]**2).mean() for x in part)))
-                     for part in (places, speeds, twice[3:], once[3:])])
-    return made
+        result.append([float(np.sqrt(sum((x[:, k]**2).mean() for x in part)))
+                       for part in (places, speeds, twice[3:], once[3:])])
+    return result
 
 
 def floor_factors(fitted: list[Runs]) -> np.ndarray:
@@ -230,12 +229,8 @@ def gap(runs: list[Runs], horizon: int, rows: str | None = None,
     """
     RMS over states of error over noise floor, at one horizon; 1 is pure noise.
 
-    Args:
-        runs: runs of all flights.
-        horizon: index into HORIZONS.
-        rows: regime; default all.
-        trim: (H, 5) factors of each flight's floor, from :func:`floor_factors`.
-
+    ``horizon`` is an index into HORIZONS, ``rows`` a regime, ``trim`` (H, 5) factors of each
+    flight's floor from :func:`floor_factors`.
     """
     parts = []
     for run in runs:

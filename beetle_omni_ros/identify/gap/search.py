@@ -36,11 +36,7 @@ class Search:
     """
     Search for the catalogue entries that explain the residual of one problem.
 
-    Args:
-        problem: flights, priors, noise.
-        candidates: candidates that may be accepted.
-        progress: callback with a short text at each stage.
-
+    ``progress`` gets a short text at each stage.
     """
 
     def __init__(self, problem: Problem, candidates: list[Candidate],
@@ -210,7 +206,7 @@ class Search:
                 elif trial.share < p.least_share and not (
                         sure and trial.share > p.weak_share) \
                         and not significant_in_prior(p, trial.gain, trial.prior_gain, price):
-                    trial.reason = 'explains too small a part of what is left'
+                    trial.reason = 'explains too small a share of the unexplained chi2'
                 else:
                     chosen = trial
         return chosen
@@ -221,8 +217,9 @@ class Search:
             trial.theta) if commanded else (), self.p.early_command)
 
     def _closed_loop_bias(self, trial, accepted):
-        return closed_loop_bias(self.problem, trial, self._proposals.points[trial.candidate.label],
-                      self._involved(accepted), self._free(accepted))
+        return closed_loop_bias(self.problem, trial,
+                                self._proposals.points[trial.candidate.label],
+                                self._involved(accepted), self._free(accepted))
 
     def _cross_validate(self, trial, accepted):
         cross_validate(self.problem, trial, self._proposals.points[trial.candidate.label],

@@ -39,17 +39,7 @@ class LowPass:
         return (len(self.taps) - 1) // 2
 
     def __call__(self, x: np.ndarray, derivative: int = 0) -> np.ndarray:
-        """
-        Filter along the first axis.
-
-        Args:
-            x: (N, ...) samples.
-            derivative: order of the time derivative: 0, 1 or 2.
-
-        Returns:
-            (M, ...) samples at ``centres(N)``.
-
-        """
+        """Filtered x (N, ...), or its derivative of order 1 or 2, at ``centres(N)``: (M, ...)."""
         taps = _derived(tuple(self.taps), derivative) / self.period**derivative
         shape = x.shape
         y = upfirdn(taps, x.reshape(shape[0], -1), 1, self.every, axis=0)

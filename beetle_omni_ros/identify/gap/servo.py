@@ -94,8 +94,8 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
         (P, M, W, 4) positions after the warm-up [rad].
 
     """
-    def column(name, made=lambda x: x):
-        return np.array([made(values.get(name, 0.0)) for values in sets])[:, None, None]
+    def column(name, result=lambda x: x):
+        return np.array([result(values.get(name, 0.0)) for values in sets])[:, None, None]
 
     def each(name):
         return np.concatenate([column(f'{name}[{k}]', np.exp) for k in range(4)], axis=2)
@@ -109,12 +109,12 @@ def simulate(robot: RobotParameters, windows: Windows, targets: np.ndarray,
     loads = _loads(windows, hanging, modules, column)
 
     def terms_at(k):
-        made = ServoTerms(targets[:, k], windows.thrust[k], windows.spin[k])
+        result = ServoTerms(targets[:, k], windows.thrust[k], windows.spin[k])
         for act, values in acting:
-            act(made, None, **values)
+            act(result, None, **values)
         for torque, size in loads:
-            made.load = made.load + size * torque[k]
-        return made
+            result.load = result.load + size * torque[k]
+        return result
 
     # The torque limit is skipped if the largest error cannot reach it.
     reach = kp * np.abs(targets - windows.start).max() * 1.5 + kd * speed

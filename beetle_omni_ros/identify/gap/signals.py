@@ -38,11 +38,6 @@ class Signals:
     """
     Series of one flight on the common grid, cached by the deviations that they depend on.
 
-    Args:
-        flight: checked measurements.
-        robot: parameters of the robot file.
-        p: parameters (params/gap.yaml).
-
     Attributes:
         t: (N,) grid [s].
         reading_noise: standard deviation of an encoder's noise [rad].
@@ -144,7 +139,7 @@ class Signals:
         """Raw position (N, 3), quaternion (N, 4), velocity (N, 3) in world axes."""
         theta = self._beyond_file(theta)
         names = ['mocap_time_offset.delay', IMU_LAG, *(f'mocap_misalignment.rotation[{k}]'
-                                              for k in range(3))]
+                                                       for k in range(3))]
         values = [theta.get(name, 0.0) for name in names]
         position, quaternion, velocity = self._cached(
             'pose', theta, names[:2], lambda: self._shifted_pose(values[0] - values[1]))

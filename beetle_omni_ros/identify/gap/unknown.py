@@ -56,50 +56,42 @@ def features(model: FlightModel, theta: dict[str, float]) -> dict[str, np.ndarra
     Rates are not among them, because in closed loop they correlate with gusts.
     """
     x = model.inputs(theta)
-    rotation, made = matrices(x['quaternion']), {}
+    rotation, result = matrices(x['quaternion']), {}
     body = np.einsum('nji,nj->ni', rotation, x['velocity'])
     place = x['position'] - [0.0, 0.0, 1.0]
     axes = 'xyz'
     for k in range(3):
-        made[f'body: v_{axes[k]}'] = body[:, k]
-        made[f'body: |v| v_{axes[k]}'] = np.linalg.norm(body, axis=1) * body[:, k]
+        result[f'body: v_{axes[k]}'] = body[:, k]
+        result[f'body: |v| v_{axes[k]}'] = np.linalg.norm(body, axis=1) * body[:, k]
         for j in range(3):
             part = rotation[:, j, k]
-            made[f'world: R_{axes[j]}{axes[k]}'] = part
+            result[f'world: R_{axes[j]}{axes[k]}'] = part
             for i in range(3):
-                made[f'world: {axes[i]} R_{axes[j]}{axes[k]}'] = place[:, i] * part
-                made[f'world: {axes[i]}^2 R_{axes[j]}{axes[k]}'] = place[:, i]**2 * part
+                result[f'world: {axes[i]} R_{axes[j]}{axes[k]}'] = place[:, i] * part
+                result[f'world: {axes[i]}^2 R_{axes[j]}{axes[k]}'] = place[:, i]**2 * part
     for i in range(4):
-        made[f'rotor: f_{i + 1}'] = x['thrust'][:, i]
-        made[f'rotor: f_{i + 1}^2'] = x['thrust'][:, i]**2 / 10
-        made[f'rotor: df_{i + 1}/dt'] = x['thrust_rate'][:, i] / 10
+        result[f'rotor: f_{i + 1}'] = x['thrust'][:, i]
+        result[f'rotor: f_{i + 1}^2'] = x['thrust'][:, i]**2 / 10
+        result[f'rotor: df_{i + 1}/dt'] = x['thrust_rate'][:, i] / 10
         for name, function in (('sin', np.sin), ('cos', np.cos)):
             angle = function(x['tilt'][:, i])
-            made[f'rotor: {name} q_{i + 1}'] = angle
-            made[f'rotor: f_{i + 1} {name} q_{i + 1}'] = x['thrust'][:, i] * angle
-            made[f'rotor: f_{i + 1} {name} 2q_{i + 1}'] = x['thrust'][:, i] * function(
+            result[f'rotor: {name} q_{i + 1}'] = angle
+            result[f'rotor: f_{i + 1} {name} q_{i + 1}'] = x['thrust'][:, i] * angle
+            result[f'rotor: f_{i + 1} {name} 2q_{i + 1}'] = x['thrust'][:, i] * function(
                 2 * x['tilt'][:, i])
-        made[f'joint: dq_{i + 1}/dt'] = x['tilt_rate'][:, i]
-    made['rotor: voltage'] = 10 * (x['voltage'] - x['voltage'].mean())
-    return made
+        result[f'joint: dq_{i + 1}/dt'] = x['tilt_rate'][:, i]
+    result['rotor: voltage'] = 10 * (x['voltage'] - x['voltage'].mean())
+    return result
 
 
 def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
-    """
-    Regress the residual on generic features with cross-validation.
-
-    Args:
-        problem: flights and noise.
-        state: the final fit.
-        names: fitted keys, which are projected out first.
-
-    """
+    """Regress the residual on generic features with cross-validation; project out fitted keys."""
     labels: list[str] = []
     columns = []
     for model in problem.models:
-        made = features(model, state.theta)
-        labels = labels or list(made)
-        columns.append(np.stack(list(made.values()), axis=1))
+        result = features(model, state.theta)
+        labels = labels or list(result)
+        columns.append(np.stack(list(result.values()), axis=1))
     gains, total = {}, np.zeros(problem.blocks)
     best: dict[str, float] = {}
     size: dict[str, float] = {}
@@ -111,8 +103,8 @@ def remainder(problem: Problem, state: State, names: list[str]) -> Remainder:
             channel += 1
             if group in 'AW':
                 continue
-            both = [_whitened(problem, model, group, k, made)
-                    for model, made in zip(problem.models, columns, strict=True)]
+            both = [_whitened(problem, model, group, k, result)
+                    for model, result in zip(problem.models, columns, strict=True)]
             x, smooth = (np.concatenate([pair[i] for pair in both]) for i in (0, 1))
             held, scores, weights, explained, r = _cross_validated(
                 x, fitted[rows], state.r[rows], problem.block[rows], problem.blocks,

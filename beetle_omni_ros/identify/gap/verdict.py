@@ -90,14 +90,7 @@ def decide(a: Analysis, p: GapParameters) -> None:
 
 
 def disagreement(a: Analysis, gap: float) -> None:
-    """
-    Replace "no gap" by "unknown" if free runs exceed the noise floor too much.
-
-    Args:
-        a: analysis with a verdict and free runs.
-        gap: error of the free runs over the noise floor.
-
-    """
+    """Replace "no gap" by "unknown" if free runs have a large error (``gap`` noise floors)."""
     if a.verdict != 'no_gap':
         return
     if not gap <= a.fit.p.agreement:
@@ -111,11 +104,7 @@ def withdraw(a: Analysis, gap: dict[str, float], why: str) -> None:
     """
     Withdraw effects that the free runs refute.
 
-    Args:
-        a: analysis with named effects.
-        gap: 'before' and 'after' of the free runs, in noise floors.
-        why: what the effects do to these flights, as the end of a sentence.
-
+    ``gap`` has the errors 'before' and 'after' in noise floors. ``why`` is the end of a sentence.
     """
     names = ' and '.join(t.candidate.name for t in a.accepted)
     a.verdict, a.partial = 'unknown', list(a.found.accepted)

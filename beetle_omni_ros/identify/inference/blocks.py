@@ -62,16 +62,8 @@ def ridge_held_out(x: np.ndarray, r: np.ndarray, block: np.ndarray, blocks: int,
     """
     Cross-validated ridge regression of r (n,) on x (n, P).
 
-    Args:
-        x: features.
-        r: whitened residual.
-        block: (n,) block of each sample.
-        blocks: number of blocks.
-        ridge: precision of the prior of every weight, about 0.
-
-    Returns:
-        gains in chi2 on each block by a fit to the others; weights (P,) of a fit to all blocks.
-
+    ``block`` (n,) is the block of each sample, ``ridge`` the precision of the weights about 0.
+    Returns the gains in chi2 on each block by a fit to the others, and weights (P,) of all blocks.
     """
     parts = [(x[block == b].T @ x[block == b], x[block == b].T @ r[block == b])
              for b in range(blocks)]

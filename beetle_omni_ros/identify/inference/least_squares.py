@@ -184,11 +184,7 @@ def solved(h: np.ndarray, right: np.ndarray, ridge: float = 1e-9) -> np.ndarray:
     """
     Solution of normal equations ``h x = right`` with coordinates of different scale.
 
-    Args:
-        h: (P, P) positive matrix.
-        right: (P,) or (P, K) right side.
-        ridge: relative increase of each diagonal element.
-
+    ``ridge`` is a relative increase of each diagonal element.
     """
     scale = 1 / np.sqrt(np.maximum(np.diag(h), 1e-12))
     inner = h * scale[:, None] * scale + ridge * np.eye(len(h))
@@ -201,7 +197,7 @@ def covariance(information: np.ndarray, free: np.ndarray) -> np.ndarray:
 
     A direction without information gets a width of thousands of scales instead of inf.
     """
-    made = np.zeros_like(information)
+    result = np.zeros_like(information)
     chosen = np.ix_(free, free)
-    made[chosen] = np.linalg.inv(information[chosen] + 1e-7 * np.eye(free.sum()))
-    return made
+    result[chosen] = np.linalg.inv(information[chosen] + 1e-7 * np.eye(free.sum()))
+    return result

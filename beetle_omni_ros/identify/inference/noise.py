@@ -77,13 +77,13 @@ class Noise:
             floor: least standard deviation, by the quantisation of the readings.
 
         """
-        made = []
+        result = []
         for row in residual:
             middle = np.median(row)
             reach = 6 * 1.4826 * np.median(np.abs(row - middle)) + 1e-9
-            made.append(autoregression([np.clip(row, middle - reach, middle + reach)], order,
-                                       1e-7))
-        taps, sigma = zip(*made, strict=True)
+            result.append(autoregression([np.clip(row, middle - reach, middle + reach)], order,
+                                         1e-7))
+        taps, sigma = zip(*result, strict=True)
         return cls(np.array(taps), np.maximum(sigma, floor))
 
     def whiten(self, residual: np.ndarray, channel: np.ndarray) -> np.ndarray:

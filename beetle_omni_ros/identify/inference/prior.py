@@ -69,9 +69,9 @@ def together(priors: dict[str, Prior], values: dict[str, float], names: list[str
         (K,) and (K,); 0 for a parameter that is free or has no prior.
 
     """
-    made = np.zeros((2, len(names)))
+    result = np.zeros((2, len(names)))
     for k, name in enumerate(names):
         if name in priors and name not in free:
             x = values.get(name, 0.0)
-            made[:, k] = priors[name].slope(x), priors[name].residual(x)
-    return made[0], made[1]
+            result[:, k] = priors[name].slope(x), priors[name].residual(x)
+    return result[0], result[1]

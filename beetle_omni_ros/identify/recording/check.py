@@ -24,12 +24,9 @@ MOST_REPAIRS = 6        # successive; a repair can reveal another damage
 def damages(recording: Recording, robot: RobotParameters,
             limits: RecordingLimits | None = None) -> list[Damage]:
     """
-    Check a recording by redundant signals.
+    Check a recording with every topic of ``NEEDED`` by redundant signals.
 
-    Args:
-        recording: recording with every topic of ``NEEDED``.
-        robot: parameters of the robot file; only geometry and joint limits are used.
-        limits: limits of a valid recording; default the package's.
+    Of the robot file, only geometry and joint limits are used.
 
     Returns:
         damages of the most fundamental kind only, because jumping values and wrong clocks hide
@@ -58,12 +55,7 @@ def _convention_damages(recording, robot, limits):
 def repaired(recording: Recording, robot: RobotParameters,
              limits: RecordingLimits | None = None) -> tuple[Recording, list[str], list[Damage]]:
     """
-    Apply certain corrections until none is left.
-
-    Args:
-        recording: see :func:`damages`.
-        robot: see :func:`damages`.
-        limits: see :func:`damages`.
+    Apply certain corrections until none is left; see :func:`damages`.
 
     Returns:
         corrected recording, descriptions of the corrections, remaining damages.

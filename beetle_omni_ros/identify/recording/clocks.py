@@ -212,10 +212,7 @@ class Ages:
 
 def change_point(values: np.ndarray) -> tuple[int, float, float, float]:
     """
-    Find the best single step in a series.
-
-    Args:
-        values: (n,) finite values.
+    Find the best single step in finite values (n,).
 
     Returns:
         index of the first value after the step, medians before and after it, standard deviation

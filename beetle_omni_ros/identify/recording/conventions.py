@@ -87,11 +87,11 @@ def _acceleration(m, convention, axes):
     if axes is ONE:
         return m.seen_acceleration[convention].sum(axis=1)
     # Row i of seen_push is acceleration component i times world axis i.
-    made = np.zeros_like(m.seen_acceleration[convention][:, 0])
+    result = np.zeros_like(m.seen_acceleration[convention][:, 0])
     for i in range(3):
         j = int(np.argmax(np.abs(axes[i])))
-        made += axes[i, j] * _along(m, convention, j, i)
-    return made
+        result += axes[i, j] * _along(m, convention, j, i)
+    return result
 
 
 def _along(m, convention, source, target):
@@ -177,14 +177,15 @@ def _most_likely(m, robot, part, moving):
 def _matched(measured, seen, units, count):
     """(log likelihood, axes, unit) of the ten best signed permutations and units."""
     cross, size, total = measured.T @ seen, (seen**2).sum(), (measured**2).sum()
-    made = []
+    result = []
     for unit in units:
         for axes in ALL_AXES:
             left = total - 2 * unit * (axes * cross).sum() + unit**2 * size
             part = max(left / max(total, 1e-12), FLOOR)
-            made.append((-1.5 * count * np.log(part) - PRIOR * (unit != 1.0), axes, unit))
-    made.sort(key=lambda one: -one[0])
-    return [(score, ONE if (axes == ONE).all() else axes, unit) for score, axes, unit in made[:10]]
+            result.append((-1.5 * count * np.log(part) - PRIOR * (unit != 1.0), axes, unit))
+    result.sort(key=lambda one: -one[0])
+    return [(score, ONE if (axes == ONE).all() else axes, unit)
+            for score, axes, unit in result[:10]]
 
 
 def _price(rate_axes, force_axes):
@@ -241,7 +242,7 @@ def _without_gravity(recording, m, robot):
 
 def _scaled(recording, m, robot, limits, moving):
     """A factor of no known unit: a wrong range or gain."""
-    made = []
+    result = []
     expected = (('angular velocity', m.rate, USUAL.rate(m)) if moving else None,
                 ('linear acceleration', m.force, USUAL.force(m, robot.gravity)))
     for what, measured, seen in filter(None, expected):
@@ -249,9 +250,9 @@ def _scaled(recording, m, robot, limits, moving):
         left = ((measured - factor * seen)**2).sum() / max((measured**2).sum(), 1e-12)
         if left < 1 - limits.least_agreement and not (
                 1 / limits.unit_factor < factor < limits.unit_factor):
-            made.append(Damage(recording.name, 'imu/data_raw', f'{what} is {factor:.3g} times '
-                               'what the pose shows: a wrong range or gain?', None, 0.9))
-    return made
+            result.append(Damage(recording.name, 'imu/data_raw', f'{what} is {factor:.3g} times '
+                                 'what the pose shows: a wrong range or gain?', None, 0.9))
+    return result
 
 
 def _same(a, b):
@@ -263,13 +264,13 @@ def _same(a, b):
 
 def _damages_of(recording, m, convention, sure, at, robot, limits, repair=True):
     """Deviations of a hypothesis from the conventions, as damages."""
-    made = []
+    result = []
     moment = None if at is None else float(at) - begin_of(recording)
 
     def add(topic, cause, fix=None, change=None):
         can = fix and repair and sure >= CERTAIN and at is None
-        made.append(Damage(recording.name, topic, cause, moment, sure, fix if can else None,
-                           change if can else None))
+        result.append(Damage(recording.name, topic, cause, moment, sure, fix if can else None,
+                             change if can else None))
 
     if convention.quaternion:
         order, sign = QUATERNIONS[convention.quaternion]
@@ -300,8 +301,8 @@ def _damages_of(recording, m, convention, sure, at, robot, limits, repair=True):
             f'make: {FORCE_UNITS[unit]}?', 'scale the linear acceleration',
             columns_changed(0, 3, lambda v: v / unit, 'imu/data_raw'))
     _add_axes(add, m, convention, slice(None) if at is None else m.t >= at)
-    return made or [Damage(recording.name, 'imu/data_raw', 'angular velocity and linear '
-                           'acceleration contradict mocap/pose', moment, sure)]
+    return result or [Damage(recording.name, 'imu/data_raw', 'angular velocity and linear '
+                             'acceleration contradict mocap/pose', moment, sure)]
 
 
 def _add_axes(add, m, convention, part):

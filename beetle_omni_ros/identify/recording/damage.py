@@ -60,17 +60,17 @@ def changed(recording: Recording, topic: str, times=None, values=None,
         keep: (N,) mask or indices of the kept messages, applied last; or None.
 
     """
-    made = replace(recording, times=dict(recording.times), values=dict(recording.values),
-                   received=dict(recording.received))
+    result = replace(recording, times=dict(recording.times), values=dict(recording.values),
+                     received=dict(recording.received))
     if times is not None:
-        made.times[topic] = times
+        result.times[topic] = times
     if values is not None:
-        made.values[topic] = values
+        result.values[topic] = values
     if keep is not None:
-        for part in (made.times, made.values, made.received):
+        for part in (result.times, result.values, result.received):
             if topic in part:
                 part[topic] = part[topic][keep]
-    return made
+    return result
 
 
 def columns_changed(first: int, last: int, change: Callable[..., np.ndarray],

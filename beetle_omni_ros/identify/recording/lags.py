@@ -46,13 +46,13 @@ def lag_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
              ('joint_states', 'command', 'encoders', 'commands', limits.servo_lag,
               np.linalg.norm(tilt, axis=1), np.linalg.norm(asked, axis=1)))
     gaps = silent(recording, t, 0.0)
-    made = []
+    result = []
     for topic, other, what, whose, allowed, late, early in pairs:
         at, lags = window_lags(t, late, early, limits, gaps)
         damage = _judged(recording, topic, other, what, whose, allowed, at, lags, limits)
         if damage:
-            made.append(damage)
-    return made
+            result.append(damage)
+    return result
 
 
 def window_lags(t, late, early, limits: RecordingLimits,

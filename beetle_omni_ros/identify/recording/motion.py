@@ -20,7 +20,7 @@ LONGEST_GAP = 0.15      # [s] for linear interpolation
 LEAST_SAMPLES = 40      # without such gaps
 # Convention of a stored quaternion -> indices of x, y, z and w, and sign of the vector part.
 QUATERNIONS = {'': ((0, 1, 2, 3), 1.0), '(w, x, y, z)': ((1, 2, 3, 0), 1.0),
-            'inverse': ((0, 1, 2, 3), -1.0), 'inverse (w, x, y, z)': ((1, 2, 3, 0), -1.0)}
+               'inverse': ((0, 1, 2, 3), -1.0), 'inverse (w, x, y, z)': ((1, 2, 3, 0), -1.0)}
 
 
 @dataclass(frozen=True)
@@ -133,12 +133,12 @@ def motion_of(recording: Recording, robot: RobotParameters,
 
 def silent(recording: Recording, t: np.ndarray, reach: float) -> np.ndarray:
     """(N,) whether any topic has a gap within ``reach`` [s] of each time."""
-    made = np.zeros(len(t), dtype=bool)
+    result = np.zeros(len(t), dtype=bool)
     for topic in NEEDED:
         stamps = series_of(recording, topic)[0]
         for k in np.flatnonzero(np.diff(stamps) > LONGEST_GAP):
-            made |= (t > stamps[k] - reach) & (t < stamps[k + 1] + reach)
-    return made
+            result |= (t > stamps[k] - reach) & (t < stamps[k + 1] + reach)
+    return result
 
 
 def _orientation(stamps, quaternion, grid):
@@ -159,14 +159,14 @@ def _body_rate(rotation):
 
 def _wrench(robot, tilt):
     """(N, 6, 4) specific force and torque over inertia by 1 N of each rotor at tilts (N, 4)."""
-    made = np.empty((len(tilt), 6, 4))
+    result = np.empty((len(tilt), 6, 4))
     for i, axis in enumerate(robot.tilt_axes):
         level = np.cross(axis, [0.0, 0.0, 1.0])
         normal = np.cos(tilt[:, i:i + 1]) * [0.0, 0.0, 1.0] + np.sin(tilt[:, i:i + 1]) * level
         torque = np.cross(robot.rotors.positions[i], normal) \
             - robot.rotors.spin[i] * robot.rotors.torque_to_thrust_ratio * normal
-        made[:, :3, i], made[:, 3:, i] = normal / robot.mass, torque / robot.inertia
-    return made
+        result[:, :3, i], result[:, 3:, i] = normal / robot.mass, torque / robot.inertia
+    return result
 
 
 def _lagged(robot, thrust):

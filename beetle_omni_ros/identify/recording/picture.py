@@ -13,14 +13,7 @@ APART = 5       # MoCap readings between two orientations of a finite difference
 
 
 def damage_figure(recording: Recording, damage: Damage):
-    """
-    Figure of the damaged readings; a dashed line marks the onset.
-
-    Args:
-        recording: uncorrected recording.
-        damage: one of its damages.
-
-    """
+    """Figure of the damaged, uncorrected readings; a dashed line marks the onset."""
     begin = begin_of(recording)
     joints = damage.topic in ('joint_states', 'command')
     figure, axes = panels(4 if joints else 3, 1, height=1.1, sharex=True)

@@ -27,11 +27,7 @@ def reading_damages(recording: Recording, limits: RecordingLimits,
     """
     Damages in the values of single topics, at most one for each topic.
 
-    Args:
-        recording: recording with every topic of ``NEEDED``.
-        limits: limits of a valid recording.
-        unclocked: topics with wrong stamps, which are ignored.
-
+    Topics with wrong stamps (``unclocked``) are ignored.
     """
     found = {}
     for topic, checks in (('imu/data_raw', (_beyond, _clipped, _outliers, _stale, _frozen)),
@@ -55,12 +51,7 @@ def noise_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]
     Sensors with unusually large noise, at most one damage for each topic.
 
     The third difference of equidistant readings removes smooth motion. Its variance is 20 times
-    that of white noise, and its median is robust against single steps.
-
-    Args:
-        recording: recording with correct units and axes; in millimetres, noise would be too large.
-        limits: limits of a valid recording.
-
+    that of white noise, and its median is robust against single steps. Units must be correct.
     """
     force, rate, place, turn, tilt = limits.scatter
     found = []
@@ -149,14 +140,14 @@ def _norms(series, limits):
                              'drop these readings' if few else None)
     off = np.abs(norm - 1) > limits.unit_length
     if off.mean() > 0.01:
-        made = series.recording.values[series.topic].copy()
-        made[:, 3:] /= np.linalg.norm(made[:, 3:], axis=1, keepdims=True)
+        result = series.recording.values[series.topic].copy()
+        result[:, 3:] /= np.linalg.norm(result[:, 3:], axis=1, keepdims=True)
         at = None if off.mean() > 0.9 else series.t[np.argmax(off)]
         damage = series.damage(f'the orientation is no unit quaternion: its norm is '
                                f'{np.median(norm[off]):.3g}, expected 1', at)
         topic = series.topic
         return Damage(damage.run, topic, damage.cause, damage.at_s, 0.99, 'normalise',
-                      lambda r: changed(r, topic, values=made))
+                      lambda r: changed(r, topic, values=result))
     return None
 
 

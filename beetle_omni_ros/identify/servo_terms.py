@@ -1,9 +1,9 @@
 """
-Which terms a servo model needs: each must improve the prediction of data it was not fitted to.
+Selection of the terms of a servo model by cross-validation.
 
-The fitted part of a log is cut into blocks. A candidate joins the model only if the model fitted
-without a block predicts that block better with the candidate than without it, summed over the
-blocks and by more than its scatter over them, and if the term is large enough to matter.
+The fitted part of a log is divided into blocks. A candidate is accepted if the models fitted
+without a block predict this block better with the candidate. The sum over the blocks must exceed
+its scatter, and the term must have a relevant size.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from beetle_omni_ros.identify.parameters import shipped
 from beetle_omni_ros.identify.servo_fit import decode, Problems, ServoFitter
 from beetle_omni_ros.identify.servo_model import INDEX, NAMES, OFF, TERMS
 
-LINEAR = ('natural_frequency', 'damping_ratio')   # always there
+LINEAR = ('natural_frequency', 'damping_ratio')   # always in the model
 P = shipped().servo
 MOST_PASSES = 3
 QUICK, THOROUGH = 6, 15  # iterations
@@ -28,14 +28,14 @@ QUICK, THOROUGH = 6, 15  # iterations
 @dataclass(frozen=True)
 class Candidate:
     """
-    What may join the model.
+    A term that may join the model.
 
     Attributes:
-        members: names of its numbers in a parameter set.
-        starts: (log, joint index) -> values of the members to start from, several.
-        needs: a candidate that must be there before.
-        rival: the candidate that looks much alike.
-        tier: when it is offered.
+        members: names of its parameters in a parameter set.
+        starts: (log, joint index) -> start values of the members.
+        needs: candidate that must be in the model before.
+        rival: candidate with a similar effect.
+        tier: order of the selection.
 
     """
 
@@ -55,9 +55,8 @@ def _errors(log, joint):
     return [(0.9 * largest,), (0.6 * largest,)]
 
 
-# Offered tier by tier. A delay and friction or play are certain to be there in some size, a limit
-# that was met spoils all else, and what comes later imitates them on slow logs: stiction, above
-# all, can stand in for a delay. A dead band is a rival of play, a limit of speed of one of torque.
+# Candidates are tried tier by tier. Delay, friction or play, and limits that were reached come
+# first, because on slow logs later terms can imitate them: stiction can replace a delay.
 CANDIDATES = {
     'delay': Candidate(('delay',), lambda log, joint: [(0.006,), (0.02,)]),
     'coulomb_friction': Candidate(('coulomb_friction',), lambda log, joint: [(0.01,), (0.04,)],
@@ -79,7 +78,7 @@ TIERS = tuple(tuple(name for name, each in CANDIDATES.items() if each.tier == ti
 
 
 def free_mask(kept: tuple[str, ...]) -> np.ndarray:
-    """(n,) which numbers a model with these candidates fits."""
+    """(n,) parameters that a model with these candidates fits."""
     names = set(LINEAR).union(*(CANDIDATES[name].members for name in kept))
     return np.array([name in names for name in NAMES])
 
@@ -87,13 +86,13 @@ def free_mask(kept: tuple[str, ...]) -> np.ndarray:
 @dataclass(frozen=True)
 class Choice:
     """
-    The model of one joint.
+    Selected model of one joint.
 
     Attributes:
-        kept: names of candidates in it.
+        kept: accepted candidates.
         values: (n,) parameter set, fitted to the whole fitted part.
-        tried: candidate -> parameter set with it in the model, those kept too.
-        gain: candidate -> chi2 gained on unseen blocks when it was last judged.
+        tried: candidate -> parameter set with it in the model, also of accepted ones.
+        gain: candidate -> last gain in chi2 on held-out blocks.
 
     """
 
@@ -103,20 +102,12 @@ class Choice:
     gain: dict[str, float]
 
 
-# (joint, any label) -> candidates in the model, and the one that is new, see _judge.
-Asked = dict[tuple[int, str | None], tuple[tuple[str, ...], str | None]]
+# (joint, label) -> candidates of the model, and the new one among them; see _cross_validated.
+Requests = dict[tuple[int, str | None], tuple[tuple[str, ...], str | None]]
 
 
 class Selector:
-    """
-    Forward selection, all joints side by side.
-
-    Args:
-        fitter: log, noise and prior.
-        weight: (N,) 0 for samples that are never looked at.
-        allowed: names of candidates; default all.
-
-    """
+    """Forward selection for all joints together; samples of weight (N,) 0 are not used."""
 
     def __init__(self, fitter: ServoFitter, weight: np.ndarray,
                  allowed: tuple[str, ...] = tuple(CANDIDATES)):
@@ -125,13 +116,7 @@ class Selector:
         self.all = self.blocks.sum(axis=0)
 
     def run(self, start: np.ndarray) -> list[Choice]:
-        """
-        Select from the linear model on.
-
-        Args:
-            start: (n,) parameter set to begin with.
-
-        """
+        """Select terms, from the linear model on; ``start`` (n,) is the initial parameter set."""
         count = len(self.log.joints)
         self.kept: list[tuple[str, ...]] = [()] * count
         self.values = [np.where(free_mask(()), start, OFF)] * count
@@ -143,7 +128,7 @@ class Selector:
             early = list(self.kept)
             for tier in TIERS[1:]:
                 self._grow(tier)
-            # What comes late, a limit say, can have hidden what was offered early.
+            # A late term such as a limit may have hidden an early one.
             if not self._swap() and self.kept == early:
                 break
         self._prune()
@@ -151,21 +136,21 @@ class Selector:
                                               strict=True)]
 
     def _grow(self, tier):
-        """Add candidates of one tier while any helps."""
+        """Add candidates of one tier while one is accepted."""
         growing = list(range(len(self.kept)))
         while growing:
-            asked: Asked = {(j, None): (self.kept[j], None) for j in growing}
-            asked |= {(j, name): ((*self.kept[j], name), name) for j in growing
-                      for name in self._open(tier, j)}
-            answers = self._judge(asked)
+            requests: Requests = {(j, None): (self.kept[j], None) for j in growing}
+            requests |= {(j, name): ((*self.kept[j], name), name) for j in growing
+                         for name in self._available(tier, j)}
+            answers = self._cross_validated(requests)
             for j in list(growing):
                 self.values[j], without = answers[j, None]
                 best, best_gain = None, 0.0
-                for name in self._open(tier, j):
+                for name in self._available(tier, j):
                     found, costs = answers[j, name]
-                    gain, real = _verdict(without - costs, _weight(name, self.kept[j]))
+                    gain, real = _gain(without - costs, _weight(name, self.kept[j]))
                     self.tried[j][name], self.gains[j][name] = found, gain
-                    if real and gain > best_gain and self._matters(j, name, found):
+                    if real and gain > best_gain and self._is_relevant(j, name, found):
                         best, best_gain = name, gain
                 if best is None:
                     growing.remove(j)
@@ -174,83 +159,83 @@ class Selector:
                     self.values[j] = self.tried[j][best]
 
     def _share_delay(self):
-        """One bus serves all joints: a delay that one of them proves is there for all."""
+        """Add a delay to all joints if one joint has one, because they share the bus."""
         if not any('delay' in names for names in self.kept):
             return
         for j, names in enumerate(self.kept):
             if 'delay' not in names:
                 self.kept[j], self.values[j] = (*names, 'delay'), self.tried[j]['delay']
 
-    def _open(self, tier, joint):
-        """Candidates of a tier that the joint can have and has not."""
+    def _available(self, tier, joint):
+        """Candidates of a tier that can still join the model of a joint."""
         kept = self.kept[joint]
-        slow = self.log.asked_speed()[joint] < P.beyond * 0.95 * self.log.speed()[joint]
+        slow = self.log.command_speed()[joint] < P.beyond * 0.95 * self.log.speed()[joint]
         return [name for name in self.allowed if name in tier and name not in kept
                 and CANDIDATES[name].needs in (None, *kept)
                 and not (name == 'velocity_limit' and slow)]
 
     def _swap(self):
-        """Exchange a term for its rival where that predicts better; tell whether any was."""
-        asked: Asked = {(j, None): (names, None) for j, names in enumerate(self.kept)}
+        """Replace terms by rivals that predict better; return whether any was replaced."""
+        requests: Requests = {(j, None): (names, None) for j, names in enumerate(self.kept)}
         for j, names in enumerate(self.kept):
             for name in names:
                 rival = CANDIDATES[name].rival
                 if rival in self.allowed and rival not in names:
-                    asked[j, name] = (tuple(rival if n == name else n for n in names
-                                            if CANDIDATES[n].needs != name), rival)
-        answers, swapped = self._judge(asked), False
-        for (j, label), (_, rival) in asked.items():
+                    requests[j, name] = (tuple(rival if n == name else n for n in names
+                                               if CANDIDATES[n].needs != name), rival)
+        answers, swapped = self._cross_validated(requests), False
+        for (j, label), (_, rival) in requests.items():
             if rival is None:
                 continue
             found, costs = answers[j, label]
             gain = float((answers[j, None][1] - costs).sum())
-            if gain > P.least_gain and self._matters(j, rival, found):
-                self.kept[j], self.values[j], swapped = asked[j, label][0], found, True
+            if gain > P.least_gain and self._is_relevant(j, rival, found):
+                self.kept[j], self.values[j], swapped = requests[j, label][0], found, True
                 self.tried[j][rival] = found
         return swapped
 
     def _prune(self):
-        """Drop what a later term has made superfluous, the least useful first."""
+        """Drop superfluous terms, the smallest gain first."""
         open_joints = list(range(len(self.kept)))
         while open_joints:
-            asked: Asked = {(j, drop): (tuple(n for n in self.kept[j] if n != drop), None)
-                            for j in open_joints for drop in (None, *self.kept[j])}
-            answers = self._judge(asked)
+            requests: Requests = {(j, drop): (tuple(n for n in self.kept[j] if n != drop), None)
+                                  for j in open_joints for drop in (None, *self.kept[j])}
+            answers = self._cross_validated(requests)
             for j in list(open_joints):
                 self.values[j], full = answers[j, None]
                 least: dict[str, float] = {}
                 for name in self.kept[j]:
                     self.tried[j][name] = self.values[j]
-                    if name == 'delay':     # shared: the other joints vouch for it
+                    if name == 'delay':     # shared with other joints
                         continue
-                    self.gains[j][name], real = _verdict(answers[j, name][1] - full,
-                                                         _weight(name, self.kept[j]))
+                    self.gains[j][name], real = _gain(answers[j, name][1] - full,
+                                                      _weight(name, self.kept[j]))
                     if not real and not any(CANDIDATES[n].needs == name for n in self.kept[j]):
                         least[name] = self.gains[j][name]
                 if not least:
                     open_joints.remove(j)
                     continue
                 name = min(least, key=lambda one: least[one])
-                self.values[j], self.kept[j] = answers[j, name][0], asked[j, name][0]
+                self.values[j], self.kept[j] = answers[j, name][0], requests[j, name][0]
 
-    def _judge(self, asked: Asked):
+    def _cross_validated(self, requests: Requests):
         """
-        Fit models and predict the blocks left out.
+        Fit models and predict the held-out blocks.
 
         Args:
-            asked: (joint, any label) -> candidates in the model, and the one among them that is
-                new and needs start values, or None.
+            requests: (joint, label) -> candidates of the model, and the new one among them, which
+                needs start values, or None.
 
         Returns:
-            (joint, label) -> fitted set, and (blocks,) chi2 of each block left out.
+            (joint, label) -> fitted set, and (blocks,) chi2 of each held-out block.
 
         """
         parts, owner = [], []
-        for key, (model, new) in asked.items():
+        for key, (model, new) in requests.items():
             for start in self._starts(key[0], new, self.values[key[0]]):
                 start = np.where(free_mask(model), start, OFF)
-                parts.append(Problems.apart([key[0]], start[None], free_mask(model)[None],
-                                            self.all[None]))
+                parts.append(Problems.single_joints([key[0]], start[None], free_mask(model)[None],
+                                                    self.all[None]))
                 owner.append(key)
         problems = Problems.join(parts)
         fits = self.fitter.solve(problems, THOROUGH)
@@ -258,16 +243,16 @@ class Selector:
         for k, key in enumerate(owner):
             if key not in best or fits.chi2[k] < fits.chi2[best[key]]:
                 best[key] = k
-        rows = np.repeat([best[key] for key in asked], len(self.blocks))
-        held = np.tile(self.blocks, (len(asked), 1))
+        rows = np.repeat([best[key] for key in requests], len(self.blocks))
+        held = np.tile(self.blocks, (len(requests), 1))
         folds = Problems(problems.joints[rows], fits.points[rows], problems.free[rows],
                          self.all - held)
         folds = replace(folds, points=self.fitter.solve(folds, QUICK).points, weight=held)
-        cost = self.fitter.cost(folds).reshape(len(asked), len(self.blocks))
-        return {key: (decode(fits.points[best[key]]), cost[k]) for k, key in enumerate(asked)}
+        cost = self.fitter.cost(folds).reshape(len(requests), len(self.blocks))
+        return {key: (decode(fits.points[best[key]]), cost[k]) for k, key in enumerate(requests)}
 
     def _starts(self, joint, name, values):
-        """Parameter sets to start from when a candidate is new."""
+        """Parameter sets to start from with a new candidate."""
         if name is None:
             return [values]
         found = []
@@ -276,19 +261,19 @@ class Selector:
             for member, value in zip(CANDIDATES[name].members, start, strict=True):
                 term = TERMS[member]
                 changed[INDEX[member]] = np.clip(value, term.low, term.high)
-            if name == 'delay':     # what the delay takes over, the servo need not lag
+            if name == 'delay':     # keep the total lag of servo and delay
                 lag = 2 * values[INDEX['damping_ratio']] / values[INDEX['natural_frequency']]
                 changed[INDEX['natural_frequency']] *= lag / max(lag - start[0], 0.2 * lag)
             found.append(changed)
         return found
 
-    def _matters(self, joint, name, values):
-        """A term below the encoder's step, or a limit that is never met, is no finding."""
+    def _is_relevant(self, joint, name, values):
+        """Whether a term exceeds the encoder's step, and a limit is reached."""
         sizes = {member: abs(values[INDEX[member]]) for member in CANDIDATES[name].members}
         if name == 'delay':
             return sizes['delay'] >= P.least_delay
         if name == 'velocity_limit':
-            return P.beyond * sizes[name] <= self.log.asked_speed()[joint]
+            return P.beyond * sizes[name] <= self.log.command_speed()[joint]
         if name == 'torque_limit':
             sent = self.log.t - values[INDEX['delay']] - self.log.period / 2
             errors = np.abs(self.log.command_at(joint, sent) - self.log.measured[joint])
@@ -298,11 +283,11 @@ class Selector:
 
 
 def _weight(name, kept):
-    """By how much a candidate must beat the least gain; twice where its rival is there too."""
+    """Factor of the least gain; twice as large if the rival is in the model."""
     return len(CANDIDATES[name].members) * (2 if CANDIDATES[name].rival in kept else 1)
 
 
-def _verdict(gains, weight):
-    """Gain over all blocks, and whether it is real: above its scatter, in most blocks."""
+def _gain(gains, weight):
+    """Gain over all blocks, and whether it exceeds its scatter in most blocks."""
     held = HeldOut(gains)
     return held.total, held.total > max(P.least_gain * weight, held.error) and held.positive > 0.5
