@@ -1,4 +1,4 @@
-"""The command line: exit statuses, one-line errors, results where they were asked for."""
+"""The command line: exit statuses, one-line errors, results of the options."""
 
 import json
 import os

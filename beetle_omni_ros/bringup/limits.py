@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 _share = partial(parameter, low=0, high=1)
 _supply = partial(parameter, unit='V', low=0, high=60)
@@ -85,15 +82,10 @@ class TopicLimits:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckLimits:
+class CheckLimits(ParameterFile, file='check.yaml'):
     """All limits of params/check.yaml."""
 
     servos: ServoLimits = parameter(doc='servos')
     battery: BatteryLimits = parameter(doc='battery')
     link: LinkLimits = parameter(doc='serial ports')
     topics: TopicLimits = parameter(doc='topics')
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> CheckLimits:
-        """Read a file; without a path, the shipped params/check.yaml."""
-        return schema.load(cls, path or share_path('params/check.yaml'))

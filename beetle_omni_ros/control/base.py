@@ -189,7 +189,7 @@ class Controller(Protocol):
     Optional members of a controller:
 
     - ``diagnostics() -> dict``: health of the last step and since reset, for operators and logs;
-    - ``set_health(health)``, if it can fly with failed actuators, see :func:`tell_health`;
+    - ``set_health(health)``, if it can fly with failed actuators, see :func:`forward_health`;
     - ``reach``: largest distance to a target [m], see :mod:`control.reach`;
     - ``guidance``: text for result tables, names the functions that modify its targets.
 

@@ -20,17 +20,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import exp, expm1, inf, sqrt
-from pathlib import Path
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, Followed, State
-from beetle_omni_ros.robot import rotations, schema
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth, ALL_HEALTHY
 from beetle_omni_ros.robot.degraded_allocation import allocator, DegradedAllocator, LocalWeights
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import group, parameter
+from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
 
 LONGEST_STEP = 0.1   # [s] between two states from which an acceleration is computed
 DAMPING = 1e-2   # [(1/kg)^2] keeps the thrusts near the plain projection where directions agree
@@ -53,7 +51,7 @@ class AxisGains:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HoverParameters:
+class HoverParameters(ParameterFile, file='hover.yaml'):
     """Tuning of the hover controller; params/hover.yaml gives the reasons."""
 
     period: float = parameter(0.01, doc='time between commands', unit='s', low=0.001, high=0.1)
@@ -72,11 +70,6 @@ class HoverParameters:
         low=0, high=20)
 
     degraded: LocalWeights = group(LocalWeights, 'allocation with what is left of the actuators')
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> HoverParameters:
-        """Read a hover file; without a path, the shipped one."""
-        return schema.load(cls, path if path else share_path('params/hover.yaml'))
 
 
 class HoverController:

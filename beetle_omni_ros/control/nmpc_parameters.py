@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from beetle_omni_ros.control.ocp import WEIGHTS
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError, ParameterFile
 
 LONGEST_HORIZON = 64  # MAX_STAGES of rti.c
 
@@ -125,7 +122,7 @@ class SolverParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
-class NmpcParameters:
+class NmpcParameters(ParameterFile, file='nmpc.yaml'):
     """All of them; one file, one controller."""
 
     horizon: HorizonParameters = group(HorizonParameters, 'look-ahead')
@@ -140,8 +137,3 @@ class NmpcParameters:
         unit='rad', low=0, high=6.3)
     reach: float = parameter(10.0, doc='a target farther from the robot is refused', unit='m',
                              low=0.5, high=1000, read_only=True)
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> NmpcParameters:
-        """Read a file; without a path, the shipped params/nmpc.yaml."""
-        return schema.load(cls, path if path else share_path('params/nmpc.yaml'))

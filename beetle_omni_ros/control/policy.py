@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite
-from pathlib import Path
 
 import numpy as np
 
@@ -17,10 +16,8 @@ from beetle_omni_ros.control.observation import disturbed, observed
 from beetle_omni_ros.control.policy_file import kind
 from beetle_omni_ros.control.policy_network import PolicyNetwork
 from beetle_omni_ros.robot import dynamics as model
-from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import group, parameter
+from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
 
 DEFAULT = 'policies/rl.onnx'
 
@@ -34,7 +31,7 @@ class EstimateParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolicyParameters(GuidanceParameters):
+class PolicyParameters(GuidanceParameters, ParameterFile, file='rl.yaml'):
     """Policy file and guidance; params/rl.yaml gives the reasons."""
 
     policy: str = parameter(DEFAULT, doc="ONNX file, in the package's share or any path",
@@ -52,11 +49,6 @@ class PolicyParameters(GuidanceParameters):
     model: EstimateParameters = group(EstimateParameters, 'for the estimate')
     disturbance: DisturbanceParameters = group(
         DisturbanceParameters, 'what a policy with memory sees')
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> PolicyParameters:
-        """Read a file; without a path, the shipped params/rl.yaml."""
-        return schema.load(cls, path if path else share_path('params/rl.yaml'))
 
 
 class PolicyController:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 
 @dataclass(frozen=True, kw_only=True)
-class MotorBoardParameters:
+class MotorBoardParameters(ParameterFile, file='motor_board.yaml'):
     """Port, MAVLink IDs, rates and time limits of the driver of the motor board."""
 
     port: str = parameter(doc='serial port', read_only=True)
@@ -47,8 +44,3 @@ class MotorBoardParameters:
                                         high=5)
     cell_voltage_high: float = parameter(doc='largest plausible cell voltage', unit='V', low=0,
                                          high=6)
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> MotorBoardParameters:
-        """Read a file; without a path, the shipped params/motor_board.yaml."""
-        return schema.load(cls, path or share_path('params/motor_board.yaml'))

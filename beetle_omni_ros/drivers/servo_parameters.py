@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from beetle_omni_ros.drivers import servo_registers as registers
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+from beetle_omni_ros.robot.schema import group, parameter, ParameterError, ParameterFile
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +44,7 @@ class ServoTiming:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServoBusParameters:
+class ServoBusParameters(ParameterFile, file='servo_bus.yaml'):
     """Four servos on one serial port, in the order of gimbal1 to gimbal4."""
 
     port: str = parameter(doc='serial port', read_only=True)
@@ -93,8 +90,3 @@ class ServoBusParameters:
         if self.baud_rate not in registers.BAUD_CODES:
             raise ParameterError(f"baud_rate {self.baud_rate} is none of the servos' "
                                  f'{", ".join(map(str, registers.BAUD_CODES))}')
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> ServoBusParameters:
-        """Read a file; without a path, the shipped one."""
-        return schema.load(cls, path or share_path('params/servo_bus.yaml'))

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import group, parameter
+from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,7 +188,7 @@ class DoubtParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EkfParameters:
+class EkfParameters(ParameterFile, file='ekf.yaml'):
     """Parameters of :class:`~beetle_omni_ros.estimation.ekf.ErrorStateEkf`."""
 
     imu: ImuParameters = group(ImuParameters)
@@ -233,14 +231,3 @@ class EkfParameters:
             mocap=replace(mocap, rotation=mounted(mocap.rotation, e.mocap_rotation),
                           time_offset=mocap.time_offset - e.mocap_delay),
             initial=replace(self.initial, time_offset=self.initial.time_offset + e.imu_delay))
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> EkfParameters:
-        """
-        Read a parameter file; without a path, the shipped one.
-
-        Raises:
-            ParameterError: names file, key and expected value.
-
-        """
-        return schema.load(cls, path if path else share_path('params/ekf.yaml'))

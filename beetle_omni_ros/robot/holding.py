@@ -21,12 +21,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from beetle_omni_ros.robot import rotations, schema
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
 from beetle_omni_ros.robot.degraded_allocation import DegradedAllocator, RESIDUAL
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 PATH_POINTS = 9         # evaluated points of the path to level, 22 deg apart at most
 BISECTIONS = 5          # towards a desired attitude: 6 deg / 2^5
@@ -36,7 +35,7 @@ GOLDEN = np.pi * (1 + np.sqrt(5))
 
 
 @dataclass(frozen=True, kw_only=True)
-class HoldingParameters:
+class HoldingParameters(ParameterFile, file='degraded.yaml'):
     """Selection of attitudes; params/degraded.yaml gives the reasons."""
 
     reach_time: float = parameter(0.1, doc='time within which actuators must act', unit='s',
@@ -54,11 +53,6 @@ class HoldingParameters:
                                    'landing turns on', unit='s', low=0.01, high=20)
     holding_margin: float = parameter(1.0, doc='margin at which a target attitude is not replaced',
                                       unit='m/s^2, rad/s^2', low=0, high=20)
-
-    @classmethod
-    def load(cls, path=None) -> HoldingParameters:
-        """Read a file; without a path, the shipped params/degraded.yaml."""
-        return schema.load(cls, path if path else share_path('params/degraded.yaml'))
 
 
 class Holding:

@@ -8,15 +8,17 @@ from dataclasses import field, fields, is_dataclass, MISSING
 from difflib import get_close_matches
 from pathlib import Path
 import types
-from typing import Any, get_args, get_origin, get_type_hints, Union
+from typing import Any, ClassVar, get_args, get_origin, get_type_hints, TypeVar, Union
 
 import numpy as np
 
+from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.robot.yaml_file import quoted, read_yaml, shortened, YamlError
 
 # Parameters with more than numbers, from lists and mappings of a file.
 STRUCTURED: dict[Any, tuple[tuple[type, ...], str]] = {
     tuple: ((list, tuple), 'a list'), dict: ((dict, type(None)), 'a mapping')}
+File = TypeVar('File', bound='ParameterFile')
 NAMES = tuple[str, ...]     # type of a parameter that is a list of names
 FILE_NAME, KEY, WHOLE = 500, 80, 1000    # characters of them in a message
 
@@ -78,6 +80,33 @@ def load_yaml(path: str | Path) -> dict:
     if not isinstance(data, dict):
         raise ParameterError(f'{path}: expected a mapping of keys, found {type(data).__name__}')
     return data
+
+
+class ParameterFile:
+    """
+    Base of the dataclass of a parameter file.
+
+    A subclass names its shipped file: ``class EkfParameters(ParameterFile, file='ekf.yaml')``.
+    """
+
+    _file: ClassVar[str]
+
+    def __init_subclass__(cls, file: str = '', **keywords):
+        """Set the shipped file; a subclass of a subclass inherits it."""
+        super().__init_subclass__(**keywords)
+        if file:
+            cls._file = file
+
+    @classmethod
+    def load(cls: type[File], path: str | Path | None = None) -> File:
+        """
+        Read a file, by default the shipped one.
+
+        Raises:
+            ParameterError: names file, key and expected value.
+
+        """
+        return load(cls, path or share_path(f'params/{cls._file}'))
 
 
 def load(cls: type, path: str | Path):
@@ -264,5 +293,5 @@ def nest(flat: dict[str, Any]) -> dict:
     return nested
 
 
-__all__ = ['ParameterError', 'bind', 'check', 'flatten', 'group', 'load', 'load_yaml',
-           'NAMES', 'nest', 'parameter']
+__all__ = ['ParameterError', 'ParameterFile', 'bind', 'check', 'flatten', 'group', 'load',
+           'load_yaml', 'NAMES', 'nest', 'parameter']

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from beetle_omni_ros.control import registry
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import group, parameter
+from beetle_omni_ros.robot.schema import group, parameter, ParameterFile
 from beetle_omni_ros.safety.levelling import LevellingParameters
 from beetle_omni_ros.safety.turnover import TurnoverParameters
 from beetle_omni_ros.safety.watch.parameters import Detection
@@ -189,7 +186,7 @@ class Envelope:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SupervisorParameters:
+class SupervisorParameters(ParameterFile, file='supervisor.yaml'):
     """All parameters of the supervisor."""
 
     controller: str = parameter(registry.DEFAULT, doc='the active controller, also in flight')
@@ -209,8 +206,3 @@ class SupervisorParameters:
                                  unit='s', low=0, high=5)
     quiet_time: float = parameter(1.0, doc='a repeated complaint is said once in this time',
                                   unit='s', low=0, high=60)
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> SupervisorParameters:
-        """Read a supervisor file; without a path, the shipped one."""
-        return schema.load(cls, path if path else share_path('params/supervisor.yaml'))

@@ -18,7 +18,6 @@ from beetle_omni_ros import __version__
 from beetle_omni_ros.control import onnx_runtime, policy_checksum
 from beetle_omni_ros.control.policy_file import INPUT, OUTPUT, PolicyContract
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.schema import flatten
 from beetle_omni_ros.train.network import ActorModel, ExportedPolicy
 from beetle_omni_ros.train.parameters import TrainParameters
 
@@ -64,10 +63,8 @@ def export_policy(actor: ActorModel, path: Path, robot: RobotParameters,
             opset_version=OPSET, dynamo=True, verbose=False)
     written = program.model_proto
     contract = PolicyContract.default(robot, parameters.memory)
-    flat = {name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, _, _, value in flatten(parameters)}
     contract = replace(
-        contract, training={**flat, **(training or {})}, metrics=metrics or {},
+        contract, training={**parameters.plain(), **(training or {})}, metrics=metrics or {},
         commit=commit(), version=__version__,
         created=datetime.now(timezone.utc).isoformat(timespec='seconds'))
     del written.metadata_props[:]

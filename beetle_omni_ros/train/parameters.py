@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import group, parameter, ParameterError
+from beetle_omni_ros.robot.schema import flatten, group, parameter, ParameterError, ParameterFile
 
 
 def _check_ranges(parameters, *names):
@@ -259,7 +257,7 @@ class ScheduleParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainParameters:
+class TrainParameters(ParameterFile, file='train.yaml'):
     """All parameters of a training; each run saves them beside its checkpoints."""
 
     seed: int = parameter(0, doc='random seed', low=0, high=2**31 - 1)
@@ -277,7 +275,7 @@ class TrainParameters:
     ppo: PpoParameters = group(PpoParameters, 'optimisation')
     schedule: ScheduleParameters = group(ScheduleParameters, 'changes during training')
 
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> TrainParameters:
-        """Read a training file; without a path, the shipped one."""
-        return schema.load(cls, path if path else share_path('params/train.yaml'))
+    def plain(self) -> dict[str, Any]:
+        """Dotted key -> value as a plain number, text or list."""
+        return {name: value.tolist() if isinstance(value, np.ndarray) else value
+                for name, _, _, value in flatten(self)}

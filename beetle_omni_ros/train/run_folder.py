@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 import re
 
-import numpy as np
 import yaml
 
-from beetle_omni_ros.robot.schema import bind, flatten, nest, ParameterError
+from beetle_omni_ros.robot.schema import bind, nest, ParameterError
 from beetle_omni_ros.robot.yaml_file import parse_yaml, quoted, YamlError
 from beetle_omni_ros.train.parameters import TrainParameters
 
@@ -28,7 +27,7 @@ def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
 
     """
     parameters = TrainParameters.load(file)
-    flat = {name: value for name, _, _, value in flatten(parameters)}
+    flat = parameters.plain()
     for key, value in changes.items():
         if key not in flat:
             raise ParameterError(f'--set {key}: unknown; keys are those of params/train.yaml, '
@@ -39,9 +38,7 @@ def read_parameters(file: Path | None, changes: dict) -> TrainParameters:
 
 def write_parameters(parameters: TrainParameters, path: Path) -> None:
     """Write parameters as YAML, for ``--config``."""
-    flat = {name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, _, _, value in flatten(parameters)}
-    path.write_text(yaml.safe_dump(nest(flat), sort_keys=False))
+    path.write_text(yaml.safe_dump(nest(parameters.plain()), sort_keys=False))
 
 
 def last_checkpoint(folder: Path) -> Path:

@@ -109,10 +109,10 @@ def test_finished_flights_are_kept_and_only_missing_ones_are_flown(poses, tmp_pa
     store = Store(tmp_path / 'kept')
     flights = plan(['hover'], [poses], ['nominal'], [0, 1])
     first = sweep.sweep(flights[:1], store=store, jobs=1)
-    told = []
+    calls = []
     both = sweep.sweep(flights, store=store, jobs=1,
-                       done=lambda flight, result, kept: told.append((flight, kept)))
-    assert told == [(flights[0], True), (flights[1], False)]
+                       done=lambda flight, result, kept: calls.append((flight, kept)))
+    assert calls == [(flights[0], True), (flights[1], False)]
     assert without_times(first[flights[0]]) == without_times(both[flights[0]])
     assert both[flights[0]]['metrics']['compute_ms'] == first[flights[0]]['metrics']['compute_ms']
     monkeypatch.setattr(sweep, 'fly_flight', never)

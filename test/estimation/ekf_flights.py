@@ -76,8 +76,8 @@ class Sensors:
     mocap_rotation: tuple = (0.0, 0.0, 0.0)
 
     @classmethod
-    def believed(cls, parameters, seed):
-        """Sensors exactly as the filter's parameters believe them, with drawn biases."""
+    def matching(cls, parameters, seed):
+        """Sensors with the noise and mounting of the filter's parameters, and random biases."""
         imu, mocap, first = parameters.imu, parameters.mocap, parameters.initial
         rng = np.random.default_rng([seed, 2])
         return cls(imu.accelerometer_noise, imu.gyroscope_noise,
@@ -162,7 +162,7 @@ def feed(ekf, sample):
 
 
 def run(ekf, flight, drop=lambda time: False, until=np.inf):
-    """Feed a flight, without poses captured when ``drop`` says so; return the filter."""
+    """Feed a flight, without the poses for which ``drop`` is true; return the filter."""
     for time, sample in flight.arrivals():
         if time > until:
             break

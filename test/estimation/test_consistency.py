@@ -1,4 +1,4 @@
-"""The covariance says how wrong the estimate is."""
+"""The covariance matches the error of the estimate."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def flights():
     parameters = EkfParameters.load()
     outcome = []
     for seed in range(FLIGHTS):
-        flight = fly(seed, DURATION, Sensors.believed(parameters, seed))
+        flight = fly(seed, DURATION, Sensors.matching(parameters, seed))
         ekf, rows = ErrorStateEkf(parameters, GRAVITY), []
         for time, sample in flight.arrivals():
             feed(ekf, sample)

@@ -1,4 +1,4 @@
-"""Dropouts, outliers, jumps: what the status says and how the filter comes back."""
+"""Dropouts, outliers, jumps: the status and the recovery of the filter."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def history(ekf, flight, drop=lambda time: False):
 
 @pytest.mark.parametrize('seed', range(6))
 def test_half_a_second_without_mocap_costs_less_than_5_cm_and_1_deg(seed):
-    sensors = Sensors.believed(EkfParameters.load(), seed)
+    sensors = Sensors.matching(EkfParameters.load(), seed)
     flight = fly(seed, 4.5, sensors)
     ekf = run(new_ekf(), flight, drop=lambda time: time > 4.0)
     error = error_state(ekf.estimate, flight)

@@ -19,7 +19,7 @@ MOUNTINGS = {
 
 
 def parameters_for(mounting):
-    """The shipped parameters, told how the sensors are mounted; clocks known to agree."""
+    """The shipped parameters with the mounting of the sensors and equal clocks."""
     shipped = EkfParameters.load()
     changes = {'imu': {}, 'mocap': {}}
     for name, value in mounting.items():
@@ -66,7 +66,7 @@ def test_offset_sensors_stay_consistent():
     mounting = MOUNTINGS['all']
     parameters, nees = parameters_for(mounting), []
     for seed in range(20):
-        flight = fly(seed, 1.5, Sensors.believed(parameters, seed))
+        flight = fly(seed, 1.5, Sensors.matching(parameters, seed))
         estimate = run(ErrorStateEkf(parameters, GRAVITY), flight).estimate
         error = error_state(estimate, flight)
         nees.append(error @ np.linalg.solve(estimate.covariance, error))

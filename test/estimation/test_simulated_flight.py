@@ -17,14 +17,14 @@ from beetle_omni_ros.sim.simulator import Simulator
 DURATION, HEIGHT, POSE_TIME = 8.0, 2.0, 2.0
 
 
-def fly(conditions, seed, drop=lambda time: False, true=None, believed=None):
+def fly(conditions, seed, drop=lambda time: False, true=None, nominal=None):
     """Fly random poses on the true state; the estimator listens. Yield it with the truth."""
     robot = true or RobotParameters.load()
     simulator = Simulator(robot, conditions=conditions, seed=seed)
     hover = HoverController(robot, HoverParameters.load())
     hover.reset()
     simulator.reset(np.array([0.0, 0.0, HEIGHT + 1]))
-    parameters = EkfParameters.load().of_robot(believed or RobotParameters.load())
+    parameters = EkfParameters.load().of_robot(nominal or RobotParameters.load())
     ekf, rng = ErrorStateEkf(parameters, robot.gravity), np.random.default_rng(seed)
     target, command = PoseTarget(np.array([0, 0, HEIGHT]), np.array([0, 0, 0, 1.0])), None
     for k in range(round(DURATION / simulator.tick)):
@@ -103,10 +103,10 @@ HIDDEN = {     # values, seconds of flight that count, columns of the errors, ho
     'imu_filter_lag': ({'delay': 0.015}, (0.0, 1.0), (1,), 1.2)}
 
 
-def flown(true, believed, duration):
+def flown(true, nominal, duration):
     """Rows of time and errors in units of what a sound flight has, and the last estimate."""
     rows = []
-    for ekf, truth in fly('nominal', 3, true=true, believed=believed):
+    for ekf, truth in fly('nominal', 3, true=true, nominal=nominal):
         if ekf.status == 'tracking':
             rows.append([truth.stamp, *errors(ekf, truth) / np.array([0.001, 0.01, 0.002])])
         if truth.stamp > duration:
@@ -118,13 +118,13 @@ def test_what_the_robot_file_says_of_a_sensor_makes_the_estimate_better(name):
     values, (first, last), columns, better = HIDDEN[name]
     true = replace(RobotParameters.load(), effects={name: values})
 
-    def error(believed):
-        rows, _ = flown(true, believed, last)
+    def error(nominal):
+        rows, _ = flown(true, nominal, last)
         rows = rows[rows[:, 0] > first, 1:]
         return float(np.sqrt(np.mean(np.square(rows[:, columns]))))
 
-    blind, told = error(None), error(true)
-    assert told < blind / better, f'{told:.2f} against {blind:.2f}'
+    uninformed, informed = error(None), error(true)
+    assert informed < uninformed / better, f'{informed:.2f} against {uninformed:.2f}'
 
 
 @pytest.mark.parametrize('name, bias, found', [
@@ -132,6 +132,6 @@ def test_what_the_robot_file_says_of_a_sensor_makes_the_estimate_better(name):
     ('imu_gyroscope_bias', (0.08, -0.06, 0.05), 'gyroscope_bias')])
 def test_a_bias_that_the_robot_file_knows_is_not_left_to_find(name, bias, found):
     true = replace(RobotParameters.load(), effects={name: {'bias': bias}})
-    left = [np.linalg.norm(getattr(flown(true, believed, 2.0)[1], found)) / np.linalg.norm(bias)
-            for believed in (None, true)]
+    left = [np.linalg.norm(getattr(flown(true, nominal, 2.0)[1], found)) / np.linalg.norm(bias)
+            for nominal in (None, true)]
     assert left[0] == pytest.approx(1.0, abs=0.1) and left[1] < 0.1

@@ -1,4 +1,4 @@
-"""Faults of processes: what estimator, controllers and supervisor say and hear."""
+"""Faults of processes: messages of estimator, controllers and supervisor."""
 
 import numpy as np
 import pytest

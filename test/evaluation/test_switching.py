@@ -93,7 +93,7 @@ def test_twenty_switches_at_random_moments_of_random_poses(flight):
     assert not {'fallback', 'landing', 'emergency_stop'} & {
         state.partition(':')[0] for state in log.states}
     assert all(pose['reached'] for pose in metrics(log, task)['poses'])
-    # What is executed is what the selected controller asked for, once it has caught up: the time
+    # The executed command is that of the selected controller, once it has caught up: the time
     # of a hand-over counts in stamps and ends with the command that crosses it.
     settled = HANDOVER.time + 2 * PERIOD
     for (start, name), (end, _) in zip(flown, [*flown[1:], (log.end, '')]):

@@ -149,7 +149,7 @@ def test_unusable_input_is_refused_in_one_line(capsys, arguments, named):
 
 def test_at_a_random_moment_faults_strike_all_over_the_time_of_a_pose(listed):
     class Recorded:
-        """Notes what it is asked for."""
+        """Record the requested targets."""
 
         def __init__(self, seed):
             self.random, self.asked = np.random.default_rng(seed), []

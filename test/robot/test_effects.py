@@ -1,4 +1,4 @@
-"""Facts about an effect stand in its declaration, and nowhere else in tables of names."""
+"""Facts about an effect are in its declaration only, not in tables of names elsewhere."""
 
 import ast
 from pathlib import Path

@@ -58,12 +58,12 @@ def test_heading_does_not_matter(holdings):
 @pytest.mark.parametrize('health', [LOST, STUCK])
 def test_the_nearest_attitude_is_firm_and_none_of_the_table_is_nearer(holdings, health):
     holding = holdings[health]
-    for wished in attitudes(30):
-        got = holding.nearest(wished, 1.0)
+    for desired in attitudes(30):
+        got = holding.nearest(desired, 1.0)
         assert holding.margin(got) >= 1.0 - 1e-9
         firm = holding.directions[holding.margins >= 1.0]
-        least = np.arccos(np.clip((firm @ up(wished)).max(), -1, 1))
-        assert rotations.geodesic_angle(got, wished) <= least + 1e-6
+        least = np.arccos(np.clip((firm @ up(desired)).max(), -1, 1))
+        assert rotations.geodesic_angle(got, desired) <= least + 1e-6
 
 
 def test_an_attitude_that_is_firm_stays(holdings):
@@ -74,12 +74,12 @@ def test_an_attitude_that_is_firm_stays(holdings):
 def test_without_any_firm_one_the_nearest_of_the_firmest_is_taken(holdings):
     holding = holdings[LOST]
     nearly = 0.8 * holding.margins.max()
-    for wished in (LEVEL, *attitudes(10)):
-        got = holding.nearest(wished, 15.0)
+    for desired in (LEVEL, *attitudes(10)):
+        got = holding.nearest(desired, 15.0)
         assert holding.margin(got) >= nearly - 1e-9
         firm = holding.directions[holding.margins >= nearly]
-        least = np.arccos(np.clip((firm @ up(wished)).max(), -1, 1))
-        assert rotations.geodesic_angle(got, wished) <= least + 1e-6
+        least = np.arccos(np.clip((firm @ up(desired)).max(), -1, 1))
+        assert rotations.geodesic_angle(got, desired) <= least + 1e-6
 
 
 def test_the_quickest_attitude_needs_no_turn_where_all_is_firm(holdings):

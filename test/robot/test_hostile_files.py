@@ -25,16 +25,16 @@ def refusal(cls, text, tmp_path):
     begin = time.process_time()
     with pytest.raises(ParameterError) as error:
         cls.load(path)
-    told = str(error.value)
+    message = str(error.value)
     assert time.process_time() - begin < 3
-    assert '\n' not in told and len(told) < LONGEST + len(str(path)), told[:2000]
-    assert str(path) in told
-    return told
+    assert '\n' not in message and len(message) < LONGEST + len(str(path)), message[:2000]
+    assert str(path) in message
+    return message
 
 
 
 
-@pytest.mark.parametrize('text, says', [
+@pytest.mark.parametrize('text, expected', [
     (LAUGHS, 'values, with aliases written out'),
     (LAUGHS + 'mass: *i\n', 'values, with aliases written out'),
     ('mass: ' + '[' * 30000 + '\n', 'nested deeper than'),
@@ -52,44 +52,44 @@ def refusal(cls, text, tmp_path):
     ('extends: "a\\0b"\n', "key 'extends': expected the name of a file"),
     ('extends: ' + 'x' * 5000 + '\n', "key 'extends': expected the name of a file"),
 ])
-def test_a_file_that_is_an_attack_is_refused_in_one_line(tmp_path, text, says):
-    assert says in refusal(RobotParameters, text, tmp_path)
+def test_a_file_that_is_an_attack_is_refused_in_one_line(tmp_path, text, expected):
+    assert expected in refusal(RobotParameters, text, tmp_path)
 
 
-@pytest.mark.parametrize('value, says', [
+@pytest.mark.parametrize('value, expected', [
     ('3', "key 'effects': expected a mapping, found 3"),
     ('[1]', "key 'effects': expected a mapping, found [1]"),
     ('{thrust_coefficient: {scale: 0x' + 'f' * 9000 + '}}', 'effects.thrust_coefficient.scale'),
     ('{thrust_coefficient: ' + 'x' * 9000 + '}', 'effects.thrust_coefficient: expected the keys'),
     ('{' + 'x' * 900 + ': 3}', 'unknown effect')])
-def test_effects_of_another_kind_are_refused(tmp_path, value, says):
+def test_effects_of_another_kind_are_refused(tmp_path, value, expected):
     text = share_path('params/robot.yaml').read_text() + f'\neffects: {value}\n'
-    assert says in refusal(RobotParameters, text, tmp_path)
+    assert expected in refusal(RobotParameters, text, tmp_path)
 
 
-@pytest.mark.parametrize('cells, says', [
+@pytest.mark.parametrize('cells, expected', [
     ('.nan', 'nan is not finite'), ('.inf', 'inf is not finite'), ('6.5', 'expected an integer'),
     ('0x' + 'f' * 9000, 'expected an integer, found an integer of 36000 bits')])
-def test_an_integer_is_an_integer(tmp_path, cells, says):
+def test_an_integer_is_an_integer(tmp_path, cells, expected):
     text = 'extends: robot.yaml\nbattery: {cells: ' + cells + '}\n'
-    told = refusal(RobotParameters, text, tmp_path)
-    assert "key 'battery.cells'" in told and says in told
+    message = refusal(RobotParameters, text, tmp_path)
+    assert "key 'battery.cells'" in message and expected in message
 
 
 @pytest.mark.parametrize('rows', ['3', 'x', '{a: 1}'])
 def test_a_thrust_map_is_a_list(tmp_path, rows):
-    told = refusal(RobotParameters, f'extends: robot.yaml\nrotors: {{map: {rows}}}\n', tmp_path)
-    assert "key 'rotors.map': expected a list" in told
+    message = refusal(RobotParameters, f'extends: robot.yaml\nrotors: {{map: {rows}}}\n', tmp_path)
+    assert "key 'rotors.map': expected a list" in message
 
 
 def test_a_charge_table_is_a_list(tmp_path):
     text = share_path('params/simulator.yaml').read_text()
     text = re.sub(r'charge_levels: +\[[^]]*\]', 'charge_levels: 1.0', text)
-    told = refusal(SimulatorParameters, text, tmp_path)
-    assert "key 'battery.charge_levels': expected a list of numbers, found 1.0" in told
+    message = refusal(SimulatorParameters, text, tmp_path)
+    assert "key 'battery.charge_levels': expected a list of numbers, found 1.0" in message
 
 
-@pytest.mark.parametrize('text, says', [
+@pytest.mark.parametrize('text, expected', [
     ('grid: x\n', "key 'grid': expected a number [s], found 'x'"),
     ('grid: .nan\n', "key 'grid': nan is not finite"),
     ('grid: 1\n', "key 'grid': 1 is outside 0.005 to 0.05 s"),
@@ -99,8 +99,8 @@ def test_a_charge_table_is_a_list(tmp_path):
     ('floors: 3\n', "key 'floors': expected shape (5,), found ()"),
     ('floors: [1, 2, 3, 4, x]\n', "key 'floors': expected numbers, found [1, 2, 3, 4, 'x']"),
     ('floors: [0.1, 0.1, 0.1, 0.1, -1]\n', "key 'floors': -1 is outside 1e-09 to 1000")])
-def test_numbers_of_the_gap_finder_keep_type_range_and_shape(tmp_path, text, says):
-    assert says in refusal(GapParameters, text, tmp_path)
+def test_numbers_of_the_gap_finder_keep_type_range_and_shape(tmp_path, text, expected):
+    assert expected in refusal(GapParameters, text, tmp_path)
 
 
 def test_a_long_value_is_quoted_in_part():

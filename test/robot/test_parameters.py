@@ -48,7 +48,7 @@ def test_the_hash_follows_physics_and_not_the_name(tmp_path, content):
     assert load(tmp_path, content).hash() != original
 
 
-@pytest.mark.parametrize('change, says', [
+@pytest.mark.parametrize('change, message', [
     (lambda c: c.update(mass=9.0), 'needs 22.1 N a rotor to hover'),
     (lambda c: c.update(mass=-1), "key 'mass': -1 is outside"),
     (lambda c: c['rotors'].pop('thrust_max'), "key 'rotors.thrust_max': missing [N]"),
@@ -62,11 +62,11 @@ def test_the_hash_follows_physics_and_not_the_name(tmp_path, content):
     (lambda c: c.update(effects={'thrust_coefficient': {'scale': 93}}), 'is outside 0.2 to 2'),
     (lambda c: c.update(effects={'wind': {'force': [1, 2]}}), 'expected shape (3,)'),
 ])
-def test_a_bad_robot_file_is_refused_by_name(tmp_path, content, change, says):
+def test_a_bad_robot_file_is_refused_by_name(tmp_path, content, change, message):
     change(content)
     with pytest.raises(ParameterError) as error:
         load(tmp_path, content)
-    assert says in str(error.value)
+    assert message in str(error.value)
     assert 'robot.yaml' in str(error.value)
     assert '\n' not in str(error.value)
 
@@ -83,16 +83,16 @@ def test_a_file_that_extends_another_names_only_what_differs(tmp_path):
     assert mine.joints == shipped.joints
 
 
-@pytest.mark.parametrize('text, says', [
+@pytest.mark.parametrize('text, message', [
     ('extends: nowhere.yaml\n', "key 'extends': no file 'nowhere.yaml'"),
     ('extends: mine.yaml\n', 'extends itself'),
     ('extends: robot.yaml\nmas: 3\n', "key 'mas': unknown key; did you mean 'mass'?"),
 ])
-def test_a_bad_extension_is_refused_by_name(tmp_path, text, says):
+def test_a_bad_extension_is_refused_by_name(tmp_path, text, message):
     (tmp_path / 'mine.yaml').write_text(text)
     with pytest.raises(ParameterError) as error:
         RobotParameters.load(tmp_path / 'mine.yaml')
-    assert says in str(error.value)
+    assert message in str(error.value)
     assert 'mine.yaml' in str(error.value)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from beetle_omni_ros.robot import schema
+from beetle_omni_ros.robot.holding import HoldingParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 
 
@@ -35,6 +36,19 @@ def write(tmp_path, text):
     return path
 
 
+@dataclass(frozen=True, kw_only=True)
+class Longer(HoldingParameters):
+    """The parameters of a shipped file, and one more."""
+
+    rate: float = parameter(5.0, doc='rate', unit='Hz')
+
+
+def test_a_class_of_a_file_reads_the_shipped_one_or_another(tmp_path):
+    assert Longer.load().turn_rate == HoldingParameters.load().turn_rate
+    other = Longer.load(write(tmp_path, 'turn_rate: 3.0\nrate: 4.0\n'))
+    assert isinstance(other, Longer) and (other.turn_rate, other.rate) == (3.0, 4.0)
+
+
 def test_plain_and_ros_form_give_the_same(tmp_path):
     plain = schema.load(Outer, write(tmp_path, 'mass: 2\ninner: {gain: 3}\n'))
     ros = schema.load(Outer, write(
@@ -43,7 +57,7 @@ def test_plain_and_ros_form_give_the_same(tmp_path):
     assert plain.inner.gain == ros.inner.gain == 3.0
 
 
-@pytest.mark.parametrize('text, says', [
+@pytest.mark.parametrize('text, message', [
     ('{}', "key 'mass': missing [kg]"),
     ('mass: 2\nmas: 3\n', "key 'mas': unknown key; did you mean 'mass'?"),
     ('mass: 2\ninner: {gian: 3}\n', "key 'inner.gian': unknown key; did you mean 'gain'?"),
@@ -60,11 +74,11 @@ def test_plain_and_ros_form_give_the_same(tmp_path):
     ('- 1\n', 'expected a mapping of keys'),
     ('mass: [1\n', 'not valid YAML at line'),
 ])
-def test_a_mistake_is_named_with_file_and_key_in_one_line(tmp_path, text, says):
+def test_a_mistake_is_named_with_file_and_key_in_one_line(tmp_path, text, message):
     path = write(tmp_path, text)
     with pytest.raises(ParameterError) as error:
         schema.load(Outer, path)
-    assert says in str(error.value)
+    assert message in str(error.value)
     assert str(path) in str(error.value)
     assert '\n' not in str(error.value)
 
@@ -77,11 +91,11 @@ def test_an_optional_group_may_be_absent(tmp_path, text, gain):
     assert (found and found.gain) == gain
 
 
-@pytest.mark.parametrize('text, says', [
+@pytest.mark.parametrize('text, message', [
     ('mass: 1\nperhaps: 3\n', "key 'perhaps': expected a mapping"),
     ('mass: 1\nperhaps: {gain: 11}\n', "key 'perhaps.gain': 11 is outside 0 to 10 1/s")])
-def test_a_mistake_in_an_optional_group_is_named(tmp_path, text, says):
-    with pytest.raises(ParameterError, match=says):
+def test_a_mistake_in_an_optional_group_is_named(tmp_path, text, message):
+    with pytest.raises(ParameterError, match=message):
         schema.load(Outer, write(tmp_path, text))
 
 

@@ -22,7 +22,7 @@ VOLTAGES = strategies.floats(21.4, 25.1)
 
 
 def cubic_thrust(row, duty):
-    """Solve a row's cubic for the thrust [N]: the oracle, which knows no table."""
+    """Solve a row's cubic for the thrust [N]: an oracle without a table."""
     coefficients = row.coefficients.copy()
     coefficients[0] -= duty
     roots = 10 * np.polynomial.polynomial.polyroots(coefficients)

@@ -11,7 +11,7 @@ torch.set_num_threads(1)    # more would only disturb each other on so small bat
 ROBOT = RobotParameters.load()
 SMALL = {'ppo.robots': 16, 'ppo.steps': 6, 'ppo.epochs': 2, 'ppo.minibatches': 2,
          'network.hidden': [16, 16], 'iterations': 4, 'log_every': 1, 'save_every': 2}
-# Neither noise nor bias nor disturbance, robots as the file says, latencies of one period.
+# Neither noise nor bias nor disturbance, robots as in the file, latencies of one period.
 QUIET = {f'random.{name}': 0.0 for name in (
     'mass_scale', 'inertia_scale', 'centre_of_mass', 'position_bias', 'position_noise',
     'attitude_bias', 'attitude_noise', 'velocity_bias', 'velocity_noise', 'rate_bias',

@@ -37,7 +37,7 @@ class Runner(command.Runner):
 
 
 def main(folder):
-    """Train by the command, tell what came out."""
+    """Train by the command and print the result."""
     rank = os.environ['RANK']
     command.Runner = Runner
     # Only the first process has had enough after its first iteration.

@@ -1,4 +1,4 @@
-"""The policy file computes what the network computes, and says all that a pilot must know."""
+"""The policy file computes the same as the network, and has all data that a flight needs."""
 
 from pathlib import Path
 

@@ -40,10 +40,10 @@ def test_a_robot_that_was_lost_counts_as_lost_and_in_nothing_else(moves):
         ('U_position', 0.01), ('U_attitude', 0.01), ('L_position', 0.02), ('L_attitude', 0.02),
         ('depth', 0.3), ('lowest', 0.25))}
     flown['U_attitude'][1, 0] = 0.2     # 11 degrees
-    told = moves.summary({**flown, 'lost': np.array([False, True])})
-    assert told['moves'] == 2 and told['robots_lost'] == 1 and told['missed'] == 1
-    assert told['deeper_than_0.25_m'] == 2 and told['deeper_than_0.4_m'] == 0
-    assert told['below_0.3_m'] == 2 and told['L_position_m'] == pytest.approx(0.02)
+    totals = moves.summary({**flown, 'lost': np.array([False, True])})
+    assert totals['moves'] == 2 and totals['robots_lost'] == 1 and totals['missed'] == 1
+    assert totals['deeper_than_0.25_m'] == 2 and totals['deeper_than_0.4_m'] == 0
+    assert totals['below_0.3_m'] == 2 and totals['L_position_m'] == pytest.approx(0.02)
 
 
 def test_robots_in_a_hover_stay_where_they_are_asked_to(moves, monkeypatch):

@@ -1,4 +1,4 @@
-"""Training in several processes: here two on the CPU, which stand for two GPUs."""
+"""Training in several processes: here two on the CPU in place of two GPUs."""
 
 import json
 import os
@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 
 @pytest.fixture(scope='module')
 def ranks(tmp_path_factory):
-    """Folder, output, and what each of two processes tells after training together."""
+    """Folder, output, and the results of two processes after training together."""
     folder = tmp_path_factory.mktemp('several')
     done = subprocess.run(
         [sys.executable, '-m', 'torch.distributed.run', '--standalone', '--nproc-per-node', '2',
@@ -49,15 +49,15 @@ def test_the_update_is_not_that_of_one_process_alone(ranks):
 
 
 def test_the_first_process_alone_writes(ranks):
-    folder, told, (first, second) = ranks
+    folder, output, (first, second) = ranks
     assert first['folder'] == str(folder / 'run') and second['folder'] == 'None'
     names = {path.name for path in (folder / 'run').iterdir()}
     assert {'train.yaml', 'model_1.pt', 'policy.onnx'} <= names and len(names) == 4
-    assert told.count('2 x 32 robots on cpu') == told.count('agrees with torch') == 1
+    assert output.count('2 x 32 robots on cpu') == output.count('agrees with torch') == 1
 
 
 def test_they_stop_together_when_the_first_one_does(ranks):
-    assert [told['iterations'] for told in ranks[2]] == [1, 1]
+    assert [output['iterations'] for output in ranks[2]] == [1, 1]
 
 
 def test_the_samples_of_all_are_counted(ranks):
@@ -86,7 +86,7 @@ def test_each_process_takes_the_gpu_of_its_rank(monkeypatch):
 
 
 def test_several_gpus_are_set_up_by_rsl_rl(monkeypatch):
-    # rsl-rl insists on its device for each process, which tells that its own set-up runs.
+    # rsl-rl requires its device for each process; the error shows that its own set-up runs.
     monkeypatch.setenv('WORLD_SIZE', '2')
     monkeypatch.setenv('RANK', '1')
     monkeypatch.setenv('LOCAL_RANK', '1')

@@ -95,7 +95,7 @@ def test_the_policy_of_a_run_flies_in_the_loop(run, tmp_path):
     task = tmp_path / 'pose.csv'
     task.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,0\n')
     result = tmp_path / 'result.json'
-    # It has learnt nothing; whatever it does, the supervisor must bring the flight to its end.
+    # The policy is untrained; the supervisor must end the flight for any behaviour of it.
     assert cli.main(['evaluate', '--controllers', 'rl', '--policy', str(run / 'policy.onnx'),
                      '--task', str(task), '--json', str(result)]) in (0, 1)
 
@@ -107,15 +107,15 @@ def test_a_run_goes_on_where_it_stopped(run, tmp_path, capsys, monkeypatch):
     (tmp_path / 'run' / 'policy.onnx').unlink()
     assert cli.main(['train', '--resume', str(tmp_path / 'run'), '--device', 'cpu', '--set',
                      'iterations=4']) == 0
-    told = capsys.readouterr().out
-    assert 'seed 5, iterations 3 to 4' in told
+    printed = capsys.readouterr().out
+    assert 'seed 5, iterations 3 to 4' in printed
     assert (tmp_path / 'run' / 'model_4.pt').is_file()
     assert (tmp_path / 'run' / 'policy.onnx').is_file()
     assert TrainParameters.load(tmp_path / 'run' / 'train.yaml').iterations == 4
     contract = PolicyNetwork(tmp_path / 'run' / 'policy.onnx', ROBOT).contract
     assert asked == ['nominal', 'published']
     assert contract.metrics == {'nominal': figures, 'published': figures}
-    assert 'nominal, training environment: reached 0.5, U_position_m 0.25' in told
+    assert 'nominal, training environment: reached 0.5, U_position_m 0.25' in printed
 
 
 def test_a_run_goes_on_in_another_folder_from_an_older_checkpoint(run, tmp_path, capsys):
@@ -139,9 +139,9 @@ def test_an_interrupted_run_keeps_its_state(tmp_path, capsys, monkeypatch, place
     folder = tmp_path / 'run'
     capsys.readouterr()
     assert cli.main(['train', *TINY, '--output', str(folder)]) == 130
-    told = capsys.readouterr()
-    assert told.err.strip() in ('', 'beetle_omni: error: interrupted')
-    assert f'continue with: beetle_omni train --resume {folder}' in told.out
+    printed = capsys.readouterr()
+    assert printed.err.strip() in ('', 'beetle_omni: error: interrupted')
+    assert f'continue with: beetle_omni train --resume {folder}' in printed.out
     assert [path.name for path in folder.glob('model_*')] == ['model_1.pt']
     assert not (folder / 'policy.onnx').exists()
     monkeypatch.undo()
