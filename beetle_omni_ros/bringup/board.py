@@ -30,18 +30,10 @@ SETTLING = 0.3      # [s] until the board has received several of our packets
 def check_board(parameters: MotorBoardParameters, robot: RobotParameters, limits: CheckLimits,
                 seconds: float, graph: ObservedGraph | None = None) -> list[Finding]:
     """
-    Check the motor board. No rotor turns; an armed board is disarmed at the end.
+    Check the motor board, listening for ``seconds``. A failure may end the list of findings.
 
-    Args:
-        parameters: parameters of the link.
-        robot: the robot, for the number of battery cells.
-        limits: limits of all checks.
-        seconds: time to listen to the board [s].
-        graph: the observed ROS graph, used if a bridge has the port open.
-
-    Returns:
-        findings; a failure that prevents the further checks ends the list.
-
+    No rotor turns, and an armed board is disarmed at the end. ``graph`` is the observed ROS graph,
+    used if a bridge has the port open.
     """
     port = port_finding('board port', parameters.port)
     if port.level != OK:

@@ -57,13 +57,9 @@ UNUSED = ('node', 'inputs', 'compute')      # statuses of every node; check_topi
 
 def bridge_findings(port: Finding, bridge: str, graph: ObservedGraph | None) -> list[Finding]:
     """
-    Findings about a device whose port cannot be opened.
+    Findings about a device whose port cannot be opened, with the failed finding ``port``.
 
-    Args:
-        port: the failed finding about the port.
-        bridge: 'joint_bridge' or 'rotor_bridge', the node that opens this port in flight.
-        graph: the observed ROS graph, or None.
-
+    If ``bridge`` runs and has the port open, its reports replace the failure.
     """
     busy = bool(port.values.get('holders')) or 'another process' in port.found
     if not (busy and graph and graph.runs(bridge)):

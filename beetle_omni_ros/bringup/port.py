@@ -17,17 +17,9 @@ USB_DEPTH = 6           # folders from a tty up to its USB device
 
 def port_finding(item: str, path: str, sys_root: Path = SYS, proc_root: Path = PROC) -> Finding:
     """
-    Check a port without opening it.
+    Check a port without opening it; ``path`` may be a link.
 
-    Args:
-        item: item of the finding.
-        path: path of the port or of a link to it.
-        sys_root: root of sysfs.
-        proc_root: root of procfs.
-
-    Returns:
-        'ok' or 'fail'; ``values['holders']`` is the number of processes that have it open.
-
+    ``values['holders']`` of the finding is the number of processes that have it open.
     """
     try:
         status = os.stat(path)
@@ -152,16 +144,7 @@ def _command(folder):
 
 
 def latency_finding(item: str, path: str, limit: int, sys_root: Path = SYS) -> Finding:
-    """
-    Check the latency timer of a USB adapter while the driver has the port open.
-
-    Args:
-        item: item of the finding.
-        path: path of the port.
-        limit: largest accepted value [ms].
-        sys_root: root of sysfs.
-
-    """
+    """Check the latency timer of a USB adapter, at most ``limit`` [ms], with the port open."""
     name = Path(os.path.realpath(path)).name
     file = sys_root / 'bus' / 'usb-serial' / 'devices' / name / 'latency_timer'
     try:

@@ -29,17 +29,9 @@ OTHER_IDS = range(21)   # searched at every baud rate if a servo is missing
 def check_servos(parameters: ServoBusParameters, joints: JointParameters, limits: CheckLimits,
                  graph: ObservedGraph | None = None) -> list[Finding]:
     """
-    Check the bus and its servos.
+    Check the bus and its servos. A failure may end the list of findings.
 
-    Args:
-        parameters: parameters of the bus.
-        joints: joint parameters, for the travel of the tilts.
-        limits: limits of all checks.
-        graph: the observed ROS graph, used if a bridge has the port open.
-
-    Returns:
-        findings; a failure that prevents the further checks ends the list.
-
+    ``graph`` is the observed ROS graph, used if a bridge has the port open.
     """
     port = port_finding('servo port', parameters.port)
     if port.level != OK:

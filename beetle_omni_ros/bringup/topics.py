@@ -20,14 +20,9 @@ CLOCK_SPREAD = 0.2      # relative spread of large ages below which clocks are t
 def check_topics(graph: ObservedGraph, limits: CheckLimits, gravity: float,
                  reported_bridges: frozenset[str] = frozenset()) -> list[Finding]:
     """
-    Check rates, ages and contents of the sensor topics.
+    Check rates, ages and contents of the sensor topics; ``gravity`` in m/s^2.
 
-    Args:
-        graph: the observed ROS graph.
-        limits: limits of all checks.
-        gravity: gravitational acceleration, the specific force at rest [m/s^2].
-        reported_bridges: bridges whose reports are already among the findings.
-
+    Reports of a running bridge are added unless it is in ``reported_bridges``.
     """
     findings = []
     for topic, (name, source, bridge) in TOPICS.items():

@@ -52,9 +52,7 @@ def parse(line: str, poses: Mapping[str, Sequence[float]]) -> Shift | Go | Order
     """
     Parse one line; None for an empty line or a comment after #.
 
-    Args:
-        line: the typed line.
-        poses: name -> x, y, z [m], roll, pitch, yaw [deg].
+    ``poses``: name -> x, y, z [m], roll, pitch, yaw [deg].
 
     Raises:
         WordError: not a command.

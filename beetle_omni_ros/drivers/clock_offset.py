@@ -17,7 +17,6 @@ class ClockOffset:
     Offset of a remote clock, remote minus local [s].
 
     Attributes:
-        exchanges: number of answers used.
         jumps: number of answers outside the interval, because the remote clock was set.
 
     """
@@ -25,7 +24,7 @@ class ClockOffset:
     def __init__(self, drift: float):
         """``drift``: bound of the relative drift of the clocks [s/s]."""
         self._drift = drift
-        self.exchanges = self.jumps = 0
+        self.jumps = 0
         self.restart()
 
     def restart(self) -> None:
@@ -53,7 +52,6 @@ class ClockOffset:
         """
         if received < sent:
             return False
-        self.exchanges += 1
         within = self._drift * (received - sent)
         low, high = remote - received - within, remote - sent + within
         known_low, known_high, at = self._bounds

@@ -34,8 +34,7 @@ class MavlinkReceiver:
     Splits a byte stream into the messages of one sender.
 
     Args:
-        system: system ID of the sender.
-        component: component ID of the sender.
+        system, component: IDs of the sender.
         restarts: whether a message is the first one after a restart of the sender, so that its
             number begins a new sequence.
 

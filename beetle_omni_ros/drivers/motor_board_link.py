@@ -21,7 +21,6 @@ class BoardLink:
     MAVLink on one serial port. The callbacks run one at a time in the thread of the link.
 
     Args:
-        parameters: parameters of the link.
         on_message: called with (message, arrival [s, monotonic]).
         on_tick: called with the monotonic time [s], at least each :data:`TICK`.
         on_connection: called with (True, '') or (False, reason) when the port opens or fails.

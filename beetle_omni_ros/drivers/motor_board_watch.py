@@ -30,12 +30,7 @@ SEVERE = ('ESC failure', 'targets timed out')
 
 class BoardWatch:
     """
-    Newest state and measurements of the board, and events about changes.
-
-    Args:
-        parameters: parameters of the link.
-        robot: robot with the number of battery cells.
-        clock: clock of all stamps [s].
+    Newest state and measurements of the board, stamped by ``clock`` [s], and events.
 
     Attributes:
         status: last heartbeat, or None.

@@ -7,6 +7,7 @@ write waits in a busy loop, without a time limit, if the output buffer is full.
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import termios
@@ -18,11 +19,31 @@ class SerialPortError(OSError):
     """The port cannot be used; the message has its name and a remedy."""
 
 
-ADVICE = {
-    2: 'no such device: check plug, power and name',
-    13: "no permission: add the user to the group 'dialout' or install the udev rule",
-    11: 'in use by another process', 16: 'in use by another process',
-}
+CAUSES = {errno.ENOENT: 'no such port; check plug, power, name and udev rule',
+          errno.EACCES: 'no permission; add the user to the group dialout and log in again, or '
+                        'install the udev rule',
+          errno.EAGAIN: 'in use by another process; stop it',
+          errno.EBUSY: 'in use by another process; stop it',
+          errno.EIO: 'unplugged', errno.ENXIO: 'unplugged', errno.ENODEV: 'unplugged'}
+OPEN_ERRORS = OSError, ValueError, termios.error
+
+
+def open_serial(name: str, baud: int) -> serial.Serial:
+    """Open a port for this process only, without timeout; raises one of OPEN_ERRORS."""
+    port = serial.Serial(name, baud, timeout=0, exclusive=True)
+    try:
+        port.set_low_latency_mode(True)
+    except (OSError, ValueError, AttributeError, NotImplementedError):
+        pass        # pseudo-terminals and USB CDC do not need this setting
+    return port
+
+
+def cause(error: Exception) -> str:
+    """Cause and remedy of a port's error."""
+    number = getattr(error, 'errno', None)
+    if number is None and error.args and isinstance(error.args[0], int):
+        number = error.args[0]
+    return CAUSES.get(number) or (str(error).splitlines() or ['unplugged'])[0]
 
 
 class SerialPort:
@@ -46,15 +67,9 @@ class SerialPort:
         self.name = name
         self.dropped = 0
         try:
-            self._serial = serial.Serial(name, baud, timeout=0, exclusive=True)
-        except (serial.SerialException, OSError, ValueError, termios.error) as error:
-            number = getattr(error, 'errno', None)
-            text = ADVICE.get(number) or str(error).splitlines()[0]
-            raise SerialPortError(f'{name}: cannot be opened ({text})') from None
-        try:
-            self._serial.set_low_latency_mode(True)
-        except (OSError, ValueError, AttributeError, NotImplementedError):
-            pass        # pseudo-terminals and USB CDC do not need this setting
+            self._serial = open_serial(name, baud)
+        except OPEN_ERRORS as error:
+            raise SerialPortError(f'{name}: cannot be opened ({cause(error)})') from None
         os.set_blocking(self._serial.fileno(), False)
         self._rest = b''
 
@@ -74,7 +89,7 @@ class SerialPort:
             data = os.read(self.fileno(), 4096)
         except BlockingIOError:
             return b''
-        except (OSError, serial.SerialException) as error:
+        except OSError as error:
             raise self._gone(error) from None
         if not data and select.select([self.fileno()], [], [], 0)[0]:
             # A tty whose other end is closed is readable and empty.
@@ -117,7 +132,7 @@ class SerialPort:
             return os.write(self.fileno(), data)
         except BlockingIOError:
             return 0
-        except (OSError, serial.SerialException) as error:
+        except OSError as error:
             raise self._gone(error) from None
 
     def _gone(self, error):

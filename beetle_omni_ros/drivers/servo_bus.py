@@ -41,7 +41,6 @@ class ServoBus:
     results. Together they then take at most one reply time. They recover without further calls.
 
     Args:
-        parameters: parameters of the bus.
         joints: joint parameters, for the travel of the tilts.
         clock: clock of the stamps of readings [s].
 

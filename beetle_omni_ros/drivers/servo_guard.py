@@ -22,15 +22,7 @@ PAUSE = 0.02        # [s] between repetitions
 
 
 class Guard:
-    """
-    The guard process of one bus.
-
-    Args:
-        port: path of the serial port.
-        baud_rate: baud rate of the bus [bit/s].
-        packet: packet that switches the torque of all servos off.
-
-    """
+    """The guard process of one bus; ``packet`` switches the torque of all servos off."""
 
     def __init__(self, port: str, baud_rate: int, packet: bytes):
         self._process = subprocess.Popen(

@@ -60,8 +60,6 @@ class ServoLink:
     The bus at one baud rate.
 
     Args:
-        path: path of the serial port.
-        baud_rate: baud rate [bit/s].
         reply_time: time limit of an answer, without its time on the wire [s].
 
     Attributes:

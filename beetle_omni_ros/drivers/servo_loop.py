@@ -31,9 +31,6 @@ class ServoPace:
     once in one or several periods. The phase of the cycles is controlled so that goals do not
     arrive during a transaction.
 
-    Args:
-        period: period of the cycles [s].
-
     Attributes:
         missed: number of periods without a cycle.
 

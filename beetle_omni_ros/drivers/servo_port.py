@@ -8,7 +8,8 @@ import termios
 import time
 
 from dynamixel_sdk import port_handler
-import serial
+
+from beetle_omni_ros.drivers.serial_port import cause, OPEN_ERRORS, open_serial
 
 # [ms] With the SDK's default of 16 a missing answer takes 34 ms. The adapter must be set
 # accordingly: docs/how-to/hardware.md.
@@ -23,11 +24,7 @@ class ServoPort(port_handler.PortHandler):
     """
     A serial port for the SDK's packet handler.
 
-    Args:
-        path: path of the device.
-        baud_rate: baud rate [bit/s].
-        reply_time: time limit of an answer without its time on the wire [s].
-
+    ``reply_time`` is the time limit of an answer without its time on the wire [s].
     """
 
     def __init__(self, path: str, baud_rate: int, reply_time: float):
@@ -41,13 +38,9 @@ class ServoPort(port_handler.PortHandler):
         if self.is_open:
             self.closePort()
         try:
-            self.ser = serial.Serial(self.port_name, self.baudrate, timeout=0, exclusive=True)
-        except (OSError, ValueError, termios.error) as error:
-            raise PortLost(reason(error)) from None
-        try:
-            self.ser.set_low_latency_mode(True)
-        except (OSError, ValueError):  # not an FTDI adapter, or a pseudo-terminal
-            pass
+            self.ser = open_serial(self.port_name, self.baudrate)
+        except OPEN_ERRORS as error:
+            raise PortLost(cause(error)) from None
         self.is_open = True
         self.tx_time_per_byte = 10_000.0 / self.baudrate
         return True
@@ -66,7 +59,7 @@ class ServoPort(port_handler.PortHandler):
         try:
             termios.tcflush(self.ser.fd, termios.TCIFLUSH)
         except (OSError, termios.error, TypeError) as error:
-            raise PortLost(reason(error)) from None
+            raise PortLost(cause(error)) from None
 
     def readPort(self, length):
         """Wait for bytes, at most until the packet's time limit."""
@@ -77,7 +70,7 @@ class ServoPort(port_handler.PortHandler):
         except BlockingIOError:
             return b''
         except (OSError, TypeError, ValueError) as error:
-            raise PortLost(reason(error)) from None
+            raise PortLost(cause(error)) from None
         if ready and not data:
             raise PortLost('unplugged')
         return data
@@ -90,7 +83,7 @@ class ServoPort(port_handler.PortHandler):
         except BlockingIOError:
             return 0
         except (OSError, TypeError) as error:
-            raise PortLost(reason(error)) from None
+            raise PortLost(cause(error)) from None
 
     def getCurrentTime(self):
         """Milliseconds of the monotonic clock."""
@@ -101,17 +94,3 @@ class ServoPort(port_handler.PortHandler):
         self.packet_start_time = self.getCurrentTime()
         self.packet_timeout = self.tx_time_per_byte * (self.unsent + packet_length) \
             + self.reply_time * 1000
-
-
-def reason(error: Exception) -> str:
-    """Describe a port's error and its remedy."""
-    number = getattr(error, 'errno', None)
-    if number is None and error.args and isinstance(error.args[0], int):
-        number = error.args[0]
-    if isinstance(error, serial.SerialException) and 'exclusively lock' in str(error):
-        return 'used by another process; stop that one'
-    hints = {2: 'no such port; check the adapter and the udev rule',
-             13: 'no permission; add the user to group dialout and log in again',
-             16: 'used by another process; stop that one',
-             5: 'unplugged', 6: 'unplugged', 19: 'unplugged'}
-    return hints.get(number, str(error).splitlines()[0] if str(error) else 'unplugged')

@@ -24,16 +24,10 @@ def recovery(link: ServoLink, parameters: ServoBusParameters, servo: Servo, enab
              forced: bool, clock: Callable[[], float], log: Callable[[str], None]
              ) -> Iterator[None]:
     """
-    Read the state of a servo and recover it.
+    Read the state of a servo and recover it, updating ``servo``.
 
-    Args:
-        link: the bus.
-        parameters: settings to restore.
-        servo: state of the servo; turns and torque are updated.
-        enabled: whether it has torque at the end.
-        forced: whether to restart it in any case.
-        clock: monotonic time [s].
-        log: adds a line to the log.
+    At the end it has torque if ``enabled``. With ``forced`` it is restarted in any case. ``clock``
+    is monotonic [s], and ``log`` adds a line to the log.
 
     Yields:
         after each transaction, and while waiting.

@@ -23,15 +23,7 @@ REPEAT_AFTER = 1.0      # [s] until an equal line is logged again
 
 
 class ServoUpkeep:
-    """
-    Recovers servos and reads their health; :meth:`step` does at most one transaction.
-
-    Args:
-        link: the bus.
-        parameters: parameters of the bus.
-        servos: states of the servos, updated here.
-
-    """
+    """Updates, checks and recovers servos; :meth:`step` does at most one transaction."""
 
     def __init__(self, link: ServoLink, parameters: ServoBusParameters, servos: list[Servo]):
         self._link, self._parameters, self._servos = link, parameters, servos

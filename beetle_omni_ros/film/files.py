@@ -19,12 +19,7 @@ FORMATS = {'.gif': GIF_FPS, '.mp4': MP4_FPS}
 
 def write_film(path: Path, frames: Iterable[Image.Image], fps: float) -> None:
     """
-    Write frames as a film.
-
-    Args:
-        path: path of a .gif, which repeats, or of an .mp4.
-        frames: frames of equal size.
-        fps: frame rate [1/s].
+    Write frames of equal size as a .gif, which repeats, or as an .mp4.
 
     Raises:
         ParameterError: the file cannot be written, or the MP4 encoder is not installed.

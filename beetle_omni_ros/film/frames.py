@@ -29,13 +29,7 @@ TICKS = ((1e-3, '1 mm'), (1e-2, '1 cm'), (1e-1, '10 cm'), (1.0, '1 m'))
 
 
 def framing(points: np.ndarray) -> Camera:
-    """
-    Place a fixed camera as near as possible, with the whole flight in its view.
-
-    Args:
-        points: (N, 3) positions of the robot [m].
-
-    """
+    """Place a fixed camera as near as possible with all positions (N, 3) [m] in its view."""
     return min((_framing(points, azimuth) for azimuth in AZIMUTHS), key=lambda c: c.distance)
 
 

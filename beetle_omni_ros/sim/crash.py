@@ -11,14 +11,10 @@ from beetle_omni_ros.sim.readings import Impact, Truth
 
 class CrashWatch:
     """
-    Checks the true state in every tick.
+    Checks the true state in every tick [s].
 
     A robot that has flown breaks if its first contact is too fast, or a contact too inclined. A
     robot that has not flown does not break, so it may be placed on its side.
-
-    Args:
-        parameters: limits.
-        tick: time between two calls of :meth:`step` [s].
 
     Attributes:
         impact: last touchdown, None before the first.

@@ -25,11 +25,6 @@ class EmulatedActuators:
     outputs act after the command delay of the conditions. A command for the IMU sample of one
     tick, received before the next tick, then acts at the same time as without devices.
 
-    Args:
-        simulator: simulator of the true robot.
-        bus: four servos without motion model; closed by :meth:`close`.
-        board: motor board; closed by :meth:`close`.
-
     """
 
     def __init__(self, simulator: Simulator, bus: EmulatedServoBus, board: EmulatedMotorBoard):

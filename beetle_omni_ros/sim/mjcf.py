@@ -27,12 +27,6 @@ def build_model(robot: RobotParameters, plant: PlantParameters,
     Generalised velocities: base_link's velocity in world (3) and angular velocity in
     base_link (3), then the four tilt rates. Controls: four thrust commands [N], four tilt
     targets [rad]; activations: the four lagged thrusts [N].
-
-    Args:
-        robot: the true robot.
-        plant: time steps and ground.
-        variation: deviation of this robot from its file.
-
     """
     model = mujoco.MjModel.from_xml_string(_mjcf(robot, plant, variation))
     _reflect_servo_inertia(model, robot)

@@ -70,10 +70,8 @@ class Stage:
     Draws pictures of robots over a floor.
 
     Args:
-        robot: dimensions of the robots.
         looks: appearance of each robot, in the order of the poses.
-        width: width of a picture [pixels].
-        height: height of a picture [pixels].
+        width, height: size of a picture [pixels].
         field_of_view: vertical field of view [deg].
         plant: sizes of feet and propellers; default: params/simulator.yaml.
 
@@ -112,16 +110,9 @@ class Stage:
     def draw(self, poses: Sequence[Pose | None], camera: Camera,
              trails: Sequence[Trail] = ()) -> np.ndarray:
         """
-        Draw one picture.
+        Draw one picture, (height, width, 3) uint8.
 
-        Args:
-            poses: poses of the robots; None hides a robot.
-            camera: viewpoint.
-            trails: paths to draw.
-
-        Returns:
-            (height, width, 3) uint8.
-
+        A pose of None hides a robot.
         """
         for k, pose in enumerate(poses):
             self._data.qpos[JOINTS * k:JOINTS * (k + 1)] = self._joints(pose)

@@ -50,13 +50,10 @@ class Sensors:
     All sensors of one robot in one flight.
 
     Args:
-        parameters: noise and latencies.
-        conditions: biases and latencies of this flight.
         seeds: five seeds, for IMU, MoCap, encoders, battery and rotor speeds, so that the noise of
             a sensor does not depend on the rate of another one.
         first: state at reset, in which the robot has been at rest.
         effort: (4,) servo torques in this state [N m].
-        errors: effects of the robot file on the sensors.
 
     Raises:
         ParameterError: a period or latency is not a multiple of the tick.

@@ -35,7 +35,6 @@ class Simulator:
         robot: the true robot.
         parameters: simulator parameters; default: params/simulator.yaml.
         conditions: 'nominal' or 'published'.
-        seed: seed of all random numbers.
 
     Attributes:
         time: time since reset [s].

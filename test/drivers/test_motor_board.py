@@ -203,7 +203,7 @@ def test_another_firmware_is_refused():
 
 
 def test_a_port_that_cannot_be_opened_is_one_line(tmp_path):
-    with pytest.raises(SerialPortError, match='board: cannot be opened .no such device'):
+    with pytest.raises(SerialPortError, match='board: cannot be opened .no such port'):
         driver(str(tmp_path / 'board')).open()
 
 

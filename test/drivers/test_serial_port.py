@@ -80,7 +80,7 @@ def test_a_port_in_use_is_refused(ends):
 
 
 def test_what_cannot_be_opened_says_what_to_do(tmp_path):
-    with pytest.raises(SerialPortError, match='nowhere: cannot be opened .no such device'):
+    with pytest.raises(SerialPortError, match='nowhere: cannot be opened .no such port'):
         SerialPort(str(tmp_path / 'nowhere'), 921600)
     (tmp_path / 'file').write_text('x')
     with pytest.raises(SerialPortError, match='file: cannot be opened'):

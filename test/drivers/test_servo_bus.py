@@ -184,7 +184,7 @@ def test_scanning_finds_servos_at_another_baud_rate(baud_rate):
 
 def test_a_port_is_refused_in_one_line(tmp_path):
     bus = ServoBus(replace(SHIPPED, port=str(tmp_path / 'nothing')), JOINTS)
-    with pytest.raises(ServoBusError, match='nothing: no such port; check the adapter'):
+    with pytest.raises(ServoBusError, match='nothing: no such port; check plug'):
         bus.open()
     readings, reports = tick(bus, GOAL)
     assert not readings.valid.any() and len(reports) == 4
@@ -194,7 +194,7 @@ def test_a_port_is_refused_in_one_line(tmp_path):
 @pytest.mark.real_time
 def test_a_port_in_use_is_refused():
     with bench() as (bus, emulated):
-        with pytest.raises(ServoBusError, match='used by another process'):
+        with pytest.raises(ServoBusError, match='in use by another process'):
             ServoBus(bus.parameters, JOINTS).open()
 
 

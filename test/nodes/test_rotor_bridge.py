@@ -264,7 +264,7 @@ def test_a_port_that_is_absent_is_waited_for_and_named(tmp_path):
     port = tmp_path / 'motor_board'
     with bench(tmp_path, port=str(port)) as made:
         commander = made.commander
-        assert commander.reaches(f'waiting: {port}: cannot be opened (no such device', START)
+        assert commander.reaches(f'waiting: {port}: cannot be opened (no such port', START)
         assert commander.told_in_diagnostics('board', 'phase', lambda phase: phase == 'rests')
         commander.supervise('takeoff')
         # Whether it has heard of 'disarmed' before is for the middleware to decide.

@@ -26,12 +26,7 @@ STOP = (0.0, 0.0, 0.0, 0.0)
 
 class BoardFirmware:
     """
-    State machine of the board.
-
-    Args:
-        parameters: parameters of the contract.
-        cells: number of battery cells in series.
-        now: time of power-up [s].
+    State machine of the board, powered at ``now`` [s] by a battery of ``cells``.
 
     Attributes:
         telemetry: measurements, set from outside.

@@ -32,7 +32,6 @@ class EmulatedMotorBoard:
     Args:
         robot: the true robot, whose rotor map converts PWM to thrust.
         parameters: parameters of the board; default: params/emulated_board.yaml.
-        seed: seed of random faults.
         port: path of the created port; by default a temporary one.
 
     Attributes:

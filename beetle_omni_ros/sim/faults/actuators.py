@@ -7,7 +7,7 @@ from math import exp
 
 import numpy as np
 
-from beetle_omni_ros.sim.faults.base import Effect, kind, Number, one_of_four, share
+from beetle_omni_ros.sim.faults.base import Effect, Number, one_of_four, share
 
 
 class RotorEffect(Effect):
@@ -20,16 +20,14 @@ class RotorEffect(Effect):
         return int(self._numbers['rotor']) - 1
 
 
-@kind('rotor_stops')
-class RotorStops(RotorEffect):
+class RotorStops(RotorEffect, kind='rotor_stops'):
     """A rotor stops; its thrust fades with the rotor lag."""
 
     def drive(self, drive):
         drive.thrust[self._k] = 0.0
 
 
-@kind('rotor_weak')
-class RotorWeak(RotorEffect):
+class RotorWeak(RotorEffect, kind='rotor_weak'):
     """A rotor turns slower and gives only a share of the commanded thrust."""
 
     numbers = {**RotorEffect.numbers, 'share': share('share of the commanded thrust')}
@@ -38,8 +36,7 @@ class RotorWeak(RotorEffect):
         drive.thrust[self._k] *= self._numbers['share']
 
 
-@kind('propeller_broken')
-class PropellerBroken(RotorEffect):
+class PropellerBroken(RotorEffect, kind='propeller_broken'):
     """A rotor has the commanded speed, and its propeller gives only a share of the thrust."""
 
     numbers = {**RotorEffect.numbers, 'share': share('share of the thrust at that speed')}
@@ -49,8 +46,7 @@ class PropellerBroken(RotorEffect):
         drive.wear[self._k] *= max(self._numbers['share'], 1e-6)
 
 
-@kind('rotor_sticks')
-class RotorSticks(RotorEffect):
+class RotorSticks(RotorEffect, kind='rotor_sticks'):
     """A rotor keeps its present thrust."""
 
     def start(self, world):
@@ -60,8 +56,7 @@ class RotorSticks(RotorEffect):
         drive.thrust[self._k] = self._thrust
 
 
-@kind('rotor_slow')
-class RotorSlow(RotorEffect):
+class RotorSlow(RotorEffect, kind='rotor_slow'):
     """A rotor follows its commands through a second lag."""
 
     numbers = {**RotorEffect.numbers,
@@ -95,8 +90,7 @@ class ServoEffect(Effect):
         return replace(reading, **changed)
 
 
-@kind('servo_jammed')
-class ServoJammed(ServoEffect):
+class ServoJammed(ServoEffect, kind='servo_jammed'):
     """A joint jams at its present angle, or after a slip by an angle."""
 
     numbers = {**ServoEffect.numbers,
@@ -116,16 +110,14 @@ class ServoJammed(ServoEffect):
         drive.jammed[self._k] = True
 
 
-@kind('servo_limp')
-class ServoLimp(ServoEffect):
+class ServoLimp(ServoEffect, kind='servo_limp'):
     """A servo loses its torque, so that the joint swings freely."""
 
     def drive(self, drive):
         drive.powered[self._k] = False
 
 
-@kind('servo_slow')
-class ServoSlow(ServoEffect):
+class ServoSlow(ServoEffect, kind='servo_slow'):
     """The rate of a servo is limited."""
 
     numbers = {**ServoEffect.numbers,
@@ -140,8 +132,7 @@ class ServoSlow(ServoEffect):
         drive.tilt[self._k] = self._angle
 
 
-@kind('servo_deaf')
-class ServoDeaf(ServoEffect):
+class ServoDeaf(ServoEffect, kind='servo_deaf'):
     """A servo ignores new targets and holds the last one."""
 
     def start(self, world):
@@ -151,8 +142,7 @@ class ServoDeaf(ServoEffect):
         drive.tilt[self._k] = self._target
 
 
-@kind('encoder_shifted')
-class EncoderShifted(ServoEffect):
+class EncoderShifted(ServoEffect, kind='encoder_shifted'):
     """An encoder has an offset, with which its servo controls the joint."""
 
     numbers = {**ServoEffect.numbers,
@@ -166,8 +156,7 @@ class EncoderShifted(ServoEffect):
                                        reading.position[self._k] + self._numbers['angle'])
 
 
-@kind('encoder_frozen')
-class EncoderFrozen(ServoEffect):
+class EncoderFrozen(ServoEffect, kind='encoder_frozen'):
     """The angle reported by a servo is frozen; the servo itself works."""
 
     _angle: float | None = None
@@ -180,16 +169,14 @@ class EncoderFrozen(ServoEffect):
         return self._shown(reading, self._angle, 0.0)
 
 
-@kind('joints_lost')
-class JointsLost(Effect):
+class JointsLost(Effect, kind='joints_lost'):
     """No joint feedback arrives."""
 
     def joints(self, reading, now):
         return None
 
 
-@kind('rotor_speed_lost')
-class RotorSpeedLost(Effect):
+class RotorSpeedLost(Effect, kind='rotor_speed_lost'):
     """No rotor speed arrives."""
 
     def rotors(self, reading, now):

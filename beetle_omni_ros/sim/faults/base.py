@@ -121,22 +121,24 @@ class Fault:
 
 class Effect:
     """
-    Effect of an active fault. A kind overrides some of the hooks.
+    Effect of an active fault, with one call of each hook in a tick [s].
+
+    A subclass with the argument ``kind`` overrides some of the hooks.
 
     Attributes:
         numbers: declarations of the kind's numbers, by name.
         process: whether it affects a process of the flight stack, see
             :class:`~beetle_omni_ros.sim.faults.processes.ProcessEffect`.
 
-    Args:
-        numbers: values of all numbers.
-        tick: time between two calls of a hook [s].
-        generator: generator of random numbers.
-
     """
 
     numbers: ClassVar[dict[str, Number]] = {}
     process: ClassVar[bool] = False
+
+    def __init_subclass__(cls, kind: str | None = None):
+        """Add a class with a ``kind`` to KINDS."""
+        if kind:
+            KINDS[kind] = cls
 
     def __init__(self, numbers: Mapping[str, float], tick: float, generator: np.random.Generator):
         self._numbers, self._tick, self._random = numbers, tick, generator
@@ -256,14 +258,6 @@ class Frozen:
     def _change(self, item):
         self._first = self._first or item
         return replace(self._first, stamp=item.stamp)
-
-
-def kind(name: str):
-    """Add a class to KINDS."""
-    def register(cls):
-        KINDS[name] = cls
-        return cls
-    return register
 
 
 def vector(unit: str, what: str, **defaults: float) -> dict[str, Number]:

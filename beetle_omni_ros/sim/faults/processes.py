@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from beetle_omni_ros.robot import rotations
-from beetle_omni_ros.sim.faults.base import Effect, Frozen, kind, Late, Number, vector
+from beetle_omni_ros.sim.faults.base import Effect, Frozen, Late, Number, vector
 
 
 class ProcessEffect(Effect):
@@ -31,8 +31,7 @@ class ProcessEffect(Effect):
         return None
 
 
-@kind('clock_jumps')
-class ClockJumps(ProcessEffect):
+class ClockJumps(ProcessEffect, kind='clock_jumps'):
     """The clock of the flight computer jumps."""
 
     numbers = {'step': Number('jump of the clock', 's', low=-100, high=100)}
@@ -42,16 +41,14 @@ class ClockJumps(ProcessEffect):
         return self._numbers['step']
 
 
-@kind('estimator_dead')
-class EstimatorDead(ProcessEffect):
+class EstimatorDead(ProcessEffect, kind='estimator_dead'):
     """The estimator publishes nothing."""
 
     def estimate(self, state):
         return None
 
 
-@kind('estimator_diverges')
-class EstimatorDiverges(ProcessEffect):
+class EstimatorDiverges(ProcessEffect, kind='estimator_diverges'):
     """The errors of position and velocity grow along world x."""
 
     numbers = {'acceleration': Number('acceleration of the error', 'm/s^2', 1.0, 0, 1000)}
@@ -65,16 +62,14 @@ class EstimatorDiverges(ProcessEffect):
                        velocity=state.velocity + gain * self._time * away)
 
 
-@kind('estimator_nan')
-class EstimatorNan(ProcessEffect):
+class EstimatorNan(ProcessEffect, kind='estimator_nan'):
     """The estimator publishes NaN."""
 
     def estimate(self, state):
         return replace(state, position=np.full(3, np.nan))
 
 
-@kind('estimator_rubbish')
-class EstimatorRubbish(ProcessEffect):
+class EstimatorRubbish(ProcessEffect, kind='estimator_rubbish'):
     """The estimator publishes random states."""
 
     def estimate(self, state):
@@ -83,16 +78,14 @@ class EstimatorRubbish(ProcessEffect):
                        quaternion=rotations.normalized(row[6:10]), angular_velocity=3 * row[10:])
 
 
-@kind('estimator_frozen')
-class EstimatorFrozen(Frozen, ProcessEffect):
+class EstimatorFrozen(Frozen, ProcessEffect, kind='estimator_frozen'):
     """The estimator publishes the same state with new stamps."""
 
     def estimate(self, state):
         return self._change(state)
 
 
-@kind('controller_silent')
-class ControllerSilent(ProcessEffect):
+class ControllerSilent(ProcessEffect, kind='controller_silent'):
     """The active controller publishes nothing."""
 
     def request(self, command, now):
@@ -106,16 +99,14 @@ class _CommandEffect(ProcessEffect):
         return [] if command is None else [self._change(command)]
 
 
-@kind('controller_nan')
-class ControllerNan(_CommandEffect):
+class ControllerNan(_CommandEffect, kind='controller_nan'):
     """The active controller commands NaN."""
 
     def _change(self, command):
         return replace(command, thrust=np.full(4, np.nan))
 
 
-@kind('controller_rubbish')
-class ControllerRubbish(_CommandEffect):
+class ControllerRubbish(_CommandEffect, kind='controller_rubbish'):
     """The active controller commands random tilts within 3 rad and thrusts up to 20 N."""
 
     def _change(self, command):
@@ -123,13 +114,11 @@ class ControllerRubbish(_CommandEffect):
                        thrust=self._random.uniform(0, 20, 4))
 
 
-@kind('controller_constant')
-class ControllerConstant(Frozen, _CommandEffect):
+class ControllerConstant(Frozen, _CommandEffect, kind='controller_constant'):
     """The active controller repeats one command with new stamps."""
 
 
-@kind('controller_noisy')
-class ControllerNoisy(_CommandEffect):
+class ControllerNoisy(_CommandEffect, kind='controller_noisy'):
     """The commands of the active controller have white noise."""
 
     numbers = {'tilt': Number('standard deviation', 'rad', 0.0, 0, 3),
@@ -141,23 +130,20 @@ class ControllerNoisy(_CommandEffect):
                        thrust=np.maximum(command.thrust + self._numbers['thrust'] * thrust, 0.0))
 
 
-@kind('controller_slow')
-class ControllerSlow(Late, ProcessEffect):
+class ControllerSlow(Late, ProcessEffect, kind='controller_slow'):
     """The commands of the active controller are late, with correct stamps."""
 
     def request(self, command, now):
         return self._delayed(command, now)
 
 
-@kind('supervisor_waits')
-class SupervisorWaits(ProcessEffect):
+class SupervisorWaits(ProcessEffect, kind='supervisor_waits'):
     """The supervisor is not scheduled; the newest ten messages of each topic wait."""
 
     supervisor_waits = True
 
 
-@kind('target')
-class Target(ProcessEffect):
+class Target(ProcessEffect, kind='target'):
     """Another program publishes a target pose in world."""
 
     numbers = {**vector('m', 'in world', x=0.0, y=0.0, z=1.0),
@@ -169,15 +155,13 @@ class Target(ProcessEffect):
                 rotations.from_rpy(n['roll'], n['pitch'], n['yaw']))
 
 
-@kind('motor_board_lost')
-class MotorBoardLost(ProcessEffect):
+class MotorBoardLost(ProcessEffect, kind='motor_board_lost'):
     """The rotor bridge reports 'lost'."""
 
     bridges = {'rotor': 'lost: motor board silent'}
 
 
-@kind('servo_bus_lost')
-class ServoBusLost(ProcessEffect):
+class ServoBusLost(ProcessEffect, kind='servo_bus_lost'):
     """The joint bridge reports 'lost'."""
 
     bridges = {'joint': 'lost: a servo is silent'}

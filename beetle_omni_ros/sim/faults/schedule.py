@@ -12,14 +12,10 @@ from beetle_omni_ros.sim.faults.base import Effect, Fault, KINDS, ROUNDING
 
 class Schedule:
     """
-    A list of faults and their effects.
+    A list of faults and their effects, updated in each tick [s].
 
     Equal faults, seeds and calls give equal results. A fault that is in the list before and after
     a change continues unchanged.
-
-    Args:
-        tick: time between two updates [s].
-        seed: seed of the random numbers of all faults.
 
     Attributes:
         active: active effects in the order of the list.

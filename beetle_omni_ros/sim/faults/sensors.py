@@ -10,7 +10,6 @@ from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.sim.faults.base import (
     Effect,
     Frozen,
-    kind,
     Late,
     Lost,
     Number,
@@ -43,13 +42,11 @@ class _ClockStep:
         return replace(reading, stamp=reading.stamp + self._numbers['step'])
 
 
-@kind('mocap_lost')
-class MocapLost(Lost, _MocapEffect):
+class MocapLost(Lost, _MocapEffect, kind='mocap_lost'):
     """No pose arrives."""
 
 
-@kind('mocap_drops')
-class MocapDrops(_MocapEffect):
+class MocapDrops(_MocapEffect, kind='mocap_drops'):
     """A share of the poses is lost."""
 
     numbers = {'share': share('share of lost poses')}
@@ -58,13 +55,11 @@ class MocapDrops(_MocapEffect):
         return None if self._random.uniform() < self._numbers['share'] else reading
 
 
-@kind('mocap_frozen')
-class MocapFrozen(Frozen, _MocapEffect):
+class MocapFrozen(Frozen, _MocapEffect, kind='mocap_frozen'):
     """The same pose arrives with new stamps."""
 
 
-@kind('mocap_jumps')
-class MocapJumps(_MocapEffect):
+class MocapJumps(_MocapEffect, kind='mocap_jumps'):
     """The position jumps and keeps the offset."""
 
     numbers = vector('m', 'of the jump in world', x=0.0, y=0.0, z=0.0)
@@ -74,8 +69,7 @@ class MocapJumps(_MocapEffect):
             [self._numbers[axis] for axis in 'xyz']))
 
 
-@kind('mocap_turned')
-class MocapTurned(_MocapEffect):
+class MocapTurned(_MocapEffect, kind='mocap_turned'):
     """The orientation jumps about axes of base_link and keeps the offset."""
 
     numbers = vector('rad', 'of the rotation', roll=0.0, pitch=0.0, yaw=0.0)
@@ -85,8 +79,7 @@ class MocapTurned(_MocapEffect):
         return replace(reading, quaternion=rotations.multiply(reading.quaternion, turn))
 
 
-@kind('mocap_noisy')
-class MocapNoisy(_MocapEffect):
+class MocapNoisy(_MocapEffect, kind='mocap_noisy'):
     """The pose has additional noise; standard deviations of an axis."""
 
     numbers = {'position': Number('standard deviation', 'm', 0.0, 0, 10),
@@ -99,16 +92,14 @@ class MocapNoisy(_MocapEffect):
                        quaternion=rotations.multiply(reading.quaternion, turn))
 
 
-@kind('mocap_delayed')
-class MocapDelayed(Late):
+class MocapDelayed(Late, kind='mocap_delayed'):
     """Poses arrive late, stamped at capture."""
 
     def mocap(self, reading, now):
         return next(iter(self._delayed(reading, now, 1)), None)
 
 
-@kind('mocap_lags')
-class MocapLags(MocapDelayed):
+class MocapLags(MocapDelayed, kind='mocap_lags'):
     """Poses arrive late, and their stamps do not contain the delay."""
 
     def mocap(self, reading, now):
@@ -116,8 +107,7 @@ class MocapLags(MocapDelayed):
         return late and replace(late, stamp=late.stamp + self._numbers['delay'])
 
 
-@kind('mocap_slow')
-class MocapSlow(Effect):
+class MocapSlow(Effect, kind='mocap_slow'):
     """Poses arrive at a lower rate."""
 
     numbers = {'period': Number('time between two poses', 's', low=0.01, high=5)}
@@ -130,23 +120,19 @@ class MocapSlow(Effect):
         return reading
 
 
-@kind('mocap_clock')
-class MocapClock(_ClockStep, _MocapEffect):
+class MocapClock(_ClockStep, _MocapEffect, kind='mocap_clock'):
     """The stamps of the poses jump and keep the offset."""
 
 
-@kind('imu_lost')
-class ImuLost(Lost, _ImuEffect):
+class ImuLost(Lost, _ImuEffect, kind='imu_lost'):
     """No IMU sample arrives."""
 
 
-@kind('imu_frozen')
-class ImuFrozen(Frozen, _ImuEffect):
+class ImuFrozen(Frozen, _ImuEffect, kind='imu_frozen'):
     """The same IMU sample arrives with new stamps."""
 
 
-@kind('imu_clock')
-class ImuClock(_ClockStep, _ImuEffect):
+class ImuClock(_ClockStep, _ImuEffect, kind='imu_clock'):
     """The stamps of the IMU jump and keep the offset."""
 
 
@@ -159,8 +145,7 @@ class _MotionEffect(_ImuEffect):
         return replace(reading, specific_force=motion[:3], angular_velocity=motion[3:])
 
 
-@kind('gyroscope_bias')
-class GyroscopeBias(_MotionEffect):
+class GyroscopeBias(_MotionEffect, kind='gyroscope_bias'):
     """The gyroscope bias steps."""
 
     numbers = vector('rad/s', 'of the step', x=0.0, y=0.0, z=0.0)
@@ -170,8 +155,7 @@ class GyroscopeBias(_MotionEffect):
         return motion
 
 
-@kind('accelerometer_bias')
-class AccelerometerBias(_MotionEffect):
+class AccelerometerBias(_MotionEffect, kind='accelerometer_bias'):
     """The accelerometer bias steps."""
 
     numbers = vector('m/s^2', 'of the step', x=0.0, y=0.0, z=0.0)
@@ -181,8 +165,7 @@ class AccelerometerBias(_MotionEffect):
         return motion
 
 
-@kind('imu_saturated')
-class ImuSaturated(_MotionEffect):
+class ImuSaturated(_MotionEffect, kind='imu_saturated'):
     """The IMU saturates."""
 
     numbers = {'specific_force': Number('largest value', 'm/s^2', 1000.0, 0, 1000),
@@ -193,16 +176,14 @@ class ImuSaturated(_MotionEffect):
         return np.clip(motion, -limit, limit)
 
 
-@kind('imu_nan')
-class ImuNan(_MotionEffect):
+class ImuNan(_MotionEffect, kind='imu_nan'):
     """The IMU samples are NaN."""
 
     def _change_motion(self, motion):
         return np.full(6, np.nan)
 
 
-@kind('imu_spikes')
-class ImuSpikes(_MotionEffect):
+class ImuSpikes(_MotionEffect, kind='imu_spikes'):
     """Single IMU samples have an error in a random direction."""
 
     numbers = {'period': Number('mean time between two spikes', 's', 0.1, 0.005, 100),
@@ -217,8 +198,7 @@ class ImuSpikes(_MotionEffect):
         return motion
 
 
-@kind('imu_axis_dead')
-class ImuAxisDead(_MotionEffect):
+class ImuAxisDead(_MotionEffect, kind='imu_axis_dead'):
     """One axis of the IMU reads zero: 1 to 3 specific force, 4 to 6 rate."""
 
     numbers = {'axis': Number('number of the axis', '', None, 1, 6, whole=True)}

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from beetle_omni_ros.sim.faults.base import Effect, kind, Late, Number, share, vector
+from beetle_omni_ros.sim.faults.base import Effect, Late, Number, share, vector
 
 
-@kind('commands_lost')
-class CommandsLost(Effect):
+class CommandsLost(Effect, kind='commands_lost'):
     """No command reaches the actuators."""
 
     def command(self, command, now):
         return []
 
 
-@kind('commands_drop')
-class CommandsDrop(Effect):
+class CommandsDrop(Effect, kind='commands_drop'):
     """A share of the commands is lost."""
 
     numbers = {'share': share('share of lost commands')}
@@ -27,16 +25,14 @@ class CommandsDrop(Effect):
         return [command]
 
 
-@kind('commands_delayed')
-class CommandsDelayed(Late):
+class CommandsDelayed(Late, kind='commands_delayed'):
     """Commands reach the actuators late."""
 
     def command(self, command, now):
         return self._delayed(command, now)
 
 
-@kind('battery_charge')
-class BatteryCharge(Effect):
+class BatteryCharge(Effect, kind='battery_charge'):
     """The charge of the battery drops to a fraction of a full one."""
 
     numbers = {'charge': share('remaining charge as a fraction of a full battery')}
@@ -45,8 +41,7 @@ class BatteryCharge(Effect):
         world.battery.charge = min(world.battery.charge, self._numbers['charge'])
 
 
-@kind('battery_resistance')
-class BatteryResistance(Effect):
+class BatteryResistance(Effect, kind='battery_resistance'):
     """The battery has additional resistance."""
 
     numbers = {'resistance': Number('additional resistance', 'ohm', low=0, high=2)}
@@ -58,16 +53,14 @@ class BatteryResistance(Effect):
         world.battery.extra_resistance -= self._numbers['resistance']
 
 
-@kind('battery_unread')
-class BatteryUnread(Effect):
+class BatteryUnread(Effect, kind='battery_unread'):
     """No reading of the battery arrives."""
 
     def battery(self, reading, now):
         return None
 
 
-@kind('payload')
-class Payload(Effect):
+class Payload(Effect, kind='payload'):
     """A mass is attached below the body."""
 
     numbers = {'mass': Number('attached mass', 'kg', low=0, high=10)}
@@ -77,8 +70,7 @@ class Payload(Effect):
         return self._numbers['mass']
 
 
-@kind('push')
-class Push(Effect):
+class Push(Effect, kind='push'):
     """A force in world and a torque in base_link act."""
 
     numbers = {**vector('N', 'force', x=0.0, y=0.0, z=0.0),
