@@ -11,7 +11,7 @@ from beetle_omni_ros.sim.readings import Impact, Truth
 
 class CrashWatch:
     """
-    Checks the true state in every tick [s].
+    Checks the true state once in each ``tick`` [s].
 
     A robot that has flown breaks if its first contact is too fast, or a contact too inclined. A
     robot that has not flown does not break, so it may be placed on its side.

@@ -23,8 +23,8 @@ class EmulatedActuators:
 
     The devices run in real time, so :meth:`step` is called once in each tick of real time. Their
     outputs act after the command delay of the conditions. A command for the IMU sample of one
-    tick, received before the next tick, then acts at the same time as without devices.
-
+    tick, received before the next tick, then acts at the same time as without devices. The bus
+    has four servos without motion model. :meth:`close` closes both devices.
     """
 
     def __init__(self, simulator: Simulator, bus: EmulatedServoBus, board: EmulatedMotorBoard):

@@ -28,10 +28,10 @@ class Plant:
     """
     One true robot over a floor.
 
-    MuJoCo integrates by the Runge-Kutta method of order 4. To halve the computing time, the solver
-    of contacts and joint stops runs only in ticks in which a contact is possible, and the tilt
-    rate is limited only in ticks in which a joint could reach the limit. Both conditions are
-    conservative.
+    MuJoCo integrates by the Runge-Kutta method of order 4. The solver of contacts and joint stops
+    runs only in ticks in which a contact is possible. The tilt rate is limited only in ticks in
+    which a joint could reach the limit. Both conditions are conservative and together halve the
+    computing time.
 
     Attributes:
         voltage_ratio: battery voltage relative to a full one, set by the owner of the battery.

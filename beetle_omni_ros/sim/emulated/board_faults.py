@@ -9,21 +9,7 @@ import random
 
 @dataclass
 class BoardFaults:
-    """
-    Present faults; may be changed at any time.
-
-    Attributes:
-        corrupt_out: probability that a packet of the board has a wrong bit.
-        corrupt_in: probability that a packet to the board has a wrong bit.
-        drop_out: probability that a packet of the board is lost.
-        drop_in: probability that a packet to the board is lost.
-        delay_out: additional delay of packets of the board [s].
-        delay_in: additional delay of packets to the board [s].
-        mute: whether all packets of the working board are lost.
-        voltage_sag: drop of the battery voltage [V].
-        failed_escs: rotors (1 to 4) that do not turn.
-
-    """
+    """Present faults, which may be changed at any time; see :class:`.BoardFaultSwitches`."""
 
     corrupt_out: float = 0.0
     corrupt_in: float = 0.0

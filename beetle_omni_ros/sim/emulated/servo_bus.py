@@ -58,19 +58,7 @@ class SecondOrderMotion:
 
 @dataclass
 class ServoFaults:
-    """
-    Present faults of the bus; may be changed at any time.
-
-    Attributes:
-        bad_crc: share of answers with a flipped bit.
-        dropped: share of lost answers.
-        delayed: share of answers that are late by ``delay`` [s].
-        silent: IDs that receive and answer nothing.
-        overload: IDs with a permanent overload, which shut down also after a reboot.
-        overheated: IDs above their temperature limit.
-        supply_voltage: supply voltage [V]; None: 12 V.
-
-    """
+    """Present faults, which may be changed at any time; see :class:`.ServoFaultSwitches`."""
 
     bad_crc: float = 0.0
     dropped: float = 0.0

@@ -121,7 +121,7 @@ class Fault:
 
 class Effect:
     """
-    Effect of an active fault, with one call of each hook in a tick [s].
+    Effect of an active fault; its hooks are called once in each ``tick`` [s].
 
     A subclass with the argument ``kind`` overrides some of the hooks.
 

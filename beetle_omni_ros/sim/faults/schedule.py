@@ -12,7 +12,7 @@ from beetle_omni_ros.sim.faults.base import Effect, Fault, KINDS, ROUNDING
 
 class Schedule:
     """
-    A list of faults and their effects, updated in each tick [s].
+    A list of faults and their effects, updated once in each ``tick`` [s].
 
     Equal faults, seeds and calls give equal results. A fault that is in the list before and after
     a change continues unchanged.
