@@ -29,7 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 from beetle_omni_ros.nodes.fly import run_fly
-from beetle_omni_ros.nodes.runner import run_before_others
+from beetle_omni_ros.nodes.runner import use_real_time_priority
 
 # name -> (composed, actuators, targets)
 ARRANGEMENTS = {
@@ -83,7 +83,7 @@ def bare_timer():
 
 def sleep_on():
     """Be that timer until SIGINT; what is late by more than half a period is missed."""
-    run_before_others()
+    use_real_time_priority()
     due, cycles, missed = time.monotonic() + PERIOD, 0, 0
     try:
         while True:

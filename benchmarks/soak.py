@@ -31,7 +31,7 @@ from beetle_omni_ros.nodes import discovery
 from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.plan import bridged, BRIDGES
+from beetle_omni_ros.nodes.plan import bridge_parameters, BRIDGES
 from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.runs.pose_file import COLUMNS
 from beetle_omni_ros.runs.tasks import POSE_DURATION, WAYPOINTS
@@ -114,7 +114,7 @@ def make_graph(folder: Path, number: int, given) -> Graph:
         'ekf_node': {}, 'nmpc_node': {}, 'rl_node': {}, 'supervisor_node': {},
         'reference_node': {'task': str(folder / 'poses.csv')}}
     if given.actuators == 'emulated':
-        for node, values in bridged(folder, {}).items():
+        for node, values in bridge_parameters(folder, {}).items():
             parameters[node] = {**parameters.get(node, {}), **values}
     return Graph(parameters, folder, number, composed=not given.separate,
                  simulated=given.clock == 'simulated')
@@ -164,7 +164,7 @@ def soak(given, console: Console) -> dict:
     operator, graph, ended = None, None, 'no take-off'
     samples: dict[str, list[Sample]] = {}
     try:
-        with discovery.reserved() as number:
+        with discovery.reserved_domain() as number:
             try:
                 graph = make_graph(folder, number, given)
                 graph.start()

@@ -25,7 +25,7 @@ import sys
 import numpy as np
 
 from beetle_omni_ros.messages import topics as message_topics
-from beetle_omni_ros.messages.topics import requester, TABLE
+from beetle_omni_ros.messages.topics import controller_of, TABLE
 from beetle_omni_ros.robot import schema
 from beetle_omni_ros.robot.resources import PACKAGE
 
@@ -230,7 +230,7 @@ def topics() -> str:
     """Topics with types, quality of service, publishers and subscribers."""
     known = {}
     for topic in TABLE:
-        name = '<controller>/command' if requester(topic.name) else topic.name
+        name = '<controller>/command' if controller_of(topic.name) else topic.name
         known.setdefault(name, (topic.type.replace('/msg/', '/'), _qos(topic.qos), topic.meaning))
     for name, (kind, profile, meaning) in OTHERS.items():
         known[name] = kind, _qos(getattr(message_topics, profile)), meaning

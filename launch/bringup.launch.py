@@ -67,17 +67,18 @@ def has_ros2_bag():
                           check=False).returncode == 0
 
 
-def wanted(given):
+def options(given):
     """Put the arguments into the terms of the graph's plan."""
-    from beetle_omni_ros.nodes.plan import Wanted
-    from beetle_omni_ros.nodes.private import scratch
+    from beetle_omni_ros.nodes.plan import GraphOptions
+    from beetle_omni_ros.nodes.private import process_folder
     simulated = given['backend'] == 'sim'
     actuators = given['actuators'] or (
         'direct' if given['clock'] == 'simulated' else 'bridges')
     emulated = simulated and actuators == 'bridges'
     # in a folder of its own: ports of two simulations must not meet
-    return Wanted(
-        simulated=simulated, actuators=actuators, ports=str(scratch('ports')) if emulated else '',
+    return GraphOptions(
+        simulated=simulated, actuators=actuators,
+        ports=str(process_folder('ports')) if emulated else '',
         bag=given['record'] if given['record'] and not has_ros2_bag() else '',
         seed=int(given['seed']),
         **{key: given[key] == 'true' for key in ('standby', 'allow_other_robot', 'viewer')},
@@ -139,8 +140,8 @@ def actions(context):
     from beetle_omni_ros.nodes import plan
     from beetle_omni_ros.nodes.discovery import confine
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    confine(asked=given['discovery'])
-    planned = plan.plan(wanted(given))
+    confine(requested=given['discovery'])
+    planned = plan.plan(options(given))
     nodes = planned.nodes
     for name, reason in planned.left_out.items():
         print(f'{name} does not stand by: {reason}', file=sys.stderr)

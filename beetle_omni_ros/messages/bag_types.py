@@ -17,8 +17,8 @@ TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 EMPTY: dict[str, Any] = {'bool': False, 'string': '', 'float32': 0.0, 'float64': 0.0}
 
 
-class BagKind:
-    """See :class:`~beetle_omni_ros.messages.conversions.Kind`."""
+class BagFactory:
+    """See :class:`~beetle_omni_ros.messages.conversions.MessageFactory`."""
 
     def new(self, name: str) -> Any:
         """Make a message with zeros from its ROS type."""
@@ -37,7 +37,7 @@ class BagKind:
         return int(value)
 
 
-BAG = BagKind()
+BAG = BagFactory()
 
 
 @cache

@@ -4,25 +4,25 @@ Conversion between messages and values, by attribute access only.
 ``read_*`` converts a message of rclpy, of a bag, or of :mod:`~beetle_omni_ros.messages.columns`.
 The numbers of the latter are arrays over N messages, so vectors have the shape (N, 3).
 ``take_*`` converts one message for use in flight and raises MessageError for unusable values.
-``write_*`` makes a message of a :class:`Kind`. Scalars are converted to ``float``, because ROS
-serialises another Python type in a float field as garbage without an error.
+``write_*`` makes a message by a :class:`MessageFactory`. Scalars are converted to ``float``,
+because ROS serialises another Python type in a float field as garbage without an error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import floor, isfinite, isnan
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.values import (
     Diagnostic,
+    HealthReport,
     MessageError,
     Odom,
-    ToldHealth,
-    Wish,
+    TargetOverride,
     Wrench,
 )
 from beetle_omni_ros.robot import rotations
@@ -45,8 +45,11 @@ UNIT_TOLERANCE = 0.01   # of a quaternion's length; above the rounding of any pu
 POINTS = 10_000     # of a trajectory: 100 s at 100 Hz; more would block the reading node
 
 
-class Kind(Protocol):
-    """A family of message classes."""
+Value = TypeVar('Value')
+
+
+class MessageFactory(Protocol):
+    """Constructors of messages, for the message classes of rclpy or of bags."""
 
     def new(self, name: str) -> Any:
         """Make a message with default values from its ROS type."""
@@ -121,8 +124,8 @@ def unit(q: np.ndarray, low: float = 1 - UNIT_TOLERANCE,
     return q / norm
 
 
-def _begin(kind, name, stamp, frame=''):
-    message = kind.new(name)
+def _begin(factory, name, stamp, frame=''):
+    message = factory.new(name)
     set_time(message.header.stamp, stamp)
     message.header.frame_id = frame
     return message
@@ -153,6 +156,17 @@ def _floats(values):
     return [float(v) for v in values]
 
 
+def _take_finite(read: Callable[[Any], Value], **names: str) -> Callable[[Any], Value]:
+    """Make ``take_*`` of ``read_*``: refuse non-finite attributes, by their names in messages."""
+    def take(message: Any) -> Value:
+        value = read(message)
+        for attribute, name in names.items():
+            finite(getattr(value, attribute), name)
+        return value
+
+    return take
+
+
 # --- sensors ------------------------------------------------------------------------------------
 
 def read_imu(message: Any) -> ImuReading:
@@ -161,17 +175,13 @@ def read_imu(message: Any) -> ImuReading:
                      xyz(message.angular_velocity))
 
 
-def take_imu(message: Any) -> ImuReading:
-    """Refuse what is not finite."""
-    sample = read_imu(message)
-    finite(sample.specific_force, 'linear_acceleration')
-    finite(sample.angular_velocity, 'angular_velocity')
-    return sample
+take_imu = _take_finite(read_imu, specific_force='linear_acceleration',
+                        angular_velocity='angular_velocity')
 
 
-def write_imu(kind: Kind, value: ImuReading) -> Any:
+def write_imu(factory: MessageFactory, value: ImuReading) -> Any:
     """Write specific force and angular rates, without orientation (REP-145)."""
-    message = _begin(kind, 'sensor_msgs/msg/Imu', value.stamp, BODY)
+    message = _begin(factory, 'sensor_msgs/msg/Imu', value.stamp, BODY)
     message.orientation.w = 1.0
     message.orientation_covariance[0] = -1.0
     set_xyz(message.linear_acceleration, value.specific_force)
@@ -185,17 +195,13 @@ def read_pose(message: Any) -> PoseReading:
                       xyzw(message.pose.orientation))
 
 
-def take_pose(message: Any) -> PoseReading:
-    """Refuse what is not finite; the estimator judges the quaternion by its own tolerance."""
-    sample = read_pose(message)
-    finite(sample.position, 'position')
-    finite(sample.quaternion, 'orientation')
-    return sample
+# The estimator checks the length of the quaternion.
+take_pose = _take_finite(read_pose, position='position', quaternion='orientation')
 
 
-def write_pose(kind: Kind, value: PoseReading | PoseTarget) -> Any:
+def write_pose(factory: MessageFactory, value: PoseReading | PoseTarget) -> Any:
     """Write a measured pose or a pose target."""
-    message = _begin(kind, 'geometry_msgs/msg/PoseStamped', value.stamp, WORLD)
+    message = _begin(factory, 'geometry_msgs/msg/PoseStamped', value.stamp, WORLD)
     _set_pose(message.pose, value.position, value.quaternion)
     return message
 
@@ -230,15 +236,15 @@ def take_known_joints(message: Any) -> JointReading:
     return JointReading(seconds(message.header.stamp), position, velocity)
 
 
-def write_joints(kind: Kind, value: JointReading) -> Any:
+def write_joints(factory: MessageFactory, value: JointReading) -> Any:
     """Write the joints that the value names."""
-    message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
+    message = _begin(factory, 'sensor_msgs/msg/JointState', value.stamp)
     message.name = list(value.names)
-    message.position = kind.doubles(value.position)
+    message.position = factory.doubles(value.position)
     if value.velocity is not None:
-        message.velocity = kind.doubles(value.velocity)
+        message.velocity = factory.doubles(value.velocity)
     if value.effort is not None:
-        message.effort = kind.doubles(value.effort)
+        message.effort = factory.doubles(value.effort)
     return message
 
 
@@ -249,11 +255,11 @@ def read_rotors(message: Any) -> RotorReading:
     return RotorReading(seconds(message.header.stamp), np.array(message.velocity, dtype=float).T)
 
 
-def write_rotors(kind: Kind, value: RotorReading) -> Any:
+def write_rotors(factory: MessageFactory, value: RotorReading) -> Any:
     """Write the speeds."""
-    message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
+    message = _begin(factory, 'sensor_msgs/msg/JointState', value.stamp)
     message.name = ROTORS
-    message.velocity = kind.doubles(value.speed)
+    message.velocity = factory.doubles(value.speed)
     return message
 
 
@@ -262,23 +268,19 @@ def read_battery(message: Any) -> BatteryReading:
     return BatteryReading(seconds(message.header.stamp), message.voltage, message.current)
 
 
-def take_battery(message: Any) -> BatteryReading:
-    """Refuse a voltage that is not finite."""
-    if not isfinite(message.voltage):
-        raise MessageError('voltage is not finite')
-    return read_battery(message)
+take_battery = _take_finite(read_battery, voltage='voltage')
 
 
-def write_battery(kind: Kind, value: BatteryReading) -> Any:
+def write_battery(factory: MessageFactory, value: BatteryReading) -> Any:
     """Write voltage and current; unmeasured fields are NaN."""
-    message = _begin(kind, 'sensor_msgs/msg/BatteryState', value.stamp)
+    message = _begin(factory, 'sensor_msgs/msg/BatteryState', value.stamp)
     message.voltage, message.current = float(value.voltage), float(value.current)
     message.temperature = message.charge = message.capacity = message.design_capacity \
         = message.percentage = float('nan')
     message.power_supply_status = message.POWER_SUPPLY_STATUS_DISCHARGING
     message.power_supply_technology = message.POWER_SUPPLY_TECHNOLOGY_LIPO
     message.present = True
-    message.cell_voltage = kind.singles([float('nan')] * value.cells)
+    message.cell_voltage = factory.singles([float('nan')] * value.cells)
     return message
 
 
@@ -306,9 +308,9 @@ def _odom(message, position, quaternion):
     return Odom(seconds(message.header.stamp), position, velocity, quaternion, xyz(twist.angular))
 
 
-def write_odom(kind: Kind, value: Odom) -> Any:
+def write_odom(factory: MessageFactory, value: Odom) -> Any:
     """Write pose in world, twist in base_link, and covariances."""
-    message = _begin(kind, 'nav_msgs/msg/Odometry', value.stamp, WORLD)
+    message = _begin(factory, 'nav_msgs/msg/Odometry', value.stamp, WORLD)
     message.child_frame_id = BODY
     _set_pose(message.pose.pose, value.position, value.quaternion)
     set_xyz(message.twist.twist.linear, rotations.matrix(value.quaternion).T @ value.velocity)
@@ -331,31 +333,26 @@ def read_command(message: Any) -> Command:
                    _values(message.effort, order[4:], 'effort'))
 
 
-def take_command(message: Any) -> Command:
-    """Refuse what is not finite."""
-    command = read_command(message)
-    finite(command.tilt, 'tilt')
-    finite(command.thrust, 'thrust')
-    return command
+take_command = _take_finite(read_command, tilt='tilt', thrust='thrust')
 
 
-def write_command(kind: Kind, value: Command) -> Any:
+def write_command(factory: MessageFactory, value: Command) -> Any:
     """Write tilts as positions and thrusts as efforts, NaN for unused values."""
-    message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
+    message = _begin(factory, 'sensor_msgs/msg/JointState', value.stamp)
     message.name = COMMAND_NAMES
-    message.position = kind.doubles([*_floats(value.tilt), *NO_VALUE])
-    message.effort = kind.doubles([*NO_VALUE, *_floats(value.thrust)])
+    message.position = factory.doubles([*_floats(value.tilt), *NO_VALUE])
+    message.effort = factory.doubles([*NO_VALUE, *_floats(value.thrust)])
     return message
 
 
-def read_health(message: Any) -> ToldHealth:
+def read_health(message: Any) -> HealthReport:
     """Read the health of the actuators, as :func:`write_health` describes it."""
     if len(message.position) != len(HEALTH_NAMES) or len(message.effort) != len(HEALTH_NAMES):
         raise MessageError('expected four joints, four rotors and four zeros')
     stuck, zeros, efforts = message.position[:4], message.position[8:], message.effort[4:8]
     if any(abs(angle) > np.pi * 2 for angle in stuck) or not all(map(isfinite, zeros)):
         raise MessageError('expected angles within one turn and finite zeros')
-    return ToldHealth(seconds(message.header.stamp), ActuatorHealth(
+    return HealthReport(seconds(message.header.stamp), ActuatorHealth(
         rotors=tuple(effort != 0 for effort in efforts),
         stuck=tuple(None if isnan(a) else float(a) for a in stuck),
         held=tuple(None if isnan(f) or f == 0 else float(f) for f in efforts),
@@ -363,7 +360,7 @@ def read_health(message: Any) -> ToldHealth:
         thrust_limit=None if isnan(message.effort[8]) else float(message.effort[8])))
 
 
-def write_health(kind: Kind, value: ToldHealth) -> Any:
+def write_health(factory: MessageFactory, value: HealthReport) -> Any:
     """
     Write the health of the actuators.
 
@@ -376,11 +373,11 @@ def write_health(kind: Kind, value: ToldHealth) -> Any:
     stuck = [np.nan if angle is None else float(angle) for angle in health.stuck]
     efforts = [0.0 if not works else np.nan if held is None else float(held)
                for works, held in zip(health.rotors, health.held)]
-    message = _begin(kind, 'sensor_msgs/msg/JointState', value.stamp)
+    message = _begin(factory, 'sensor_msgs/msg/JointState', value.stamp)
     message.name = HEALTH_NAMES
-    message.position = kind.doubles([*stuck, *NO_VALUE, *map(float, health.zeros)])
+    message.position = factory.doubles([*stuck, *NO_VALUE, *map(float, health.zeros)])
     limit = np.nan if health.thrust_limit is None else float(health.thrust_limit)
-    message.effort = kind.doubles([*NO_VALUE, *efforts, *[limit] * 4])
+    message.effort = factory.doubles([*NO_VALUE, *efforts, *[limit] * 4])
     return message
 
 
@@ -390,17 +387,12 @@ def read_wrench(message: Any) -> Wrench:
                   xyz(message.wrench.torque))
 
 
-def take_wrench(message: Any) -> Wrench:
-    """Refuse what is not finite."""
-    wrench = read_wrench(message)
-    finite(wrench.force, 'force')
-    finite(wrench.torque, 'torque')
-    return wrench
+take_wrench = _take_finite(read_wrench, force='force', torque='torque')
 
 
-def write_wrench(kind: Kind, value: Wrench) -> Any:
+def write_wrench(factory: MessageFactory, value: Wrench) -> Any:
     """Write force in world and torque in base_link."""
-    message = _begin(kind, 'geometry_msgs/msg/WrenchStamped', value.stamp, WORLD)
+    message = _begin(factory, 'geometry_msgs/msg/WrenchStamped', value.stamp, WORLD)
     set_xyz(message.wrench.force, value.force)
     set_xyz(message.wrench.torque, value.torque)
     return message
@@ -458,17 +450,18 @@ def take_trajectory(message: Any) -> TrajectoryTarget:
                             path.angular_velocities, path.stamp)
 
 
-def write_trajectory(kind: Kind, value: TrajectoryTarget) -> Any:
+def write_trajectory(factory: MessageFactory, value: TrajectoryTarget) -> Any:
     """Write a trajectory; angular velocities are in the body frame of the reference."""
-    message = _begin(kind, 'trajectory_msgs/msg/MultiDOFJointTrajectory', value.stamp, WORLD)
+    message = _begin(factory, 'trajectory_msgs/msg/MultiDOFJointTrajectory', value.stamp, WORLD)
     message.joint_names = [BODY]
-    message.points = [_point(kind, value, k) for k in range(len(value.times))]
+    message.points = [_point(factory, value, k) for k in range(len(value.times))]
     return message
 
 
-def _point(kind, path, k):
-    point = kind.new('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
-    transform, twist = kind.new('geometry_msgs/msg/Transform'), kind.new('geometry_msgs/msg/Twist')
+def _point(factory, path, k):
+    point = factory.new('trajectory_msgs/msg/MultiDOFJointTrajectoryPoint')
+    transform = factory.new('geometry_msgs/msg/Transform')
+    twist = factory.new('geometry_msgs/msg/Twist')
     set_xyz(transform.translation, path.positions[k])
     set_xyzw(transform.rotation, path.quaternions[k])
     set_xyz(twist.linear, path.velocities[k])
@@ -479,16 +472,16 @@ def _point(kind, path, k):
     return point
 
 
-def take_wish(message: Any) -> Wish:
+def take_override(message: Any) -> TargetOverride:
     """Read the supervisor's target; None for a message without points."""
-    return Wish(seconds(message.header.stamp),
+    return TargetOverride(seconds(message.header.stamp),
                 take_trajectory(message) if message.points else None)
 
 
-def write_wish(kind: Kind, value: Wish) -> Any:
+def write_override(factory: MessageFactory, value: TargetOverride) -> Any:
     """Write the supervisor's target; a message without points for None."""
-    return kind.new('trajectory_msgs/msg/MultiDOFJointTrajectory') if value.target is None \
-        else write_trajectory(kind, value.target)
+    return factory.new('trajectory_msgs/msg/MultiDOFJointTrajectory') if value.target is None \
+        else write_trajectory(factory, value.target)
 
 
 # --- text ---------------------------------------------------------------------------------------
@@ -498,9 +491,9 @@ def read_text(message: Any) -> str:
     return message.data
 
 
-def write_text(kind: Kind, value: str) -> Any:
+def write_text(factory: MessageFactory, value: str) -> Any:
     """Write a text."""
-    message = kind.new('std_msgs/msg/String')
+    message = factory.new('std_msgs/msg/String')
     message.data = value
     return message
 
@@ -514,15 +507,15 @@ def read_diagnostics(message: Any) -> list[Diagnostic]:
             for status in message.status]
 
 
-def write_diagnostics(kind: Kind, value: Sequence[Diagnostic]) -> Any:
+def write_diagnostics(factory: MessageFactory, value: Sequence[Diagnostic]) -> Any:
     """Write statuses into one message with the stamp of the first."""
-    message = _begin(kind, 'diagnostic_msgs/msg/DiagnosticArray', value[0].t)
+    message = _begin(factory, 'diagnostic_msgs/msg/DiagnosticArray', value[0].t)
     for entry in value:
-        status = kind.new('diagnostic_msgs/msg/DiagnosticStatus')
-        status.level, status.name = kind.byte(entry.level), entry.name
+        status = factory.new('diagnostic_msgs/msg/DiagnosticStatus')
+        status.level, status.name = factory.byte(entry.level), entry.name
         status.message, status.hardware_id = entry.message, 'beetle_omni'
         for key, text in entry.values.items():
-            pair = kind.new('diagnostic_msgs/msg/KeyValue')
+            pair = factory.new('diagnostic_msgs/msg/KeyValue')
             pair.key, pair.value = str(key), str(text)
             status.values.append(pair)
         message.status.append(status)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages import conversions as c
-from beetle_omni_ros.messages.values import Diagnostic, Odom, ToldHealth, Wish, Wrench
+from beetle_omni_ros.messages.values import Diagnostic, HealthReport, Odom, TargetOverride, Wrench
 from beetle_omni_ros.robot.readings import (
     BatteryReading,
     ImuReading,
@@ -54,7 +54,7 @@ class Topic:
         qos: quality of service that its publisher offers.
         value: class of its values.
         read: message -> value; MessageError for another layout.
-        write: (kind of message classes, value) -> message.
+        write: (message factory, value) -> message.
         meaning: description for the reference page.
         take: message -> value for use in flight; MessageError for unusable values. Default: read.
         required: whether a bag without it gets a warning.
@@ -67,7 +67,7 @@ class Topic:
     qos: Qos
     value: type
     read: Callable[[Any], Any]
-    write: Callable[[c.Kind, Any], Any]
+    write: Callable[[c.MessageFactory, Any], Any]
     meaning: str
     take: Callable[[Any], Any] | None = None
     required: bool = False
@@ -87,7 +87,7 @@ def _text(name, meaning, in_flight=False):
                  in_flight=in_flight)
 
 
-def request(controller: str) -> Topic:
+def command_topic(controller: str) -> Topic:
     """Return the command topic of a controller."""
     return Topic(f'{controller}/command', JOINT_STATE, COMMAND, Command, c.read_command,
                  c.write_command, 'command of a controller, before the supervisor',
@@ -117,16 +117,18 @@ TABLE = (
           c.write_trajectory,
           'time-parameterised reference; `reference_node` or a user publishes it',
           c.take_trajectory),
-    *map(request, registry.standing_by()),      # topic_of() makes those of other controllers
+    *map(command_topic, registry.standing_by()),      # topic_of() makes those of other controllers
     Topic('command', JOINT_STATE, COMMAND, Command, c.read_command, c.write_command,
           'the selected and checked command that the actuators execute', c.take_command,
           required=True),
     _text('supervisor/identity',
           'identity of the supervisor; actuators execute its commands only'),
-    Topic('supervisor/target', TRAJECTORY, LATCHED, Wish, c.take_wish, c.write_wish,
+    Topic('supervisor/target', TRAJECTORY, LATCHED, TargetOverride, c.take_override,
+          c.write_override,
           'target that controllers fly to instead of the target of the operator; none if it has '
           'no points', in_flight=False),
-    Topic('supervisor/actuators', JOINT_STATE, LATCHED, ToldHealth, c.read_health, c.write_health,
+    Topic('supervisor/actuators', JOINT_STATE, LATCHED, HealthReport, c.read_health,
+          c.write_health,
           '`gimbal1..4`, `rotor1..4`, `gimbal1_zero..4_zero`: `position` holds true angles of '
           'stuck joints (NaN: the joint moves) and the zeros of encoders that jumped, reading '
           'minus true tilt; `effort` is NaN for a rotor that follows its command, 0 for a lost '
@@ -153,10 +155,10 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in TABLE if topic.in_fli
 
 def topics_with(controllers: Iterable[str]) -> dict[str, Topic]:
     """Return name -> topic of a flight with these controllers."""
-    return {**TOPICS, **{topic.name: topic for topic in map(request, controllers)}}
+    return {**TOPICS, **{topic.name: topic for topic in map(command_topic, controllers)}}
 
 
-def requester(name: str) -> str:
+def controller_of(name: str) -> str:
     """Return the controller of a topic '<controller>/command'; '' for any other name."""
     controller, _, rest = name.partition('/')
     return controller if rest == 'command' else ''
@@ -171,8 +173,8 @@ def topic_of(name: str) -> Topic:
 
     """
     known = ALL.get(name)
-    if known is None and requester(name):
-        return request(requester(name))
+    if known is None and controller_of(name):
+        return command_topic(controller_of(name))
     return ALL[name] if known is None else known
 
 

@@ -67,7 +67,7 @@ class Wrench:
 
 
 @dataclass(frozen=True)
-class ToldHealth:
+class HealthReport:
     """Health of the actuators, as the supervisor has determined it."""
 
     stamp: float
@@ -75,14 +75,14 @@ class ToldHealth:
 
 
 @dataclass(frozen=True)
-class Wish:
+class TargetOverride:
     """Target of the supervisor instead of the operator's target; None: no such target."""
 
     stamp: float
     target: TrajectoryTarget | None
 
     @classmethod
-    def of(cls, target: TrajectoryTarget | None) -> Wish:
+    def of(cls, target: TrajectoryTarget | None) -> TargetOverride:
         """Take the stamp of the target; 0 for None."""
         return cls(target.stamp if target else 0.0, target)
 

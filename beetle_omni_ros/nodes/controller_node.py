@@ -55,7 +55,7 @@ class ControllerNode(FlightNode):
 
         """
         entry = controller if isinstance(controller, ControllerEntry) else \
-            registry.find(controller or _asked())
+            registry.find(controller or _requested_controller())
         is_own = isinstance(controller, str) and controller     # the executable has one controller
         super().__init__(f'{entry.name}_node', node_parameters(entry, not is_own),
                          entry.parameters_file, entry.file_key, completed=entry.completed)
@@ -64,7 +64,7 @@ class ControllerNode(FlightNode):
             RobotParameters.load(self.parameters.robot_file or None),
             parameters=self.parameters if entry.parameters else None)
         self._target = self._joints = self._command = None
-        self._hold = self._wish = self._position = None
+        self._hold = self._override = self._position = None
         self._actuators = ALL_HEALTHY
         self._checks = TargetChecks(RobotParameters.load(self.parameters.robot_file or None))
         self._mode, self._own_mode = '', f'flying:{entry.name}'
@@ -75,10 +75,10 @@ class ControllerNode(FlightNode):
         self.listen('command', self._on_command, read=CommandSource(self).read, stale_after=None)
         # Publishers that follow INTERFACES latch targets; `ros2 topic pub` does not.
         for topic in ('target_pose', 'target_trajectory'):
-            self.listen(topic, self._on_target, every_offer=True, stale_after=None,
+            self.listen(topic, self._on_target, any_qos=True, stale_after=None,
                         published=True, check=self._check_target)
         self.follow('supervisor/state', self._on_mode)
-        self.listen('supervisor/target', self._on_wish, stale_after=None)
+        self.listen('supervisor/target', self._on_override, stale_after=None)
         self.listen('supervisor/actuators', self._on_actuators, stale_after=None)
         self.health.track_compute(self._controller.period)
         self.health.report('controller', self._controller_status)
@@ -124,8 +124,8 @@ class ControllerNode(FlightNode):
             return replace(target, stamp=now)
         return replace(target, stamp=now, times=target.times + now)
 
-    def _on_wish(self, wish):
-        self._wish = wish.target
+    def _on_override(self, override):
+        self._override = override.target
 
     def _on_actuators(self, told):
         self._actuators = told.health
@@ -135,7 +135,7 @@ class ControllerNode(FlightNode):
         state = mode.partition(':')[0]
         if state in ('disarmed', 'emergency_stop') and self._mode.partition(':')[0] != state:
             self._controller.reset()
-            self._command = self._hold = self._wish = None
+            self._command = self._hold = self._override = None
         took_over = mode == self._own_mode != self._mode
         self._mode = mode
         if took_over and self._target is not None and (reason := self._too_far(self._target)):
@@ -153,7 +153,7 @@ class ControllerNode(FlightNode):
         if self._target is None:
             if self._hold is None or not self._mode.startswith('flying'):
                 self._hold = PoseTarget(odom.position, odom.quaternion, odom.stamp)
-        target = self._wish or self._target or self._hold
+        target = self._override or self._target or self._hold
         command = self.timed(self._controller.step, state, target)
         self._publisher.publish(checked(self._entry.name, command))
 
@@ -162,13 +162,13 @@ class ControllerNode(FlightNode):
         since = stamp - self._last_step
         if since < 0:
             return True     # the clock was set back
-        if self._in_the_way(stamp):
+        if self._coincides_with_active(stamp):
             # One estimate later: from then on this node computes between the steps of the active
             # controller, whose command would otherwise be delayed.
             period *= 1.5
         return since >= period - STEP_TOLERANCE
 
-    def _in_the_way(self, stamp):
+    def _coincides_with_active(self, stamp):
         """Whether the active controller is another one and answers the same estimates."""
         if self._command is None or not self._mode.startswith('flying:') \
                 or self._mode == self._own_mode:
@@ -188,19 +188,19 @@ class NoParameters:
     """Parameters of a controller that has none."""
 
 
-def node_parameters(entry: ControllerEntry, chosen: bool) -> type:
+def node_parameters(entry: ControllerEntry, selectable: bool) -> type:
     """
     Make the parameter class of a controller's node: controller, robot file and controller file.
 
     Args:
         entry: registry entry of the controller.
-        chosen: whether the parameter ``controller`` selects the controller.
+        selectable: whether the parameter ``controller`` selects the controller.
 
     """
     base = entry.parameter_class or NoParameters
     more = {'robot_file': ('', 'robot file of the controller; empty: the shipped one'),
             entry.file_key: ('', f"controller file; empty: {entry.parameters_file or 'none'}")}
-    if chosen:
+    if selectable:
         more['controller'] = (entry.reference, 'controller that this node runs')
     return make_dataclass(
         f'{entry.name}_parameters',
@@ -209,7 +209,7 @@ def node_parameters(entry: ControllerEntry, chosen: bool) -> type:
         bases=(base,), frozen=base.__dataclass_params__.frozen, kw_only=True)
 
 
-def _asked() -> str:
+def _requested_controller() -> str:
     """Read the parameter ``controller`` by a temporary node, before the real one is made."""
     probe = Node(NAME, start_parameter_services=False, enable_rosout=False)
     given, name = probe._parameter_overrides.get('controller'), probe.get_name()

@@ -12,29 +12,30 @@ from itertools import count
 import os
 import socket
 
-from beetle_omni_ros.nodes.private import forget, HeldError, Lock
+from beetle_omni_ros.nodes.private import HeldError, Lock, remove_stale_locks
 from beetle_omni_ros.robot.schema import ParameterError
 
-OWN, ARGUMENT = 'BEETLE_OMNI_DISCOVERY', '--discovery'
+VARIABLE, ARGUMENT = 'BEETLE_OMNI_DISCOVERY', '--discovery'
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 # Settings of ROS; if the user set one of them, it has precedence over the default.
-CHOSEN = (RANGE, 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS')
+ROS_SETTINGS = (RANGE, 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS')
 RANGES = ('LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT')
 # The ports of domains up to 101 are below the ephemeral ports of Linux; 0 is the default domain.
 DOMAINS = range(101, 0, -1)
 # Ports of the RTPS standard: base + gain * domain + offset. Offset 0: discovery, shared by all
 # participants of a domain; USER_UNICAST: first participant.
 PORT_BASE, DOMAIN_GAIN, USER_UNICAST = 7400, 250, 11
-_turns = count(os.getpid())
+_starts = count(os.getpid())
 
 
-def confine(environment: MutableMapping[str, str] | None = None, asked: str | None = None) -> None:
+def confine(environment: MutableMapping[str, str] | None = None,
+            requested: str | None = None) -> None:
     """
     Set the range of discovery; must run before the first context is made.
 
     Args:
         environment: variables to change; None: those of this process.
-        asked: one of ``RANGES``, for this process and its children; '' or None: the value of
+        requested: one of ``RANGES``, for this process and its children; '' or None: the value of
             ``BEETLE_OMNI_DISCOVERY``, else this computer only.
 
     Raises:
@@ -42,18 +43,19 @@ def confine(environment: MutableMapping[str, str] | None = None, asked: str | No
 
     """
     environment = os.environ if environment is None else environment
-    source, wanted = (ARGUMENT, asked) if asked else (OWN, environment.get(OWN, ''))
+    source, wanted = (ARGUMENT, requested) if requested else \
+        (VARIABLE, environment.get(VARIABLE, ''))
     wanted = wanted.strip().upper()
     if wanted and wanted not in RANGES:
         raise ParameterError(f"{source}: expected one of {', '.join(RANGES)}, "
                              f'found {wanted[:40]!r}')
     if wanted:
-        environment[OWN] = environment[RANGE] = wanted
-    elif not any(environment.get(name) for name in CHOSEN):
+        environment[VARIABLE] = environment[RANGE] = wanted
+    elif not any(environment.get(name) for name in ROS_SETTINGS):
         environment[RANGE] = RANGES[0]
 
 
-def take(arguments: Sequence[str]) -> list[str]:
+def apply_argument(arguments: Sequence[str]) -> list[str]:
     """
     Apply ``--discovery RANGE`` of a node's arguments.
 
@@ -69,14 +71,14 @@ def take(arguments: Sequence[str]) -> list[str]:
     for argument in left:
         name, equals, value = argument.partition('=')
         if name == ARGUMENT:
-            confine(asked=(value if equals else next(left, '')) or 'nothing')
+            confine(requested=(value if equals else next(left, '')) or 'nothing')
         else:
             rest.append(argument)
     return rest
 
 
 @contextmanager
-def reserved():
+def reserved_domain():
     """
     Reserve a free ROS domain while the context lasts.
 
@@ -90,25 +92,25 @@ def reserved():
         OSError: no domain is free, or there is no safe folder for the locks.
 
     """
-    first = next(_turns) % len(DOMAINS)
+    first = next(_starts) % len(DOMAINS)
     for number in [*DOMAINS[first:], *DOMAINS[:first]]:
         try:
             lock = Lock(f'domain{number}.lock')
         except HeldError:
             continue
         try:
-            if _quiet(number):
+            if _ports_are_free(number):
                 try:
                     yield number
                 finally:
-                    forget(f'{number}.*.lock')      # files of nodes that were killed
+                    remove_stale_locks(f'{number}.*.lock')      # files of nodes that were killed
                 return
         finally:
             lock.close()
     raise OSError('no free ROS domain between 1 and 101')
 
 
-def _quiet(number):
+def _ports_are_free(number):
     """Whether the ports of the domain are free."""
     for offset in (0, USER_UNICAST):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

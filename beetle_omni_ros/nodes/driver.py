@@ -25,7 +25,7 @@ from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.discovery import confine
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.runner import terminable
+from beetle_omni_ros.nodes.runner import sigterm_as_interrupt
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
@@ -74,7 +74,7 @@ class Driver(Operator):
         return self.state.startswith('flying')
 
     @property
-    def is_there(self) -> bool:
+    def at_goal(self) -> bool:
         """Whether the robot is at its goal; if no controller flies, whether it is at rest."""
         if not self.flies:
             return self.state in RESTING
@@ -98,7 +98,7 @@ class Driver(Operator):
             self._targets.publish(PoseTarget(self.steering.position, self.steering.quaternion))
         return refused
 
-    def obey(self, action: Shift | Go | Order) -> str:
+    def execute(self, action: Shift | Go | Order) -> str:
         """Execute an action; return the text for the user."""
         if isinstance(action, Order):
             return self._order(action)
@@ -133,13 +133,13 @@ class Driver(Operator):
 
     def where(self) -> str:
         """Return state, pose of the robot and of its target in one line."""
-        told = [self.state or 'no supervisor']
+        parts = [self.state or 'no supervisor']
         for name, at in (('at', self.odom), ('target', self.steering)):
             if at is not None:
                 angles = np.degrees(rotations.to_rpy(at.quaternion))
-                told.append(f"{name} {' '.join(f'{x:.2f}' for x in at.position)} m, "
+                parts.append(f"{name} {' '.join(f'{x:.2f}' for x in at.position)} m, "
                             f"{' '.join(f'{a:.0f}' for a in angles)} deg")
-        return '; '.join(told)
+        return '; '.join(parts)
 
 
 def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None = None,
@@ -159,16 +159,16 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
         raise ParameterError(f"source '{source}': expected {' or '.join(SOURCES)}")
     p = DriveParameters.load(parameters)
     named = {**p.poses, **(read_named_poses(poses) if poses else {})}
-    believed = RobotParameters.load(robot)
+    robot_parameters = RobotParameters.load(robot)
     if source == 'keyboard' and not sys.stdin.isatty():
         raise ParameterError('keyboard: standard input is no terminal; expected one, or the '
                              "source 'terminal', which reads lines")
-    confine(asked=discovery)
+    confine(requested=discovery)
     console = console or Console()
     domain = int(os.environ.get('ROS_DOMAIN_ID') or 0) if domain_id is None else domain_id
     with ExitStack() as stack:
-        stack.enter_context(terminable())
-        driver = Driver(domain, p, believed)
+        stack.enter_context(sigterm_as_interrupt())
+        driver = Driver(domain, p, robot_parameters)
         stack.callback(driver.close)
 
         def say(text):
@@ -182,18 +182,18 @@ def run_drive(source: str, *, parameters: Path | None = None, poses: Path | None
                   'expected a running graph (bringup.launch.py, or beetle_omni fly)',
                   file=sys.stderr)
             return FAILED
-        asks = {'keyboard': _Keyboard, 'joystick': _Joystick, 'terminal': _Terminal}[source](
-            driver, p, named, say)
-        stack.enter_context(asks.open())
-        say(asks.help)
+        readers = {'keyboard': _Keyboard, 'joystick': _Joystick, 'terminal': _Terminal}
+        source_reader = readers[source](driver, p, named, say)
+        stack.enter_context(source_reader.open())
+        say(source_reader.help)
         say(driver.where())
         before = driver.time()
         try:
-            while not asks.done:
+            while not source_reader.done:
                 driver.spin(PERIOD)
                 now = driver.time()
-                for action in asks.actions(now - before):
-                    say(driver.obey(action))
+                for action in source_reader.actions(now - before):
+                    say(driver.execute(action))
                 say(driver.follow(now - before))
                 before = now
         finally:    # also at Ctrl-C
@@ -307,7 +307,7 @@ class _Terminal:
             return False
         passed = self._driver.time() - self._begin
         if self._until is None:
-            over = passed > SETTLE_TIME and self._driver.is_there
+            over = passed > SETTLE_TIME and self._driver.at_goal
         else:
             over = passed >= self._until
         if over:

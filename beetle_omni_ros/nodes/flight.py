@@ -20,13 +20,13 @@ TAKEOFF_ATTEMPTS = 3
 SETTLE_TIME = 1.0       # s before arming, in which start-up work ends
 LANDING_TIMEOUT = 30.0  # s
 SPARE_TIME = 10.0       # s beyond the task's duration before a flight counts as stuck
-LOOK_PERIOD = 0.1       # s between checks of processes and progress
+CHECK_PERIOD = 0.1      # s between checks of processes and progress
 WATCH_TIME = 2.0        # s before arming in which the simulator is checked for real time
 LOST_TIME = 0.2         # s that the simulator may lose in this time
-BUSY = 0.9              # part of a core that the composed nodes may need
+MAX_LOAD = 0.9          # part of a core that the composed nodes may need
 # s lost by the simulator above which a failure is attributed to the slow computer: the actuators
 # stop after so long without a command.
-HELD_UP = 0.1
+SLOW_TIME = 0.1
 PAUSED = 'supervisor_paused'
 PACING = 'sim_node: pacing'
 
@@ -47,7 +47,7 @@ class Flight:
         graph: started nodes.
         operator: operator in the same ROS domain.
         task: task to fly.
-        bars: display of the progress.
+        progress: display of the progress.
         may_be_slow: fly even if the simulator does not keep real time.
         faults: value of sim_node's parameter ``faults`` from the task's start on.
 
@@ -57,12 +57,12 @@ class Flight:
 
     """
 
-    def __init__(self, graph: Graph, operator: Operator, task: Task, bars: Progress,
+    def __init__(self, graph: Graph, operator: Operator, task: Task, progress: Progress,
                  may_be_slow: bool = True, faults: str = ''):
         self._graph, self._operator, self._task = graph, operator, task
         self._bridges = [node for node in graph.nodes if node in BRIDGES]
-        self._bars, self._faults, self._may_be_slow = bars, faults, may_be_slow
-        self._bar = bars.add_task('', total=task.duration, at='')
+        self._progress, self._faults, self._may_be_slow = progress, faults, may_be_slow
+        self._bar = progress.add_task('', total=task.duration, at='')
         self._reported: set[str] = set()
         self.measured: dict[str, float] = {}
 
@@ -81,34 +81,34 @@ class Flight:
         self._await('actuators', lambda: not operator.waits_for(self._bridges), BRIDGES_TIMEOUT)
         self._await('watching the simulator', lambda: PACING in operator.diagnostics,
                     BRIDGES_TIMEOUT)
-        lost, begin = self._lost(), operator.time()
+        lost, begin = self._lost_time(), operator.time()
         if not self._may_be_slow:
-            self._watch(lost)
+            self._check_speed(lost)
         try:
             self._take_off()
             self._fly_task()
         except FlightError as error:
-            late, flown = self._lost() - lost, operator.time() - begin
+            late, flown = self._lost_time() - lost, operator.time() - begin
             paused = any(PAUSED in state for state in operator.states)
-            if late < HELD_UP and not paused:
+            if late < SLOW_TIME and not paused:
                 raise
             kind = FlightError if self._may_be_slow else TooSlowError
             raise kind(f'{error}; the simulator fell {late:.1f} s behind in {flown:.0f} s'
                        + (', and supervisor_node was not scheduled' if paused else '')) from None
         self._take_latencies()
 
-    def _watch(self, lost):
+    def _check_speed(self, lost):
         """Check for a while whether the nodes keep real time."""
         graph, steady = self._graph, time.monotonic()
         cpu = graph.cpu_seconds() - graph.cpu_seconds(bridges=True)
-        self._look(WATCH_TIME)
+        self._spin(WATCH_TIME)
         cpu = graph.cpu_seconds() - graph.cpu_seconds(bridges=True) - cpu
-        if (late := self._lost() - lost) > LOST_TIME:
+        if (late := self._lost_time() - lost) > LOST_TIME:
             raise TooSlowError(f'the simulator fell {late:.1f} s behind in {WATCH_TIME:g} s')
-        if graph.composed and (busy := cpu / (time.monotonic() - steady)) > BUSY:
+        if graph.composed and (busy := cpu / (time.monotonic() - steady)) > MAX_LOAD:
             raise TooSlowError(f'the nodes use {busy:.0%} of a core before the start')
 
-    def _lost(self):
+    def _lost_time(self):
         """Return the time that the simulator skipped because it was late [s]."""
         return float(self._operator.values(PACING).get('lost_s', 0.0))
 
@@ -118,12 +118,12 @@ class Flight:
         cpu, bridges_cpu = graph.cpu_seconds(), graph.cpu_seconds(bridges=True)
         start, steady = operator.time(), time.monotonic()
         if self._faults:
-            self._strike()
+            self._inject_faults()
         left = operator.countdown(self._task.duration + SPARE_TIME)
         while not operator.progress.startswith('done'):
-            self._look()
+            self._spin()
             flown, passed = operator.time() - start, time.monotonic() - steady
-            self._say(f'{self._task.name} ({operator.state})', operator.progress, flown)
+            self._show(f'{self._task.name} ({operator.state})', operator.progress, flown)
             self.measured['cpu_percent'] = 100 * (graph.cpu_seconds() - cpu) / passed
             if self._bridges:
                 self.measured['bridges_cpu_percent'] = \
@@ -135,7 +135,7 @@ class Flight:
             if next(left, None) is None:
                 raise FlightError(f"the task hangs at '{operator.progress}'")
 
-    def _strike(self):
+    def _inject_faults(self):
         """Set the faults as the task begins, so that their times count from there."""
         operator = self._operator
         if not operator.wait(lambda: operator.progress.startswith('flying'), TAKEOFF_TIMEOUT):
@@ -159,13 +159,13 @@ class Flight:
         """Arm and take off; repeat if the supervisor disarms on the ground."""
         operator = self._operator
         for _ in range(TAKEOFF_ATTEMPTS):
-            self._say('arming')
+            self._show('arming')
             left = operator.countdown(ARM_TIMEOUT)
-            self._look(SETTLE_TIME)
+            self._spin(SETTLE_TIME)
             while not (answer := operator.call('arm'))[0]:
                 if next(left, None) is None:
                     raise FlightError(f'supervisor_node refuses to arm: {answer[1]}')
-                self._look()
+                self._spin()
             operator.states.clear()
             # The state may name a fault: disarmed:joint1_jammed.
             self._await('taking off', lambda: operator.state.startswith('flying') or any(
@@ -180,7 +180,7 @@ class Flight:
         operator = self._operator
         if operator.state in ('', 'disarmed', 'emergency_stop'):
             return
-        self._say('landing')
+        self._show('landing')
         accepted, answer = operator.call('land')
         if not accepted:
             print(f'beetle_omni fly: error: no landing: {answer}', file=sys.stderr)
@@ -190,16 +190,16 @@ class Flight:
             operator.spin(1.1)      # the last diagnostics
 
     def _await(self, text, condition, timeout):
-        self._say(text)
+        self._show(text)
         left = self._operator.countdown(timeout)
         while not condition():
-            self._look()
+            self._spin()
             if next(left, None) is None:
                 waits = self._operator.waits_for(self._bridges)
                 raise FlightError(f'{text}: nothing after {timeout:g} s, supervisor in '
                                   f"'{self._operator.state}'" + (waits and f'; {waits}'))
 
-    def _look(self, seconds=LOOK_PERIOD):
+    def _spin(self, seconds=CHECK_PERIOD):
         """Process messages; a process that has ended ends the flight."""
         self._operator.spin(seconds)
         dead = {name: how for name, how in self._graph.dead().items()
@@ -208,6 +208,6 @@ class Flight:
         if dead:
             raise FlightError('; '.join(f'{name} died ({how})' for name, how in dead.items()))
 
-    def _say(self, text, at='', completed=0.0):
-        self._bars.update(self._bar, description=text, at=at,
+    def _show(self, text, at='', completed=0.0):
+        self._progress.update(self._bar, description=text, at=at,
                           completed=min(completed, self._task.duration))

@@ -19,12 +19,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.nodes import runner
-from beetle_omni_ros.nodes.discovery import confine, reserved
+from beetle_omni_ros.nodes.discovery import confine, reserved_domain
 from beetle_omni_ros.nodes.flight import Flight, FlightError, TooSlowError
 from beetle_omni_ros.nodes.graph import child_environment, Graph
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.plan import ACTUATORS, plan, Wanted
-from beetle_omni_ros.nodes.runner import terminable, undisturbed
+from beetle_omni_ros.nodes.plan import ACTUATORS, GraphOptions, plan
+from beetle_omni_ros.nodes.runner import signals_ignored, sigterm_as_interrupt
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table
@@ -63,43 +63,43 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         if (discovery or '').strip().upper() == 'OFF':
             raise ParameterError('--discovery OFF: the nodes of a flight would not find each '
                                  'other; expected LOCALHOST, SUBNET or SYSTEM_DEFAULT')
-        confine(asked=discovery)
+        confine(requested=discovery)
         with ExitStack() as stack:
-            stack.enter_context(terminable())
+            stack.enter_context(sigterm_as_interrupt())
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='beetle_omni_')))
             bag = Path(bag).absolute() if bag else folder / 'bag'
             check_new(bag)
             if json_path:
                 check_writable(json_path)
-            flown = make_task(task, seed, registry.find(controller).reach(
+            flown_task = make_task(task, seed, registry.find(controller).reach(
                 RobotParameters.load(robot)))
             RobotParameters.load(plant or robot)
-            struck = listed.load_faults(faults) if faults else []
-            actuators = _actuators_for(struck, actuators)
+            injected = listed.load_faults(faults) if faults else []
+            actuators = _actuators_for(injected, actuators)
             clocks = _clocks(clock, actuators)
-            wanted = Wanted(
+            options = GraphOptions(
                 controller=controller, policy=str(policy or ''), standby=standby,
                 allow_other_robot=allow_other_robot, robot_file=_absolute(robot),
                 plant_file=_absolute(plant), conditions=conditions, seed=int(seed),
                 task=_absolute(task) if Path(task).is_file() else str(task), bag=str(bag),
                 compression=compression, actuators='direct', ports=str(folder))
-            for name, reason in plan(wanted).left_out.items():
-                _tell(console, f'{name} does not stand by: {reason}')
+            for name, reason in plan(options).left_out.items():
+                _print(console, f'{name} does not stand by: {reason}')
             controller = registry.find(controller).name
-            number = stack.enter_context(reserved()) if domain_id is None else domain_id
+            number = stack.enter_context(reserved_domain()) if domain_id is None else domain_id
             if view:
-                stack.enter_context(viewed(number, robot, allow_targets, console))
+                stack.enter_context(viewer_process(number, robot, allow_targets, console))
             meta = {'task': task, 'conditions': conditions, 'seed': seed,
                     'robot': str(robot) if robot else 'params/robot.yaml',
                     'plant': str(plant) if plant else None, 'version': __version__,
                     'controller': controller, 'composed': composed}
-            if struck:
-                meta['faults'] = [str(fault) for fault in struck]
-            status = _attempt(clocks, actuators, wanted, meta, folder, number, flown,
-                              listed.text(struck), console)
+            if injected:
+                meta['faults'] = [str(fault) for fault in injected]
+            status = _attempt(clocks, actuators, options, meta, folder, number, flown_task,
+                              listed.text(injected), console)
             if not bag.exists():
                 return status or runner.FAILED
-            return max(status, _report(bag, controller, flown, meta, json_path, console))
+            return max(status, _report(bag, controller, flown_task, meta, json_path, console))
     except (ParameterError, BagError, OSError) as error:
         print(f'beetle_omni fly: error: {error}', file=sys.stderr)
         return runner.UNUSABLE
@@ -108,20 +108,20 @@ def run_fly(*, controller: str = registry.DEFAULT, task: str = 'waypoints',
         return INTERRUPTED
 
 
-def _attempt(clocks, actuators, wanted, meta, folder, number, task, faults, console) -> int:
+def _attempt(clocks, actuators, options, meta, folder, number, task, faults, console) -> int:
     """Fly by the first clock that the computer is fast enough for; extends ``meta``."""
-    bag = Path(wanted.bag)
+    bag = Path(options.bag)
     for kind in clocks:
         meta |= {'clock': kind, 'actuators': actuators or (
             'direct' if kind == 'simulated' else 'emulated')}
-        graph = _make_graph(wanted, meta, folder, number)
+        graph = _make_graph(options, meta, folder, number)
         try:
             return _fly(graph, meta['controller'], task, meta, console, faults,
                         may_be_slow=kind == clocks[-1])
         except TooSlowError as error:
-            _clear(bag, folder, error, console)
+            _discard_attempt(bag, folder, error, console)
         except KeyboardInterrupt:
-            _keep(bag, meta)
+            _save_meta(bag, meta)
             raise
     return runner.FAILED
 
@@ -148,7 +148,7 @@ def _actuators_for(faults, actuators):
 
 
 @contextmanager
-def viewed(domain_id: int, robot: Path | None, allow_targets: bool, console: Console
+def viewer_process(domain_id: int, robot: Path | None, allow_targets: bool, console: Console
            ) -> Iterator[subprocess.Popen]:
     """Run `beetle_omni view` during a flight and print its lines on the console."""
     process = subprocess.Popen(
@@ -158,7 +158,7 @@ def viewed(domain_id: int, robot: Path | None, allow_targets: bool, console: Con
          *(['--allow-targets'] if allow_targets else [])],
         env=child_environment(domain_id), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
         text=True, start_new_session=True)
-    threading.Thread(target=lambda: [_tell(console, line.rstrip()) for line in process.stdout],
+    threading.Thread(target=lambda: [_print(console, line.rstrip()) for line in process.stdout],
                      daemon=True).start()
     try:
         yield process
@@ -183,25 +183,25 @@ def _clocks(clock, actuators):
     return CLOCKS['system' if actuators == 'emulated' else clock]
 
 
-def _make_graph(wanted, meta, folder, number):
+def _make_graph(options, meta, folder, number):
     if meta['actuators'] == 'emulated':
-        wanted = replace(wanted, actuators='bridges')
-    return Graph(plan(wanted).nodes, folder, number, meta['composed'],
+        options = replace(options, actuators='bridges')
+    return Graph(plan(options).nodes, folder, number, meta['composed'],
                  meta['clock'] == 'simulated')
 
 
-def _clear(bag, folder, error, console):
+def _discard_attempt(bag, folder, error, console):
     """Print why the flight is repeated, and delete bag and logs of the first attempt."""
-    _tell(console, f'this computer is too slow for real time: {error}; again in simulated time, '
+    _print(console, f'this computer is too slow for real time: {error}; again in simulated time, '
           'which waits for the nodes, and without serial devices')
     shutil.rmtree(bag, ignore_errors=True)
     for log in folder.glob('*.log'):
         log.unlink()
 
 
-def _keep(bag, meta):
+def _save_meta(bag, meta):
     """Write the metadata into the bag of an interrupted flight, if there is one."""
-    with undisturbed():
+    with signals_ignored():
         try:
             if (bag / 'metadata.yaml').exists():
                 add_meta(bag, {**meta, 'interrupted': True})
@@ -209,7 +209,7 @@ def _keep(bag, meta):
             print(f'beetle_omni fly: error: {error}', file=sys.stderr)
 
 
-def _tell(console, text):
+def _print(console, text):
     console.print(text, markup=False, emoji=False, highlight=False)
 
 
@@ -237,12 +237,12 @@ def _fly(graph: Graph, controller: str, task: Task, meta: dict, console: Console
                 status = runner.FAILED
             flight.land()
         meta['graph'] = flight.measured
-        operator.report('fly: run', 'what is flown', {k: v for k, v in meta.items()
+        operator.report('fly: run', 'what is flown_task', {k: v for k, v in meta.items()
                                                       if not isinstance(v, dict)})
         operator.report('fly: graph', 'CPU of all nodes, latency of commands', flight.measured)
         operator.spin(0.2)
     finally:
-        with undisturbed():
+        with signals_ignored():
             stubborn = graph.stop()
             if operator:
                 operator.close()
@@ -271,7 +271,7 @@ def _print_measured(meta, console):
     measured = meta.get('graph', {})
     if 'cpu_percent' in measured:
         console.print(f"graph: {'composed' if meta['composed'] else 'separate processes'}, CPU "
-                      f"{measured['cpu_percent']:.0f} % of one core while the task was flown"
+                      f"{measured['cpu_percent']:.0f} % of one core while the task was flown_task"
                       + (f", of it {measured['bridges_cpu_percent']:.0f} % in the bridges"
                          if 'bridges_cpu_percent' in measured else ''))
     if 'real_time_factor' in measured:

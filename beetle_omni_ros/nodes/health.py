@@ -142,12 +142,12 @@ class Health:
 
     def _publish(self):
         now = self._node.elapsed()
-        told = [self._input_status(now)] if self._inputs else []
+        statuses = [self._input_status(now)] if self._inputs else []
         if self._compute is not None:
-            told.append(self._compute_status())
-        told += [self._status(name, *source()) for name, source in self._extra]
+            statuses.append(self._compute_status())
+        statuses += [self._status(name, *source()) for name, source in self._extra]
         self._last = now
-        self._publisher.publish(told or [self._status('node', OK, 'running', {})])
+        self._publisher.publish(statuses or [self._status('node', OK, 'running', {})])
 
     def _input_status(self, now):
         level, faults, values = OK, [], {}

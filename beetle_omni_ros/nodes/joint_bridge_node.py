@@ -24,9 +24,9 @@ from beetle_omni_ros.robot.parameters import JOINT_NAMES, RobotParameters
 from beetle_omni_ros.robot.readings import JointReading
 from beetle_omni_ros.robot.schema import parameter
 
-COMMAND_AGE = 0.1   # [s] older commands are not written
-LOST_AFTER = 0.3    # [s] after which a servo without response or torque is lost
-LOOK_PERIOD = 0.05  # [s] between checks of the bus thread's events
+COMMAND_AGE = 0.1       # [s] older commands are not written
+LOST_AFTER = 0.3        # [s] after which a servo without response or torque is lost
+CHECK_PERIOD = 0.05     # [s] between checks of the bus thread's events
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,15 +53,15 @@ class JointBridgeNode(LifecycleFlightNode):
                          changeable=('confirm_tilts', 'confirmed_tilts'))
         self._travel = RobotParameters.load(self.parameters.robot_file or None).joints
         self._bus = self._loop = None
-        self._was_active = ''
+        self._lost_reason = ''
         self._latency, self._since = health.Distribution(), 'publication'
         self._state = self.publisher('joint_bridge/state')
-        self._told = ''
+        self._published = ''
         self._joints = self.publisher('joint_states')
         self.listen('command', self._on_command, read=CommandSource(self).read,
                     max_age=COMMAND_AGE, stale_after=None, published=True)
         self._bus_status = bus_status()
-        self.health.report('bus', lambda: self._bus_status(self.stage, self._told, self._bus,
+        self.health.report('bus', lambda: self._bus_status(self.stage, self._published, self._bus,
                                                            self._loop))
         self.health.report('latency', self._latency_status)
         for k, name in enumerate(JOINT_NAMES):
@@ -70,13 +70,13 @@ class JointBridgeNode(LifecycleFlightNode):
                                 lambda request, response, k=k: self._on_reboot([k], response))
         self.create_service(Trigger, '~/reboot', lambda request, response: self._on_reboot(
             None, response))
-        self.create_timer(LOOK_PERIOD, self.changed, clock=self.steady_clock)
+        self.create_timer(CHECK_PERIOD, self.changed, clock=self.steady_clock)
         self.start_by_itself(self.parameters.autostart)
         self.changed()
 
     def waits_for(self):
         """Return the state of the servos."""
-        return self._told.replace('waiting:', 'its servos:')
+        return self._published.replace('waiting:', 'its servos:')
 
     # --- lifecycle ----------------------------------------------------------------------------
 
@@ -85,7 +85,7 @@ class JointBridgeNode(LifecycleFlightNode):
         self._bus = ServoBus(self.parameters, self._travel, self.now)
         self._bus.open()
         self._bus.configure()
-        self._was_active = ''
+        self._lost_reason = ''
         self._loop = ServoLoop(self._bus, self._publish, self._on_written)
         self._loop.start()
 
@@ -99,7 +99,7 @@ class JointBridgeNode(LifecycleFlightNode):
     def deactivate(self):
         """Switch the torque off."""
         if self._bus.enabled:
-            self._was_active = 'no torque, deactivated'
+            self._lost_reason = 'no torque, deactivated'
         with self._loop.exclusive() as bus:
             confirmed = bus.disable()
         if not confirmed:
@@ -113,7 +113,7 @@ class JointBridgeNode(LifecycleFlightNode):
         if bus is None:
             return
         if bus.enabled:
-            self._was_active = 'no torque, the node was shut down'
+            self._lost_reason = 'no torque, the node was shut down'
         if loop is not None:
             loop.stop()
             self._log(loop)
@@ -176,12 +176,12 @@ class JointBridgeNode(LifecycleFlightNode):
         if self._loop is not None:
             self._log(self._loop)
         text = self._state_text()
-        if text != self._told:
-            if text.startswith('lost') and not self._was_active:
+        if text != self._published:
+            if text.startswith('lost') and not self._lost_reason:
                 self.get_logger().error(text)
             else:
                 self.get_logger().info(text)
-            self._told = text
+            self._published = text
             self._state.publish(text)
 
     def _log(self, loop):
@@ -194,8 +194,8 @@ class JointBridgeNode(LifecycleFlightNode):
             return f'lost: {lost}' if lost else 'ready'
         if self.refusal:
             return f'waiting: {self.refusal}'
-        if self._was_active:
-            return f'lost: {self._was_active}'
+        if self._lost_reason:
+            return f'lost: {self._lost_reason}'
         return 'waiting: no torque, not activated' if self.stage == INACTIVE \
             else 'waiting: not configured'
 
@@ -207,25 +207,25 @@ class JointBridgeNode(LifecycleFlightNode):
 
 def bus_status():
     """Make a function that returns the bus's status, with rates since its last call."""
-    told = {'cycles': 0, 'missed': 0, 'time': time.monotonic(), 'loop': None}
+    last = {'cycles': 0, 'missed': 0, 'time': time.monotonic(), 'loop': None}
 
     def status(stage, text, bus, loop):
         if loop is None:
             return (health.WARN if stage == ACTIVE else health.OK), text, {'stage': stage}
-        if loop is not told['loop']:
-            told.update(cycles=0, missed=0, loop=loop)
+        if loop is not last['loop']:
+            last.update(cycles=0, missed=0, loop=loop)
         now = time.monotonic()
         link = bus.statistics
         values = {
             'stage': stage, 'cycles': loop.cycles, 'missed_cycles': loop.missed,
-            'rate_hz': (loop.cycles - told['cycles']) / max(now - told['time'], 1e-3),
+            'rate_hz': (loop.cycles - last['cycles']) / max(now - last['time'], 1e-3),
             'connected': bus.connected, 'goals_written': loop.written,
             'goals_stale': loop.stale, 'goals_clipped': bus.clipped,
             'incomplete': loop.incomplete, 'transactions': link.transactions,
             'unanswered': link.unanswered, 'corrupt': link.corrupt, 'refused': link.refused,
             'connections': link.connections}
-        missed = loop.missed - told['missed']
-        told.update(cycles=loop.cycles, missed=loop.missed, time=now)
+        missed = loop.missed - last['missed']
+        last.update(cycles=loop.cycles, missed=loop.missed, time=now)
         if text.startswith('lost'):
             return health.ERROR, text, values
         if not bus.connected or missed:

@@ -88,22 +88,22 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Switch the power off; ends the automatic start."""
-        return self._attempt('deactivate', self._ordered(self.deactivate))
+        return self._attempt('deactivate', self._by_operator(self.deactivate))
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the device; ends the automatic start."""
-        return self._attempt('clean up', self._ordered(self.release))
+        return self._attempt('clean up', self._by_operator(self.release))
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the device."""
-        return self._attempt('shut down', self._ordered(self.release))
+        return self._attempt('shut down', self._by_operator(self.release))
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the device after an unexpected exception; it can be configured again."""
         self.release()
         return TransitionCallbackReturn.SUCCESS
 
-    def _ordered(self, action):
+    def _by_operator(self, action):
         def act():
             if self._start_timer is not None:
                 self._start_timer.cancel()
@@ -118,14 +118,14 @@ class LifecycleFlightNode(LifecycleNodeMixin, FlightNode):
             undo()
             self.refusal = ' '.join(str(error).split())
             if self.refusal != before:      # attempts are repeated, lines are not
-                self._say_refusal(f'cannot {what}: {self.refusal}')
+                self._log_refusal(f'cannot {what}: {self.refusal}')
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             self.get_logger().fatal(f'cannot {what}: {type(error).__name__}: {error}')
             raise
         return TransitionCallbackReturn.SUCCESS
 
-    def _say_refusal(self, text):
+    def _log_refusal(self, text):
         """Log as an error; as a warning if the automatic start repeats the transition."""
         if self._starts:
             self.get_logger().warning(f'{text}; tries again')

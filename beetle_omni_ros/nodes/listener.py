@@ -36,7 +36,7 @@ def listen(seconds: float, namespace: str = '', discovery: str | None = None) ->
         ParameterError: invalid namespace or range of discovery.
 
     """
-    confine(asked=discovery)
+    confine(requested=discovery)
     context = rclpy.Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:

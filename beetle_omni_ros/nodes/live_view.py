@@ -9,7 +9,6 @@ import os
 from pathlib import Path
 import threading
 
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.clock import Clock, ClockType
@@ -19,10 +18,10 @@ from rich.console import Console
 
 from beetle_omni_ros.control.base import PoseTarget
 from beetle_omni_ros.messages.bag_types import from_bytes
-from beetle_omni_ros.messages.topics import requester, SENSOR, topic_of
+from beetle_omni_ros.messages.topics import controller_of, SENSOR, topic_of
 from beetle_omni_ros.nodes import runner, wire
 from beetle_omni_ros.nodes.discovery import confine
-from beetle_omni_ros.nodes.wire import EveryOffer
+from beetle_omni_ros.nodes.wire import AnyQosSubscription
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import Model
@@ -40,7 +39,7 @@ NICENESS = 10           # the nodes of the flight have precedence
 SUPERVISOR = 'supervisor_node'
 
 
-class Listener:
+class LiveGraph:
     """
     ROS side of the page; implements :class:`~beetle_omni_ros.view.live.Graph`.
 
@@ -48,7 +47,7 @@ class Listener:
         namespace: namespace of the robot's topics.
         domain: ROS domain; None: ``ROS_DOMAIN_ID``.
         discovery: range, see :mod:`discovery`.
-        speaks: whether targets and the selection of a controller are sent.
+        writable: whether targets and the selection of a controller are sent.
 
     Raises:
         ParameterError: invalid namespace or range of discovery.
@@ -56,8 +55,8 @@ class Listener:
     """
 
     def __init__(self, namespace: str = '', domain: int | None = None,
-                 discovery: str | None = None, speaks: bool = False):
-        confine(asked=discovery)
+                 discovery: str | None = None, writable: bool = False):
+        confine(requested=discovery)
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context, domain_id=domain,
                    signal_handler_options=SignalHandlerOptions.NO)
@@ -77,11 +76,11 @@ class Listener:
         for topic in EVENTS:
             self._subscribe(topic, partial(self._queue, topic))
         for topic in TARGETS:
-            EveryOffer(node, wire.message_class(topic_of(topic).type), topic,
+            AnyQosSubscription(node, wire.message_class(topic_of(topic).type), topic,
                        partial(self._queue, topic), raw=True)
-        self._targets = wire.Publisher(node, 'target_pose') if speaks else None
+        self._targets = wire.Publisher(node, 'target_pose') if writable else None
         self._setting = node.create_client(SetParameters, f'{SUPERVISOR}/set_parameters') \
-            if speaks else None
+            if writable else None
         self._executor = runner.make_executor(self._context)
         self._executor.add_node(node)
         self._stopped = threading.Event()
@@ -123,7 +122,7 @@ class Listener:
     def controllers(self) -> list[str]:
         """Return the names of the controllers whose command topic exists."""
         prefix = self._node.get_namespace().rstrip('/') + '/'
-        names = (requester(name.removeprefix(prefix))
+        names = (controller_of(name.removeprefix(prefix))
                  for name, _ in self._node.get_topic_names_and_types() if name.startswith(prefix))
         return sorted(filter(None, names))
 
@@ -137,13 +136,11 @@ class Listener:
         if self._setting is None or not self._setting.service_is_ready():
             answer(f'{SUPERVISOR} is not there')
             return
-        request = SetParameters.Request(parameters=[Parameter(
-            name='controller', value=ParameterValue(
-                type=ParameterType.PARAMETER_STRING, string_value=controller))])
 
         def done(future):
             result = future.result().results[0]
             answer('' if result.successful else result.reason or 'no reason given')
+        request = wire.parameter_request('controller', controller)
         self._setting.call_async(request).add_done_callback(done)
 
     def close(self) -> None:
@@ -181,7 +178,7 @@ def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: st
     model, parameters = Model.load(urdf), RobotParameters.load(robot)
     from beetle_omni_ros.view.page import Page
     with ExitStack() as stack:
-        listener = Listener(namespace, domain_id, discovery, allow_targets)
+        listener = LiveGraph(namespace, domain_id, discovery, allow_targets)
         stack.callback(listener.close)
         os.nice(NICENESS)
         page = Page(['live'], model, parameters, title='Flight', host=host, port=port, dark=dark)

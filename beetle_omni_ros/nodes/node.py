@@ -13,22 +13,23 @@ from beetle_omni_ros.messages.values import MessageError
 from beetle_omni_ros.nodes import parameters, wire
 from beetle_omni_ros.nodes.health import Health
 from beetle_omni_ros.nodes.private import HeldError, Lock
+from beetle_omni_ros.safety.events import ERROR, WARNING
 
 FUTURE = 0.05       # s ahead of the clock above which a stamp is refused
-TWIN_CHECKS = 3
+UNIQUE_CHECKS = 3
 
 
 class StartError(RuntimeError):
     """A node cannot start or continue; the text is one line for the operator."""
 
 
-def claim(node: Node):
+def lock_name(node: Node):
     """
     Take the lock of the node's name, until it is closed or the process ends.
 
     The commands of two supervisors or the estimates of two estimators would alternate on one
     topic. The lock file detects a second node on the same computer at once;
-    :func:`refuse_twin` detects one on another computer.
+    :func:`check_unique_name` detects one on another computer.
 
     Raises:
         StartError: another process of this computer holds the lock.
@@ -46,7 +47,7 @@ def claim(node: Node):
         return None
 
 
-def refuse_twin(node: Node) -> None:
+def check_unique_name(node: Node) -> None:
     """
     Check that the ROS graph has no other node of the same name.
 
@@ -88,7 +89,7 @@ class FlightNode(Node):
 
         """
         super().__init__(name)
-        self._claim = claim(self)
+        self._name_lock = lock_name(self)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         # Simulated time may stop, so timers of the flight must use it too.
         self.simulated = bool(self.get_parameter(parameters.CLOCK).value)
@@ -98,8 +99,8 @@ class FlightNode(Node):
         parameters.lock_clock(self)
         self.health = Health(self)
         self.get_logger().debug('started')      # the first call is slow: not during a flight
-        self._twin_checks = 0
-        self._twin_timer = self.create_timer(1.0, self._look_for_twin, clock=self.steady_clock)
+        self._unique_checks = 0
+        self._unique_timer = self.create_timer(1.0, self._check_unique, clock=self.steady_clock)
 
     def now(self) -> float:
         """ROS time [s]."""
@@ -108,6 +109,17 @@ class FlightNode(Node):
     def elapsed(self) -> float:
         """Return steady time, or simulated time if it is used [s]."""
         return self.now() if self.simulated else time.monotonic()
+
+    def log_line(self, severity: str, text: str) -> None:
+        """Log ``text`` with a severity of :mod:`~beetle_omni_ros.safety.events`."""
+        # One call for each severity: rclpy ties a severity to the line of the call.
+        logger = self.get_logger()
+        if severity == ERROR:
+            logger.error(text)
+        elif severity == WARNING:
+            logger.warning(text)
+        else:
+            logger.info(text)
 
     def publisher(self, topic: str) -> wire.Publisher:
         """Make the publisher of a topic."""
@@ -118,7 +130,7 @@ class FlightNode(Node):
         wire.subscribe(self, topic, handle)
 
     def listen(self, topic: str, handle: Callable, *, read: Callable | None = None,
-               qos: Qos | None = None, every_offer: bool = False, max_age: float | None = None,
+               qos: Qos | None = None, any_qos: bool = False, max_age: float | None = None,
                stale_after: float | None = 0.5, published: bool = False,
                check: Callable | None = None) -> None:
         """
@@ -130,8 +142,8 @@ class FlightNode(Node):
             read: message -> value with a ``stamp``, raises MessageError; default: the table's
                 ``take``.
             qos: quality of service; default: the table's.
-            every_offer: receive from publishers of any quality of service, see
-                :class:`~beetle_omni_ros.nodes.wire.EveryOffer`.
+            any_qos: receive from publishers of any quality of service, see
+                :class:`~beetle_omni_ros.nodes.wire.AnyQosSubscription`.
             max_age: limit of a stamp's age [s], also refuses future stamps; None: no check.
             stale_after: silence after a message that is an error [s]; None: never.
             published: whether ``check`` and ``handle`` also get the time of publication [s, system
@@ -157,9 +169,9 @@ class FlightNode(Node):
             handle(value, *publication)
 
         kind = wire.message_class(entry.type)
-        if every_offer:
-            wire.EveryOffer(self, kind, topic, callback if published else
-                       lambda message, _: callback(message))
+        if any_qos:
+            wire.AnyQosSubscription(self, kind, topic, callback if published else
+                                    lambda message, _: callback(message))
             return
         taken = wire.with_publication(callback) if published else callback
         self.create_subscription(kind, topic, taken, wire.profile(qos or entry.qos))
@@ -171,12 +183,12 @@ class FlightNode(Node):
         self.health.computed(time.thread_time() - cpu, time.perf_counter() - wall)
         return result
 
-    def _look_for_twin(self):
+    def _check_unique(self):
         # Discovery needs some seconds, so one check is not enough.
-        refuse_twin(self)
-        self._twin_checks += 1
-        if self._twin_checks >= TWIN_CHECKS:
-            self._twin_timer.cancel()
+        check_unique_name(self)
+        self._unique_checks += 1
+        if self._unique_checks >= UNIQUE_CHECKS:
+            self._unique_timer.cancel()
 
     def waits_for(self) -> str:
         """Return the inputs without which the node does not work, as text; '' for none."""
@@ -194,9 +206,9 @@ class FlightNode(Node):
         """Close, leave the graph, release the name."""
         self.close()
         super().destroy_node()
-        if self._claim:
-            self._claim.close()
-            self._claim = None
+        if self._name_lock:
+            self._name_lock.close()
+            self._name_lock = None
 
 
 def _check_age(age, limit):

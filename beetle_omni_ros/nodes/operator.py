@@ -7,14 +7,13 @@ import time
 
 from rcl_interfaces.srv import SetParameters
 import rclpy
-from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.messages.conversions import seconds
-from beetle_omni_ros.messages.topics import request, SENSOR
+from beetle_omni_ros.messages.topics import command_topic, SENSOR
 from beetle_omni_ros.messages.values import Diagnostic
 from beetle_omni_ros.nodes import health, runner, wire
 from beetle_omni_ros.nodes.discovery import confine
@@ -62,7 +61,7 @@ class Operator:
         wire.subscribe(node, 'reference/state', self._on_progress)
         for bridge, topic in STATES.items():
             wire.subscribe(node, topic, self._on_bridge(bridge))
-        node.create_subscription(wire.message_class(request(controller).type),
+        node.create_subscription(wire.message_class(command_topic(controller).type),
                                  f'{controller}/command', self._on_command, wire.profile(SENSOR),
                                  raw=True)
         wire.subscribe(node, 'diagnostics', self._on_diagnostics)
@@ -77,10 +76,10 @@ class Operator:
         """Return simulated time if it is used, else steady time [s]."""
         return time.monotonic() if self._simulated is None else self._simulated
 
-    def _on_state(self, told):
-        state = told.partition(':')[0]
-        self.state = told if state == 'flying' else state
-        self.states.append(told)
+    def _on_state(self, text):
+        state = text.partition(':')[0]
+        self.state = text if state == 'flying' else state
+        self.states.append(text)
 
     def _on_progress(self, progress):
         self.progress = progress
@@ -108,8 +107,8 @@ class Operator:
 
     def waits_for(self, bridges: Sequence[str]) -> str:
         """Return the states of the bridges that are not ready, '' if all are."""
-        told = {name: self.bridges.get(name, 'silent') for name in bridges}
-        return '; '.join(f'{name} {text}' for name, text in told.items()
+        states = {name: self.bridges.get(name, 'silent') for name in bridges}
+        return '; '.join(f'{name} {text}' for name, text in states.items()
                          if not text.startswith(READY))
 
     def spin(self, seconds: float) -> None:
@@ -150,8 +149,7 @@ class Operator:
         client = self._node.create_client(SetParameters, f'{node}/set_parameters')
         if not self.wait(client.service_is_ready, timeout):
             return False, f'{node} is not there'
-        future = client.call_async(SetParameters.Request(parameters=[
-            Parameter(name, value=value).to_parameter_msg()]))
+        future = client.call_async(wire.parameter_request(name, value))
         if not self.wait(future.done, timeout):
             return False, f'{node} does not answer'
         return future.result().results[0].successful, future.result().results[0].reason

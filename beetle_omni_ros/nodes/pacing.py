@@ -15,7 +15,7 @@ LAG = 0.02              # s between the newest sample and the newest answered on
 PATIENCE = 0.3          # s of steady time without an answer after which a node has stopped
 
 
-class Pacing:
+class RealTimePacing:
     """
     Ticks on the steady clock, stamps in ROS time; starts with the first call of :meth:`due`.
 
@@ -94,7 +94,7 @@ class Pacing:
             self._offset = offset
 
 
-class Waiting:
+class SimulatedTimePacing:
     """
     Ticks of simulated time: one each time the timer fires, none while a node is late.
 
@@ -109,7 +109,7 @@ class Waiting:
     Attributes:
         ticks: number of ticks so far.
         waits: calls of :meth:`due` that returned no tick.
-        started, lost_ticks, clock_steps: as in :class:`Pacing`; no tick is lost.
+        started, lost_ticks, clock_steps: as in :class:`RealTimePacing`; no tick is lost.
 
     """
 
@@ -118,7 +118,7 @@ class Waiting:
     def __init__(self, tick: float, steady, epoch: float):
         self._tick, self._steady, self.epoch = tick, steady, epoch
         self._sent = float('-inf')
-        self._heard: dict[str, tuple[float, float]] = {}
+        self._answers: dict[str, tuple[float, float]] = {}
         self._last = steady()
         self.ticks = self.waits = 0
 
@@ -127,19 +127,19 @@ class Waiting:
         """Simulated time [s]."""
         return self.epoch + self.ticks * self._tick
 
-    def sent(self, stamp: float) -> None:
+    def sample_sent(self, stamp: float) -> None:
         """Record the stamp of a published sample."""
         self._sent = stamp
 
-    def heard(self, name: str, stamp: float) -> None:
+    def answered(self, name: str, stamp: float) -> None:
         """Record that ``name`` has answered the sample with this stamp."""
-        self._heard[name] = (stamp, self._steady())
+        self._answers[name] = (stamp, self._steady())
 
     def due(self) -> int:
         """Return the number of ticks that are due now: 1 or 0."""
         now = self._steady()
         late = any(self._sent - stamp > LAG and now - arrived < PATIENCE
-                   for stamp, arrived in self._heard.values())
+                   for stamp, arrived in self._answers.values())
         if late and now - self._last < PATIENCE:
             self.waits += 1
             return 0

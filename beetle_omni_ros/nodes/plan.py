@@ -32,13 +32,13 @@ COMPOSED, BRIDGES_COMPOSED = 'composed', 'bridges'      # processes of several n
 Parameters = dict[str, dict]        # node name -> parameters that differ from the shipped ones
 
 
-def bridged(folder: Path, believed: dict) -> dict[str, dict]:
+def bridge_parameters(folder: Path, robot: dict) -> dict[str, dict]:
     """
     Return the parameters of simulator and bridges that share pseudo-terminals.
 
     Args:
         folder: folder of the names of the two pseudo-terminals.
-        believed: parameters with the robot file of estimator, controllers and bridges.
+        robot: parameters with the robot file of estimator, controllers and bridges.
 
     Returns:
         Node name -> parameters.
@@ -46,8 +46,8 @@ def bridged(folder: Path, believed: dict) -> dict[str, dict]:
     """
     servos, board = str(Path(folder) / 'servo_bus'), str(Path(folder) / 'motor_board')
     return {'sim_node': {'actuators': 'emulated', 'servo_port': servos, 'board_port': board},
-            'joint_bridge_node': {**believed, 'port': servos, 'autostart': 'activate'},
-            'rotor_bridge_node': {**believed, 'port': board}}
+            'joint_bridge_node': {**robot, 'port': servos, 'autostart': 'activate'},
+            'rotor_bridge_node': {**robot, 'port': board}}
 
 
 class BridgeCounts:
@@ -93,7 +93,7 @@ class BridgeCounts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wanted:
+class GraphOptions:
     """
     Options of a graph.
 
@@ -155,7 +155,7 @@ class Plan:
     left_out: dict[str, str] = field(default_factory=dict)
 
 
-def plan(wanted: Wanted) -> Plan:
+def plan(options: GraphOptions) -> Plan:
     """
     List the nodes of a graph.
 
@@ -163,34 +163,35 @@ def plan(wanted: Wanted) -> Plan:
         ParameterError: the active controller is unusable, or the clock does not fit the actuators.
 
     """
-    if wanted.clock == 'simulated' and (not wanted.simulated or wanted.actuators == 'bridges'):
+    if options.clock == 'simulated' and (
+            not options.simulated or options.actuators == 'bridges'):
         raise ParameterError("clock 'simulated': devices keep real time; expected the simulator, "
                              'with direct actuators')
-    believed = {'robot_file': wanted.robot_file} if wanted.robot_file else {}
-    true = {'robot_file': wanted.plant_file} if wanted.plant_file else believed
+    robot = {'robot_file': options.robot_file} if options.robot_file else {}
+    plant = {'robot_file': options.plant_file} if options.plant_file else robot
     controllers, left_out = controller_nodes(
-        wanted.controller, robot_file=wanted.robot_file, policy=wanted.policy,
-        allow_other_robot=wanted.allow_other_robot, standby=wanted.standby)
-    active = registry.find(wanted.controller).name
+        options.controller, robot_file=options.robot_file, policy=options.policy,
+        allow_other_robot=options.allow_other_robot, standby=options.standby)
+    active = registry.find(options.controller).name
     # The default of these nodes is the list of standby controllers.
     others = {} if active in registry.standing_by() else {
         'controllers': [active, *registry.standing_by()]}
-    packed = {} if wanted.compression == 'none' else {'compression': wanted.compression}
-    bridges = _bridges(wanted, believed)
+    packed = {} if options.compression == 'none' else {'compression': options.compression}
+    bridges = _bridges(options, robot)
     table = (
-        ('recorder_node', wanted.bag, {'bag': wanted.bag, **packed, **others}),
-        ('sim_node', wanted.simulated, {
-            **true, 'conditions': wanted.conditions, 'seed': wanted.seed,
+        ('recorder_node', options.bag, {'bag': options.bag, **packed, **others}),
+        ('sim_node', options.simulated, {
+            **plant, 'conditions': options.conditions, 'seed': options.seed,
             **bridges.get('sim_node', {})}),
-        ('ekf_node', True, believed),
+        ('ekf_node', True, robot),
         *((name, True, values) for name, values in controllers.items()),
-        ('supervisor_node', True, {**believed, 'controller': active, **others}),
-        ('reference_node', wanted.task, {'task': wanted.task, 'seed': wanted.seed}),
-        ('viewer_node', wanted.viewer, believed),
+        ('supervisor_node', True, {**robot, 'controller': active, **others}),
+        ('reference_node', options.task, {'task': options.task, 'seed': options.seed}),
+        ('viewer_node', options.viewer, robot),
         *((name, bridges, bridges.get(name)) for name in BRIDGES))
     # Copies: YAML would write a shared list as an alias, which ROS cannot read.
-    nodes = {name: deepcopy(values) for name, is_there, values in table if is_there}
-    return Plan(in_simulated_time(nodes) if wanted.clock == 'simulated' else nodes, left_out)
+    nodes = {name: deepcopy(values) for name, is_used, values in table if is_used}
+    return Plan(in_simulated_time(nodes) if options.clock == 'simulated' else nodes, left_out)
 
 
 def in_simulated_time(nodes: Parameters) -> Parameters:
@@ -200,19 +201,19 @@ def in_simulated_time(nodes: Parameters) -> Parameters:
             for name, values in nodes.items()}
 
 
-def _bridges(wanted, believed):
+def _bridges(options, robot):
     """Parameters of bridges and simulator for the actuators, by node name."""
-    if wanted.actuators != 'bridges':
+    if options.actuators != 'bridges':
         return {}
-    nodes = bridged(Path(wanted.ports), believed) if wanted.simulated else \
-        {name: dict(believed) for name in BRIDGES}
+    nodes = bridge_parameters(Path(options.ports), robot) if options.simulated else \
+        {name: dict(robot) for name in BRIDGES}
     servos, board = BRIDGES
-    nodes[servos]['autostart'] = wanted.autostart or (
-        'activate' if wanted.simulated else 'configure')
-    if wanted.servo_bus_file:
-        nodes[servos]['servo_bus_file'] = wanted.servo_bus_file
-    if wanted.motor_board_file:
-        nodes[board]['motor_board_file'] = wanted.motor_board_file
+    nodes[servos]['autostart'] = options.autostart or (
+        'activate' if options.simulated else 'configure')
+    if options.servo_bus_file:
+        nodes[servos]['servo_bus_file'] = options.servo_bus_file
+    if options.motor_board_file:
+        nodes[board]['motor_board_file'] = options.motor_board_file
     return nodes
 
 
@@ -227,7 +228,7 @@ def controller_nodes(active: str, *, robot_file: str = '', policy: str = '',
 
     Args:
         active: a name, or ``package.module:Class``.
-        robot_file: as in :class:`Wanted`; also the following ones.
+        robot_file: as in :class:`GraphOptions`; also the following ones.
         policy: policy file.
         allow_other_robot: whether a policy for other robot parameters may fly.
         standby: whether standby controllers run.

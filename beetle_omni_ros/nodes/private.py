@@ -27,9 +27,9 @@ def folder() -> Path:
     runtime = Path(os.environ.get('XDG_RUNTIME_DIR') or f'/run/user/{os.getuid()}')
     try:
         _check(runtime)
-        return _own(runtime / NAME)
+        return _make_folder(runtime / NAME)
     except OSError:
-        return _own(Path(tempfile.gettempdir()) / f'{NAME}_{os.getuid()}')
+        return _make_folder(Path(tempfile.gettempdir()) / f'{NAME}_{os.getuid()}')
 
 
 class HeldError(Exception):
@@ -73,7 +73,7 @@ class Lock:
             if self._is_in_place():
                 self._path.unlink(missing_ok=True)
             self._file.close()
-            _leave(self._path.parent)
+            _remove_if_empty(self._path.parent)
 
     def _is_in_place(self):
         """Whether the locked file is still the one under this name."""
@@ -83,7 +83,7 @@ class Lock:
             return False
 
 
-def forget(pattern: str) -> None:
+def remove_stale_locks(pattern: str) -> None:
     """Remove the files of released locks; only for names that no process takes meanwhile."""
     for path in folder().glob(pattern):
         try:
@@ -118,7 +118,7 @@ def _open(name):
     place = folder()
     parent = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
-        _judge(os.fstat(parent), place)     # of the opened folder: the name may change meanwhile
+        _check_access(os.fstat(parent), place)  # the opened folder: its name may change meanwhile
         number = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o600,
                          dir_fd=parent)
     except FileNotFoundError:
@@ -135,7 +135,7 @@ def _open(name):
     return os.fdopen(number, 'r+')
 
 
-def scratch(name: str) -> Path:
+def process_folder(name: str) -> Path:
     """
     Make a folder that is removed with this process; remove those of killed processes.
 
@@ -155,10 +155,10 @@ def scratch(name: str) -> Path:
 
 def _remove(made):
     shutil.rmtree(made, ignore_errors=True)
-    _leave(made.parent)
+    _remove_if_empty(made.parent)
 
 
-def _leave(place):
+def _remove_if_empty(place):
     """Remove the folder if it is empty."""
     try:
         place.rmdir()
@@ -166,7 +166,7 @@ def _leave(place):
         pass
 
 
-def _own(path):
+def _make_folder(path):
     """Make the folder if it is missing; return the checked path."""
     try:
         path.mkdir(mode=0o700)
@@ -177,10 +177,10 @@ def _own(path):
 
 
 def _check(path):
-    _judge(os.lstat(path), path)
+    _check_access(os.lstat(path), path)
 
 
-def _judge(found, path):
+def _check_access(found, path):
     """Refuse anything but a folder of this user that is closed to others."""
     if not stat.S_ISDIR(found.st_mode):
         raise OSError(f'{path}: expected a folder, found a link or file; remove it')

@@ -16,10 +16,10 @@ from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.conversions import read_command, read_odom
 from beetle_omni_ros.messages.topics import EVENT, SENSOR
 from beetle_omni_ros.nodes import wire
-from beetle_omni_ros.nodes.discovery import confine, reserved
+from beetle_omni_ros.nodes.discovery import confine, reserved_domain
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.plan import BRIDGES, plan, Wanted
+from beetle_omni_ros.nodes.plan import BRIDGES, GraphOptions, plan
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.sim.faults.listed import FaultList, OutcomeLimits
@@ -43,7 +43,7 @@ class Observer(Operator):
         self.touched: float | None = None
         self.client = lambda node: AsyncParameterClient(self._node, node)
         wire.subscribe(self._node, 'ground_truth/odom', self._on_truth, qos=SENSOR, read=read_odom)
-        wire.subscribe(self._node, 'command', self._on_asked, qos=SENSOR, read=read_command)
+        wire.subscribe(self._node, 'command', self._on_command, qos=SENSOR, read=read_command)
 
     def publisher(self, topic):
         """Make a publisher and wait for its first subscription."""
@@ -70,7 +70,7 @@ class Observer(Operator):
             self.takeoffs += 1
             self._floor = None
 
-    def _on_asked(self, command):
+    def _on_command(self, command):
         if np.nansum(command.thrust) > self._limits.idle_thrust:
             self.thrust_at = time.monotonic()
 
@@ -83,26 +83,26 @@ class ProcessFault:
     Attributes:
         what: description.
         expected: expected outcome, as in params/faults.yaml.
-        strike: injects the fault; returns whether the graph refused it.
+        inject: injects the fault; returns whether the graph refused it.
         bridges: whether the actuators are emulated devices with their bridges.
 
     """
 
     what: str
     expected: str
-    strike: Callable[[Graph, Observer], bool]
+    inject: Callable[[Graph, Observer], bool]
     bridges: bool = False
 
 
 def _kill(node):
-    def strike(graph, observer):
+    def inject(graph, observer):
         graph.kill(node)
         return False
-    return strike
+    return inject
 
 
 def _pause(node, seconds):
-    def strike(graph, observer):
+    def inject(graph, observer):
         process = graph.processes[node]
         process.send_signal(signal.SIGSTOP)
         try:
@@ -112,7 +112,7 @@ def _pause(node, seconds):
         finally:
             process.send_signal(signal.SIGCONT)
         return False
-    return strike
+    return inject
 
 
 def _refused(observer, node, topic, before):
@@ -134,13 +134,13 @@ def _second_publisher(_, observer):
 
 
 def _target(height, x=0.0, stamp=0.0):
-    def strike(_, observer):
+    def inject(_, observer):
         publisher, before = observer.publisher('target_pose'), _count(
             observer, 'nmpc_node', 'target_pose')
         publisher.publish(PoseTarget(np.array([x, 0.0, height]), np.array([0.0, 0.0, 0.0, 1.0]),
                                      stamp))
         return _refused(observer, 'nmpc_node', 'target_pose', before)
-    return strike
+    return inject
 
 
 def _clock(_, observer):
@@ -203,7 +203,7 @@ def fly_through_ros(name: str, listed: FaultList) -> dict:
               'named': '', 'states': [], 'impact_m_s': None, 'stopped_s': None, 'takeoffs': 0,
               'bag_lost': False, 'error': ''}
     confine()
-    with tempfile.TemporaryDirectory(prefix='beetle_omni_') as folder, reserved() as number:
+    with tempfile.TemporaryDirectory(prefix='beetle_omni_') as folder, reserved_domain() as number:
         graph, observer = _graph(Path(folder), number, fault.bridges), None
         try:
             graph.start()
@@ -220,9 +220,9 @@ def fly_through_ros(name: str, listed: FaultList) -> dict:
 
 
 def _graph(folder, number, bridges):
-    wanted = Wanted(standby=False, actuators='bridges' if bridges else 'direct',
-                    ports=str(folder), bag=str(folder / 'bag'))
-    return Graph(plan(wanted).nodes, folder, number, composed=False)
+    options = GraphOptions(standby=False, actuators='bridges' if bridges else 'direct',
+                           ports=str(folder), bag=str(folder / 'bag'))
+    return Graph(plan(options).nodes, folder, number, composed=False)
 
 
 def _start(graph, observer):
@@ -245,7 +245,7 @@ def _watch(graph, observer, fault, listed):
     """Inject the fault, observe, land; return the observations."""
     flight = listed.flight
     observer.begin()
-    refused = fault.strike(graph, observer)
+    refused = fault.inject(graph, observer)
     observer.wait(lambda: observer.state in OFF or observer.touched is not None, flight.watch_time)
     asked = observer.state.partition(':')[0] in ('flying', 'fallback') and observer.touched is None
     if asked:
@@ -253,10 +253,10 @@ def _watch(graph, observer, fault, listed):
     observer.wait(lambda: observer.state in OFF, flight.landing_time if observer.touched is None
                   else 2.0)
     observer.spin(flight.end_time + 1.0)      # long enough for a diagnostic of the simulator
-    return _judged(observer, asked, refused, listed.limits)
+    return _outcome(observer, asked, refused, listed.limits)
 
 
-def _judged(observer, asked, refused, limits):
+def _outcome(observer, asked, refused, limits):
     robot = observer.values(ROBOT)
     broken = robot.get('broken') == '1'
     impact = float(robot['impact_m_s']) if 'impact_m_s' in robot else None

@@ -55,7 +55,8 @@ class RecorderNode(FlightNode):
         for name, topic in {**ALL, **topics}.items():
             kind, write = wire.message_class(topic.type), self._writer(prefix + name, topic.type)
             if name in TARGETS:
-                wire.EveryOffer(self, kind, name, write, depth=50, raw=True, on_lost=self._on_lost)
+                wire.AnyQosSubscription(self, kind, name, write, depth=50, raw=True,
+                                        on_lost=self._on_lost)
                 continue
             profile = wire.profile(LATCHED_LOG if topic.qos.latched else LOG)
             self.create_subscription(

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Wrench
-from beetle_omni_ros.nodes import health, runner
+from beetle_omni_ros.nodes import health, runner, wire
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import parameter
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer
@@ -125,10 +124,7 @@ class ReferenceNode(FlightNode):
         if self._task.kind in ('force', 'torque'):
             self._wrenches.publish(Wrench(now, moment.force_world, moment.torque_body))
         if self._task.kind == 'payload':
-            value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE,
-                                   double_value=float(moment.payload))
-            request = SetParameters.Request(parameters=[Parameter(name='payload', value=value)])
-            self._payload.call_async(request)
+            self._payload.call_async(wire.parameter_request('payload', float(moment.payload)))
 
 
 def main(args=None):

@@ -59,9 +59,9 @@ class RotorBridgeNode(LifecycleFlightNode):
         self._arming.inhibit(UNCONFIGURED)
         self._stream = TargetStream(self._period)
         self._command = None
-        # _absent: why the port is closed, '' if not yet known; None: open, or not configured.
-        self._state, self._absent = '', None
-        self._looked = self._next_try = time.monotonic()
+        # _port_error: why the port is closed, '' if not yet known; None: open, or not configured.
+        self._state, self._port_error = '', None
+        self._updated = self._next_try = time.monotonic()
         self._cycle, self._sent = 0, 0.0
         self._states = self.publisher('rotor_bridge/state')
         self._batteries = self.publisher('battery_state')
@@ -79,7 +79,7 @@ class RotorBridgeNode(LifecycleFlightNode):
 
     def configure(self):
         """Open the port, now or as soon as it exists; then battery and rotors are published."""
-        self._absent, self._next_try = '', time.monotonic()
+        self._port_error, self._next_try = '', time.monotonic()
         self._arming.inhibit(INACTIVE)
 
     def activate(self):
@@ -93,18 +93,18 @@ class RotorBridgeNode(LifecycleFlightNode):
     def release(self):
         """Disarm and close the port."""
         self._arming.inhibit(UNCONFIGURED)
-        self._absent = None
+        self._port_error = None
         self._board.close()
 
     def changed(self):
         """Publish the state."""
-        self._tell()
+        self._publish_state()
 
     # --- the stream ---------------------------------------------------------------------------
 
     def waits_for(self):
         """Return the state of the motor board."""
-        self._tell()
+        self._publish_state()
         return self._state.replace('waiting:', 'the motor board:')
 
     def _on_command(self, command, published):
@@ -120,13 +120,13 @@ class RotorBridgeNode(LifecycleFlightNode):
 
     def _on_supervisor(self, state):
         self._arming.follow(state)
-        self._tell()
+        self._publish_state()
 
     def _on_timer(self):
         now = time.monotonic()
         self._open(now)
-        self._arming.update(now - self._looked)
-        self._looked = now
+        self._arming.update(now - self._updated)
+        self._updated = now
         if now - self._sent < self._period / 2:
             # A command came between this expiry and its callback; its reset of the timer was
             # too late.
@@ -136,21 +136,21 @@ class RotorBridgeNode(LifecycleFlightNode):
         self._cycle += 1
         if self._cycle % POLL_CYCLES == 0:
             self._poll()
-        self._tell()
+        self._publish_state()
 
     def _open(self, now):
         """Try to open the port; afterwards the driver itself reconnects."""
-        if self._absent is None or now < self._next_try:
+        if self._port_error is None or now < self._next_try:
             return
         self._next_try = now + self.parameters.reconnect_period
         try:
             self._board.open()
         except SerialPortError as error:
-            if str(error) != self._absent:
-                self._absent = str(error)
+            if str(error) != self._port_error:
+                self._port_error = str(error)
                 self.get_logger().warning(f'{error}; looking for it')
         else:
-            self._absent = None
+            self._port_error = None
 
     def _send(self):
         """Send the newest thrusts while flying; return whether they were sent."""
@@ -173,25 +173,16 @@ class RotorBridgeNode(LifecycleFlightNode):
             self._rotors.publish(RotorReading(
                 update.rotors.stamp, RPM * update.rotors.rpm))
         for event in update.events:
-            self._log(*event)
+            self.log_line(*event)
 
-    def _log(self, level, text):
-        # One call for each severity: rclpy ties a severity to the line of the call.
-        logger = self.get_logger()
-        if level == 'error':
-            logger.error(text)
-        elif level == 'warning':
-            logger.warning(text)
-        else:
-            logger.info(text)
-
-    def _tell(self):
+    def _publish_state(self):
         text = self._arming.text
-        if self._absent and text.startswith('waiting'):
-            text = f'waiting: {self._absent}'
+        if self._port_error and text.startswith('waiting'):
+            text = f'waiting: {self._port_error}'
         if text != self._state:
             if not text.startswith('waiting'):
-                self._log('error' if text.startswith('lost') else 'info', f'motor board: {text}')
+                self.log_line('error' if text.startswith('lost') else 'info',
+                              f'motor board: {text}')
             self._state = text
             self._states.publish(text)
 

@@ -85,7 +85,7 @@ def run(node_classes: Sequence[type], argv: Sequence[str], name: str) -> int:
         # Not for a single node: real-time processes that wait for one another delayed the
         # simulator by a third of a second.
         if len(nodes) > 1 and any(getattr(node, 'real_time', False) for node in nodes):
-            run_before_others()
+            use_real_time_priority()
         executor.spin_until_future_complete(_stop_on_signal(), FOREVER)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -111,7 +111,7 @@ def own_arguments(argv: Sequence[str], name: str) -> list[str]:
     """
     try:
         _check_parameter_files(argv)
-        return discovery.take(remove_ros_args(list(argv))[1:])
+        return discovery.apply_argument(remove_ros_args(list(argv))[1:])
     except Exception as error:
         # rclpy does not export the class of its error on bad arguments.
         if not isinstance(error, ParameterError) and 'ROSArgs' not in type(error).__name__:
@@ -157,7 +157,7 @@ def _stop_on_signal() -> Future:
     return stop
 
 
-def run_before_others():
+def use_real_time_priority():
     """
     Give all present threads real-time priority, if the system permits it.
 
@@ -194,7 +194,7 @@ def _fail(name, error, status):
 
 
 @contextmanager
-def terminable():
+def sigterm_as_interrupt():
     """
     Raise KeyboardInterrupt on SIGTERM too, so that the block is cleaned up.
 
@@ -228,7 +228,7 @@ def terminable():
 
 
 @contextmanager
-def undisturbed():
+def signals_ignored():
     """Ignore signals during a clean-up: a launch system sends them twice."""
     if threading.current_thread() is not threading.main_thread():
         yield

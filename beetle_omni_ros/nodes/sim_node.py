@@ -16,7 +16,7 @@ from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import health, runner, wire
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
-from beetle_omni_ros.nodes.pacing import Pacing, Waiting
+from beetle_omni_ros.nodes.pacing import RealTimePacing, SimulatedTimePacing
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import group, parameter, ParameterError
 from beetle_omni_ros.sim.emulated.fault_switches import (
@@ -91,7 +91,7 @@ class SimNode(FlightNode):
             self._robot, SimulatorParameters.load(given.simulator_file or None),
             conditions=given.conditions, seed=given.seed)
         self._simulator.set_payload(given.payload)
-        self._strike(given)
+        self._set_faults(given)
         self._pacing = self._make_pacing(given)
         self._latency = health.Distribution()
         self._publish_to = {
@@ -109,13 +109,13 @@ class SimNode(FlightNode):
 
     def _make_pacing(self, given):
         if given.clock == 'system':
-            return Pacing(self._simulator.tick, time.monotonic, self.now)
+            return RealTimePacing(self._simulator.tick, time.monotonic, self.now)
         if given.actuators == 'emulated':
             raise ParameterError("key 'clock': simulated: serial devices keep real time; start "
                                  'with actuators:=direct')
-        pacing = Waiting(self._simulator.tick, time.monotonic, super().now())
+        pacing = SimulatedTimePacing(self._simulator.tick, time.monotonic, super().now())
         self._clock_publisher = self.create_publisher(Clock, '/clock', wire.profile(SENSOR))
-        self.listen('odom', lambda odom: pacing.heard('odom', odom.stamp))
+        self.listen('odom', lambda odom: pacing.answered('odom', odom.stamp))
         return pacing
 
     def now(self) -> float:
@@ -164,7 +164,7 @@ class SimNode(FlightNode):
         if self._devices is not None:
             self._devices.close()
 
-    def _strike(self, given):
+    def _set_faults(self, given):
         """Set the active faults of robot and sensors; unchanged ones continue."""
         faults = parse_faults(given.faults)
         for fault in faults:
@@ -176,7 +176,7 @@ class SimNode(FlightNode):
 
     def _changed(self, new):
         if new.faults != self.parameters.faults:
-            self._strike(new)
+            self._set_faults(new)
             self.get_logger().info(f"faults: {new.faults or 'none'}")
         if self._devices is None:
             self._refuse_faults(new)
@@ -216,7 +216,7 @@ class SimNode(FlightNode):
                 set_time(message.clock, self._pacing.now)
                 self._clock_publisher.publish(message)
                 if frame.imu is not None:
-                    self._pacing.sent(self._pacing.epoch + frame.imu.stamp)
+                    self._pacing.sample_sent(self._pacing.epoch + frame.imu.stamp)
             self._publish(frame)
 
     def _publish(self, frame):
@@ -239,7 +239,7 @@ class SimNode(FlightNode):
     def _on_command(self, command):
         self._latency.add(self.now() - command.stamp)
         if self._clock_publisher is not None:
-            self._pacing.heard('command', command.stamp)
+            self._pacing.answered('command', command.stamp)
         if self._pacing.started:
             self._simulator.command(replace(command, stamp=command.stamp - self._pacing.epoch))
 

@@ -11,14 +11,13 @@ from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.messages.conversions import take_known_joints
-from beetle_omni_ros.messages.values import ToldHealth, Wish
+from beetle_omni_ros.messages.values import HealthReport, TargetOverride
 from beetle_omni_ros.nodes import health, runner
 from beetle_omni_ros.nodes.command_source import new_identity, TOPIC
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
-from beetle_omni_ros.safety.events import ERROR, WARNING
 from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import DISARMED, FALLBACK, FLYING, STOPPED, Supervisor
 
@@ -71,7 +70,7 @@ class SupervisorNode(FlightNode):
         self._states = self.publisher('supervisor/state')
         self._targets = self.publisher('supervisor/target')
         self._actuators = self.publisher('supervisor/actuators')
-        self._wish, self._healthy = None, ALL_HEALTHY
+        self._override, self._health = None, ALL_HEALTHY
         self._listen()
         for name in ('arm', 'disarm', 'land', 'emergency_stop'):
             self.create_service(Trigger, f'~/{name}', self._request(name))
@@ -101,7 +100,7 @@ class SupervisorNode(FlightNode):
 
     def _changed(self, new):
         answer = self._supervisor.select(new.controller, self.now())
-        self._tell()
+        self._publish_states()
         if not answer:
             raise ParameterError(f"key 'controller': {answer.text}")
 
@@ -146,33 +145,23 @@ class SupervisorNode(FlightNode):
         if command is not None and (command.stamp, supervisor.source) != self._sent:
             self._sent = (command.stamp, supervisor.source)
             self._publisher.publish(command, self._identity)
-        self._tell()
+        self._publish_states()
 
-    def _tell(self):
+    def _publish_states(self):
         supervisor = self._supervisor
         state = supervisor.reported_state
         if state != self._state:
             self._state = state
             self._states.publish(state)
-        if supervisor.wish is not self._wish:
-            self._wish = supervisor.wish
-            self._targets.publish(Wish.of(self._wish))
-        if supervisor.health is not self._healthy:
-            self._healthy = supervisor.health
-            self._actuators.publish(ToldHealth(self.now(), self._healthy))
+        if supervisor.wish is not self._override:
+            self._override = supervisor.wish
+            self._targets.publish(TargetOverride.of(self._override))
+        if supervisor.health is not self._health:
+            self._health = supervisor.health
+            self._actuators.publish(HealthReport(self.now(), self._health))
         for event in supervisor.events:
-            self._log(event)
+            self.log_line(event.severity, event.text)
         supervisor.events.clear()
-
-    def _log(self, event):
-        # One call for each severity: rclpy ties a severity to the line of the call.
-        logger = self.get_logger()
-        if event.severity == ERROR:
-            logger.error(event.text)
-        elif event.severity == WARNING:
-            logger.warning(event.text)
-        else:
-            logger.info(event.text)
 
     def _supervisor_status(self):
         supervisor = self._supervisor

@@ -60,7 +60,7 @@ class ViewerNode(FlightNode):
         self.listen('odom', self._keep('_odom'), qos=SENSOR)
         self.listen('joint_states', self._keep('_joints'))
         self.listen('command', self._keep('_command'), qos=SENSOR, stale_after=None)
-        self.listen('target_pose', self._keep('_target'), every_offer=True, stale_after=None)
+        self.listen('target_pose', self._keep('_target'), any_qos=True, stale_after=None)
         self.create_timer(1 / given.rate, self._draw, clock=self.steady_clock)
 
     def _changed(self, new):

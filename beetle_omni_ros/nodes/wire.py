@@ -7,20 +7,22 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
-from inspect import Parameter, Signature
+import inspect
 import math
 from typing import Any
 
+from rcl_interfaces.srv import SetParameters
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from beetle_omni_ros.messages.topics import Qos, topic_of
 
-LOOK_PERIOD = 0.5       # s between checks of the publishers' quality of service
+CHECK_PERIOD = 0.5      # s between checks of the publishers' quality of service
 COPIES = 64             # newest messages that are compared to detect a copy
-TWO_ARGUMENTS = Signature([Parameter(name, Parameter.POSITIONAL_ONLY)
-                           for name in ('message', 'info')])
+TWO_ARGUMENTS = inspect.Signature([
+    inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY) for name in ('message', 'info')])
 
 
 @cache
@@ -30,8 +32,8 @@ def message_class(name: str) -> type:
     return getattr(import_module(f'{package}.msg'), message)
 
 
-class RclpyKind:
-    """See :class:`~beetle_omni_ros.messages.conversions.Kind`."""
+class RclpyFactory:
+    """See :class:`~beetle_omni_ros.messages.conversions.MessageFactory`."""
 
     def new(self, name: str) -> Any:
         """Make a message with default values, by its ROS type."""
@@ -50,7 +52,7 @@ class RclpyKind:
         return bytes((value,))
 
 
-RCLPY = RclpyKind()
+RCLPY = RclpyFactory()
 
 
 def profile(qos: Qos) -> QoSProfile:
@@ -75,6 +77,11 @@ def message(topic: str, value: Any, frame: str | None = None) -> Any:
     if frame is not None:
         made.header.frame_id = frame
     return made
+
+
+def parameter_request(name: str, value: Any) -> SetParameters.Request:
+    """Return the request of a service ``set_parameters`` for one parameter."""
+    return SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
 
 
 class Publisher:
@@ -142,7 +149,7 @@ def with_publication(callback: Callable) -> Callable:
     return take
 
 
-class EveryOffer:
+class AnyQosSubscription:
     """
     Receives the messages of publishers with any quality of service, each message once.
 
@@ -170,14 +177,14 @@ class EveryOffer:
         self._depth, self._raw, self._on_lost = depth, raw, on_lost
         self._callback = callback
         self._seen: deque[float] = deque(maxlen=COPIES)     # times of publication
-        self._heard: set[tuple[ReliabilityPolicy, DurabilityPolicy]] = set()
+        self._profiles: set[tuple[ReliabilityPolicy, DurabilityPolicy]] = set()
         self._subscribe(ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)
-        node.create_timer(LOOK_PERIOD, self._look, clock=node.steady_clock)
+        node.create_timer(CHECK_PERIOD, self._check_publishers, clock=node.steady_clock)
 
     def _subscribe(self, reliability, durability):
-        if (reliability, durability) in self._heard:
+        if (reliability, durability) in self._profiles:
             return
-        self._heard.add((reliability, durability))
+        self._profiles.add((reliability, durability))
         self._node.create_subscription(
             self._type, self._topic, with_publication(self._take),
             QoSProfile(depth=self._depth, reliability=reliability, durability=durability),
@@ -190,7 +197,7 @@ class EveryOffer:
         self._seen.append(publication)
         self._callback(message, publication)
 
-    def _look(self):
+    def _check_publishers(self):
         """Add the subscriptions that the present publishers need."""
         for publisher in self._node.get_publishers_info_by_topic(self._topic):
             offer = publisher.qos_profile

@@ -14,8 +14,8 @@ from beetle_omni_ros.control.base import TrajectoryTarget
 from beetle_omni_ros.messages.bag_types import from_bytes
 from beetle_omni_ros.messages.columns import read_all
 from beetle_omni_ros.messages.topics import (
+    controller_of,
     is_ambiguous,
-    requester,
     split_topic,
     topic_of,
     TOPICS,
@@ -111,13 +111,13 @@ class _Reading:
             name = self._name(messages.topic)
             if name is None:
                 continue
-            if self._left_out is not None and (name in self._left_out or requester(name)):
+            if self._left_out is not None and (name in self._left_out or controller_of(name)):
                 self._counts[name] += len(messages.data)
                 continue
             kind = topic_of(name).type
             if messages.type != kind:
                 self._refuse(name, f'type is {messages.type}, not {kind}', len(messages.data))
-            elif name in SERIES_OF or requester(name):
+            elif name in SERIES_OF or controller_of(name):
                 waiting, times = self._waiting.setdefault(name, ([], []))
                 waiting += messages.data
                 times.append(messages.received)

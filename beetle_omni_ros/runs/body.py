@@ -13,6 +13,7 @@ from beetle_omni_ros.runs.log import FlightLog
 # [s] tolerance of a window's edges. Stamps are integer nanoseconds in a bag and floats in memory,
 # where UNIX time has a resolution of 0.24 us.
 EDGE = 1e-5
+SAME_TIME = 2.5e-3  # [s] between stamps of an estimate and of the truth that are compared
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,24 @@ def errors(body: Motion, target: Target, window: slice = slice(None)):
         position, quaternion = reference_poses(target, body.t[window])
     return (np.linalg.norm(body.position[window] - position, axis=1),
             np.degrees(geodesic_angles(body.quaternion[window], quaternion)))
+
+
+def estimate_errors(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Compute the errors of the estimate from the truth, where their stamps agree within 2.5 ms.
+
+    Returns:
+        (n,) times [s], (n,) position errors [m], (n,) orientation errors [deg].
+
+    """
+    if not len(log.truth_t):
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+    index = np.clip(np.searchsorted(log.truth_t, log.odom_t - SAME_TIME), 0, len(log.truth_t) - 1)
+    near = np.abs(log.truth_t[index] - log.odom_t) < SAME_TIME
+    index = index[near]
+    distance = np.linalg.norm(log.odom_position[near] - log.truth_position[index], axis=1)
+    angle = np.degrees(geodesic_angles(log.odom_quaternion[near], log.truth_quaternion[index]))
+    return log.odom_t[near], distance, angle
 
 
 def reference_poses(target: Target, times: np.ndarray):

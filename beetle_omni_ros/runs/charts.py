@@ -9,14 +9,14 @@ from beetle_omni_ros.pages.charts import Chart, Series
 from beetle_omni_ros.pages.figures import INK, PARTS
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.yaml_file import shortened
-from beetle_omni_ros.runs.body import EDGE, errors, geodesic_angles, hold, inside, roll_pitch_yaw
+from beetle_omni_ros.runs.body import EDGE, errors, estimate_errors, hold, inside, roll_pitch_yaw
 from beetle_omni_ros.runs.metrics import (
     L_WINDOW,
     REACHED_ORIENTATION,
     REACHED_POSITION,
     U_WINDOW,
 )
-from beetle_omni_ros.runs.shown import error_series, Run, target_poses, TimeAxis
+from beetle_omni_ros.runs.report_runs import error_series, Run, target_poses, TimeAxis
 from beetle_omni_ros.runs.tasks import POSE_DURATION
 
 FEW_POSES = 20          # up to this number, L and U windows are shaded
@@ -127,15 +127,9 @@ def estimate(runs: list[Run], axis: TimeAxis) -> list[Chart]:
     """Plot the error of the estimate, if the truth was recorded."""
     places, angles = [], []
     for number, run in enumerate(runs):
-        log = run.log
-        if not (len(log.truth_t) and len(log.odom_t)):
+        if not (len(run.log.truth_t) and len(run.log.odom_t)):
             continue
-        index = np.clip(np.searchsorted(log.truth_t, log.odom_t - 2.5e-3), 0,
-                        len(log.truth_t) - 1)
-        near = np.abs(log.truth_t[index] - log.odom_t) < 2.5e-3
-        t, index = log.odom_t[near], index[near]
-        distance = np.linalg.norm(log.odom_position[near] - log.truth_position[index], axis=1)
-        angle = np.degrees(geodesic_angles(log.odom_quaternion[near], log.truth_quaternion[index]))
+        t, distance, angle = estimate_errors(run.log)
         for made, values in ((places, MILLI * distance), (angles, angle)):
             made.append(Series(run.label, run.colour, axis.sampled(run, t, values), number))
     return [Chart(label, series, wide=False) for label, series in

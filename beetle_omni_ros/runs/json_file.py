@@ -39,13 +39,24 @@ def write_json(path: str | Path, results: dict) -> None:
         ParameterError: the file cannot be written.
 
     """
+    write_text(path, json.dumps(_strict(results), indent=1) + '\n')
+
+
+def write_text(path: str | Path, text: str, what: str = 'result file') -> None:
+    """
+    Write a file atomically.
+
+    Raises:
+        ParameterError: the file cannot be written.
+
+    """
     path = Path(path)
     temporary = path.with_name(path.name + '.tmp')
     try:
-        temporary.write_text(json.dumps(_strict(results), indent=1) + '\n')
+        temporary.write_text(text, encoding='utf-8')
         temporary.replace(path)
     except OSError as error:
-        raise ParameterError(f'{path}: cannot write the result file ({error.strerror})') from None
+        raise ParameterError(f'{path}: cannot write the {what} ({error.strerror})') from None
 
 
 def _strict(value):

@@ -15,7 +15,7 @@ from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.runs.body import (
     errors,
-    geodesic_angles,
+    estimate_errors,
     hold,
     inside,
     Motion,
@@ -164,7 +164,7 @@ def _judge(log, task, flown, expected):
     result.update(_timing(log, flown.intervals))
     result.update(_estimation(log, flown.intervals))
     if task:
-        result.update(extras(log, body, task, U_WINDOW))
+        result.update(_task_metrics(log, body, task))
     return result
 
 
@@ -289,18 +289,11 @@ def _timing(log, intervals):
 
 def _estimation(log, intervals):
     """RMS and largest error of the estimate; {} without truth."""
-    times = log.odom_t[inside(log.odom_t, intervals)]
-    if not len(times) or not len(log.truth_t):
+    t, distance, angle = estimate_errors(log)
+    used = inside(t, intervals)
+    if not np.any(used):
         return {}
-    odom, truth = motion(log, 'odom'), motion(log, 'truth')
-    mine = np.searchsorted(odom.t, times)
-    theirs = np.clip(np.searchsorted(truth.t, times - 2.5e-3), 0, len(truth.t) - 1)
-    close = np.abs(truth.t[theirs] - times) < 2.5e-3
-    if not np.any(close):
-        return {}
-    mine, theirs = mine[close], theirs[close]
-    distance = np.linalg.norm(odom.position[mine] - truth.position[theirs], axis=1)
-    angle = np.degrees(geodesic_angles(odom.quaternion[mine], truth.quaternion[theirs]))
+    distance, angle = distance[used], angle[used]
     return {'estimation': {'position_rms_m': float(np.sqrt(np.mean(distance ** 2))),
                            'orientation_rms_deg': float(np.sqrt(np.mean(angle ** 2))),
                            'position_max_m': float(np.max(distance)),
@@ -317,17 +310,8 @@ def _std(values):
     return float(np.std(values)) if values.size else None
 
 
-def extras(log: FlightLog, body: Motion, task: Task, u_window: tuple[float, float]) -> dict:
-    """
-    Compute the additional metrics of the task's kind; empty for pose tasks.
-
-    Args:
-        log: the flight.
-        body: motion of the robot.
-        task: flown task; it began with the log's first target.
-        u_window: U window of a pose [s].
-
-    """
+def _task_metrics(log: FlightLog, body: Motion, task: Task) -> dict:
+    """Additional metrics of the task's kind, which began with the log's first target."""
     if not log.targets:
         return {}
     start = log.targets[0].stamp
@@ -336,7 +320,7 @@ def extras(log: FlightLog, body: Motion, task: Task, u_window: tuple[float, floa
     if task.kind in ('force', 'torque'):
         return {task.kind: _levels(log, body, task, start)}
     if task.kind == 'payload':
-        return {'payload': _payloads(log, body, task, u_window)}
+        return {'payload': _payloads(log, body, task)}
     if task.kind == 'hover':
         return {'hover': _summary(body, log.targets[0], start + POSE_DURATION,
                                   start + task.duration)}
@@ -428,12 +412,12 @@ def _level_windows(task, start):
     return [tuple(float(v) for v in window) for window in windows]
 
 
-def _payloads(log, body, task, u_window):
+def _payloads(log, body, task):
     """Steady height error, positive above the target, and steady errors for each payload."""
     results = []
     targets = [t for t in log.targets if isinstance(t, PoseTarget)]
     for segment, target in zip(task.segments, targets, strict=False):
-        begin, end = target.stamp + u_window[0], target.stamp + u_window[1]
+        begin, end = target.stamp + U_WINDOW[0], target.stamp + U_WINDOW[1]
         entry = {'payload_kg': segment.payload, 'height_error_m': None,
                  'position_m': None, 'orientation_deg': None}
         if body.covers(begin, end):

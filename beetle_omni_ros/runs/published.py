@@ -54,9 +54,6 @@ DISTURBANCE = {
     'RL': {'force_N': 100.0, 'torque_N_m': 15.0},
 }
 
-# On the robot's ARM board (Khadas VIM4): the policy's inference, the NMPC's control period.
-COMPUTE = {'NMPC, real robot': {'typical_below_ms': 10.0},
-           'RL, real robot': {'mean_ms': 0.3}}
 
 LEMNISCATE = {
     'NMPC, real robot': {'position_mean_m': 0.05, 'position_std_m': 0.02,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, Target
-from beetle_omni_ros.messages.topics import requester
+from beetle_omni_ros.messages.topics import controller_of
 from beetle_omni_ros.messages.values import Diagnostic
 from beetle_omni_ros.runs.log import (
     Commands,
@@ -94,9 +94,9 @@ class LogRecorder(Recorder):
         series = SERIES_OF.get(topic)
         if series:
             self._add(series, self._rows[series], value, received)
-        elif requester(topic):
-            self._add('command', self._requests.setdefault(requester(topic), array('d')), value,
-                      received)
+        elif controller_of(topic):
+            rows = self._requests.setdefault(controller_of(topic), array('d'))
+            self._add('command', rows, value, received)
         elif topic in ('target_pose', 'target_trajectory'):
             self._log.targets.append(value)
         elif topic == 'supervisor/state':

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 import sys
 
@@ -14,11 +13,11 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.runs import table
 from beetle_omni_ros.runs.bag import BagError, read_bag
 from beetle_omni_ros.runs.body import motion
-from beetle_omni_ros.runs.json_file import write_json
+from beetle_omni_ros.runs.json_file import write_json, write_text
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.metrics import metrics_by_controller, task_of
 from beetle_omni_ros.runs.report_page import make_page
-from beetle_omni_ros.runs.shown import Run
+from beetle_omni_ros.runs.report_runs import Run
 
 MAX_RUNS = len(COLOURS)  # each run has its own colour
 
@@ -57,12 +56,7 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     results = results_of(runs)
     table.print_results(results, console)
     page = make_page(runs, results)
-    try:
-        temporary = output.with_name(output.name + '.tmp')
-        temporary.write_text(page, encoding='utf-8')
-        os.replace(temporary, output)
-    except OSError as error:
-        raise ParameterError(f'{output}: cannot write the report ({error.strerror})') from None
+    write_text(output, page, 'report')
     if json_path:
         write_json(json_path, results)
     console.print(f'{output}: {len(page) / 1e6:.1f} MB', highlight=False)

@@ -15,7 +15,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.yaml_file import shortened
 from beetle_omni_ros.runs import charts, table
-from beetle_omni_ros.runs.shown import Run, target_poses, TimeAxis
+from beetle_omni_ros.runs.report_runs import Run, target_poses, TimeAxis
 
 MOST_ROWS = 40      # of states, faults and warnings
 DISC_RADIUS = 0.4   # of the distance between neighbouring rotors

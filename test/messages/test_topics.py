@@ -13,10 +13,10 @@ from beetle_omni_ros.messages.columns import read_all
 from beetle_omni_ros.messages.topics import ALL, TABLE, topic_of
 from beetle_omni_ros.messages.values import (
     Diagnostic,
+    HealthReport,
     MessageError,
     Odom,
-    ToldHealth,
-    Wish,
+    TargetOverride,
     Wrench,
 )
 from beetle_omni_ros.robot import rotations
@@ -51,8 +51,8 @@ def value(topic, seed=0, stamp=STAMP):
         PoseTarget: lambda: PoseTarget(draw(size=3), turn, stamp),
         TrajectoryTarget: lambda: path,
         Command: lambda: Command(stamp, draw(size=4), draw(size=4)),
-        Wish: lambda: Wish.of(path),
-        ToldHealth: lambda: ToldHealth(stamp, ActuatorHealth(
+        TargetOverride: lambda: TargetOverride.of(path),
+        HealthReport: lambda: HealthReport(stamp, ActuatorHealth(
             (True, False, True, True), (None, 0.5, None, None), thrust_limit=8.75)),
         Wrench: lambda: Wrench(stamp, draw(size=3), draw(size=3)),
         str: lambda: 'flying:nmpc',

@@ -15,6 +15,6 @@ from beetle_omni_ros.nodes import discovery
 @pytest.fixture
 def ros_domain(monkeypatch):
     """Hold a free ROS domain for one test, so that tests can run at the same time."""
-    with discovery.reserved() as number:
+    with discovery.reserved_domain() as number:
         monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
         yield number

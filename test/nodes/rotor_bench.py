@@ -140,7 +140,7 @@ class Bench:
 @contextmanager
 def bench(folder, **parameters):
     """Start a bridge; without a parameter ``port``, on an emulated board."""
-    with discovery.reserved() as number, EmulatedMotorBoard(parameters=QUICK) as board:
+    with discovery.reserved_domain() as number, EmulatedMotorBoard(parameters=QUICK) as board:
         patient = {'port': board.port, 'reconnect_period': 0.1, 'silence': 1.0}
         graph = Graph({NODE: {**patient, **parameters}}, folder, number, composed=False)
         commander = None

@@ -133,7 +133,7 @@ class ServoWitness(Operator):
 @contextmanager
 def joint_bridge(folder, others=(), **parameters):
     """Run the node in a process of its own, or composed with others; yield graph and witness."""
-    with discovery.reserved() as number:
+    with discovery.reserved_domain() as number:
         graph = Graph({NODE: {**PATIENT, **parameters}, **{name: {} for name in others}}, folder,
                       number, composed=bool(others))
         witness = None

@@ -18,7 +18,7 @@ from witness import PATIENT, READY, Witness
 
 from beetle_omni_ros.nodes import discovery
 from beetle_omni_ros.nodes.graph import BRIDGES_COMPOSED, Graph
-from beetle_omni_ros.nodes.plan import bridged, BRIDGES
+from beetle_omni_ros.nodes.plan import bridge_parameters, BRIDGES
 
 pytestmark = pytest.mark.alone
 
@@ -71,9 +71,9 @@ class Mechanic(Witness):
 def airborne(folder):
     """Graph and mechanic of a robot in the air, in a ROS domain of its own."""
     parameters = {'sim_node': {}, 'ekf_node': {}, 'nmpc_node': {}, 'supervisor_node': PATIENT}
-    for node, values in bridged(folder, {}).items():
+    for node, values in bridge_parameters(folder, {}).items():
         parameters[node] = {**parameters.get(node, {}), **values}
-    with discovery.reserved() as number, pytest.MonkeyPatch.context() as patch:
+    with discovery.reserved_domain() as number, pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_DOMAIN_ID', str(number))
         graph, mechanic = Graph(parameters, folder, number), None
         try:

@@ -111,8 +111,8 @@ def test_what_cannot_be_flown_ends_the_node_with_one_line(ros_domain, override, 
 
 
 def test_the_plan_of_a_graph_with_another_controller():
-    nodes = plan.plan(plan.Wanted(controller=OWN, actuators='direct', bag='/b',
-                                  task='hover')).nodes
+    nodes = plan.plan(plan.GraphOptions(controller=OWN, actuators='direct', bag='/b',
+                                        task='hover')).nodes
     assert list(nodes) == ['recorder_node', 'sim_node', 'ekf_node', 'pose_controller_node',
                            'nmpc_node', 'rl_node', 'supervisor_node', 'reference_node']
     assert nodes['pose_controller_node'] == {'controller': OWN}
@@ -122,7 +122,7 @@ def test_the_plan_of_a_graph_with_another_controller():
     assert nodes['recorder_node']['controllers'] == known
     assert plan.executable('pose_controller_node') == 'controller_node'
     assert plan.arguments(nodes, ['ekf_node', 'pose_controller_node']) == ['ekf_node', OWN]
-    alone = plan.plan(plan.Wanted(controller=OWN, actuators='direct', standby=False)).nodes
+    alone = plan.plan(plan.GraphOptions(controller=OWN, actuators='direct', standby=False)).nodes
     assert list(alone) == ['sim_node', 'ekf_node', 'pose_controller_node', 'supervisor_node']
 
 

@@ -20,7 +20,7 @@ PROBE = ('import os, sys\n'
 
 @pytest.fixture
 def unset(monkeypatch):
-    for name in (*discovery.CHOSEN, discovery.OWN):
+    for name in (*discovery.ROS_SETTINGS, discovery.VARIABLE):
         monkeypatch.delenv(name, raising=False)
 
 
@@ -80,10 +80,10 @@ def test_commands_that_join_the_graph_have_the_argument(command):
 
 def test_an_argument_of_fly_holds_for_the_processes_that_it_starts(tmp_path, unset, monkeypatch):
     monkeypatch.setenv(discovery.RANGE, 'LOCALHOST')        # put back afterwards
-    monkeypatch.setenv(discovery.OWN, '')
+    monkeypatch.setenv(discovery.VARIABLE, '')
     given = {}
     monkeypatch.setattr(subprocess, 'Popen', lambda *_, env, **__: given.update(env))
-    discovery.confine(asked='subnet')
+    discovery.confine(requested='subnet')
     Graph({'ekf_node': {}}, tmp_path, 7).start_process('composed')
     assert given['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SUBNET'
 
@@ -98,7 +98,7 @@ def test_a_graph_is_confined(tmp_path, unset, monkeypatch):
 @pytest.mark.parametrize('composed', [True, False])
 def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, unset, monkeypatch, composed):
     monkeypatch.setenv(discovery.RANGE, 'LOCALHOST')        # put back afterwards
-    monkeypatch.setenv(discovery.OWN, '')
+    monkeypatch.setenv(discovery.VARIABLE, '')
     started = {}
 
     def start(arguments, env, **_):
@@ -107,9 +107,9 @@ def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, unset, monk
 
     monkeypatch.setattr(subprocess, 'Popen', start)
     monkeypatch.setattr(os.path, 'exists', lambda _: True)
-    discovery.confine(asked='subnet')
-    nodes = plan.plan(plan.Wanted(controller='hover', ports=str(tmp_path), task='hover',
-                                  bag=str(tmp_path / 'bag'))).nodes
+    discovery.confine(requested='subnet')
+    nodes = plan.plan(plan.GraphOptions(controller='hover', ports=str(tmp_path), task='hover',
+                                        bag=str(tmp_path / 'bag'))).nodes
     graph = Graph(nodes, tmp_path, 7, composed)
     graph.start()
     assert len(graph.processes) == (2 if composed else len(nodes))

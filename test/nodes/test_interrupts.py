@@ -9,14 +9,14 @@ import time
 
 import pytest
 
-from beetle_omni_ros.nodes.runner import terminable, undisturbed
+from beetle_omni_ros.nodes.runner import signals_ignored, sigterm_as_interrupt
 from beetle_omni_ros.runs.bag import read_bag
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_an_interrupt_whatever_a_library_makes_of_it(number):
     before = signal.getsignal(number)
-    with pytest.raises(KeyboardInterrupt), terminable():
+    with pytest.raises(KeyboardInterrupt), sigterm_as_interrupt():
         try:
             os.kill(os.getpid(), number)
             time.sleep(1)
@@ -26,13 +26,13 @@ def test_a_signal_is_an_interrupt_whatever_a_library_makes_of_it(number):
 
 
 def test_an_error_without_a_signal_stays_what_it_is():
-    with pytest.raises(RuntimeError, match='mine'), terminable():
+    with pytest.raises(RuntimeError, match='mine'), sigterm_as_interrupt():
         raise RuntimeError('mine')
 
 
 def test_a_second_signal_does_not_cut_the_clean_up_short():
     cleaned = []
-    with pytest.raises(KeyboardInterrupt), terminable():
+    with pytest.raises(KeyboardInterrupt), sigterm_as_interrupt():
         try:
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(1)
@@ -46,7 +46,7 @@ def test_a_second_signal_does_not_cut_the_clean_up_short():
 
 def test_a_signal_while_a_flight_that_is_over_is_cleaned_up_waits():
     cleaned = False
-    with terminable(), undisturbed():
+    with sigterm_as_interrupt(), signals_ignored():
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.01)
         cleaned = True

@@ -169,11 +169,11 @@ def test_ros2_bag_records_where_it_is_installed_else_the_recorder(bringup, monke
 
 
 def test_a_launch_is_found_on_this_computer_alone(bringup, monkeypatch):
-    for name in (*discovery.CHOSEN, discovery.OWN):
+    for name in (*discovery.ROS_SETTINGS, discovery.VARIABLE):
         monkeypatch.delenv(name, raising=False)
     bringup.generate_launch_description()
     assert os.environ[discovery.RANGE] == 'LOCALHOST'
-    monkeypatch.setenv(discovery.OWN, 'SUBNET')
+    monkeypatch.setenv(discovery.VARIABLE, 'SUBNET')
     bringup.generate_launch_description()
     assert os.environ[discovery.RANGE] == 'SUBNET'
     bringup.start(composed='false', discovery='OFF')

@@ -11,7 +11,7 @@ import rclpy
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.values import Odom
 from beetle_omni_ros.nodes import runner, wire
-from beetle_omni_ros.nodes.live_view import Listener
+from beetle_omni_ros.nodes.live_view import LiveGraph
 from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.view.frames import COLUMNS, pose, Sampler
 
@@ -42,7 +42,7 @@ def graph(ros_domain):
 
 @pytest.fixture
 def listener(graph, ros_domain):
-    made = Listener(domain=ros_domain, speaks=True)
+    made = LiveGraph(domain=ros_domain, writable=True)
     yield made
     made.close()
 
@@ -109,7 +109,7 @@ def test_the_supervisor_decides_who_flies(graph, listener):
 
 
 def test_who_may_not_speak_offers_no_target(graph, ros_domain):
-    silent = Listener(domain=ros_domain)
+    silent = LiveGraph(domain=ros_domain)
     try:
         silent.publish_target(PoseTarget(np.zeros(3), TURNED, 1.0))
         answers = []
@@ -123,4 +123,4 @@ def test_who_may_not_speak_offers_no_target(graph, ros_domain):
 
 def test_an_impossible_namespace_is_refused():
     with pytest.raises(ParameterError, match="--namespace '7 up'"):
-        Listener('7 up')
+        LiveGraph('7 up')

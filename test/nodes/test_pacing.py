@@ -5,7 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from beetle_omni_ros.nodes.pacing import CATCH_UP_TICKS, LAG, Pacing, PATIENCE, Waiting
+from beetle_omni_ros.nodes.pacing import (
+    CATCH_UP_TICKS,
+    LAG,
+    PATIENCE,
+    RealTimePacing,
+    SimulatedTimePacing,
+)
 
 TICK, ROS = 0.005, 1.8e9
 
@@ -18,7 +24,7 @@ def clock():
 
 @pytest.fixture
 def pacing(clock):
-    return Pacing(TICK, lambda: clock.now, lambda: clock.now + clock.offset)
+    return RealTimePacing(TICK, lambda: clock.now, lambda: clock.now + clock.offset)
 
 
 def run(pacing, clock, seconds, jitter=None):
@@ -81,7 +87,7 @@ def test_a_preemption_between_the_clock_readings_changes_no_stamp(clock):
         clock.now += readings.hold          # held up in the middle of the comparison
         return clock.now + ROS
 
-    pacing = Pacing(TICK, lambda: clock.now, ros)
+    pacing = RealTimePacing(TICK, lambda: clock.now, ros)
     run(pacing, clock, 0.5)
     readings.hold = 0.02
     pacing.due()
@@ -90,17 +96,17 @@ def test_a_preemption_between_the_clock_readings_changes_no_stamp(clock):
 
 @pytest.fixture
 def waiting(clock):
-    return Waiting(TICK, lambda: clock.now, ROS)
+    return SimulatedTimePacing(TICK, lambda: clock.now, ROS)
 
 
 def fly(waiting, clock, seconds, answers):
     """Fire the timer; ``answers(k)`` is the stamp that is answered after call k, or None."""
     for k in range(round(seconds / TICK)):
         if waiting.due():
-            waiting.sent(waiting.now)
+            waiting.sample_sent(waiting.now)
         clock.now += TICK
         if (stamp := answers(k)) is not None:
-            waiting.heard('odom', stamp)
+            waiting.answered('odom', stamp)
 
 
 def test_simulated_time_goes_on_while_everybody_answers_or_nobody_has_yet(waiting, clock):

@@ -7,7 +7,7 @@ import pytest
 from witness import READY, Witness
 
 from beetle_omni_ros.nodes.graph import Graph
-from beetle_omni_ros.nodes.plan import COMPOSED, plan, Wanted
+from beetle_omni_ros.nodes.plan import COMPOSED, GraphOptions, plan
 
 pytestmark = pytest.mark.real_time
 PAUSE = 0.5     # [s]
@@ -16,9 +16,9 @@ SOFT = 0.6      # [m/s] of a touchdown; a fall by 0.1 m is faster
 
 def test_a_pause_of_the_computer_in_flight_ends_without_a_crash_that_was_none(ros_domain,
                                                                               tmp_path):
-    wanted = Wanted(controller='nmpc', task='hover', actuators='direct', ports=str(tmp_path),
-                    bag=str(tmp_path / 'bag'), standby=False)
-    graph = Graph(plan(wanted).nodes, tmp_path, ros_domain)
+    options = GraphOptions(controller='nmpc', task='hover', actuators='direct',
+                           ports=str(tmp_path), bag=str(tmp_path / 'bag'), standby=False)
+    graph = Graph(plan(options).nodes, tmp_path, ros_domain)
     witness = None
     try:
         graph.start()

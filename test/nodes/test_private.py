@@ -41,7 +41,7 @@ def test_the_runtime_folder_comes_first_where_it_is_safe(temporary, monkeypatch)
 def test_a_link_in_place_of_the_folder_is_refused(temporary, name):
     (temporary / 'victim').mkdir(mode=0o700)
     (temporary / name).symlink_to(temporary / 'victim')
-    with pytest.raises(OSError, match='found a link or file'), discovery.reserved():
+    with pytest.raises(OSError, match='found a link or file'), discovery.reserved_domain():
         pass
     assert not list((temporary / 'victim').iterdir())
 
@@ -49,7 +49,8 @@ def test_a_link_in_place_of_the_folder_is_refused(temporary, name):
 def test_a_folder_that_others_may_enter_is_refused(temporary, name):
     (temporary / name).mkdir()
     (temporary / name).chmod(0o777)
-    with pytest.raises(OSError, match='open to other users .mode 777.'), discovery.reserved():
+    with pytest.raises(OSError, match='open to other users .mode 777.'), \
+            discovery.reserved_domain():
         pass
 
 
@@ -57,7 +58,7 @@ def test_a_folder_that_others_may_enter_is_refused(temporary, name):
 def test_a_folder_of_another_user_is_refused(temporary, name):
     (temporary / name).mkdir(mode=0o700)
     os.chown(temporary / name, 12345, -1)
-    with pytest.raises(OSError, match='belongs to user 12345'), discovery.reserved():
+    with pytest.raises(OSError, match='belongs to user 12345'), discovery.reserved_domain():
         pass
 
 
@@ -67,7 +68,7 @@ def test_a_file_of_the_victim_is_not_emptied(temporary, link):
     victim.write_text('precious')
     for number in discovery.DOMAINS:
         link(victim, private.folder() / f'domain{number}.lock')
-    with pytest.raises(OSError, match='lock'), discovery.reserved():
+    with pytest.raises(OSError, match='lock'), discovery.reserved_domain():
         pass
     assert victim.read_text() == 'precious'
 
@@ -112,7 +113,7 @@ def test_a_lock_that_its_holder_removes_meanwhile_is_taken_anew(temporary, monke
 
 
 def test_a_domain_leaves_nothing_behind_but_the_locks_of_who_lives(temporary):
-    with discovery.reserved() as number:
+    with discovery.reserved_domain() as number:
         alive = private.Lock(f'{number}.ekf_node.lock')
         (private.folder() / f'{number}.sim_node.lock').write_text('999999999')   # was killed
     assert [path.name for path in private.folder().iterdir()] == [f'{number}.ekf_node.lock']
@@ -152,7 +153,7 @@ def test_folders_go_with_their_process_and_those_of_killed_ones_at_the_next_star
     (place / f'ports_{os.getpid()}_abc').mkdir()
     script = ('import sys; from beetle_omni_ros.nodes import private\n'
               f'private.folder = lambda: private.Path({str(place)!r})\n'
-              'print(private.scratch("ports"))')
+              'print(private.process_folder("ports"))')
     done = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True,
                           check=True, timeout=60)
     made = Path(done.stdout.strip())

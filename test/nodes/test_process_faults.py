@@ -38,7 +38,7 @@ BROKEN = {'broken': '1', 'impact_m_s': '4.1'}
     (seen(SOFT, on=1e9), True, False, 'does not land'),
     (seen(BROKEN, takeoffs=1), False, False, 'takes off')])
 def test_a_flight_is_judged_by_truth_and_by_what_was_commanded(observer, asked, refused, outcome):
-    judged = process_faults._judged(observer, asked, refused, LIMITS)
+    judged = process_faults._outcome(observer, asked, refused, LIMITS)
     assert judged['outcome'] == outcome and judged['named'] == 'rotor1_lost'
 
 

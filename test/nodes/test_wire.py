@@ -8,7 +8,7 @@ from sensor_msgs.msg import JointState
 
 from beetle_omni_ros.control.base import Command, PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages import conversions
-from beetle_omni_ros.messages.values import MessageError, Odom, ToldHealth, Wish
+from beetle_omni_ros.messages.values import HealthReport, MessageError, Odom, TargetOverride
 from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.actuator_health import ActuatorHealth
@@ -128,12 +128,13 @@ def test_bad_messages_are_refused_with_a_reason(rng):
 def test_what_the_supervisor_tells_survives_the_way_through_messages():
     way = TrajectoryTarget(np.array([5.0, 6.0]), np.zeros((2, 3)), np.tile([0, 0, 0, 1.0], (2, 1)),
                            np.zeros((2, 3)), np.zeros((2, 3)), stamp=5.0)
-    told = conversions.take_wish(wire.message('supervisor/target', Wish.of(way)))
+    told = conversions.take_override(wire.message('supervisor/target', TargetOverride.of(way)))
     assert told.stamp == 5.0 and np.allclose(told.target.times, way.times)
-    assert conversions.take_wish(wire.message('supervisor/target', Wish.of(None))).target is None
+    none = wire.message('supervisor/target', TargetOverride.of(None))
+    assert conversions.take_override(none).target is None
     health = ActuatorHealth((True, False, True, True), (None, 0.4, None, None))
-    message = wire.message('supervisor/actuators', ToldHealth(7.0, health))
-    assert conversions.read_health(message) == ToldHealth(7.0, health)
+    message = wire.message('supervisor/actuators', HealthReport(7.0, health))
+    assert conversions.read_health(message) == HealthReport(7.0, health)
     message.position[1] = np.inf
     with pytest.raises(MessageError):
         conversions.read_health(message)
