@@ -127,9 +127,9 @@ class ControllerNode(FlightNode):
     def _on_override(self, override):
         self._override = override.target
 
-    def _on_actuators(self, told):
-        self._actuators = told.health
-        forward_health(self._controller, told.health)
+    def _on_actuators(self, report):
+        self._actuators = report.health
+        forward_health(self._controller, report.health)
 
     def _on_mode(self, mode):
         state = mode.partition(':')[0]
@@ -178,9 +178,9 @@ class ControllerNode(FlightNode):
 
     def _controller_status(self):
         controller = self._controller
-        told = getattr(controller, 'diagnostics', dict)()
+        report = getattr(controller, 'diagnostics', dict)()
         return health.OK, getattr(controller, 'name', self._entry.name), {
-            **told, 'guidance': guidance_of(controller)}
+            **report, 'guidance': guidance_of(controller)}
 
 
 @dataclass(frozen=True, kw_only=True)

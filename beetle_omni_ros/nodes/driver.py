@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager, ExitStack
+from contextlib import contextmanager, ExitStack, nullcontext
 import os
 from pathlib import Path
 import select
@@ -241,15 +241,10 @@ class _Joystick:
     """Actions from the topic joy."""
 
     help = 'joy: sticks move and turn, buttons arm, land, hold, home; Ctrl-C leaves'
-    done = False
+    done, open = False, staticmethod(nullcontext)
 
     def __init__(self, driver, p, poses, say):
         self._driver, self._p, self._poses, self._buttons = driver, p, poses, ()
-
-    @contextmanager
-    def open(self):
-        """Nothing to open."""
-        yield
 
     def actions(self, seconds):
         """Return the actions of sticks and buttons."""
@@ -268,16 +263,12 @@ class _Terminal:
     """Actions from lines of standard input; at its end the last one is carried out."""
 
     help = f'{words.HELP}, or the name of a pose'
+    open = staticmethod(nullcontext)
 
     def __init__(self, driver, p, poses, say):
         self._driver, self._poses, self._say = driver, poses, say
         self._rest, self._ended, self.done = '', False, False
         self._until = self._begin = None
-
-    @contextmanager
-    def open(self):
-        """Nothing to open."""
-        yield
 
     def actions(self, seconds):
         """Return the actions of the next lines, up to the next `wait`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import sys
 import time
 
@@ -9,7 +10,7 @@ from rich.progress import Progress
 
 from beetle_omni_ros.nodes.graph import Graph
 from beetle_omni_ros.nodes.operator import Operator
-from beetle_omni_ros.nodes.plan import BridgeCounts, BRIDGES
+from beetle_omni_ros.nodes.plan import BRIDGES
 from beetle_omni_ros.runs.tasks import Task
 
 READY_TIMEOUT = 300.0   # s; the first start compiles the controller
@@ -29,6 +30,9 @@ MAX_LOAD = 0.9          # part of a core that the composed nodes may need
 SLOW_TIME = 0.1
 PAUSED = 'supervisor_paused'
 PACING = 'sim_node: pacing'
+# bridge -> (name of its status in diagnostics, prefix of the keys of a flight's measurements)
+MEASURED = {
+    'joint_bridge_node': ('bus', 'servos'), 'rotor_bridge_node': ('board', 'motor_board')}
 
 
 class FlightError(RuntimeError):
@@ -37,6 +41,48 @@ class FlightError(RuntimeError):
 
 class TooSlowError(FlightError):
     """The computer is too slow to fly this flight in real time."""
+
+
+class BridgeCounts:
+    """
+    Cycles and latencies of the bridges since this object was made, from their diagnostics.
+
+    Args:
+        values: status name -> its newest values.
+
+    """
+
+    def __init__(self, values: Callable[[str], dict[str, str]]):
+        self._values = values
+        self._first = self._cycles()
+
+    def measured(self) -> dict[str, float]:
+        """
+        Return the counts and latencies [ms].
+
+        Keys: ``servos_cycles``, ``servos_missed_cycles``, ``servos_latency_median_ms``,
+        ``..._p99_ms`` and ``..._max_ms``, and the same for ``motor_board``. The latency is from
+        the publication of `command` to its last byte written.
+        """
+        found = {}
+        last = self._cycles()
+        for node, (_, name) in MEASURED.items():
+            for key in ('cycles', 'missed_cycles'):
+                if f'{name}_{key}' in last:
+                    found[f'{name}_{key}'] = \
+                        last[f'{name}_{key}'] - self._first.get(f'{name}_{key}', 0)
+            latency = self._values(f'{node}: latency')
+            found.update({f'{name}_latency_{key}': float(latency[key])
+                          for key in ('median_ms', 'p99_ms', 'max_ms') if key in latency})
+        return found
+
+    def _cycles(self):
+        counts = {}
+        for node, (status, name) in MEASURED.items():
+            values = self._values(f'{node}: {status}')
+            counts.update({f'{name}_{key}': int(values[key])
+                           for key in ('cycles', 'missed_cycles') if key in values})
+        return counts
 
 
 class Flight:
@@ -169,7 +215,7 @@ class Flight:
             operator.states.clear()
             # The state may name a fault: disarmed:joint1_jammed.
             self._await('taking off', lambda: operator.state.startswith('flying') or any(
-                told.partition(':')[0] == 'disarmed' for told in operator.states),
+                state.partition(':')[0] == 'disarmed' for state in operator.states),
                         TAKEOFF_TIMEOUT)
             if operator.state.startswith('flying'):
                 return

@@ -93,7 +93,7 @@ class Health:
         entry.age = age
         first, entry.seen = entry.seen is None, self._node.elapsed()
         if first and entry.stale_after is not None and not self.waits_for():
-            self._node.get_logger().info('all has come that it waited for')
+            self._node.get_logger().info('all required inputs have arrived')
 
     def waits_for(self) -> list[str]:
         """Return the required topics without a message so far."""

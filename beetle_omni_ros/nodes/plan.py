@@ -6,7 +6,7 @@ Plan of a ROS graph: its nodes, their parameters and their processes, as data.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +19,6 @@ BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
 STATES = {'joint_bridge_node': 'joint_bridge/state', 'rotor_bridge_node': 'rotor_bridge/state'}
 ACTUATORS = ('emulated', 'direct')
 READY = 'ready'
-# bridge -> (name of its status in diagnostics, prefix of the keys of a flight's measurements)
-MEASURED = {
-    'joint_bridge_node': ('bus', 'servos'), 'rotor_bridge_node': ('board', 'motor_board')}
 # Executables: modules of this folder with a class of the same name. `controller_node` runs any
 # registered controller under the name `<controller>_node`.
 NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'controller_node', 'supervisor_node',
@@ -48,48 +45,6 @@ def bridge_parameters(folder: Path, robot: dict) -> dict[str, dict]:
     return {'sim_node': {'actuators': 'emulated', 'servo_port': servos, 'board_port': board},
             'joint_bridge_node': {**robot, 'port': servos, 'autostart': 'activate'},
             'rotor_bridge_node': {**robot, 'port': board}}
-
-
-class BridgeCounts:
-    """
-    Cycles and latencies of the bridges since this object was made, from their diagnostics.
-
-    Args:
-        values: status name -> its newest values.
-
-    """
-
-    def __init__(self, values: Callable[[str], dict[str, str]]):
-        self._values = values
-        self._first = self._cycles()
-
-    def measured(self) -> dict[str, float]:
-        """
-        Return the counts and latencies [ms].
-
-        Keys: ``servos_cycles``, ``servos_missed_cycles``, ``servos_latency_median_ms``,
-        ``..._p99_ms`` and ``..._max_ms``, and the same for ``motor_board``. The latency is from
-        the publication of `command` to its last byte written.
-        """
-        found = {}
-        last = self._cycles()
-        for node, (_, name) in MEASURED.items():
-            for key in ('cycles', 'missed_cycles'):
-                if f'{name}_{key}' in last:
-                    found[f'{name}_{key}'] = \
-                        last[f'{name}_{key}'] - self._first.get(f'{name}_{key}', 0)
-            latency = self._values(f'{node}: latency')
-            found.update({f'{name}_latency_{key}': float(latency[key])
-                          for key in ('median_ms', 'p99_ms', 'max_ms') if key in latency})
-        return found
-
-    def _cycles(self):
-        counts = {}
-        for node, (status, name) in MEASURED.items():
-            values = self._values(f'{node}: {status}')
-            counts.update({f'{name}_{key}': int(values[key])
-                           for key in ('cycles', 'missed_cycles') if key in values})
-        return counts
 
 
 @dataclass(frozen=True, kw_only=True)

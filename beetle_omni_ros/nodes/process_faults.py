@@ -247,16 +247,17 @@ def _watch(graph, observer, fault, listed):
     observer.begin()
     refused = fault.inject(graph, observer)
     observer.wait(lambda: observer.state in OFF or observer.touched is not None, flight.watch_time)
-    asked = observer.state.partition(':')[0] in ('flying', 'fallback') and observer.touched is None
-    if asked:
+    flying = observer.touched is None and \
+        observer.state.partition(':')[0] in ('flying', 'fallback')
+    if flying:
         observer.call('land')
     observer.wait(lambda: observer.state in OFF, flight.landing_time if observer.touched is None
                   else 2.0)
     observer.spin(flight.end_time + 1.0)      # long enough for a diagnostic of the simulator
-    return _outcome(observer, asked, refused, listed.limits)
+    return _outcome(observer, flying, refused, listed.limits)
 
 
-def _outcome(observer, asked, refused, limits):
+def _outcome(observer, flying, refused, limits):
     robot = observer.values(ROBOT)
     broken = robot.get('broken') == '1'
     impact = float(robot['impact_m_s']) if 'impact_m_s' in robot else None
@@ -273,10 +274,10 @@ def _outcome(observer, asked, refused, limits):
     elif float(robot.get('inclination_deg', 0.0)) > np.degrees(limits.inclination):
         outcome = 'tilted'
     else:
-        outcome = ('refused' if refused else 'flies_on') if asked else 'lands'
-    told = [state.partition(':')[2] for state in observer.states
+        outcome = ('refused' if refused else 'flies_on') if flying else 'lands'
+    faults = [state.partition(':')[2] for state in observer.states
             if not state.startswith('flying')]
-    return {'outcome': outcome, 'named': ', '.join(dict.fromkeys(filter(None, told))),
+    return {'outcome': outcome, 'named': ', '.join(dict.fromkeys(filter(None, faults))),
             'states': list(observer.states), 'impact_m_s': impact,
             'stopped_s': on if broken else None, 'takeoffs': observer.takeoffs}
 

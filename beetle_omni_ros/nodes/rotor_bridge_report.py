@@ -119,7 +119,7 @@ class RotorBridgeReport:
         saturates = stream.saturated[k] > self._saturated[k]
         self._saturated[k] = stream.saturated[k]
         if rotors is None:
-            return health.OK, 'nothing told yet', values
+            return health.OK, 'no data yet', values
         faults = list(rotors.failures[k])
         if math.isnan(rotors.rpm[k]):
             faults.append('offline')
@@ -131,8 +131,8 @@ class RotorBridgeReport:
         if faults:
             return health.ERROR, ', '.join(faults), values
         if saturates:
-            return health.WARN, 'asked for more thrust than the battery can give', values
-        return health.OK, 'well', values
+            return health.WARN, 'target above the thrust that the battery permits', values
+        return health.OK, 'ok', values
 
 
 def _link(update):

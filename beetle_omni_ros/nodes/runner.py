@@ -204,38 +204,37 @@ def sigterm_as_interrupt():
         KeyboardInterrupt: a signal came, even if a library turned it into another exception.
 
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came = []
+    received = []
 
     def interrupt(number, _):
-        came.append(number)
+        received.append(number)
         for each in ENDING:
             signal.signal(each, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt) for number in ENDING}
-    try:
-        yield
-    except Exception:
-        if came:
-            raise KeyboardInterrupt from None
-        raise
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with _handled_by(interrupt):
+        try:
+            yield
+        except Exception:
+            if received:
+                raise KeyboardInterrupt from None
+            raise
+
+
+def signals_ignored():
+    """Ignore signals during a clean-up: a launch system sends them twice."""
+    return _handled_by(signal.SIG_IGN)
 
 
 @contextmanager
-def signals_ignored():
-    """Ignore signals during a clean-up: a launch system sends them twice."""
+def _handled_by(handler):
+    """Set a handler of the ending signals; without effect outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in ENDING}
+    before = {number: signal.signal(number, handler) for number in ENDING}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, previous in before.items():
+            signal.signal(number, previous)

@@ -165,12 +165,12 @@ class SupervisorNode(FlightNode):
 
     def _supervisor_status(self):
         supervisor = self._supervisor
-        told = supervisor.diagnostics()
+        values = supervisor.diagnostics()
         for name, at in supervisor.faults.items():
-            told[f'fault.{name}'] = f'{at:.3f}'     # [s]: six digits are too few for a stamp
+            values[f'fault.{name}'] = f'{at:.3f}'     # [s]: six digits are too few for a stamp
         level = LEVELS.get(supervisor.state, health.WARN if supervisor.faults else health.OK)
         named = ', '.join(supervisor.faults)
-        return level, f'{self._state}; faults: {named}' if named else self._state, told
+        return level, f'{self._state}; faults: {named}' if named else self._state, values
 
 
 def main(args=None):

@@ -40,9 +40,9 @@ def page(title: str, subtitle: str, grids: list[Grid], notes: list[str],
         head: HTML above the tables, such as :func:`verdict_head`.
 
     """
-    said = ''.join(f'<li>{escape(note)}</li>' for note in notes)
+    items = ''.join(f'<li>{escape(note)}</li>' for note in notes)
     return frame(title, subtitle, f"""{head}<section>{''.join(map(html, grids))}
-{f'<ul>{said}</ul>' if said else ''}</section>
+{f'<ul>{items}</ul>' if items else ''}</section>
 {''.join(sections)}""")
 
 

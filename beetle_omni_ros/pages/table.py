@@ -72,8 +72,8 @@ def html(grid: Grid) -> str:
     """Return a table as HTML."""
     def cell(tag, text, row, column):
         faint = row in grid.faint or column in grid.faint_columns
-        sort = PUBLISHED if faint else LONG if len(text) > LONGEST_CELL else ''
-        return f'<{tag}{sort}>{escape(text)}</{tag}>'
+        style = PUBLISHED if faint else LONG if len(text) > LONGEST_CELL else ''
+        return f'<{tag}{style}>{escape(text)}</{tag}>'
 
     head = ''.join(cell('th', text, None, k) for k, text in enumerate(grid.header))
     body = ''.join(

@@ -222,13 +222,13 @@ def use(runs: list[Run], robot: RobotParameters) -> list[Chart]:
               (-joints.velocity_limit, joints.velocity_limit),
               (rotors.thrust_min, rotors.thrust_max), ())
     titles = ('tilt angle [rad]', 'tilt rate [rad/s]', 'thrust command [N]', '|q* - q| [rad]')
-    used = [_used(run) for run in runs]
+    used = [_actuator_use(run) for run in runs]
     return [chart for title, limit, column in zip(titles, limits, zip(*used, strict=True),
                                                   strict=True)
             for chart in _histograms(runs, column, title, limit)]
 
 
-def _used(run):
+def _actuator_use(run):
     log = run.log
     flown = [(run.start, log.end)]
     joint, command = inside(log.joint_t, flown), inside(log.command_t, flown)

@@ -38,11 +38,12 @@ REACHED_POSITION = 0.10  # [m]
 REACHED_ORIENTATION = 10.0  # [deg]
 COMMAND_PERIOD = 0.010  # [s] for changes of the command
 CRASH = 'emergency_stop:crash'    # supervisor/state after a crash
+SUMMARY = (('mean', np.mean), ('std', np.std), ('min', np.min), ('max', np.max))
 POSE_KEYS = ('U_position_m', 'U_orientation_deg', 'L_position_m', 'L_orientation_deg')
 
 
 @dataclass(frozen=True)
-class Flown:
+class ControllerPart:
     """
     Part of a flight with one controller.
 
@@ -73,17 +74,18 @@ def metrics(log: FlightLog, task: Task | None = None) -> dict:
     """
     results = metrics_by_controller(log, task)
     if not results:
-        return _judge(log, task or task_of(log), Flown('unknown', [], []), None)
+        nothing = ControllerPart('unknown', [], [])
+        return _controller_metrics(log, task or task_of(log), nothing, None)
     return next(iter(results.values()))
 
 
 def metrics_by_controller(log: FlightLog, task: Task | None = None) -> dict[str, dict]:
     """Compute the metrics of each controller of a flight; see :func:`metrics`."""
     task = task or task_of(log)
-    flown = _split(log, task)
+    parts = _split(log, task)
     # If one controller flew the whole task, poses after an early end count as missed.
-    expected = len(task.poses) if task and len(flown) == 1 else None
-    return {part.name: _judge(log, task, part, expected) for part in flown}
+    expected = len(task.poses) if task and len(parts) == 1 else None
+    return {part.name: _controller_metrics(log, task, part, expected) for part in parts}
 
 
 def task_of(log: FlightLog) -> Task | None:
@@ -119,7 +121,7 @@ def _split(log, task):
             poses[name].append(k)
         if shares:
             intervals[name].append((target.stamp, min(end, log.end, _landing(log, target.stamp))))
-    return [Flown(name, poses[name], intervals[name]) for name in poses
+    return [ControllerPart(name, poses[name], intervals[name]) for name in poses
             if poses[name] or intervals[name]]
 
 
@@ -140,9 +142,9 @@ def _landing(log, after):
                  if t > after and state.partition(':')[0] in ('landing', 'disarmed')), np.inf)
 
 
-def _judge(log, task, flown, expected):
+def _controller_metrics(log, task, part, expected):
     body = motion(log)
-    poses = [_pose(body, log.targets[k], task) for k in flown.poses]
+    poses = [_pose(body, log.targets[k], task) for k in part.poses]
     for missing in (task.poses[len(poses):] if expected else ()):
         poses.append({'target': [float(v) for v in missing], **dict.fromkeys(POSE_KEYS),
                       'reached': False})
@@ -151,18 +153,18 @@ def _judge(log, task, flown, expected):
                          ('min', np.min)):
         result[name] = {key: _reduced(reduce, [pose[key] for pose in poses]) for key in POSE_KEYS}
     result['success_rate'] = float(np.mean([p['reached'] for p in poses])) if poses else None
-    result['crashed'] = _crashed(log, body, flown)
-    result['guidance'] = _guidance(log, flown.name)
-    result['lowest'] = _lowest(log, body, flown)
-    compute = log.compute.get(flown.name, {})
+    result['crashed'] = _crashed(log, body, part)
+    result['guidance'] = _guidance(log, part.name)
+    result['lowest'] = _lowest(log, body, part)
+    compute = log.compute.get(part.name, {})
     result['compute_ms'] = {key: compute.get(key)
                             for key in ('median', 'p99', 'max', 'deadline_misses')}
     windows = [(log.targets[k].stamp + U_WINDOW[0], log.targets[k].stamp + U_WINDOW[1])
-               for k in flown.poses]
-    result.update(_effort(log, flown.intervals, windows))
+               for k in part.poses]
+    result.update(_effort(log, part.intervals, windows))
     result.update(_stillness(body, windows))
-    result.update(_timing(log, flown.intervals))
-    result.update(_estimation(log, flown.intervals))
+    result.update(_timing(log, part.intervals))
+    result.update(_estimation(log, part.intervals))
     if task:
         result.update(_task_metrics(log, body, task))
     return result
@@ -170,12 +172,12 @@ def _judge(log, task, flown, expected):
 
 def _guidance(log, controller):
     """Guidance of the controller, from its diagnostics or the metadata; None if unknown."""
-    told = [entry.values['guidance'] for entry in log.diagnostics
+    reports = [entry.values['guidance'] for entry in log.diagnostics
             if entry.name.rpartition('/')[2] == f'{controller}_node: controller'
             and 'guidance' in entry.values]
-    if not told and log.meta.get('controller') == controller:
+    if not reports and log.meta.get('controller') == controller:
         return log.meta.get('guidance')
-    return told[-1] if told else None
+    return reports[-1] if reports else None
 
 
 def _pose(body: Motion, target, task):
@@ -206,11 +208,11 @@ def _reduced(reduce, values):
     return float(reduce(values)) if values else None
 
 
-def _crashed(log, body, flown):
+def _crashed(log, body, part):
     """Whether the robot hit the ground, had an emergency stop, or has a non-finite position."""
     if any(state == CRASH for state in log.states):
         return True
-    for begin, end in flown.intervals:
+    for begin, end in part.intervals:
         position = body.position[body.window(begin, end)]
         if not np.all(np.isfinite(position)) or np.any(position[:, 2] < GROUND_HEIGHT):
             return True
@@ -220,15 +222,15 @@ def _crashed(log, body, flown):
     return False
 
 
-def _lowest(log, body, flown):
+def _lowest(log, body, part):
     """Lowest height of base_link and the pose during which it occurred; {} without samples."""
-    rows = np.flatnonzero(inside(body.t, flown.intervals))
+    rows = np.flatnonzero(inside(body.t, part.intervals))
     rows = rows[np.isfinite(body.position[rows, 2])]
     if not len(rows):
         return {}
     row = rows[np.argmin(body.position[rows, 2])]
-    begun = [n for n, k in enumerate(flown.poses) if log.targets[k].stamp <= body.t[row]]
-    return {'height_m': float(body.position[row, 2]), 'pose': begun[-1] if begun else None}
+    started = [n for n, k in enumerate(part.poses) if log.targets[k].stamp <= body.t[row]]
+    return {'height_m': float(body.position[row, 2]), 'pose': started[-1] if started else None}
 
 
 def _effort(log, intervals, windows):
@@ -329,23 +331,24 @@ def _task_metrics(log: FlightLog, body: Motion, task: Task) -> dict:
 
 def _summary(body, target, begin, end):
     """Mean, std, min, max of both errors in a window; None without samples."""
-    position, orientation = errors(body, target, body.window(begin, end))
-    result = {}
-    for name, unit, values in (('position', 'm', position), ('orientation', 'deg', orientation)):
-        for what, reduce in (('mean', np.mean), ('std', np.std), ('min', np.min),
-                             ('max', np.max)):
-            result[f'{name}_{what}_{unit}'] = float(reduce(values)) if len(values) else None
-    return result
+    both = errors(body, target, body.window(begin, end))
+    return {f'{name}_{what}_{unit}': float(reduce(values)) if len(values) else None
+            for (name, unit), values in zip((('position', 'm'), ('orientation', 'deg')), both,
+                                            strict=True)
+            for what, reduce in SUMMARY}
 
 
 def _tracking(log, body, task, start):
     """Tracking errors over all rounds and of each; None for an incomplete round."""
+    unknown = {f'{name}_{what}_{unit}': None
+               for name, unit in (('position', 'm'), ('orientation', 'deg'))
+               for what, _ in SUMMARY}
     windows = [t for t in log.targets if isinstance(t, TrajectoryTarget)]
     if not windows:
-        return {**dict.fromkeys(_summary_keys()), 'rounds': []}
+        return {**unknown, 'rounds': []}
     target = _joined(windows)
     rounds = [_summary(body, target, start + begin, start + end)
-              if body.covers(start + begin, start + end) else dict.fromkeys(_summary_keys())
+              if body.covers(start + begin, start + end) else dict(unknown)
               for begin, end in task.rounds]
     whole = _summary(body, target, start + task.rounds[0][0], start + task.rounds[-1][1])
     return {**whole, 'rounds': rounds}
@@ -361,10 +364,6 @@ def _joined(windows):
         for name in ('times', 'positions', 'quaternions', 'velocities', 'angular_velocities')),
         stamp=windows[0].stamp)
 
-
-def _summary_keys():
-    return [f'{name}_{what}_{unit}' for name, unit in (('position', 'm'), ('orientation', 'deg'))
-            for what in ('mean', 'std', 'min', 'max')]
 
 
 def _levels(log, body, task, start):

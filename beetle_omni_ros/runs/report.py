@@ -87,10 +87,11 @@ def make_runs(logs: list[FlightLog], names: list[str]) -> list[Run]:
         if names.count(name) > 1:
             name = f'{name} ({names[:k + 1].count(name)})'
         task = task_of(log)
-        judged = metrics_by_controller(log, task)
-        labels = {key: name if len(judged) == 1 else f'{name}: {key}' for key in judged}
-        runs.append(Run(name, COLOURS[k % MAX_RUNS], log, task,
-                        {labels[key]: result for key, result in judged.items()}))
+        by_controller = metrics_by_controller(log, task)
+        several = len(by_controller) > 1
+        runs.append(Run(name, COLOURS[k % MAX_RUNS], log, task, {
+            f'{name}: {key}' if several else name: result
+            for key, result in by_controller.items()}))
     return runs
 
 

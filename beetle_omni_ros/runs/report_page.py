@@ -69,8 +69,9 @@ def make_page(runs: list[Run], results: dict) -> str:
                      for grid in (*supervisor_grids(run), *fault_grids(run)))
     content = f"""<div class="cards">{''.join(map(_card, range(len(runs)), runs))}</div>
 {_player()}
-<section><h2>Flight</h2><p>Solid: flown, ghost: target, arrows: thrust. Below: what the supervisor
-did, with faults. Drag to turn; tap a plot or a strip to go there, drag over a plot to zoom.</p>
+<section><h2>Flight</h2><p>Solid: flown, ghost: target, arrows: thrust. Below: states of the
+supervisor, with faults. Drag to turn; tap a plot or a strip to go there, drag over a plot to
+zoom.</p>
 <div id="scene"><div id="errors"></div></div>
 <div class="views">{''.join(f'<button data-view="{name}">{text}</button>' for name, text in VIEWS)}
 </div>{''.join(_strip(number, run, axis) for number, run in enumerate(runs))}</section>
@@ -99,7 +100,7 @@ def _subtitle(meta):
 
 def outcome(run: Run) -> str:
     """Return the outcome of a flight in one sentence."""
-    said = []
+    sentences = []
     for label, result in run.results.items():
         name = '' if label == run.label else f'{label.removeprefix(run.label + ": ")}: '
         poses = result.get('poses') or []
@@ -114,8 +115,8 @@ def outcome(run: Run) -> str:
         if tracking.get('position_mean_m') is not None:
             parts.append(f"mean error {1e3 * tracking['position_mean_m']:.1f} mm and "
                          f"{tracking['orientation_mean_deg']:.2f}° on the trajectory")
-        said.append(name + (', '.join(parts) or 'no target'))
-    return '; '.join(said)
+        sentences.append(name + (', '.join(parts) or 'no target'))
+    return '; '.join(sentences)
 
 
 def _card(number, run):

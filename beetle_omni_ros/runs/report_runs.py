@@ -44,7 +44,7 @@ class Run:
         return self.log.targets[0].stamp if self.log.targets else self.log.start
 
     @property
-    def pursued(self) -> list[tuple[Target, float]]:
+    def target_spans(self) -> list[tuple[Target, float]]:
         """(target, its end [s]) of each target; empty if none was recorded."""
         targets = self.log.targets
         return list(zip(targets, [t.stamp for t in targets[1:]] + [self.log.end], strict=False))
@@ -102,7 +102,7 @@ class TimeAxis:
 def error_series(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (n,) times [s], (n,) position errors [m], (n,) orientation errors [deg]."""
     body, parts = run.body, []
-    for target, end in run.pursued:
+    for target, end in run.target_spans:
         window = body.window(target.stamp, end - 1e-3)
         if body.t[window].size:
             parts.append((body.t[window], *errors(body, target, window)))
@@ -114,7 +114,7 @@ def error_series(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def target_poses(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (n,) times since the first target [s] and (n, 3), (n, 4) poses of the targets."""
     times, positions, quaternions = [], [], []
-    for target, end in run.pursued:
+    for target, end in run.target_spans:
         t = np.array([target.stamp]) if isinstance(target, PoseTarget) else \
             np.arange(target.times[0], min(end, target.times[-1]), TRAJECTORY_STEP)
         position, quaternion = reference_poses(target, t)

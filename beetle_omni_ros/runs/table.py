@@ -41,37 +41,37 @@ def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
 
     """
     task = str(results.get('meta', {}).get('task', ''))
-    judged = {name: result for name, result in results.items() if name != 'meta'}
-    made = [_summary(judged, task)]
-    if any('trajectory' in result for result in judged.values()):
-        made.append(_tracking(judged, task))
+    by_label = {name: result for name, result in results.items() if name != 'meta'}
+    made = [_summary(by_label, task)]
+    if any('trajectory' in result for result in by_label.values()):
+        made.append(_tracking(by_label, task))
     for kind, unit in (('force', 'N'), ('torque', 'N_m')):
-        if any(kind in result for result in judged.values()):
-            made.append(_levels(_with(judged, kind), kind, unit))
-    if any('payload' in result for result in judged.values()):
-        made.append(_payloads(_with(judged, 'payload')))
-    if any('hover' in result for result in judged.values()):
-        made.append(_hover(judged))
-    for group in _same_poses(judged):
+        if any(kind in result for result in by_label.values()):
+            made.append(_levels(_with(by_label, kind), kind, unit))
+    if any('payload' in result for result in by_label.values()):
+        made.append(_payloads(_with(by_label, 'payload')))
+    if any('hover' in result for result in by_label.values()):
+        made.append(_hover(by_label))
+    for group in _same_poses(by_label):
         count = len(next(iter(group.values()))['poses'])
         if with_poses or (with_poses is None and 1 < count <= MANY_POSES):
             made.append(_poses(group))
     return made
 
 
-def _same_poses(judged):
+def _same_poses(by_label):
     """Groups of results with the same targets, which one table can compare."""
     groups: dict[tuple, dict] = {}
-    for name, result in judged.items():
+    for name, result in by_label.items():
         key = tuple(round(v, 6) for pose in result['poses'] for v in pose['target'])
         groups.setdefault(key, {})[name] = result
     return [group for key, group in groups.items() if key]
 
 
-def _summary(judged, task):
+def _summary(by_label, task):
     """Table with a column for each controller and published result, a row for each metric."""
     others = published.pose_results(task)
-    columns = [*judged.values(), *others.values()]
+    columns = [*by_label.values(), *others.values()]
     rows = [[text, *(_number(_at(column, path), digits) for column in columns)]
             for text, path, digits in ERROR_ROWS]
     rows += [['poses reached', *(_reached(column) for column in columns)],
@@ -85,9 +85,9 @@ def _summary(judged, task):
     if any('stamp_to_command_ms' in column for column in columns):
         rows.append(['stamp to command, 99 % [ms]', *(
             _number(_at(column, 'stamp_to_command_ms.p99'), 2) for column in columns)])
-    first = len(judged) + 1
+    first = len(by_label) + 1
     return Grid('U: hovering, 7.0 to 7.5 s after each target; L: on the way, 1 to 7 s',
-                ['', *judged, *(f'published {name}' for name in others)], rows,
+                ['', *by_label, *(f'published {name}' for name in others)], rows,
                 faint_columns=frozenset(range(first, first + len(others))))
 
 
@@ -109,14 +109,14 @@ def _reached(result):
     return f"{sum(pose['reached'] for pose in result['poses'])} of {len(result['poses'])}"
 
 
-def _with(judged, key):
-    return {name: result for name, result in judged.items() if key in result}
+def _with(by_label, key):
+    return {name: result for name, result in by_label.items() if key in result}
 
 
-def _tracking(judged, task):
+def _tracking(by_label, task):
     header = ['', 'round', 'position mean ± std (max) [m]', 'orientation mean ± std (max) [deg]']
     rows = []
-    for name, result in judged.items():
+    for name, result in by_label.items():
         tracking = result.get('trajectory')
         if not tracking:
             continue
@@ -138,35 +138,35 @@ def _tracking_cells(part):
     return cells
 
 
-def _levels(judged, kind, unit):
+def _levels(by_label, kind, unit):
     text = unit.replace('_', ' ')
-    header = [f'{kind} [{text}]'] + [f'{name}: {what}' for name in judged
+    header = [f'{kind} [{text}]'] + [f'{name}: {what}' for name in by_label
                                      for what in ('peak position [m]', 'peak orientation [deg]')]
-    steps = sorted({entry[f'level_{unit}'] for result in judged.values()
+    steps = sorted({entry[f'level_{unit}'] for result in by_label.values()
                     for entry in result.get(kind, {}).get('levels', [])})
     rows = []
     for step in steps:
         row = [f'{step:g}']
-        for result in judged.values():
+        for result in by_label.values():
             entry = next((e for e in result.get(kind, {}).get('levels', [])
                           if e[f'level_{unit}'] == step), None)
             row += [_number(entry['peak_position_m'], 3) + (' lost' if entry['lost'] else ''),
                     _number(entry['peak_orientation_deg'], 1)] if entry else [ABSENT, ABSENT]
         rows.append(row)
-    lost = [result.get(kind, {}).get(f'lost_at_{unit}') for result in judged.values()]
+    lost = [result.get(kind, {}).get(f'lost_at_{unit}') for result in by_label.values()]
     rows.append(['lost at'] + [cell for level in lost for cell in
                                ('never' if level is None else f'{level:g} {text}', '')])
     return Grid(f'Disturbance: {kind}', header, rows)
 
 
-def _payloads(judged):
-    header = ['payload [kg]'] + [f'{name}: {what}' for name in judged
+def _payloads(by_label):
+    header = ['payload [kg]'] + [f'{name}: {what}' for name in by_label
                                  for what in ('height error [m]', 'orientation [deg]')]
-    count = max(len(result.get('payload', [])) for result in judged.values())
+    count = max(len(result.get('payload', [])) for result in by_label.values())
     rows = []
     for k in range(count):
         entries = [result['payload'][k] if k < len(result.get('payload', [])) else None
-                   for result in judged.values()]
+                   for result in by_label.values()]
         mass = next(entry['payload_kg'] for entry in entries if entry)
         rows.append([f'{mass:g}'] + [cell for entry in entries for cell in (
             [_number(entry['height_error_m'], 4), _number(entry['orientation_deg'], 2)]
@@ -174,18 +174,18 @@ def _payloads(judged):
     return Grid('Payload, steady errors', header, rows)
 
 
-def _hover(judged):
+def _hover(by_label):
     header = ['', 'position mean ± std (max) [m]', 'orientation mean ± std (max) [deg]']
-    rows = [[name, *_tracking_cells(result['hover'])] for name, result in judged.items()
+    rows = [[name, *_tracking_cells(result['hover'])] for name, result in by_label.items()
             if 'hover' in result]
     return Grid('Hover after 8 s', header, rows)
 
 
-def _poses(judged):
+def _poses(by_label):
     header = ['', 'x y z [m] roll pitch yaw [deg]'] + [
-        f'{name}: {what}' for name in judged for what in ('U [m]', '[deg]')]
+        f'{name}: {what}' for name in by_label for what in ('U [m]', '[deg]')]
     rows = []
-    for k, poses in enumerate(zip(*(r['poses'] for r in judged.values()), strict=True)):
+    for k, poses in enumerate(zip(*(r['poses'] for r in by_label.values()), strict=True)):
         target = poses[0]['target']
         row = [str(k + 1), ' '.join([*(f'{v:.2f}' for v in target[:3]),
                                      *(f'{v:.0f}' for v in target[3:])])]

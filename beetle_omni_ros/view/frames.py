@@ -60,18 +60,18 @@ class Sampler(Recorder):
         states: (t, state) of the supervisor, in the order of receipt.
         faults: name -> time of the first report [s].
         clock: stamp of the newest pose [s]; NaN before the first.
-        remarks: (status, text) of each warning or error about a node's inputs.
+        input_warnings: (status, text) of each warning or error about a node's inputs.
 
     """
 
     def __init__(self):
         self.clock = np.nan
-        self.remarks: list[tuple[str, str]] = []
+        self.input_warnings: list[tuple[str, str]] = []
         self._row = np.full(WIDTH, np.nan)      # newest values, before _stand_in
         self._series: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []   # since rows()
         self.target: Target | None = None
         self._targets: list[tuple[float, Target | None]] = [(-np.inf, None)]
-        self._told = FlightLog()
+        self._log = FlightLog()
         self._named: frozenset = frozenset()
         self.meta: dict = {}
         self.states: list[tuple[float, str]] = []
@@ -143,19 +143,19 @@ class Sampler(Recorder):
 
     def _take_state(self, state, received):
         self.states.append((float(received), state))
-        self._told.state_t = np.append(self._told.state_t, received)
-        self._told.states.append(state)
-        self.faults = self._told.named_faults()
+        self._log.state_t = np.append(self._log.state_t, received)
+        self._log.states.append(state)
+        self.faults = self._log.named_faults()
 
     def _take_diagnostics(self, statuses, _):
         for status in statuses:
             if status.level and status.name.endswith(INPUTS):
-                self.remarks.append((status.name, status.message))
+                self.input_warnings.append((status.name, status.message))
             named = frozenset(key for key in status.values if key.startswith(FAULT_KEY))
             if status.name.endswith(SUPERVISOR_STATUS) and named - self._named:
                 self._named |= named
-                self._told.diagnostics.append(status)
-                self.faults = self._told.named_faults()
+                self._log.diagnostics.append(status)
+                self.faults = self._log.named_faults()
 
     _TAKERS = {'target_pose': _take_target, 'target_trajectory': _take_target,
                'supervisor/state': _take_state, 'diagnostics': _take_diagnostics}

@@ -58,13 +58,13 @@ class Live:
         self._sampler, self._rows = Sampler(), Rows(KEPT)
         self._begin: float | None = None
         self._stop = threading.Event()
-        self._asked: tuple[float, PoseTarget | None] | None = None
-        self._wanted: PoseTarget | None = None      # set by the page, published by the next step
+        self._pending: tuple[float, PoseTarget | None] | None = None
+        self._requested: PoseTarget | None = None   # set by the page, published by the next step
         self._dragging = False
         self._gizmo = None
         gui = page.server.gui
         with page.controls:
-            self._told = gui.add_markdown(WAITING)
+            self._text = gui.add_markdown(WAITING)
             if allow_targets:
                 self._controller = gui.add_dropdown('controller', ('-',), initial_value='-')
                 self._controller.on_update(self._on_controller)
@@ -120,14 +120,14 @@ class Live:
             if flying in names and self._controller.value != flying:
                 self._controller.value = flying
             self._place_gizmo(pose(row, 'target_') or pose(row))
-        if self._told.content != text:
-            self._told.content = text
+        if self._text.content != text:
+            self._text.content = text
 
     # -- controls --------------------------------------------------------------------------
 
     def _place_gizmo(self, placed):
         self._gizmo.visible = True
-        if not self._dragging and self._asked is None:
+        if not self._dragging and self._pending is None:
             self._gizmo.position, self._gizmo.wxyz = placed[0], wxyz(placed[1])
 
     async def _on_gizmo(self, event):   # a coroutine: viser then keeps the order of events
@@ -148,29 +148,29 @@ class Live:
         if reason := self._checks.why_not(target, None):
             self._page.notify('target not sent', reason)
             return
-        self._wanted = target
+        self._requested = target
 
     def _publish(self):
         """Publish the requested target; in the drawing thread, which owns the sampler."""
-        target, self._wanted = self._wanted, None
+        target, self._requested = self._requested, None
         if target is not None:
-            self._asked = (time.monotonic(), self._sampler.target)
-            self._sampler.remarks.clear()
+            self._pending = (time.monotonic(), self._sampler.target)
+            self._sampler.input_warnings.clear()
             self._sampler.target = target
             self._graph.publish_target(target)
 
     def _look_for_refusal(self):
-        if self._asked is None:
-            self._sampler.remarks.clear()
+        if self._pending is None:
+            self._sampler.input_warnings.clear()
             return
-        at, before = self._asked
-        for status, text in self._sampler.remarks:
+        at, before = self._pending
+        for status, text in self._sampler.input_warnings:
             if 'target_pose' in text and 'rejected' in text:
                 self._page.notify('target refused', f'{status}: {text}')
-                self._sampler.target, self._asked = before, None
+                self._sampler.target, self._pending = before, None
                 return
         if time.monotonic() - at > ANSWER_TIME:
-            self._asked = None
+            self._pending = None
 
     def _on_controller(self, event):
         name = self._controller.value

@@ -346,27 +346,26 @@ def status(run: Shown, headline: str, model: Model, names: list[str]) -> str:
         lines.append('<div style="font-size:.85em">' + ' &nbsp; '.join(
             f'<span style="color:{plots.colour(k)}">&#9632;</span> {html.escape(name)}'
             for k, name in enumerate(names)) + '</div>')
-    state = html.escape(run.state or 'unknown')
     target, placed = pose(run.row, 'target_'), pose(run.row)
     voltage, current = known(run.row, 'voltage'), known(run.row, 'current')
-    told = [('state', state)]
+    entries = [('state', html.escape(run.state or 'unknown'))]
     if target is not None and placed is not None:
         away = float(np.linalg.norm(placed[0] - target[0]))
         angle = np.degrees(rotations.geodesic_angle(placed[1], target[1]))
-        told.append(('off target', f'{away:.3f} m, {angle:.1f}&deg;'))
+        entries.append(('off target', f'{away:.3f} m, {angle:.1f}&deg;'))
     off = estimate_error(run.row)
     if np.isfinite(off[0]):
-        told.append(('estimate', f'{off[0]:.3f} m, {off[1]:.1f}&deg; off'))
+        entries.append(('estimate', f'{off[0]:.3f} m, {off[1]:.1f}&deg; off'))
     if voltage is not None:
         text = f'{voltage[0]:.1f} V'
         if current is not None:
             text += f', {-current[0]:.0f} A'
-        told.append(('battery', text))
+        entries.append(('battery', text))
     faults = run.faults or {}
-    told.append(('faults', '<span style="color:#e03131;font-weight:600">' + html.escape(
+    entries.append(('faults', '<span style="color:#e03131;font-weight:600">' + html.escape(
         ', '.join(faults)) + '</span>' if faults else 'none'))
     rows = ''.join(f'<tr><td style="opacity:.65;padding-right:.8em">{key}</td>'
-                   f'<td>{value}</td></tr>' for key, value in told)
+                   f'<td>{value}</td></tr>' for key, value in entries)
     lines.append(f'<table style="font-size:.85em;line-height:1.45">{rows}</table>')
     lines.append(_winding(run.row, model))
     return f'<div style="padding:.2em .9em .3em">{"".join(lines)}</div>'
@@ -374,14 +373,14 @@ def status(run: Shown, headline: str, model: Model, names: list[str]) -> str:
 
 def _winding(row, model):
     """HTML of a bar for each tilt joint: angle between the limits, and command as a line."""
-    tilt, told = known(row, 'tilt'), known(row, 'tilt_command')
+    tilt, command = known(row, 'tilt'), known(row, 'tilt_command')
     bars = []
     for k, name in enumerate(JOINT_NAMES):
         low, high = model.limits.get(name, (-np.pi, np.pi))
         if tilt is None:
             continue
-        share = 100 * (np.clip([tilt[k], told[k] if told is not None else tilt[k]], low, high)
-                       - low) / (high - low)
+        ends = [tilt[k], tilt[k] if command is None else command[k]]
+        share = 100 * (np.clip(ends, low, high) - low) / (high - low)
         left, width = min(share[0], 50.0), abs(share[0] - 50.0)
         colour = '#e03131' if abs(share[0] - 50) > 42 else plots.COLOURS[k]
         bars.append(

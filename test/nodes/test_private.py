@@ -122,7 +122,7 @@ def test_a_domain_leaves_nothing_behind_but_the_locks_of_who_lives(temporary):
 
 
 def test_a_node_leaves_the_file_behind_a_link_alone(temporary):
-    from beetle_omni_ros.nodes.node import claim
+    from beetle_omni_ros.nodes.node import lock_name
     victim = temporary / 'victim'
     victim.write_text('precious')
     told = []
@@ -143,7 +143,7 @@ def test_a_node_leaves_the_file_behind_a_link_alone(temporary):
             told.append(text)
 
     (private.folder() / '7.ekf_node.lock').symlink_to(victim)
-    assert claim(Node()) is None
+    assert lock_name(Node()) is None
     assert victim.read_text() == 'precious' and '7.ekf_node.lock' in told[0]
 
 

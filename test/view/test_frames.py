@@ -92,7 +92,7 @@ def test_the_estimate_stands_for_a_truth_that_nobody_knows():
     assert sampler.clock == 2.0
 
 
-def test_faults_and_remarks_are_kept_with_their_time():
+def test_faults_and_input_warnings_are_kept_with_their_time():
     sampler = Sampler()
     write_state(sampler, 1.0, 'flying:nmpc')
     sampler.write_diagnostic(2.0, 'supervisor_node: supervisor', {'fault.rotor_1': '1.8'})
@@ -103,7 +103,7 @@ def test_faults_and_remarks_are_kept_with_their_time():
         ['', 'flying:nmpc', 'flying:nmpc', 'landing:mocap_lost']
     sampler.write_diagnostic(5.0, 'nmpc_node: inputs', {}, 1, 'target_pose: 1 rejected, low')
     sampler.write_diagnostic(5.0, 'nmpc_node: inputs', {}, 0, 'all arriving')
-    assert sampler.remarks == [('nmpc_node: inputs', 'target_pose: 1 rejected, low')]
+    assert sampler.input_warnings == [('nmpc_node: inputs', 'target_pose: 1 rejected, low')]
 
 
 def test_an_older_target_does_not_replace_a_newer_one():
