@@ -1,4 +1,4 @@
-"""The table of topics: what nodes publish and what bags hold are the same bytes, read alike."""
+"""The table of topics: nodes and bags write the same bytes and read the same values."""
 
 from dataclasses import fields, replace
 import itertools
@@ -35,7 +35,7 @@ SERIES = ('mocap/pose', 'imu/data_raw', 'joint_states', 'battery_state', 'rotor_
 
 
 def value(topic, seed=0, stamp=STAMP):
-    """Some value of a topic."""
+    """A value of a topic."""
     draw = np.random.default_rng(seed).normal
     turn = rotations.normalized(draw(size=4))
     path = TrajectoryTarget(stamp + np.arange(3.0), draw(size=(3, 3)), np.tile(turn, (3, 1)),
@@ -66,7 +66,7 @@ def cdr(topic, of):
 
 
 @pytest.mark.parametrize('topic', list(ALL))
-def test_what_a_node_publishes_is_what_a_bag_holds(topic):
+def test_nodes_and_bags_write_the_same_bytes(topic):
     serialization = pytest.importorskip('rclpy.serialization')
     from beetle_omni_ros.nodes import wire
     sent = serialization.serialize_message(wire.message(topic, value(topic)))
@@ -93,7 +93,7 @@ def test_a_value_comes_back_from_its_message(topic):
 
 @pytest.mark.parametrize('topic', SERIES)
 @pytest.mark.parametrize('one_by_one', [False, True])
-def test_messages_read_at_once_are_those_read_one_by_one(topic, one_by_one, monkeypatch):
+def test_messages_read_together_equal_those_read_one_by_one(topic, one_by_one, monkeypatch):
     if one_by_one:
         monkeypatch.setattr(columns, 'LAYOUTS', 0)
     entry = ALL[topic]
@@ -147,7 +147,7 @@ def test_big_endian_messages_are_read_too():
 
 
 @pytest.mark.parametrize('topic', [name for name in SERIES if name != 'rotor_states'])
-def test_what_is_not_finite_is_read_but_not_flown_with(topic):
+def test_non_finite_values_are_read_but_refused_in_flight(topic):
     entry, sent = ALL[topic], value(topic)
     name = next(field.name for field in fields(sent)
                 if field.name != 'stamp' and field.name not in ('names', 'cells'))

@@ -1,4 +1,4 @@
-"""ROS tests: field types checked, nothing leaves this computer, a domain of its own for each."""
+"""Fixtures of ROS tests: checked field types, a reserved local ROS domain for each test."""
 
 import os
 

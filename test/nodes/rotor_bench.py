@@ -1,4 +1,4 @@
-"""rotor_bridge_node as a process, an emulated board in this one, and whoever commands it."""
+"""Test bench of rotor_bridge_node: its process, an emulated board and a commanding node."""
 
 from contextlib import contextmanager
 from dataclasses import replace
@@ -39,12 +39,12 @@ class Commander(Operator):
     def __init__(self, number):
         super().__init__(number)
         node = self._node
-        self.told, self.batteries, self.rotors = [], [], []
+        self.bridge_states, self.batteries, self.rotors = [], [], []
         self.thrust, self.period, self.age, self.stamps = None, 0.01, 0.0, []
         self.supervised = ''
         self._supervisor = wire.Publisher(node, 'supervisor/state')
         self._commands = wire.Publisher(node, 'command')
-        wire.subscribe(node, 'rotor_bridge/state', self.told.append)
+        wire.subscribe(node, 'rotor_bridge/state', self.bridge_states.append)
         node.create_subscription(BatteryState, 'battery_state', self.batteries.append,
                                  wire.profile(SENSOR))
         node.create_subscription(JointState, 'rotor_states', self.rotors.append,
@@ -62,12 +62,12 @@ class Commander(Operator):
                 self.stamps.append(stamp)
 
     def supervise(self, state):
-        """Say what the supervisor says."""
+        """Publish a state of the supervisor."""
         self.supervised = state
         self._supervisor.publish(state)
 
     def change(self, transition, timeout=SOON):
-        """Ask the bridge for a transition; whether it made it."""
+        """Request a lifecycle transition; return whether it succeeded."""
         client = self._node.create_client(ChangeState, f'{NODE}/change_state')
         try:
             assert self.wait(client.service_is_ready, timeout)
@@ -79,11 +79,11 @@ class Commander(Operator):
 
     @property
     def bridge(self):
-        """What the bridge said last."""
-        return self.told[-1] if self.told else ''
+        """Newest state of the bridge."""
+        return self.bridge_states[-1] if self.bridge_states else ''
 
     def reaches(self, state, timeout=SOON):
-        """Wait until the bridge says it."""
+        """Wait for a state of the bridge."""
         return self.wait(lambda: self.bridge.startswith(state), timeout)
 
     def told_in_diagnostics(self, status, key, condition, timeout=SOON):
@@ -92,48 +92,48 @@ class Commander(Operator):
                          timeout)
 
     def close(self):
-        """Say nothing more."""
+        """Stop publishing."""
         self._stop.set()
         self._thread.join()
         super().close()
 
 
 class Bench:
-    """One board, one bridge, one commander."""
+    """One board, one bridge, one commanding node."""
 
     def __init__(self, board, graph, commander):
         self.board, self.graph, self.commander = board, graph, commander
 
     def take_off(self):
-        """From rest to rotors that turn as commanded."""
+        """Take off and wait until the rotors turn as commanded."""
         commander, board = self.commander, self.board
-        assert commander.reaches('ready'), (commander.told, self.log)
+        assert commander.reaches('ready'), (commander.bridge_states, self.log)
         commander.supervise('takeoff')
-        assert commander.wait(lambda: board.armed, SOON), (commander.told, self.log)
+        assert commander.wait(lambda: board.armed, SOON), (commander.bridge_states, self.log)
         commander.thrust = HOVER
-        assert commander.wait(lambda: self.follows(), SOON), (commander.told, self.log)
+        assert commander.wait(lambda: self.follows(), SOON), (commander.bridge_states, self.log)
 
     def follows(self, thrust=HOVER):
-        """Whether the rotors strive for these thrusts within 0.1 %."""
+        """Whether the rotors' targets are these thrusts within 0.1 %."""
         return np.allclose(self.board.thrust_targets, thrust, rtol=1e-3, atol=0)
 
     def rest(self):
-        """Back to disarmed, nothing wrong, whatever happened."""
+        """Restore the disarmed state without faults."""
         board, commander = self.board, self.commander
         board.faults = type(board.faults)()
         board.on_target = None
         board.plug()
         board.set_battery(25.2, 0.0)
         commander.thrust, commander.period, commander.age = None, 0.01, 0.0
-        flew, told = commander.supervised != 'disarmed', len(commander.told)
+        flew, count = commander.supervised != 'disarmed', len(commander.bridge_states)
         commander.supervise('disarmed')
         # The 'ready' of the flight is not yet that of the ground.
-        return commander.wait(lambda: not flew or len(commander.told) > told, SOON) \
+        return commander.wait(lambda: not flew or len(commander.bridge_states) > count, SOON) \
             and commander.reaches('ready') and not board.armed
 
     @property
     def log(self):
-        """What the bridge has printed, and how it ended."""
+        """Output and exit status of the bridge."""
         return self.graph.log(NODE).read_text(), self.graph.dead()
 
 

@@ -1,4 +1,4 @@
-"""What tests of the joint bridge share: a real node, emulated servos, and an operator of both."""
+"""Test bench of joint_bridge_node: its process, emulated servos and an operator."""
 
 from contextlib import contextmanager
 import time
@@ -31,14 +31,14 @@ TRANSITIONS = {'configure': Transition.TRANSITION_CONFIGURE,
 
 
 class ServoWitness(Operator):
-    """An operator who commands tilts and sees what the joint bridge makes of them."""
+    """Operator that commands tilts and observes the joint bridge."""
 
     def __init__(self, number):
         super().__init__(number)
         node = self._node
-        self.told, self.joints, self.arrivals = [], [], []
+        self.bridge_states, self.joints, self.arrivals = [], [], []
         self.goal, self.age = None, 0.0
-        wire.subscribe(node, 'joint_bridge/state', self.told.append)
+        wire.subscribe(node, 'joint_bridge/state', self.bridge_states.append)
         node.create_subscription(JointState, 'joint_states', self._on_joints, wire.profile(SENSOR))
         self._command = wire.Publisher(node, 'command')
         self._clients = {}
@@ -56,11 +56,11 @@ class ServoWitness(Operator):
 
     @property
     def now(self):
-        """What the bridge says of itself."""
-        return self.told[-1] if self.told else ''
+        """Newest state of the bridge."""
+        return self.bridge_states[-1] if self.bridge_states else ''
 
     def ask(self, kind, name, request):
-        """Call a service of the node; its response."""
+        """Call a service of the node; return its response."""
         if name not in self._clients:
             self._clients[name] = self._node.create_client(kind, f'{NODE}/{name}')
         client = self._clients[name]
@@ -70,7 +70,7 @@ class ServoWitness(Operator):
         return future.result()
 
     def change(self, name):
-        """Make a transition; whether it was made."""
+        """Request a lifecycle transition; return whether it succeeded."""
         request = ChangeState.Request()
         request.transition.id = TRANSITIONS[name]
         return self.ask(ChangeState, 'change_state', request).success
@@ -81,7 +81,7 @@ class ServoWitness(Operator):
         return self.ask(GetState, 'get_state', GetState.Request()).current_state.label
 
     def trigger(self, name):
-        """Call a Trigger service; (accepted, answer)."""
+        """Call a Trigger service; return (accepted, answer)."""
         response = self.ask(Trigger, name, Trigger.Request())
         return response.success, response.message
 
@@ -93,11 +93,11 @@ class ServoWitness(Operator):
         assert all(one.successful for one in future.result().results)
 
     def until(self, condition, why=''):
-        """Wait for it."""
-        assert self.wait(condition, WITHIN), f'{why} {self.told[-3:]}'
+        """Wait until a condition holds."""
+        assert self.wait(condition, WITHIN), f'{why} {self.bridge_states[-3:]}'
 
     def go_to(self, stage):
-        """Bring the node to a lifecycle state, from wherever it is."""
+        """Bring the node to a lifecycle state from any other."""
         path = {'unconfigured': 0, 'inactive': 1, 'active': 2}
         end = time.monotonic() + WITHIN
         while (here := path[self.stage]) != path[stage]:
@@ -107,19 +107,19 @@ class ServoWitness(Operator):
             assert self.change(name) or time.monotonic() < end, f'{name}: {self.now}'
 
     def numbers(self, name):
-        """Values of a status that is told from now on."""
+        """Values of the next message of a status."""
         self.diagnostics.pop(f'{NODE}: {name}', None)
         self.until(lambda: f'{NODE}: {name}' in self.diagnostics, f'no status {name}')
         return self.diagnostics[f'{NODE}: {name}'].values
 
     def level(self, name):
-        """Level and text of a status that is told from now on."""
+        """Level and text of the next message of a status."""
         self.numbers(name)
         status = self.diagnostics[f'{NODE}: {name}']
         return status.level, status.message
 
     def angles(self):
-        """Newest complete angles (4,), or None when the newest message is incomplete."""
+        """Newest angles (4,), or None if the newest message is incomplete."""
         if not self.joints or list(self.joints[-1].name) != list(JOINT_NAMES):
             return None
         return np.array(self.joints[-1].position)
@@ -132,7 +132,7 @@ class ServoWitness(Operator):
 
 @contextmanager
 def joint_bridge(folder, others=(), **parameters):
-    """Run the node in a process of its own, or composed with others; yield graph and witness."""
+    """Run the node in a separate process, or composed with others; yield graph and witness."""
     with discovery.reserved_domain() as number:
         graph = Graph({NODE: {**PATIENT, **parameters}, **{name: {} for name in others}}, folder,
                       number, composed=bool(others))
@@ -140,7 +140,7 @@ def joint_bridge(folder, others=(), **parameters):
         try:
             graph.start()
             witness = ServoWitness(number)
-            witness.until(lambda: witness.told, 'no state')
+            witness.until(lambda: witness.bridge_states, 'no state')
             yield graph, witness
         finally:
             stubborn = graph.stop()

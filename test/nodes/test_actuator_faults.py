@@ -27,7 +27,7 @@ DEVICES = 'sim_node: devices'
 
 
 class Mechanic(Witness):
-    """A witness who breaks and mends the simulated devices; ``sound`` where all are mended."""
+    """Witness that sets faults of the simulated devices; ``sound`` if there are none."""
 
     sound = False
 
@@ -44,18 +44,18 @@ class Mechanic(Witness):
         assert result.successful, result.reason
 
     def device(self, key):
-        """What the simulator says about its devices, fresh; a number or a text."""
+        """Newest value of the devices' diagnostics, as number or text."""
         self.diagnostics.pop(DEVICES, None)
         assert self.wait(lambda: DEVICES in self.diagnostics, 5), 'sim_node is silent'
         return self.values(DEVICES)[key]
 
     def start(self):
-        """Arm, as soon as the bridges are ready, and wait until the controller flies."""
+        """Arm as soon as the bridges are ready, and wait until the controller flies."""
         assert self.wait(lambda: not self.waits_for(BRIDGES), 20), self.waits_for(BRIDGES)
         self.take_off(lambda: self.state == FLYING)
 
     def count(self, node, status, key):
-        """A counter of a bridge's diagnostics; 0 while it is not there."""
+        """A counter of a bridge's diagnostics; 0 if missing."""
         return int(self.values(f'{node}: {status}').get(key, 0))
 
     def ask(self, service):
@@ -69,7 +69,7 @@ class Mechanic(Witness):
 
 @contextmanager
 def airborne(folder):
-    """Graph and mechanic of a robot in the air, in a ROS domain of its own."""
+    """Graph and mechanic of a flying robot, in a separate ROS domain."""
     parameters = {'sim_node': {}, 'ekf_node': {}, 'nmpc_node': {}, 'supervisor_node': PATIENT}
     for node, values in bridge_parameters(folder, {}).items():
         parameters[node] = {**parameters.get(node, {}), **values}
@@ -92,14 +92,14 @@ def airborne(folder):
 
 @pytest.fixture(scope='module')
 def hangar():
-    """Keeps a robot from one test to the next."""
+    """Keeps a flying robot from one test to the next."""
     with ExitStack() as stack:
         yield SimpleNamespace(stack=stack, robot=None)
 
 
 @pytest.fixture
 def robot(hangar, tmp_path):
-    """Graph and mechanic of a robot in the air: the last test's, if that left it sound there."""
+    """Graph and mechanic of a flying robot, if possible those of the last test."""
     if hangar.robot is None:
         hangar.robot = hangar.stack.enter_context(airborne(tmp_path))
     graph, mechanic = hangar.robot
@@ -132,7 +132,7 @@ BEARABLE = [
 ]
 
 
-def test_faults_that_drivers_bear_do_not_end_a_flight(robot):
+def test_faults_that_drivers_recover_from_do_not_end_a_flight(robot):
     graph, mechanic = robot
     for switched, mended, bridge, status, counter in BEARABLE:
         where = f'{bridge}_bridge_node', status, counter
@@ -159,14 +159,14 @@ LANDING = [
 ]
 
 
-def test_what_does_not_obey_or_is_not_heard_ends_the_flight_with_a_landing(robot):
+def test_a_failed_or_silent_actuator_ends_the_flight_with_a_landing(robot):
     graph, mechanic = robot
     for name, value, mended, text, reboot in LANDING:
-        said = []
+        states = []
         mechanic.set(name, value)
-        assert mechanic.wait(lambda s=said: s.extend(mechanic.bridges.values())
+        assert mechanic.wait(lambda s=states: s.extend(mechanic.bridges.values())
                              or mechanic.state == 'landing', 5), (name, mechanic.states)
-        assert any(line.startswith(text) for line in said), (name, set(said))
+        assert any(line.startswith(text) for line in states), (name, set(states))
         sinking = []
         assert mechanic.wait(lambda s=sinking: s.append(mechanic.truth.velocity[2])
                              or mechanic.state in ('disarmed', 'emergency_stop'), 30), name
@@ -181,7 +181,7 @@ def test_what_does_not_obey_or_is_not_heard_ends_the_flight_with_a_landing(robot
 
 
 def rests(mechanic):
-    """Whether no rotor may turn and nothing tells it to."""
+    """Whether no rotor is commanded to turn, and none may."""
     return mechanic.device('armed') == 'False' and not np.any(mechanic.last_command[1].thrust)
 
 

@@ -1,4 +1,4 @@
-"""What the nodes add to the pure code: pacing, triggering, holding, selecting, refusing."""
+"""Behaviour of the nodes beyond the pure code: triggering, holding, selecting, refusing."""
 
 from types import SimpleNamespace
 
@@ -24,7 +24,7 @@ LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
 @pytest.fixture
 def make(ros_domain):
-    """Make one node of this process, with parameters."""
+    """Make one node in this process, with parameters."""
     nodes = []
 
     def build(node_class, *overrides):
@@ -47,31 +47,31 @@ class Sent(list):
         self._topic = topic
 
     def publish(self, value):
-        """Keep it."""
+        """Store a value."""
         self.append(wire.message(self._topic, value))
 
 
 class Follower:
-    """A controller that remembers what it was asked."""
+    """A controller that records its targets."""
 
     name, period = 'follower', 0.01
 
     def __init__(self):
-        self.asked, self.resets = [], 0
+        self.received, self.resets = [], 0
 
     def reset(self):
         self.resets += 1
 
     def step(self, state, target):
-        self.asked.append((state, target))
+        self.received.append((state, target))
         return Command(state.stamp, np.zeros(4), np.full(4, 7.5))
 
     def diagnostics(self):
-        return {'steps': len(self.asked)}
+        return {'steps': len(self.received)}
 
 
 class FollowerNode(ControllerNode):
-    """The controller node with a controller that needs no solver."""
+    """The controller node with a controller without solver."""
 
     def __init__(self):
         super().__init__(ControllerEntry(name='nmpc', controller=Follower))
@@ -135,12 +135,12 @@ def test_without_a_target_it_holds_the_pose_of_the_hand_over(make):
     fly(node, [100.0], height=0.2)
     node._on_mode('flying:nmpc')
     fly(node, [100.01], height=1.3)
-    heights = [target.position[2] for _, target in node.follower.asked]
+    heights = [target.position[2] for _, target in node.follower.received]
     assert heights == [0.2, 0.2]
     node._on_mode('disarmed')
     assert node.follower.resets == 1
     fly(node, [101.0], height=0.4)
-    assert node.follower.asked[-1][1].position[2] == 0.4
+    assert node.follower.received[-1][1].position[2] == 0.4
 
 
 def test_the_newest_target_counts_and_an_unset_stamp_means_now(make):
@@ -149,11 +149,11 @@ def test_the_newest_target_counts_and_an_unset_stamp_means_now(make):
     for stamp, x in ((50.0, 1.0), (60.0, 2.0), (50.0, 3.0)):
         node._on_target(PoseTarget(np.array([x, 0, 0]), LEVEL, stamp))
     fly(node, [100.0])
-    assert node.follower.asked[-1][1].position[0] == 2.0
+    assert node.follower.received[-1][1].position[0] == 2.0
     node._on_target(PoseTarget(np.array([4.0, 0, 0]), LEVEL, 0.0))
     fly(node, [101.0])
-    assert node.follower.asked[-1][1].position[0] == 4.0
-    assert node.follower.asked[-1][1].stamp == pytest.approx(node.now(), abs=5)
+    assert node.follower.received[-1][1].position[0] == 4.0
+    assert node.follower.received[-1][1].stamp == pytest.approx(node.now(), abs=5)
 
 
 def test_the_payload_changes_in_flight_within_its_range(make):
@@ -227,7 +227,7 @@ def test_trajectory_windows_join_without_a_gap_and_keep_to_the_path(make, monkey
     assert conversions.take_trajectory(node._trajectories[0]).times[0] == pytest.approx(2008.0)
 
 
-def test_the_estimator_publishes_only_what_it_believes(make):
+def test_the_estimator_publishes_only_valid_estimates(make):
     node = make(EkfNode)
     node._publisher = Sent('odom')
     at_rest = np.array([0, 0, 9.80665])

@@ -1,4 +1,4 @@
-"""Targets are heard once, however they are published, and nobody warns of their offers."""
+"""Targets are received once with any quality of service, without warnings."""
 
 import time
 
@@ -18,7 +18,7 @@ SOON = 10       # s
 
 
 class Bench:
-    """A recorder, and a user who publishes targets to it."""
+    """A recorder, and a node that publishes targets."""
 
     def __init__(self, domain, bag):
         rclpy.init(args=['--ros-args', '-p', f'bag:={bag}'], domain_id=domain)
@@ -42,7 +42,7 @@ class Bench:
         return self.recorder._bag.counts['/target_pose']
 
     def publish(self, publisher, height):
-        """Publish when somebody listens; wait until it is written."""
+        """Publish after the subscription; wait until the message is written."""
         before, end = self.written(), time.monotonic() + SOON
         message = PoseStamped()
         message.pose.position.z, message.pose.orientation.w = height, 1.0
@@ -73,7 +73,7 @@ def test_a_volatile_target_is_recorded_without_an_incompatible_offer(bench, tmp_
     assert log.targets[0].stamp == pytest.approx(time.time(), abs=60)   # unstamped: as it came
 
 
-def test_a_latched_target_of_before_is_recorded(bench):
+def test_a_target_latched_before_the_start_is_recorded(bench):
     publisher = bench.publisher(wire.profile(LATCHED))
     publisher.publish(PoseStamped())        # nobody can listen yet
     end = time.monotonic() + SOON
@@ -84,7 +84,7 @@ def test_a_latched_target_of_before_is_recorded(bench):
 
 
 @pytest.mark.parametrize('profile', [wire.profile(EVENT), wire.profile(LATCHED), BEST_EFFORT])
-def test_each_target_is_recorded_once_whatever_is_offered(bench, profile):
+def test_each_target_is_recorded_once_with_any_quality_of_service(bench, profile):
     publisher = bench.publisher(profile)
     bench.spin(1.2)     # the subscriptions that it needs are there
     assert [bench.publish(publisher, height) for height in (1.0, 1.1, 1.2)] == [1, 1, 1]

@@ -23,28 +23,29 @@ def test_a_callback_gets_the_time_at_which_its_message_was_published(make, ros_d
     node = rclpy.create_node('listener', context=context)
     executor = make(context=context)
     executor.add_node(node)
-    heard = []
+    received = []
     node.create_subscription(String, 'word', wire.with_publication(
-        lambda message, published: heard.append((message.data, published))), wire.profile(COMMAND))
+        lambda message, published: received.append((message.data, published))),
+        wire.profile(COMMAND))
     publisher = node.create_publisher(String, 'word', wire.profile(COMMAND))
     try:
         deadline = time.monotonic() + PATIENCE
-        while not heard and time.monotonic() < deadline:
+        while not received and time.monotonic() < deadline:
             before = time.time()
             publisher.publish(String(data='now'))
             after = time.time()
             executor.spin_once(timeout_sec=0.2)
-        assert heard[0][0] == 'now'
-        assert before - 1e-3 <= heard[0][1] <= after + 1e-3
+        assert received[0][0] == 'now'
+        assert before - 1e-3 <= received[0][1] <= after + 1e-3
     finally:
         node.destroy_node()
         context.try_shutdown()
 
 
-def test_a_middleware_that_tells_no_time_gives_nan():
-    heard = []
-    take = wire.with_publication(lambda message, published: heard.append(published))
+def test_a_middleware_without_publication_times_gives_nan():
+    received = []
+    take = wire.with_publication(lambda message, published: received.append(published))
     take('message', {'source_timestamp': 0})
     take(('message', {}))
     take('message', {'source_timestamp': 2_500_000_000})
-    assert math.isnan(heard[0]) and math.isnan(heard[1]) and heard[2] == 2.5
+    assert math.isnan(received[0]) and math.isnan(received[1]) and received[2] == 2.5

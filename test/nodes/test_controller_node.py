@@ -1,4 +1,4 @@
-"""Any registered controller as a node: by name, by its class, in a whole graph."""
+"""Any registered controller as a node: by name, by class, in a whole graph."""
 
 import math
 import os
@@ -28,7 +28,7 @@ OWN = f"{Path(__file__).resolve().parents[2] / 'examples' / 'own_controller.py'}
 
 @pytest.fixture
 def make(ros_domain):
-    """Make one node of this process, with parameters."""
+    """Make one node in this process, with parameters."""
     nodes = []
 
     def build(node_class, *overrides):
@@ -44,11 +44,11 @@ def make(ros_domain):
 
 
 def topics(node):
-    """Names that a node publishes."""
+    """Topics that a node publishes."""
     return [publisher.topic_name for publisher in node.publishers]
 
 
-def test_the_parameter_says_which_controller_a_node_runs(make):
+def test_a_parameter_selects_the_controller_of_a_node(make):
     node = make(ControllerNode, f'controller:={OWN}')
     assert node.get_name() == 'pose_controller_node'
     assert '/pose_controller/command' in topics(node)
@@ -56,7 +56,7 @@ def test_the_parameter_says_which_controller_a_node_runs(make):
     assert node._controller_status()[2] == {'guidance': 'none'}
 
 
-def test_a_shipped_one_comes_with_its_parameters_and_its_own_policy(make):
+def test_a_shipped_controller_has_its_parameters_and_policy(make):
     node = make(ControllerNode, 'controller:=rl_memory', 'unwinding.attempts:=0')
     assert node.get_name() == 'rl_memory_node'
     assert node.get_parameter('policy').value == registry.find('rl_memory').policy_file
@@ -84,7 +84,7 @@ def test_any_controller_sees_true_tilts_and_no_target_beyond_its_reach(make, mon
         node._check_target(far, math.nan)
 
 
-def test_the_supervisor_knows_those_that_it_is_told(make):
+def test_the_supervisor_accepts_the_listed_controllers(make):
     node = make(SupervisorNode, f"controllers:=['nmpc','{OWN}']", 'controller:=pose_controller')
     assert node._supervisor.active == 'pose_controller'
     assert node.get_parameter('controllers').value == ['nmpc', OWN]
@@ -92,7 +92,7 @@ def test_the_supervisor_knows_those_that_it_is_told(make):
     assert not refused.successful and 'nmpc, pose_controller' in refused.reason
 
 
-def test_an_active_controller_that_the_supervisor_does_not_know_is_refused(make):
+def test_an_active_controller_outside_the_supervisors_list_is_refused(make):
     with pytest.raises(ParameterError, match="'controller': expected one of nmpc, rl, found 'x'"):
         make(SupervisorNode, 'controller:=x')
 
@@ -101,7 +101,7 @@ def test_an_active_controller_that_the_supervisor_does_not_know_is_refused(make)
     ((), "'controller': missing"), (('-p', 'controller:=nmpx'), "'nmpx': expected one of nmpc"),
     (('-p', 'controller:=absent.module:My'), "no module 'absent'"),
     (('-p', f'controller:={OWN}Not'), 'its classes: PoseController')])
-def test_what_cannot_be_flown_ends_the_node_with_one_line(ros_domain, override, message):
+def test_an_unusable_controller_ends_the_node_with_one_line(ros_domain, override, message):
     done = subprocess.run(
         [sys.executable, '-m', 'beetle_omni_ros.nodes.controller_node', '--ros-args', *override],
         capture_output=True, text=True, timeout=60, check=False, env=dict(os.environ))
@@ -126,7 +126,7 @@ def test_the_plan_of_a_graph_with_another_controller():
     assert list(alone) == ['sim_node', 'ekf_node', 'pose_controller_node', 'supervisor_node']
 
 
-def test_topics_of_any_controller_are_told_from_those_of_a_robot():
+def test_topics_of_any_controller_are_distinguished_from_those_of_a_robot():
     assert split_topic('/nmpc/command') == ('', 'nmpc/command')
     assert split_topic('/robot1/rl/command') == ('/robot1', 'rl/command')
     assert split_topic('/robot1/command') == ('/robot1', 'command')

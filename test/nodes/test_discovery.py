@@ -1,4 +1,4 @@
-"""Nodes are found on this computer alone, however they are started, until somebody opens it."""
+"""Discovery is limited to this computer unless another range is requested."""
 
 import os
 import subprocess
@@ -30,7 +30,7 @@ def unset(monkeypatch):
     ({'BEETLE_OMNI_DISCOVERY': 'subnet', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}, 'SUBNET'),
     ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, 'SUBNET'),
     ({'ROS_STATIC_PEERS': '192.168.1.2'}, None), ({'ROS_LOCALHOST_ONLY': '0'}, None)])
-def test_what_a_user_has_chosen_holds(given, holds):
+def test_the_users_setting_has_precedence(given, holds):
     discovery.confine(given)
     assert given.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == holds
 
@@ -52,7 +52,7 @@ def test_every_node_that_is_started_alone_or_composed_is_confined(ros_domain, un
     assert done.stderr.strip() == 'probe_node: error: SUBNET'
 
 
-def test_one_argument_of_a_node_opens_it(ros_domain, unset):
+def test_an_argument_of_a_node_sets_the_range(ros_domain, unset):
     def start(*arguments):
         code = f'{PROBE}runner.main(ProbeNode, ["probe", *{list(arguments)!r}])'
         return subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
@@ -64,7 +64,7 @@ def test_one_argument_of_a_node_opens_it(ros_domain, unset):
         assert start(*bad).startswith('probe_node: error: --discovery: expected one of LOCALHOST')
 
 
-def test_what_a_node_composition_was_told_is_none_of_its_nodes(ros_domain, unset):
+def test_the_range_argument_of_a_composition_is_not_a_node(ros_domain, unset):
     done = subprocess.run(
         [sys.executable, '-m', 'beetle_omni_ros.nodes.composed', '--discovery', 'subnet',
          'no_node'], capture_output=True, text=True, check=False, timeout=60)
@@ -113,4 +113,4 @@ def test_an_argument_of_fly_reaches_every_node_of_the_plan(tmp_path, unset, monk
     graph = Graph(nodes, tmp_path, 7, composed)
     graph.start()
     assert len(graph.processes) == (2 if composed else len(nodes))
-    assert {told for told, _ in started.values()} == {'SUBNET'}
+    assert {value for value, _ in started.values()} == {'SUBNET'}

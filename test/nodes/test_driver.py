@@ -1,4 +1,4 @@
-"""Driving by hand through ROS: words, a stick, and what is refused."""
+"""Manual driving through ROS: lines of text, a joystick, and refusals."""
 
 import os
 import subprocess
@@ -20,7 +20,7 @@ NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node')
 
 @pytest.fixture
 def flight(ros_domain, tmp_path):
-    """A graph in simulated time that nobody flies; (domain, witness)."""
+    """A graph in simulated time without targets; (domain, witness)."""
     graph = Graph({name: {} for name in NODES}, tmp_path, ros_domain, simulated=True)
     witness = None
     try:
@@ -41,7 +41,7 @@ def drive(source, domain):
         stderr=subprocess.PIPE, text=True, env={**os.environ, 'COLUMNS': '300'})
 
 
-def test_words_fly_the_robot_and_the_fence_holds(flight):
+def test_lines_of_text_fly_the_robot_within_the_fence(flight):
     domain, witness = flight
     driver = drive('terminal', domain)
     driver.stdin.write('up 1\narm\nwait\njump\ngoto 40 0 1\nup 0.4\nroll 60\nwait\nwhere\n')
@@ -50,16 +50,16 @@ def test_words_fly_the_robot_and_the_fence_holds(flight):
     witness.wait(lambda: driver.poll() is not None, 60)
     output, error = driver.communicate(timeout=10)
     assert driver.returncode == 0, output + error
-    said = iter(output.splitlines())
+    lines = iter(output.splitlines())
     for part in ('arm first', 'arm: ', "'jump': expected", 'the fence', 'flying:nmpc; at', 'left'):
-        assert any(part in line for line in said), output
+        assert any(part in line for line in lines), output
     truth = witness.truth
     assert truth.position[2] == pytest.approx(1.4, abs=0.1)
     assert rotations.geodesic_angle(truth.quaternion, rotations.from_rpy(
         np.radians(60), 0, rotations.to_rpy(truth.quaternion)[2])) < np.radians(8)
 
 
-def test_a_stick_moves_the_robot_at_the_speed_and_silence_holds_it(flight):
+def test_a_stick_moves_the_robot_at_its_speed_and_a_silent_joystick_holds_it(flight):
     domain, witness = flight
     p, driver = DriveParameters.load(), drive('joystick', domain)
     joy = witness._node.create_publisher(Joy, 'joy', wire.profile(EVENT))
@@ -97,21 +97,21 @@ def test_a_stick_moves_the_robot_at_the_speed_and_silence_holds_it(flight):
         driver.communicate(timeout=10)
 
 
-@pytest.mark.parametrize(('arguments', 'said'), [
+@pytest.mark.parametrize(('arguments', 'expected'), [
     (['wheel'], "source 'wheel': expected keyboard or joystick or terminal"),
     (['keyboard'], 'standard input is no terminal'),
     (['terminal', '--params', 'none.yaml'], 'none.yaml'),
     (['terminal', '--poses', 'none.yaml'], 'none.yaml'),
     (['terminal', '--domain-id', '300'], "--domain-id '300': expected")])
-def test_what_cannot_drive_is_refused_in_one_line(capsys, monkeypatch, arguments, said):
+def test_an_unusable_source_is_refused_in_one_line(capsys, monkeypatch, arguments, expected):
     from beetle_omni_ros import cli
     monkeypatch.setattr(sys, 'stdin', open(os.devnull))
     assert cli.main(['drive', *arguments]) == 2
     line, = capsys.readouterr().err.splitlines()
-    assert said in line
+    assert expected in line
 
 
-def test_without_a_graph_it_says_what_it_missed(ros_domain, monkeypatch, capfd):
+def test_without_a_graph_the_missing_topic_is_named(ros_domain, monkeypatch, capfd):
     from beetle_omni_ros.nodes import driver
     monkeypatch.setattr(driver, 'SUPERVISOR_TIMEOUT', 0.3)
     assert driver.run_drive('terminal', domain_id=ros_domain) == 1

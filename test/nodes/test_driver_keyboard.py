@@ -1,4 +1,4 @@
-"""Driving by keys in a terminal: keys in, targets out, and the terminal as it was afterwards."""
+"""Manual driving by keys: targets from keys, and the restored terminal."""
 
 import fcntl
 import os
@@ -25,7 +25,7 @@ PATIENCE = 60       # [s]
 
 
 class Terminal:
-    """A terminal in which `beetle_omni drive keyboard` runs, as a shell starts it."""
+    """A terminal with `beetle_omni drive keyboard`, started like by a shell."""
 
     def __init__(self, domain):
         self.mine, self.its = pty.openpty()
@@ -37,7 +37,7 @@ class Terminal:
         self.text = ''
 
     def _control(self):
-        """Let its Ctrl-C reach what runs in it."""
+        """Make it the controlling terminal, so that Ctrl-C reaches the program."""
         os.setsid()
         fcntl.ioctl(self.its, termios.TIOCSCTTY, 0)
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -46,7 +46,7 @@ class Terminal:
         os.write(self.mine, keys.encode())
 
     def shows(self, text):
-        """Whether it has printed ``text``."""
+        """Whether the program has printed ``text``."""
         while select.select([self.mine], [], [], 0)[0]:
             self.text += os.read(self.mine, 4096).decode()
         return text in self.text
@@ -60,7 +60,7 @@ class Terminal:
         return bool(self.state[LOCAL_FLAGS] & termios.ECHO)
 
     def ends(self, witness):
-        """Status of its program."""
+        """Exit status of the program."""
         assert witness.wait(lambda: self.shows('') or self.process.poll() is not None, PATIENCE)
         deadline = time.monotonic() + PATIENCE
         while self.process.poll() is None and time.monotonic() < deadline:
@@ -78,7 +78,7 @@ class Terminal:
 
 @pytest.fixture
 def driven(ros_domain, tmp_path):
-    """A graph in simulated time, who watches it, its targets, and a terminal that drives it."""
+    """A graph in simulated time, its witness, its targets, and a driving terminal."""
     graph = Graph({name: {} for name in NODES}, tmp_path, ros_domain, simulated=True)
     witness = terminal = None
     try:
@@ -97,7 +97,7 @@ def driven(ros_domain, tmp_path):
             witness.close()
 
 
-def test_keys_become_targets_and_q_gives_the_terminal_back(driven):
+def test_keys_become_targets_and_q_restores_the_terminal(driven):
     witness, targets, terminal = driven
     assert witness.wait(lambda: not terminal.echoes, 10)
     terminal.press('w')
@@ -120,7 +120,7 @@ def test_keys_become_targets_and_q_gives_the_terminal_back(driven):
     assert terminal.state == terminal.before and witness.state.startswith('flying')
 
 
-def test_ctrl_c_gives_the_terminal_back(driven):
+def test_ctrl_c_restores_the_terminal(driven):
     witness, _, terminal = driven
     assert witness.wait(lambda: not terminal.echoes, 10)
     terminal.press('\x03')

@@ -161,7 +161,7 @@ FLY = ('import sys\nfrom pathlib import Path\nfrom beetle_omni_ros.nodes.fly imp
 
 
 def fly(tmp_path, poses, arrangement, clock='auto'):
-    """Start a flight as the command line does; (process, bag, result file)."""
+    """Start a flight by the command line; (process, bag, result file)."""
     task, bag, result = tmp_path / 'poses.csv', tmp_path / 'run', tmp_path / 'result.json'
     task.write_text(HEADER + poses)
     environment = dict(os.environ)
@@ -203,7 +203,7 @@ def test_one_call_flies_and_the_bag_gives_the_printed_numbers(tmp_path):
 
 
 @pytest.mark.simulated_time
-def test_a_death_in_flight_is_named_and_nothing_is_left_behind(tmp_path):
+def test_a_killed_node_is_named_and_all_processes_end(tmp_path):
     process, bag, _ = fly(tmp_path, '0,0,1.2,0,0,0\n' * 10, 'separate', 'simulated')
     deadline, nodes = time.monotonic() + READY, {}
     try:

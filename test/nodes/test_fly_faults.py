@@ -1,4 +1,4 @@
-"""`fly --faults`: what a flight through ROS cannot make fail is refused."""
+"""`fly --faults`: faults that a flight through ROS cannot simulate are refused."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from beetle_omni_ros import cli
     ('controller_silent, at: 1', [], 'expected a fault of the robot'),
     ('joints_lost', ['--actuators', 'emulated'], 'expected --actuators direct'),
     ('rotor_stops', [], "'rotor' is missing")])
-def test_what_this_flight_cannot_make_fail_is_refused(capsys, tmp_path, fault, more, named):
+def test_faults_that_this_flight_cannot_simulate_are_refused(capsys, tmp_path, fault, more, named):
     file = tmp_path / 'faults.yaml'
     file.write_text(f'faults: [{{what: {fault}}}]\n')
     assert cli.main(['fly', '--bag', str(tmp_path / 'bag'), '--faults', str(file), *more]) == 2

@@ -18,7 +18,7 @@ def test_quantiles_agree_with_sorting_within_two_percent(spread):
     assert distribution.max == samples.max() and distribution.count == 5000
 
 
-def test_an_empty_distribution_says_so_and_extremes_fit():
+def test_an_empty_distribution_gives_nan_and_extremes_are_counted():
     distribution = Distribution()
     assert np.isnan(distribution.quantile(0.5))
     for sample in (0.0, 1e-9, 1e4):

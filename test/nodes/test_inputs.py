@@ -1,4 +1,4 @@
-"""What nodes refuse from topics and in flight, and that what they had stays."""
+"""Refusals of messages and parameters, after which the previous values remain."""
 
 import re
 import time
@@ -40,7 +40,7 @@ SOON = 10       # s; a busy test machine must not look like a fault
 
 
 class StillNode(ControllerNode):
-    """The controller node around nothing."""
+    """The controller node without a solver."""
 
     def __init__(self):
         super().__init__(ControllerEntry(name='nmpc', controller=lambda: SimpleNamespace(
@@ -49,7 +49,7 @@ class StillNode(ControllerNode):
 
 
 class Bench:
-    """One node of this process, and another that publishes to it."""
+    """A node in this process, and another that publishes to it."""
 
     def __init__(self, domain, *overrides):
         arguments = [a for override in overrides for a in ('-p', override)]
@@ -60,30 +60,30 @@ class Bench:
         self.nodes = [self.user]
 
     def add(self, node):
-        """Spin this node too; log lines of its refusals are kept in ``node.said``."""
-        node.said = []
+        """Spin this node too; log lines of its refusals are kept in ``node.refusals``."""
+        node.refusals = []
         before = node.health.rejected
         node.health.rejected = lambda topic, reason, kind='': (
-            node.said.append(f'{topic}: {reason}'), before(topic, reason, kind))
+            node.refusals.append(f'{topic}: {reason}'), before(topic, reason, kind))
         self.executor.add_node(node)
         self.nodes.append(node)
         return node
 
     def publisher(self, kind, topic, profile=wire.profile(EVENT), readers=1):
-        """Make a publisher that is heard."""
+        """Make a publisher and wait for its subscription."""
         made = self.user.create_publisher(kind, topic, profile)
         assert self.wait(lambda: made.get_subscription_count() >= readers)
         return made
 
     def wait(self, condition, timeout=SOON):
-        """Spin until it holds."""
+        """Spin until a condition holds."""
         end = time.monotonic() + timeout
         while not condition() and time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.02)
         return condition()
 
     def close(self):
-        """End."""
+        """Destroy the nodes."""
         for node in self.nodes:
             self.executor.remove_node(node)
             node.destroy_node()
@@ -92,7 +92,7 @@ class Bench:
 
 @pytest.fixture
 def bench(ros_domain):
-    """Without a node yet."""
+    """A bench without a node."""
     made = Bench(ros_domain)
     yield made
     made.close()
@@ -110,16 +110,16 @@ def test_a_bad_target_pose_is_refused_with_its_reason_and_the_old_one_stays(benc
     poses.publish(pose())
     assert bench.wait(lambda: node._target is not None)
     first, now = node._target, time.time()
-    for message, said in (
+    for message, expected in (
             (pose(-5.0), 'z = -5 m, expected at least'),
             (pose(0.05), 'z = 0.05 m, expected at least'), (pose(1e300), 'the fence'),
             (pose(x=25.0), '|x| = 25 m, expected at most'), (pose(frame='map'), "frame_id 'map'"),
             (pose(stamp=1.5), 's old, expected at most 10 s'),
             (pose(stamp=now + 100), 's ahead, expected at most')):
-        heard = len(node.said)
+        received = len(node.refusals)
         poses.publish(message)
-        assert bench.wait(lambda heard=heard: len(node.said) > heard), said
-        assert node.said[-1].startswith('target_pose: ') and said in node.said[-1]
+        assert bench.wait(lambda received=received: len(node.refusals) > received), expected
+        assert node.refusals[-1].startswith('target_pose: ') and expected in node.refusals[-1]
         assert node._target is first
     kinds = node.health._inputs['target_pose'].rejected
     assert kinds['cannot be flown'] == 6 and kinds.total() == 7
@@ -141,7 +141,7 @@ def test_a_stamp_of_1970_is_refused_in_simulated_time_too(bench, monkeypatch):
     for time_now, stamp, good in (
             (now, 1.5, False), (now, now + 1e5, False), (now, now - 60, True),
             (100.0, 1.5, True), (0.0, now, True), (100.0, now, False)):
-        monkeypatch.setattr(node, 'now', lambda told=time_now: told)
+        monkeypatch.setattr(node, 'now', lambda t=time_now: t)
         target = conversions.take_pose_target(pose(stamp=stamp))
         if good:
             node._check_target(target, now)
@@ -159,7 +159,7 @@ def test_a_latched_target_stays_good_for_a_node_that_starts_later(bench, monkeyp
     assert bench.wait(lambda: node._target is not None)
 
 
-def test_a_target_beyond_the_reach_of_who_flies_is_refused_and_not_taken_over(bench):
+def test_a_target_beyond_the_reach_of_the_active_controller_is_refused_and_not_taken_over(bench):
     node = bench.add(StillNode())
     node._controller.reach = 6.5
     node._position = np.array([0.0, 0.0, 1.0])
@@ -167,13 +167,14 @@ def test_a_target_beyond_the_reach_of_who_flies_is_refused_and_not_taken_over(be
     poses.publish(pose(x=12.0))
     assert bench.wait(lambda: node._target is not None)     # on standby: another may get there
     node._on_mode('flying:nmpc')
-    assert node._target is None and 'the present pose is held' in node.said[-1]
+    assert node._target is None and 'the present pose is held' in node.refusals[-1]
     poses.publish(pose(x=3.0))
     assert bench.wait(lambda: node._target is not None)
-    near, heard = node._target, len(node.said)
+    near, received = node._target, len(node.refusals)
     poses.publish(pose(x=12.0))
-    assert bench.wait(lambda: len(node.said) > heard)
-    assert node._target is near and '12 m from the robot, expected at most 6.5 m' in node.said[-1]
+    assert bench.wait(lambda: len(node.refusals) > received)
+    assert node._target is near
+    assert '12 m from the robot, expected at most 6.5 m' in node.refusals[-1]
 
 
 def trajectory(heights, stamp):
@@ -188,13 +189,13 @@ def test_every_point_of_a_target_trajectory_is_checked(bench):
     node = bench.add(StillNode())
     paths = bench.publisher(MultiDOFJointTrajectory, 'target_trajectory')
     paths.publish(trajectory([1.0, 1.1, -5.0], time.time()))
-    assert bench.wait(lambda: node.said)
-    assert node.said[0].startswith('target_trajectory: point 3: z = -5 m, expected')
+    assert bench.wait(lambda: node.refusals)
+    assert node.refusals[0].startswith('target_trajectory: point 3: z = -5 m, expected')
     fast = trajectory([1.0, 1.1], time.time())
     fast.points[1].velocities[0].linear.x = 1e300
     paths.publish(fast)
-    assert bench.wait(lambda: len(node.said) > 1)
-    assert 'point 2: velocity 1e+300 m/s, expected within +-10 m/s' in node.said[1]
+    assert bench.wait(lambda: len(node.refusals) > 1)
+    assert 'point 2: velocity 1e+300 m/s, expected within +-10 m/s' in node.refusals[1]
     assert node._target is None
     paths.publish(trajectory([1.0, 1.1, 1.2], time.time()))
     assert bench.wait(lambda: node._target is not None)
@@ -210,8 +211,8 @@ def test_refusals_of_many_kinds_take_no_memory(bench):
 @pytest.mark.parametrize(('kind', 'overrides'), [
     (SimNode, ()), (JointBridgeNode, ('port:=/tmp/none/a',)),
     (RotorBridgeNode, ('port:=/tmp/none/b',)), (StillNode, ())])
-def test_only_the_supervisors_commands_are_obeyed_and_others_are_named(ros_domain, kind,
-                                                                       overrides):
+def test_only_the_supervisors_commands_are_executed_and_others_are_named(ros_domain, kind,
+                                                                         overrides):
     bench = Bench(ros_domain, *overrides)
     try:
         _fly_with_an_intruder(bench, bench.add(kind()))
@@ -220,9 +221,9 @@ def test_only_the_supervisors_commands_are_obeyed_and_others_are_named(ros_domai
 
 
 def _fly_with_an_intruder(bench, node):
-    told = []
+    texts = []
     bench.user.create_subscription(
-        DiagnosticArray, 'diagnostics', lambda m: told.extend(s.message for s in m.status), 10)
+        DiagnosticArray, 'diagnostics', lambda m: texts.extend(s.message for s in m.status), 10)
     commands = bench.publisher(JointState, 'command', wire.profile(COMMAND))
     identities = bench.publisher(String, command_source.TOPIC, wire.profile(LATCHED))
     entry = node.health._inputs['command']
@@ -243,30 +244,30 @@ def _fly_with_an_intruder(bench, node):
         assert bench.wait(lambda: answer('') == 'refused')
         assert answer(own) == 'taken'
         for other in ('', 'x' * 100_000, 'supervisor_node:00000000'):
-            assert answer(other) == 'refused' and len(node.said[-1]) < 200
-        assert f"expected '{own}'" in node.said[-1]
+            assert answer(other) == 'refused' and len(node.refusals[-1]) < 200
+        assert f"expected '{own}'" in node.refusals[-1]
     time.sleep(0.6)     # silence of the supervisor gives nobody else the actuators
     assert answer('') == 'refused'
     assert bench.wait(lambda: any('command: ' in text and '2nd publisher' in text
-                                  for text in told))
+                                  for text in texts))
 
 
-def test_the_supervisor_signs_its_commands_and_tells_its_identity(bench):
-    heard, sent = [], []
-    wire.subscribe(bench.user, command_source.TOPIC, heard.append)
+def test_the_supervisor_signs_its_commands_and_publishes_its_identity(bench):
+    received, sent = [], []
+    wire.subscribe(bench.user, command_source.TOPIC, received.append)
     node = bench.add(SupervisorNode())
-    assert bench.wait(lambda: heard)
+    assert bench.wait(lambda: received)
     node._publisher._publisher = SimpleNamespace(publish=sent.append)
     node._supervisor.update = lambda now: Command(now, np.zeros(4), np.zeros(4))
     node._update()
-    assert sent[0].header.frame_id == heard[0]
-    assert re.fullmatch('supervisor_node:[0-9a-f]{8}', heard[0])
+    assert sent[0].header.frame_id == received[0]
+    assert re.fullmatch('supervisor_node:[0-9a-f]{8}', received[0])
 
 
 @pytest.mark.parametrize('kind', [
     EkfNode, SimNode, SupervisorNode, ReferenceNode, StillNode, RecorderNode, ViewerNode,
     JointBridgeNode, RotorBridgeNode])
-def test_what_is_read_only_cannot_be_set_in_flight(ros_domain, tmp_path, kind):
+def test_read_only_parameters_cannot_be_set_in_flight(ros_domain, tmp_path, kind):
     own = {JointBridgeNode: ('port:=/tmp/none/a',), RotorBridgeNode: ('port:=/tmp/none/b',),
            RecorderNode: (f'bag:={tmp_path}/bag',)}
     bench = Bench(ros_domain, *own.get(kind, ()))

@@ -1,4 +1,4 @@
-"""Signals that end a flight: one line, a complete bag, nothing left behind."""
+"""Signals that end a flight: one line, a complete bag, no process left."""
 
 import os
 from pathlib import Path
@@ -14,7 +14,7 @@ from beetle_omni_ros.runs.bag import read_bag
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_is_an_interrupt_whatever_a_library_makes_of_it(number):
+def test_a_signal_is_an_interrupt_even_if_a_library_converts_it(number):
     before = signal.getsignal(number)
     with pytest.raises(KeyboardInterrupt), sigterm_as_interrupt():
         try:
@@ -25,12 +25,12 @@ def test_a_signal_is_an_interrupt_whatever_a_library_makes_of_it(number):
     assert signal.getsignal(number) is before
 
 
-def test_an_error_without_a_signal_stays_what_it_is():
+def test_an_error_without_a_signal_is_not_changed():
     with pytest.raises(RuntimeError, match='mine'), sigterm_as_interrupt():
         raise RuntimeError('mine')
 
 
-def test_a_second_signal_does_not_cut_the_clean_up_short():
+def test_a_second_signal_does_not_interrupt_the_clean_up():
     cleaned = []
     with pytest.raises(KeyboardInterrupt), sigterm_as_interrupt():
         try:

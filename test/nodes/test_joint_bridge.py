@@ -1,4 +1,4 @@
-"""joint_bridge_node as a real process in front of emulated servos, with every fault of the bus."""
+"""joint_bridge_node as a process with emulated servos and faults of the bus."""
 
 import signal
 import time
@@ -22,7 +22,7 @@ ERROR = 2
 
 @pytest.fixture(scope='module')
 def shared(tmp_path_factory):
-    """One process and one bus for all tests that leave both whole."""
+    """One process and one bus for all tests that do not break them."""
     folder = tmp_path_factory.mktemp('joint_bridge')
     with EmulatedServoBus(motion=JOINTS, reboot_time=0.05) as emulated, \
             joint_bridge(folder, port=emulated.port) as (graph, witness):
@@ -55,7 +55,7 @@ def active(bench):
 
 
 def torque_is_back(emulated, witness, goal):
-    """Whether all is as before the fault."""
+    """Whether the state is as before the fault."""
     return witness.now == 'ready' and emulated.torque_enabled.all() and witness.stands_at(goal)
 
 
@@ -91,15 +91,15 @@ def test_angles_come_at_200_hz_with_the_time_of_their_reading(bench):
     witness.joints.clear()
     witness.arrivals.clear()
     first, began = witness.numbers('bus'), time.monotonic()
-    heard = len(witness.joints)
+    received = len(witness.joints)
     witness.spin(1.5)
     last, seconds = witness.numbers('bus'), time.monotonic() - began
-    heard = len(witness.joints) - heard
+    received = len(witness.joints) - received
     cycles, missed, torn = (int(last[key]) - int(first[key])
                             for key in ('cycles', 'missed_cycles', 'incomplete'))
     assert cycles + missed == pytest.approx(200 * seconds, rel=0.25)
     # Best effort: a busy reader loses some.
-    assert 0.5 * cycles < heard <= cycles + 60
+    assert 0.5 * cycles < received <= cycles + 60
     stamps = np.array([conversions.seconds(message.header.stamp) for message in witness.joints])
     assert (np.diff(stamps) > 0).all()
     assert (stamps < witness.arrivals).all() and (stamps > np.array(witness.arrivals) - 1).all()
@@ -108,7 +108,7 @@ def test_angles_come_at_200_hz_with_the_time_of_their_reading(bench):
     assert all(len(message.velocity) == len(message.effort) == 4 for message in whole)
 
 
-def test_a_command_moves_the_joints_and_its_latency_is_told(active):
+def test_a_command_moves_the_joints_and_its_latency_is_reported(active):
     emulated, witness = active
     witness.goal = GOAL
     witness.until(lambda: witness.stands_at(GOAL), 'does not move')
@@ -119,7 +119,7 @@ def test_a_command_moves_the_joints_and_its_latency_is_told(active):
     servo = witness.numbers('gimbal2')
     assert servo['id'] == '2' and servo['errors'] == 'none' and servo['torque'] == 'True'
     assert float(servo['voltage_v']) == 12.0 and float(servo['temperature_c']) > 20
-    # Without torque nothing moves, and the command is heard all the same.
+    # Without torque nothing moves, and the command is received all the same.
     witness.go_to('inactive')
     witness.goal = HOME
     witness.spin(0.3)
@@ -137,7 +137,7 @@ def test_stale_commands_are_not_written(active):
     witness.until(lambda: witness.stands_at(GOAL), 'not taken up again')
 
 
-def test_an_ambiguous_turn_is_refused_in_one_line_until_the_operator_says_which(bench):
+def test_an_ambiguous_turn_is_refused_in_one_line_until_the_operator_confirms_one(bench):
     emulated, witness = bench
     witness.go_to('unconfigured')
     emulated.set_state([0, 3.0, 0, 0], np.zeros(4), np.zeros(4))
@@ -241,7 +241,7 @@ def test_a_servo_can_be_rebooted_with_and_without_torque(shared, active):
 # --- the process ------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('how', [signal.SIGKILL, signal.SIGTERM])
-def test_no_torque_is_left_when_the_process_is_gone(tmp_path, how):
+def test_the_torque_is_off_after_the_process_has_ended(tmp_path, how):
     with EmulatedServoBus() as emulated:
         with joint_bridge(tmp_path, port=emulated.port, autostart='activate') as (graph, witness):
             witness.until(lambda: witness.now == 'ready')

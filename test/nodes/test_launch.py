@@ -1,4 +1,4 @@
-"""The launch file: arguments become processes (launch itself is replaced by recorders)."""
+"""The launch file: processes of its arguments (launch itself is replaced by stand-ins)."""
 
 from importlib.util import module_from_spec, spec_from_file_location
 import os
@@ -16,7 +16,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 
 
 class Recorded:
-    """Stands for any class of launch: keeps what it was made from."""
+    """Stand-in for any class of launch, which stores its arguments."""
 
     def __init__(self, *args, **kwargs):
         self.args, self.kwargs = args, kwargs
@@ -113,7 +113,7 @@ def test_simulator_and_bridges_meet_at_the_same_ports(bringup):
                                    ).kwargs['parameters'][0]
 
 
-def test_on_the_robot_the_bridges_take_their_own_files_and_give_no_torque(bringup):
+def test_on_the_robot_the_bridges_use_their_files_and_switch_no_torque_on(bringup):
     nodes = {n.kwargs['name']: n.kwargs['parameters'][0] for n in bringup.start(
         composed='false', backend='none', robot_file='r.yaml', servo_bus_file='s.yaml',
         motor_board_file='m.yaml')}
@@ -123,7 +123,7 @@ def test_on_the_robot_the_bridges_take_their_own_files_and_give_no_torque(bringu
     assert 'sim_node' not in nodes
 
 
-def test_the_plant_may_differ_from_what_is_believed(bringup):
+def test_the_plant_may_differ_from_the_robot_file(bringup):
     nodes = bringup.start(composed='false', robot_file='a.yaml', plant_file='b.yaml',
                           actuators='direct')
     given = {n.kwargs['name']: n.kwargs['parameters'][0].get('robot_file') for n in nodes}
@@ -185,7 +185,7 @@ def test_the_ports_of_a_launch_lie_in_the_users_own_folder(bringup):
     assert Path(nodes['sim_node']['servo_port']).parent.parent == private.folder()
 
 
-def test_the_browser_viewer_is_a_process_of_its_own_that_asks_for_nothing_by_itself(bringup):
+def test_the_browser_viewer_is_a_separate_process_without_targets(bringup):
     def viewers(**arguments):
         return [action.kwargs['cmd'] for action in bringup.start(**arguments)
                 if 'view' in action.kwargs.get('cmd', ())]

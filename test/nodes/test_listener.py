@@ -1,4 +1,4 @@
-"""`beetle_omni check` hears real publishers: rates, ages, twins, wrong types, bridges."""
+"""`beetle_omni check` with real publishers: rates, ages, duplicates, wrong types, bridges."""
 
 import threading
 import time
@@ -86,7 +86,7 @@ class Drivers:
         self.context.try_shutdown()
 
 
-def test_what_real_publishers_send_is_heard_and_judged(ros_domain):
+def test_messages_of_real_publishers_are_recorded_and_checked(ros_domain):
     with Drivers(ros_domain):
         for _ in range(5):      # discovery takes its time on a busy machine
             graph = listen(3.0)

@@ -1,4 +1,4 @@
-"""What the viewer hears of a graph, and what of its wishes arrives there."""
+"""The viewer's data of a graph, and its targets and selections."""
 
 import threading
 import time
@@ -21,7 +21,7 @@ TURNED = np.array([0.0, 0.0, np.sin(0.3), np.cos(0.3)])
 
 @pytest.fixture
 def graph(ros_domain):
-    """A node that stands for a graph, spun in a thread."""
+    """A node in place of a graph, spun in a thread."""
     rclpy.init(domain_id=ros_domain)
     node = rclpy.create_node('supervisor_node')
     executor = runner.make_executor()
@@ -56,13 +56,13 @@ def wait(condition):
     return False
 
 
-def test_what_the_topics_say_becomes_a_row(graph, listener):
+def test_messages_become_a_row(graph, listener):
     odom, truth, command, target = (wire.Publisher(graph, topic) for topic in (
         'odom', 'ground_truth/odom', 'command', 'target_pose'))
     target.publish(PoseTarget(np.array([0, 0, 2.0]), TURNED, 6.0))
     sampler = Sampler()
 
-    def told():
+    def complete():
         for publisher, height in ((odom, 1.01), (truth, 1.0)):
             publisher.publish(Odom(7.0, np.array([0.5, 0, height]), np.zeros(3), TURNED,
                                    np.zeros(3), np.zeros((6, 6)), np.zeros((6, 6))))
@@ -71,7 +71,7 @@ def test_what_the_topics_say_becomes_a_row(graph, listener):
         row = sampler.row(8.0)
         return not np.isnan(row[COLUMNS['thrust']]).any() and \
             pose(row, 'estimate_') and pose(row, 'target_')
-    assert wait(told)
+    assert wait(complete)
     row = sampler.row(8.0)
     np.testing.assert_allclose(row[COLUMNS['position']], [0.5, 0, 1.0])
     np.testing.assert_allclose(row[COLUMNS['estimate_position']], [0.5, 0, 1.01])
@@ -80,19 +80,19 @@ def test_what_the_topics_say_becomes_a_row(graph, listener):
     assert sampler.clock == pytest.approx(7.0)
 
 
-def test_a_target_arrives_latched_and_as_it_was_asked(graph, listener):
+def test_a_target_arrives_latched_and_unchanged(graph, listener):
     wished = PoseTarget(np.array([0.4, -0.2, 1.5]), TURNED, 12.25)
     listener.publish_target(wished)
-    heard = []      # of a subscriber that comes later
-    wire.subscribe(graph, 'target_pose', heard.append)
-    assert wait(lambda: heard)
-    found = heard[0]
+    received = []      # of a subscriber that comes later
+    wire.subscribe(graph, 'target_pose', received.append)
+    assert wait(lambda: received)
+    found = received[0]
     np.testing.assert_allclose(found.position, wished.position)
     np.testing.assert_allclose(found.quaternion, wished.quaternion)
     assert found.stamp == wished.stamp
 
 
-def test_the_supervisor_decides_who_flies(graph, listener):
+def test_the_supervisor_accepts_or_refuses_a_controller(graph, listener):
     answers = []
     graph.declare_parameter('controller', 'nmpc')
     graph.add_on_set_parameters_callback(lambda given: SetParametersResult(
@@ -108,7 +108,7 @@ def test_the_supervisor_decides_who_flies(graph, listener):
     assert graph.get_parameter('controller').value == 'rl'
 
 
-def test_who_may_not_speak_offers_no_target(graph, ros_domain):
+def test_a_read_only_graph_publishes_no_target(graph, ros_domain):
     silent = LiveGraph(domain=ros_domain)
     try:
         silent.publish_target(PoseTarget(np.zeros(3), TURNED, 1.0))

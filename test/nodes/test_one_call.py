@@ -1,4 +1,4 @@
-"""One call of `fly`: an own controller flies the whole graph, and what shall fail fails."""
+"""One call of `fly` with a user's controller in the whole graph and a fault."""
 
 import json
 import os
@@ -19,7 +19,7 @@ FAULTS = 'faults: [{what: rotor_half, at: 100}, {what: mocap_lost, at: 3, durati
 
 @pytest.fixture(scope='module')
 def flown(tmp_path_factory):
-    """Results and log of one flight: a pose, a class of a file, MoCap lost for a moment."""
+    """Results and log of a flight: one pose, a controller from a file, MoCap lost shortly."""
     folder = tmp_path_factory.mktemp('flown')
     (folder / 'poses.csv').write_text(HEADER + '0.3,0,1,20,0,30\n')
     (folder / 'faults.yaml').write_text(FAULTS)

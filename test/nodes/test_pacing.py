@@ -1,4 +1,4 @@
-"""Ticks in real time: no spiral after a stall, stamps that stay with the clock."""
+"""Ticks in real time after stalls, and stamps that follow the clock."""
 
 from types import SimpleNamespace
 
@@ -18,7 +18,7 @@ TICK, ROS = 0.005, 1.8e9
 
 @pytest.fixture
 def clock():
-    """Steady time and ROS time minus steady time; both are what the test says."""
+    """Steady time and ROS time minus steady time, both set by the test."""
     return SimpleNamespace(now=1000.0, offset=ROS)
 
 
@@ -60,7 +60,7 @@ def test_jitter_costs_no_ticks(pacing, clock):
     assert ages.max() < 0.0035 and ages.min() > -0.002
 
 
-def test_a_stall_costs_ticks_but_never_a_spiral(pacing, clock):
+def test_a_stall_costs_ticks_but_no_lasting_delay(pacing, clock):
     run(pacing, clock, 0.5)
     clock.now += 3.0                        # everything stood still
     assert pacing.due() == CATCH_UP_TICKS
@@ -109,7 +109,7 @@ def fly(waiting, clock, seconds, answers):
             waiting.answered('odom', stamp)
 
 
-def test_simulated_time_goes_on_while_everybody_answers_or_nobody_has_yet(waiting, clock):
+def test_simulated_time_continues_while_all_nodes_answer_or_none_has_yet(waiting, clock):
     fly(waiting, clock, 1.0, lambda k: None)
     fly(waiting, clock, 1.0, lambda k: waiting.now - 0.5 * LAG)
     assert waiting.ticks == 400 and waiting.waits == 0
@@ -117,7 +117,7 @@ def test_simulated_time_goes_on_while_everybody_answers_or_nobody_has_yet(waitin
 
 
 @pytest.mark.parametrize('slowness', [3, 10])
-def test_it_is_as_slow_as_the_slowest_and_never_far_ahead(waiting, clock, slowness):
+def test_simulated_time_is_as_slow_as_the_slowest_node(waiting, clock, slowness):
     leads = []
 
     def answer(k):
@@ -131,7 +131,7 @@ def test_it_is_as_slow_as_the_slowest_and_never_far_ahead(waiting, clock, slowne
     assert max(leads) <= LAG + 2 * TICK and waiting.lost_ticks == 0
 
 
-def test_who_falls_silent_is_waited_for_once_and_again_when_it_is_back(waiting, clock):
+def test_a_silent_node_is_waited_for_once_and_again_after_its_return(waiting, clock):
     fly(waiting, clock, 0.5, lambda k: waiting.now)
     fly(waiting, clock, 2.0, lambda k: None)
     silent = PATIENCE / TICK
@@ -142,7 +142,7 @@ def test_who_falls_silent_is_waited_for_once_and_again_when_it_is_back(waiting, 
     assert waiting.waits - before == pytest.approx(19, abs=1)
 
 
-def test_answers_that_never_become_newer_stop_it_for_no_longer_than_its_patience(waiting, clock):
+def test_answers_that_never_become_newer_delay_a_tick_by_at_most_the_patience(waiting, clock):
     fly(waiting, clock, 0.1, lambda k: ROS)
     before = waiting.ticks
     fly(waiting, clock, 10 * PATIENCE, lambda k: ROS)

@@ -1,4 +1,4 @@
-"""Parameters: files and overrides in, one-line refusals out, changes in flight validated."""
+"""Parameters: files, overrides, one-line refusals, changes in flight."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ class Gains:
 
 @dataclass(frozen=True, kw_only=True)
 class Example:
-    """All kinds of leaves."""
+    """Parameters of all types."""
 
     gains: Gains = group(Gains)
     mode: str = parameter('slow', doc='speed', choices=('slow', 'fast'))
@@ -33,7 +33,7 @@ class Example:
 
 @pytest.fixture
 def make_node(ros_domain):
-    """Make nodes with command line arguments; clean up after them."""
+    """Make nodes with command line arguments, and destroy them afterwards."""
     made = []
 
     def make(*arguments):
@@ -60,7 +60,7 @@ def test_overrides_arrive_in_the_dataclass(make_node):
     assert descriptor.floating_point_range[0].to_value == 10
 
 
-def test_a_file_serves_the_node_as_it_serves_the_tools(make_node, tmp_path):
+def test_node_and_tools_read_a_file_alike(make_node, tmp_path):
     file = tmp_path / 'example.yaml'
     file.write_text('/**/example:\n  ros__parameters:\n    gains: {kp: 6.5}\n    count: 2\n')
     given = parameters.declare(make_node('--params-file', str(file)), Example)

@@ -1,4 +1,4 @@
-"""Processes that the computer does not schedule for a while: what is true is told, no more."""
+"""Processes that are not scheduled for a while: only true faults are reported."""
 
 import signal
 import time
@@ -14,8 +14,8 @@ PAUSE = 0.5     # [s]
 SOFT = 0.6      # [m/s] of a touchdown; a fall by 0.1 m is faster
 
 
-def test_a_pause_of_the_computer_in_flight_ends_without_a_crash_that_was_none(ros_domain,
-                                                                              tmp_path):
+def test_a_pause_of_the_computer_in_flight_is_not_reported_as_a_crash(ros_domain,
+                                                                      tmp_path):
     options = GraphOptions(controller='nmpc', task='hover', actuators='direct',
                            ports=str(tmp_path), bag=str(tmp_path / 'bag'), standby=False)
     graph = Graph(plan(options).nodes, tmp_path, ros_domain)

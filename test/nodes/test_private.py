@@ -1,4 +1,4 @@
-"""Locks and ports lie where no other user can reach them; nothing is left behind."""
+"""Locks and ports are in a private folder, and are removed."""
 
 import os
 from pathlib import Path
@@ -112,7 +112,7 @@ def test_a_lock_that_its_holder_removes_meanwhile_is_taken_anew(temporary, monke
     second.close()
 
 
-def test_a_domain_leaves_nothing_behind_but_the_locks_of_who_lives(temporary):
+def test_a_domain_leaves_only_the_locks_of_running_processes(temporary):
     with discovery.reserved_domain() as number:
         alive = private.Lock(f'{number}.ekf_node.lock')
         (private.folder() / f'{number}.sim_node.lock').write_text('999999999')   # was killed
@@ -125,7 +125,7 @@ def test_a_node_leaves_the_file_behind_a_link_alone(temporary):
     from beetle_omni_ros.nodes.node import lock_name
     victim = temporary / 'victim'
     victim.write_text('precious')
-    told = []
+    warnings = []
 
     class Node:
         context = property(lambda self: self)
@@ -140,14 +140,14 @@ def test_a_node_leaves_the_file_behind_a_link_alone(temporary):
             return self
 
         def warning(self, text):
-            told.append(text)
+            warnings.append(text)
 
     (private.folder() / '7.ekf_node.lock').symlink_to(victim)
     assert lock_name(Node()) is None
-    assert victim.read_text() == 'precious' and '7.ekf_node.lock' in told[0]
+    assert victim.read_text() == 'precious' and '7.ekf_node.lock' in warnings[0]
 
 
-def test_folders_go_with_their_process_and_those_of_killed_ones_at_the_next_start(temporary):
+def test_folders_are_removed_with_their_process_or_at_the_next_start(temporary):
     place = private.folder()
     (place / 'ports_999999999_abc').mkdir()
     (place / f'ports_{os.getpid()}_abc').mkdir()

@@ -1,4 +1,4 @@
-"""Faults of processes: how a flight through ROS is judged, and one that is flown."""
+"""Faults of processes: outcomes of a flight through ROS, and one real flight."""
 
 import time
 from types import SimpleNamespace
@@ -16,7 +16,7 @@ LIMITS = FaultList.load().limits
 
 
 def seen(robot, *, touched=5.0, on=4.9, takeoffs=0, states=('landing:rotor1_lost',)):
-    """An observer who has seen so much; times [s] since some moment."""
+    """An observer with given observations; times in seconds."""
     zero = time.monotonic() - 10
     return SimpleNamespace(values=lambda _: robot, takeoffs=takeoffs, states=list(states),
                            thrust_at=zero + on,
@@ -28,7 +28,7 @@ SOFT, HARD = {'broken': '0', 'impact_m_s': '0.3', 'inclination_deg': '2'}, {
 BROKEN = {'broken': '1', 'impact_m_s': '4.1'}
 
 
-@pytest.mark.parametrize('observer, asked, refused, outcome', [
+@pytest.mark.parametrize('observer, flying, refused, outcome', [
     (seen(SOFT, on=6.0), True, False, 'flies_on'), (seen(SOFT, on=6.0), True, True, 'refused'),
     (seen(SOFT, on=6.0), False, False, 'lands'), (seen(HARD), False, False, 'hard'),
     (seen({**SOFT, 'inclination_deg': '40'}), False, False, 'tilted'),
@@ -37,9 +37,9 @@ BROKEN = {'broken': '1', 'impact_m_s': '4.1'}
     (seen(SOFT, touched=None), True, False, 'does not land'),
     (seen(SOFT, on=1e9), True, False, 'does not land'),
     (seen(BROKEN, takeoffs=1), False, False, 'takes off')])
-def test_a_flight_is_judged_by_truth_and_by_what_was_commanded(observer, asked, refused, outcome):
-    judged = process_faults._outcome(observer, asked, refused, LIMITS)
-    assert judged['outcome'] == outcome and judged['named'] == 'rotor1_lost'
+def test_the_outcome_is_determined_from_truth_and_commands(observer, flying, refused, outcome):
+    result = process_faults._outcome(observer, flying, refused, LIMITS)
+    assert result['outcome'] == outcome and result['named'] == 'rotor1_lost'
 
 
 def test_a_take_off_from_the_floor_is_counted_and_a_bounce_is_none(monkeypatch):

@@ -1,4 +1,4 @@
-"""rl_node as a real process, and the change between controllers in a real flight."""
+"""rl_node as a process, and changes of the controller in a flight."""
 
 from dataclasses import replace
 import json
@@ -42,7 +42,7 @@ LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
 @pytest.fixture
 def process(ros_domain, tmp_path):
-    """rl_node alone in its process, with a policy made by hand; (graph, witness, file)."""
+    """rl_node in its own process with an artificial policy; (graph, witness, file)."""
     policy = write(tmp_path / 'policy.onnx', hidden=(32, 16), seed=5)
     graph = Graph({'rl_node': {'policy': str(policy)}}, tmp_path, ros_domain, composed=False)
     witness = None
@@ -86,9 +86,9 @@ def test_the_node_answers_as_the_controller_does(process):
             State.join(state, JointReading(now, tilt, np.zeros(4)), None), target)
         return round(now, 4), np.concatenate((expected.tilt, expected.thrust))
 
-    def answered(asked):
+    def answered(requested):
         found = {round(a.stamp, 4): np.concatenate((a.tilt, a.thrust)) for a in answers}
-        return [(found[stamp], expected) for stamp, expected in asked.items() if stamp in found]
+        return [(found[stamp], answer) for stamp, answer in requested.items() if stamp in found]
 
     # A busy machine delivers the target when it likes; from then on every answer is the same.
     assert witness.wait(
@@ -103,7 +103,7 @@ def test_the_node_answers_as_the_controller_does(process):
 
 
 def refusal(*overrides):
-    """What rl_node says when it does not start; status 2 and one line."""
+    """Error of rl_node, which does not start: status 2 and one line."""
     arguments = [a for override in overrides for a in ('-p', override)]
     done = subprocess.run(
         [sys.executable, '-m', 'beetle_omni_ros.nodes.rl_node', '--ros-args', *arguments],
@@ -141,7 +141,7 @@ def test_a_policy_that_cannot_fly_does_not_stand_by(tmp_path):
 
 
 class Pilot(Witness):
-    """A witness who selects controllers as `ros2 param set` does, and keeps every command."""
+    """Witness that selects controllers like `ros2 param set`, and stores every command."""
 
     def __init__(self, domain):
         super().__init__(domain)
@@ -149,23 +149,23 @@ class Pilot(Witness):
         self.taken, self.marks, self.targets = [], [], []
         wire.subscribe(self._node, 'target_pose', lambda target: self.targets.append(target.stamp))
 
-    def _on_state(self, told):
-        super()._on_state(told)
-        self.marks.append((told, len(self.taken)))
+    def _on_state(self, text):
+        super()._on_state(text)
+        self.marks.append((text, len(self.taken)))
 
     def _on_actuators(self, message):
         super()._on_actuators(message)
         self.taken.append(self.last_command[1])
 
     def select(self, name):
-        """Set the parameter; (accepted, reason)."""
+        """Set the parameter; return (accepted, reason)."""
         future = self.client.set_parameters([Parameter('controller', value=name)])
         assert self.wait(future.done, 3), 'supervisor_node does not answer'
         result = future.result().results[0]
         return result.successful, result.reason
 
     def select_when_good(self, name):
-        """As :meth:`select`; who was held up a moment ago, on a busy machine, is asked again."""
+        """As :meth:`select`; repeated for a controller that was delayed by a busy computer."""
         for _ in range(20):
             accepted, reason = self.select(name)
             if accepted or 'good for only' not in reason:
@@ -222,7 +222,7 @@ def test_twenty_switches_through_the_parameter_in_a_real_flight(flight):
 
 
 def is_smooth(commands, targets):
-    """Whether a few commands keep to the rates of a hand-over; a new target excuses them."""
+    """Whether commands keep the rates of a hand-over, except after a new target."""
     assert len(commands) == 4
     if any(commands[0].stamp - 0.05 < target < commands[-1].stamp for target in targets):
         return True

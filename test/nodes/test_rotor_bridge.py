@@ -1,4 +1,4 @@
-"""rotor_bridge_node as a real process against the emulated motor board, faults included."""
+"""rotor_bridge_node as a process with the emulated motor board and its faults."""
 
 import math
 import os
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.real_time
 
 @pytest.fixture(scope='module')
 def shared(tmp_path_factory):
-    """One process for all tests that leave it alive."""
+    """One process for all tests that do not end it."""
     with bench(tmp_path_factory.mktemp('bridge')) as made:
         assert made.commander.reaches('ready', START), made.log
         yield made
@@ -31,9 +31,9 @@ def shared(tmp_path_factory):
 
 @pytest.fixture
 def bridge(shared):
-    """Process and board at rest, nothing wrong."""
-    assert shared.rest(), (shared.commander.told, shared.log)
-    shared.commander.told[:-1] = []
+    """Process and board at rest, without faults."""
+    assert shared.rest(), (shared.commander.bridge_states, shared.log)
+    shared.commander.bridge_states[:-1] = []
     yield shared
     assert not shared.graph.dead()
 
@@ -57,9 +57,9 @@ def test_it_arms_at_takeoff_follows_the_thrusts_and_disarms_with_the_supervisor(
         assert commander.wait(lambda thrust=thrust: bridge.follows(thrust), SOON)
     commander.supervise('disarmed')
     assert commander.wait(lambda: not board.armed, SOON) and not board.commands.any()
-    assert commander.wait(lambda: 'waiting: throttle not low' in commander.told
-                          and commander.bridge == 'ready', SOON), commander.told
-    assert not any(text.startswith('lost') for text in commander.told)
+    assert commander.wait(lambda: 'waiting: throttle not low' in commander.bridge_states
+                          and commander.bridge == 'ready', SOON), commander.bridge_states
+    assert not any(text.startswith('lost') for text in commander.bridge_states)
 
 
 def test_thrusts_arrive_at_a_sagging_battery(flying):
@@ -139,7 +139,7 @@ def test_a_stream_that_stays_away_disarms_and_is_not_armed_again_in_this_flight(
 def test_a_lost_board_stays_disarmed_until_the_supervisor_was(flying, fault, why):
     board, commander = flying.board, flying.commander
     fault(board)
-    assert commander.reaches(why.format(port=board.port)), commander.told
+    assert commander.reaches(why.format(port=board.port)), commander.bridge_states
     assert commander.wait(lambda: not board.armed and not board.commands.any(), SOON)
     board.plug()
     commander.spin(0.3)         # the supervisor goes on, and the board could be armed again
@@ -149,21 +149,21 @@ def test_a_lost_board_stays_disarmed_until_the_supervisor_was(flying, fault, why
     assert commander.bridge.startswith('lost')
     commander.thrust = None
     commander.supervise('disarmed')
-    assert commander.reaches('ready'), commander.told
+    assert commander.reaches('ready'), commander.bridge_states
     flying.take_off()
 
 
-def test_a_board_that_is_not_heard_keeps_its_targets_until_the_supervisor_is_down(flying):
+def test_a_silent_board_keeps_getting_targets_until_the_supervisor_has_landed(flying):
     board, commander = flying.board, flying.commander
     board.faults.mute = True
-    assert commander.reaches('silent: nothing heard of the board'), commander.told
+    assert commander.reaches('silent: nothing heard of the board'), commander.bridge_states
     commander.spin(0.3)
     assert board.armed and board.commands.all()
     commander.thrust = None
     commander.supervise('disarmed')
     assert commander.wait(lambda: not board.armed, SOON)
     board.faults.mute = False
-    assert commander.reaches('ready'), commander.told
+    assert commander.reaches('ready'), commander.bridge_states
 
 
 @pytest.mark.parametrize('faults', [
@@ -182,7 +182,7 @@ def test_a_poor_link_is_flown_through(flying, faults):
     else:
         commander.spin(0.5)
     assert board.armed and commander.wait(lambda: flying.follows(), SOON)
-    assert commander.told == ['ready']
+    assert commander.bridge_states == ['ready']
 
 
 def test_battery_and_rotor_speeds_are_published_in_our_units_and_signs(bridge):
@@ -208,7 +208,7 @@ def test_battery_and_rotor_speeds_are_published_in_our_units_and_signs(bridge):
     board._thrust = None        # rotors follow at once again
 
 
-def test_diagnostics_tell_link_clock_latency_and_a_failed_esc(flying):
+def test_diagnostics_contain_link_clock_latency_and_a_failed_esc(flying):
     board, commander = flying.board, flying.commander
     board.faults.failed_escs = (3,)
     assert commander.told_in_diagnostics('rotor3', 'failures', lambda text: 'offline' in text)
@@ -246,7 +246,7 @@ def test_a_bridge_that_is_killed_leaves_no_rotor_turning_and_its_successor_does_
         assert not board.armed and not board.commands.any()
 
 
-def test_a_bridge_that_is_told_to_end_disarms_and_says_so(tmp_path):
+def test_a_bridge_that_ends_disarms_and_reports_it(tmp_path):
     with bench(tmp_path) as made:
         board, commander = made.board, made.commander
         assert commander.reaches('ready', START), made.log
@@ -268,15 +268,15 @@ def test_a_port_that_is_absent_is_waited_for_and_named(tmp_path):
         assert commander.told_in_diagnostics('board', 'phase', lambda phase: phase == 'rests')
         commander.supervise('takeoff')
         # Whether it has heard of 'disarmed' before is for the middleware to decide.
-        assert commander.reaches('lost: '), commander.told
+        assert commander.reaches('lost: '), commander.bridge_states
         commander.supervise('disarmed')
         os.symlink(made.board.port, port)
-        assert commander.reaches('ready'), (commander.told, made.log)
+        assert commander.reaches('ready'), (commander.bridge_states, made.log)
         made.take_off()
         assert made.log[0].count('cannot be opened') == 1
 
 
-def test_supervisor_node_refuses_to_arm_in_the_words_of_the_bridges(ros_domain, tmp_path):
+def test_supervisor_node_refuses_to_arm_with_the_reason_of_the_bridges(ros_domain, tmp_path):
     graph = Graph({'supervisor_node': {}}, tmp_path, ros_domain, composed=False)
     operator = None
     try:
@@ -307,7 +307,7 @@ CONFIGURE, ACTIVATE, DEACTIVATE, CLEAN_UP = (
         Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP))
 
 
-def test_told_to_wait_it_arms_only_after_it_was_configured_and_activated(tmp_path):
+def test_without_autostart_it_arms_only_after_it_was_configured_and_activated(tmp_path):
     with bench(tmp_path, autostart='none') as bridge:
         board, commander = bridge.board, bridge.commander
         assert commander.reaches('waiting: not configured', START), bridge.log
@@ -331,8 +331,8 @@ def test_told_to_wait_it_arms_only_after_it_was_configured_and_activated(tmp_pat
         assert commander.reaches('ready')
         assert commander.change(DEACTIVATE) and commander.change(CLEAN_UP)
         assert commander.reaches('waiting: not configured')
-        heard = len(commander.batteries)
+        received = len(commander.batteries)
         commander.spin(0.5)
-        assert len(commander.batteries) <= heard + 1
+        assert len(commander.batteries) <= received + 1
         assert commander.change(CONFIGURE) and commander.change(ACTIVATE)
         bridge.take_off()                                               # the port opens again

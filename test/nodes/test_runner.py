@@ -1,4 +1,4 @@
-"""Processes: one-line refusals, one instance, clean ends, quiet waiting."""
+"""Processes of nodes: one-line refusals, one instance, clean ends."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ def start(node, *arguments, **popen):
 
 
 def finish(process, timeout=20):
-    """Wait for the end: (exit status, what it printed on standard error)."""
+    """Wait for the end; return (exit status, standard error)."""
     try:
         _, error = process.communicate(timeout=timeout)
     except subprocess.TimeoutExpired:
@@ -29,7 +29,7 @@ def finish(process, timeout=20):
 
 
 def wait_until_it_spins(process):
-    """The runner ignores no signal before that; a node is up when it holds its lock."""
+    """Wait until a node has its lock; from then on it handles signals."""
     from beetle_omni_ros.nodes.operator import Operator
     operator = Operator(int(os.environ['ROS_DOMAIN_ID']))
     try:
@@ -71,7 +71,7 @@ def test_an_unknown_argument_is_refused_and_help_is_given(ros_domain):
     assert status == 2 and "unknown node 'ekv_node'" in error
 
 
-def test_a_node_says_what_it_waits_for_is_alone_and_ends_cleanly(ros_domain):
+def test_a_node_names_missing_inputs_is_unique_and_ends_cleanly(ros_domain):
     first = start('ekf_node')
     try:
         wait_until_it_spins(first)
@@ -83,8 +83,8 @@ def test_a_node_says_what_it_waits_for_is_alone_and_ends_cleanly(ros_domain):
         first.send_signal(signal.SIGINT)     # as a launch system does
         status, error = finish(first)
         assert status == 0
-        told, = error.splitlines()
-        assert '[ekf_node]' in told and told.endswith('Waits for imu/data_raw, mocap/pose.')
+        line, = error.splitlines()
+        assert '[ekf_node]' in line and line.endswith('Waits for imu/data_raw, mocap/pose.')
     finally:
         first.kill()
         first.communicate()

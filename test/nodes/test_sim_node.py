@@ -1,4 +1,4 @@
-"""sim_node with emulated actuators: ports instead of topics, faults set in flight."""
+"""sim_node with emulated actuators: ports instead of topics, faults in flight."""
 
 import os
 from pathlib import Path
@@ -34,28 +34,28 @@ def make(ros_domain, tmp_path):
 
 
 def put(node, **values):
-    """Set parameters as `ros2 param set` does, one after the other; the last answer."""
+    """Set parameters one after the other like `ros2 param set`; return the last answer."""
     for name, value in values.items():
         answer = node.set_parameters([Parameter(name.replace('__', '.'), value=value)])[0]
     return answer
 
 
 def topics(node):
-    """Names that a node publishes, and that it subscribes."""
+    """Topics that a node publishes and subscribes."""
     return ({one.topic_name for one in node.publishers},
             {one.topic_name for one in node.subscriptions})
 
 
 def test_commands_and_joint_states_pass_through_the_ports_instead_of_topics(make):
-    published, heard = topics(make())
-    assert '/imu/data_raw' in published and '/disturbance' in heard
-    assert not {'/joint_states', '/battery_state'} & published and '/command' not in heard
+    published, subscribed = topics(make())
+    assert '/imu/data_raw' in published and '/disturbance' in subscribed
+    assert not {'/joint_states', '/battery_state'} & published and '/command' not in subscribed
 
 
 def test_the_direct_path_is_as_it_was(make):
     node = make(actuators='direct')
-    published, heard = topics(node)
-    assert {'/joint_states', '/battery_state'} <= published and '/command' in heard
+    published, subscribed = topics(node)
+    assert {'/joint_states', '/battery_state'} <= published and '/command' in subscribed
     refused = put(node, servo_faults__silent=[2])
     assert not refused.successful and 'servo_faults: silent [2]: there are no' in refused.reason
     assert not put(node, board_faults__hang=True).successful
@@ -100,7 +100,7 @@ def test_simulated_time_and_serial_devices_do_not_go_together(make):
         make('clock:=simulated')
 
 
-def test_ports_have_the_names_that_were_asked_for_and_go_with_the_node(make, tmp_path):
+def test_ports_have_the_requested_names_and_end_with_the_node(make, tmp_path):
     servos, board = tmp_path / 'servos', tmp_path / 'board'
     servos.symlink_to('/nowhere')           # left by a process that was killed
     node = make(f'servo_port:={servos}', f'board_port:={board}')

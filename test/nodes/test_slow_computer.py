@@ -1,4 +1,4 @@
-"""What a flight does where the computer cannot keep real time."""
+"""Flights on a computer that cannot keep real time."""
 
 import io
 from itertools import count
@@ -14,7 +14,7 @@ from beetle_omni_ros.runs.tasks import make_task
 
 
 class Nodes:
-    """Stands in for graph and operator of nodes that are ready and refuse to arm."""
+    """Stand-in for graph and operator of nodes that are ready and refuse to arm."""
 
     nodes, composed, simulated = ('sim_node',), True, False
     ready, progress, state, states = True, 'waiting', 'disarmed', []
@@ -57,7 +57,7 @@ def flown(nodes, **options):
 @pytest.mark.parametrize(('nodes', 'named'), [
     ({'load': 0.99}, '99% of a core before the start'),
     ({'lost': 0.5}, 'the simulator fell 0.5 s behind in 2 s')])
-def test_a_computer_that_is_too_slow_is_found_out_before_arming(nodes, named):
+def test_a_computer_that_is_too_slow_is_detected_before_arming(nodes, named):
     with pytest.raises(TooSlowError, match=named):
         flown(Nodes(**nodes), may_be_slow=False)
     with pytest.raises(FlightError, match='refuses to arm: not level') as raised:
@@ -66,7 +66,7 @@ def test_a_computer_that_is_too_slow_is_found_out_before_arming(nodes, named):
 
 
 @pytest.mark.real_time
-def test_a_fast_one_tries_and_a_failed_flight_says_what_the_simulator_lost():
+def test_a_failed_flight_reports_the_time_that_the_simulator_lost():
     with pytest.raises(FlightError, match='refuses to arm: not level$') as raised:
         flown(Nodes(), may_be_slow=False)
     assert raised.type is FlightError
@@ -76,7 +76,7 @@ def test_a_fast_one_tries_and_a_failed_flight_says_what_the_simulator_lost():
 
 @pytest.mark.real_time
 @pytest.mark.parametrize('may_be_slow', [True, False])
-def test_a_flight_that_fails_after_a_pause_says_so(may_be_slow):
+def test_a_flight_that_fails_after_a_pause_reports_the_pause(may_be_slow):
     class Paused(Nodes):
         states = ['fallback:supervisor_paused', 'emergency_stop:crash']
 
@@ -110,7 +110,7 @@ def test_a_fault_that_keeps_it_on_the_ground_ends_the_attempt_at_once():
 
 @pytest.fixture
 def attempts(monkeypatch):
-    """Graphs that `fly` started; the first in real time is too slow."""
+    """Graphs that `fly` started; the first one, in real time, is too slow."""
     graphs = []
 
     def one(graph, controller, task, meta, console, faults, may_be_slow):
@@ -123,7 +123,7 @@ def attempts(monkeypatch):
     return graphs
 
 
-def test_fly_turns_to_simulated_time_without_serial_devices_and_says_so(attempts, tmp_path):
+def test_fly_changes_to_simulated_time_without_serial_devices_and_reports_it(attempts, tmp_path):
     text = io.StringIO()
     status = fly.run_fly(bag=tmp_path / 'bag', domain_id=1, console=Console(file=text, width=300))
     assert status == 1
@@ -137,14 +137,14 @@ def test_fly_turns_to_simulated_time_without_serial_devices_and_says_so(attempts
 
 
 @pytest.mark.parametrize('clock', ['system', 'simulated'])
-def test_a_clock_that_was_asked_for_is_kept(attempts, tmp_path, clock):
+def test_a_requested_clock_is_kept(attempts, tmp_path, clock):
     fly.run_fly(clock=clock, bag=tmp_path / 'bag', domain_id=1,
                 console=Console(file=io.StringIO()))
     assert [(graph.simulated, may) for graph, _, may in attempts] == [
         (clock == 'simulated', True)]
 
 
-def test_serial_devices_that_were_asked_for_stay_in_real_time(attempts, tmp_path):
+def test_requested_serial_devices_need_real_time(attempts, tmp_path):
     fly.run_fly(actuators='emulated', bag=tmp_path / 'bag', domain_id=1,
                 console=Console(file=io.StringIO()))
     assert [(graph.simulated, may) for graph, _, may in attempts] == [(False, True)]

@@ -1,4 +1,4 @@
-"""Which periods of the motor board's targets count as missed."""
+"""Missed periods of the motor board's targets."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The viewer draws what the topics say."""
+"""Markers and frames of the viewer agree with the topics."""
 
 import time
 
@@ -21,7 +21,7 @@ from beetle_omni_ros.robot.readings import JointReading
 
 
 class Sent(list):
-    """A publisher that keeps what it is given."""
+    """A publisher that stores its messages."""
 
     publish = list.append
 
@@ -70,10 +70,10 @@ def test_the_frames_of_all_links_form_one_tree_and_stand_where_the_rotors_are(ro
     listener = rclpy.create_node('listener', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(listener)
-    heard = {'/tf': [], '/tf_static': [], 'robot_description': []}
+    received = {'/tf': [], '/tf_static': [], 'robot_description': []}
     for topic, profile in (('/tf', wire.profile(EVENT)), ('/tf_static', wire.profile(LATCHED))):
-        listener.create_subscription(transform_message(), topic, heard[topic].append, profile)
-    listener.create_subscription(String, 'robot_description', heard['robot_description'].append,
+        listener.create_subscription(transform_message(), topic, received[topic].append, profile)
+    listener.create_subscription(String, 'robot_description', received['robot_description'].append,
                                  wire.profile(LATCHED))
     rclpy.init(domain_id=ros_domain)
     node = ViewerNode()
@@ -83,12 +83,12 @@ def test_the_frames_of_all_links_form_one_tree_and_stand_where_the_rotors_are(ro
         node._odom = Odom(5.0, position, np.zeros(3), rotation, np.zeros(3))
         node._joints = JointReading(4.9, tilt, np.zeros(4))
         end = time.monotonic() + 20
-        while not all(heard.values()) and time.monotonic() < end:
+        while not all(received.values()) and time.monotonic() < end:
             node._moved = None
             node._move()
             executor.spin_once(timeout_sec=0.1)
         frames = {frame.child_frame_id: frame for topic in ('/tf', '/tf_static')
-                  for frame in heard[topic][-1].transforms}
+                  for frame in received[topic][-1].transforms}
         assert set(frames) == {'base_link', 'main_body', 'end_effector', 'imu', *(
             f'{kind}{k}' for kind in ('module', 'rotor') for k in (1, 2, 3, 4))}
         assert frames['base_link'].header.stamp.sec == 5
@@ -103,7 +103,7 @@ def test_the_frames_of_all_links_form_one_tree_and_stand_where_the_rotors_are(ro
             assert at == pytest.approx(position + axes @ node._robot.rotors.positions[k])
             tilted = rotations.matrix(rotations.exp(node._robot.tilt_axes[k] * tilt[k]))
             assert rotations.matrix(turn)[:, 2] == pytest.approx(axes @ tilted[:, 2])
-        assert '<robot' in heard['robot_description'][0].data
+        assert '<robot' in received['robot_description'][0].data
     finally:
         node.destroy_node()
         listener.destroy_node()
@@ -112,7 +112,7 @@ def test_the_frames_of_all_links_form_one_tree_and_stand_where_the_rotors_are(ro
         rclpy.try_shutdown(context=context)
 
 
-def test_nothing_is_drawn_where_nobody_looks(viewer):
+def test_nothing_is_drawn_without_subscriptions(viewer):
     viewer._odom = Odom(5.0, np.zeros(3), np.zeros(3), np.array([0, 0, 0, 1.0]),
                                 np.zeros(3))
     for publisher in (viewer._markers, viewer._transforms):

@@ -1,4 +1,4 @@
-"""Messages and dataclasses carry the same numbers, and bad messages are refused by name."""
+"""Round trips of messages and values, and refusals of bad messages."""
 
 from builtin_interfaces.msg import Time
 import numpy as np
@@ -125,11 +125,11 @@ def test_bad_messages_are_refused_with_a_reason(rng):
             'mocap/pose', PoseReading(0.0, [0, float('inf'), 0], [0, 0, 0, 1])))
 
 
-def test_what_the_supervisor_tells_survives_the_way_through_messages():
+def test_messages_of_the_supervisor_round_trip():
     way = TrajectoryTarget(np.array([5.0, 6.0]), np.zeros((2, 3)), np.tile([0, 0, 0, 1.0], (2, 1)),
                            np.zeros((2, 3)), np.zeros((2, 3)), stamp=5.0)
-    told = conversions.take_override(wire.message('supervisor/target', TargetOverride.of(way)))
-    assert told.stamp == 5.0 and np.allclose(told.target.times, way.times)
+    value = conversions.take_override(wire.message('supervisor/target', TargetOverride.of(way)))
+    assert value.stamp == 5.0 and np.allclose(value.target.times, way.times)
     none = wire.message('supervisor/target', TargetOverride.of(None))
     assert conversions.take_override(none).target is None
     health = ActuatorHealth((True, False, True, True), (None, 0.4, None, None))
@@ -141,5 +141,5 @@ def test_what_the_supervisor_tells_survives_the_way_through_messages():
     speeds = JointState(name=['rotor1', 'rotor2', 'rotor3', 'rotor4'],
                         velocity=[1.0, 2.0, 3.0, np.nan])
     speeds.header.stamp = time_message(3.0)
-    told = conversions.read_rotors(speeds)
-    assert told.stamp == 3.0 and told.speed[2] == 3.0
+    value = conversions.read_rotors(speeds)
+    assert value.stamp == 3.0 and value.speed[2] == 3.0

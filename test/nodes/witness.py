@@ -1,4 +1,4 @@
-"""What tests of real flights share: patient limits, and an operator who sees the truth."""
+"""Test bench of real flights: long timeouts, and an operator that observes the truth."""
 
 import time
 
@@ -21,7 +21,7 @@ PATIENT = {'commands': {'timeout': 0.08, 'stale_after': 0.08},
 
 
 class Witness(Operator):
-    """An operator who also sees the truth and the commands."""
+    """Operator that also observes truth and commands."""
 
     def __init__(self, domain):
         super().__init__(domain)
@@ -37,13 +37,13 @@ class Witness(Operator):
         self.last_command = time.monotonic(), command
 
     def stays_in_the_air(self, seconds):
-        """Watch for so long; whether the robot never went below half a metre."""
+        """Observe for ``seconds``; return whether the robot stayed above half a metre."""
         self.height_min = np.inf
         self.spin(seconds)
         return 0.5 < self.height_min < np.inf
 
     def can_judge(self, graph):
-        """Skip where the nodes cannot keep real time: what they do then says nothing."""
+        """Skip the test if the nodes cannot keep real time."""
         before = graph.cpu_seconds() - graph.cpu_seconds(bridges=True)
         begin = time.monotonic()
         self.spin(1.0)
@@ -52,7 +52,7 @@ class Witness(Operator):
             pytest.skip(f'too slow for a flight in real time: the nodes use {busy:.0%} of a core')
 
     def take_off(self, flies):
-        """Arm and climb until ``flies()``; a start that a busy machine spoilt is tried again."""
+        """Arm and climb until ``flies()``; repeated on a busy computer."""
         for _ in range(TAKEOFF_ATTEMPTS):
             assert self.wait(lambda: self.call('arm')[0], 15), self.call('arm')
             self.states.clear()

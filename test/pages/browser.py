@@ -13,7 +13,7 @@ WIDTHS = (1280, 400)
 
 @contextmanager
 def browser():
-    """Start it, or skip the test with the reason."""
+    """Start the browser, or skip the test with the reason."""
     playwright = pytest.importorskip('playwright.sync_api', reason='playwright is not installed')
     path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None:
@@ -28,7 +28,7 @@ def browser():
 
 @contextmanager
 def opened(chromium, file, width):
-    """Show a page; fail where it complains or asks for anything that is not in it."""
+    """Show a page; fail if it logs an error or requests anything outside it."""
     page = chromium.new_page(viewport={'width': width, 'height': 800})
     page.set_default_timeout(60_000)
     wrong = []
@@ -46,7 +46,7 @@ def opened(chromium, file, width):
 
 
 def cut_off(page):
-    """Elements beyond the width of the page that no box lets one scroll to."""
+    """Elements beyond the width of the page that cannot be scrolled to."""
     return page.evaluate("""() => [...document.querySelectorAll('main *')].filter(e => {
         if (e.closest('.scroll, .strip, #scene, .u-wrap') || e.closest('[hidden]')) return false;
         const box = e.getBoundingClientRect();

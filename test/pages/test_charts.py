@@ -1,4 +1,4 @@
-"""Numbers of a page: what is packed is what was given, and it is small."""
+"""Packed numbers of a page: accuracy and size."""
 
 import base64
 import gzip

@@ -1,4 +1,4 @@
-"""Pages of identify, gap, faults and compare in a real browser: whole, silent, not cut off."""
+"""Pages of identify, gap, faults and compare in a real browser: complete, without errors."""
 
 import json
 from pathlib import Path

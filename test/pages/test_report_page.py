@@ -1,4 +1,4 @@
-"""The report in a real browser: it draws, plays, zooms, and switches runs off."""
+"""The report in a real browser: drawing, playback, zoom, switching off runs."""
 
 import io
 
@@ -34,14 +34,14 @@ def chromium():
 
 
 def picture(page, selector):
-    """Pixels of what an element shows."""
+    """Pixels of an element."""
     from PIL import Image
     shot = page.locator(selector).first.screenshot()
     return np.asarray(Image.open(io.BytesIO(shot)).convert('RGB')).astype(int)
 
 
 def coloured(pixels, colour):
-    """How many pixels have about the colour."""
+    """Number of pixels with about this colour."""
     return int((np.abs(pixels - colour).max(axis=2) < 30).sum())
 
 
@@ -90,13 +90,13 @@ def test_a_run_that_is_switched_off_is_gone(chromium, page_file):
 def test_the_flight_plays_and_stops(chromium, page_file):
     with opened(chromium, page_file, 1280) as page:
         seek(page, 8.0)
-        before, told = picture(page, '#scene canvas'), page.locator('#time').inner_text()
+        before, shown = picture(page, '#scene canvas'), page.locator('#time').inner_text()
         page.locator('#speed').select_option('4')
         page.locator('#play').click()
         page.wait_for_timeout(1200)
         page.locator('#play').click()
         after, later = picture(page, '#scene canvas'), page.locator('#time').inner_text()
-        assert told == '8.0 s' and 8.2 < float(later.split()[0]) < 24
+        assert shown == '8.0 s' and 8.2 < float(later.split()[0]) < 24
         assert (np.abs(after - before).max(axis=2) > 40).sum() > 100
         mark = page.locator('[data-chart="chart0"] .now')
         assert 'translateX(0px)' not in mark.get_attribute('style')
@@ -104,7 +104,7 @@ def test_the_flight_plays_and_stops(chromium, page_file):
         assert page.locator('#time').inner_text() == later
 
 
-def test_the_scene_tells_the_error_that_the_metrics_have(chromium, page_file):
+def test_the_scene_shows_the_error_of_the_metrics(chromium, page_file):
     with opened(chromium, page_file, 1280) as page:
         seek(page, 15.2)
         near, far = page.locator('#errors span').all_inner_texts()

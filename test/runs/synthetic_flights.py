@@ -112,7 +112,7 @@ def write_command(recorder, t, tilt, thrust, received=None):
 
 
 def write_request(recorder, controller, t, tilt, thrust, received=None):
-    """What one controller asked for, before the supervisor."""
+    """Record a controller's command, before the supervisor."""
     recorder.write(f'{controller}/command', Command(t, tilt, thrust), received)
 
 

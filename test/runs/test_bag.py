@@ -1,4 +1,4 @@
-"""Bags: round trip, independent readers, cut-off files, refusals."""
+"""Bags: round trip, independent readers, truncated files, refusals."""
 
 import os
 from pathlib import Path
@@ -88,7 +88,7 @@ def test_a_flight_comes_back_from_its_bag_as_it_was_recorded(recorded):
     assert log.warnings == []
 
 
-def test_a_replay_comes_bit_by_bit_without_what_is_left_out(recorded):
+def test_a_replay_is_incremental_without_the_omitted_topics(recorded):
     folder, memory, _ = recorded
     recorder, warnings, known = LogRecorder(), [], []
     times = []
@@ -182,7 +182,7 @@ def test_files_of_other_writers_read_the_same(recorded, tmp_path, chunks, compre
     assert_equal_logs(memory, log)
 
 
-def test_metadata_says_what_ros2_bag_info_needs(recorded):
+def test_metadata_has_the_fields_for_ros2_bag_info(recorded):
     folder, _, counts = recorded
     information = yaml.safe_load((folder / 'metadata.yaml').read_text())[
         'rosbag2_bagfile_information']
@@ -261,7 +261,7 @@ def test_flushed_messages_survive_a_sigkill(tmp_path):
     assert len(read_bag(tmp_path / 'killed').imu_t) == 50
 
 
-def test_a_damaged_file_gives_what_stands_before_the_damage(recorded, tmp_path):
+def test_a_damaged_file_is_read_up_to_the_damage(recorded, tmp_path):
     folder, _, _ = recorded
     data = bytearray((folder / f'{folder.name}.mcap').read_bytes())
     middle = len(data) // 2
@@ -288,7 +288,7 @@ def test_a_folder_without_permission_is_refused(tmp_path):
         BagWriter(tmp_path / 'bag')
 
 
-def test_what_is_no_bag_is_refused_by_name(tmp_path):
+def test_a_path_that_is_no_bag_is_refused_by_name(tmp_path):
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'text.mcap').write_text('hello, this is no bag at all')
     (tmp_path / 'notes.txt').write_text('x')

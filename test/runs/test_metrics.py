@@ -98,7 +98,7 @@ def test_mean_median_and_max_are_over_the_poses():
     assert [pose['target'] for pose in result['poses']] == [list(p) for p in task.poses]
 
 
-def test_the_lowest_point_is_told_with_the_pose_that_was_flown_then():
+def test_the_lowest_point_is_reported_with_its_pose():
     task, recorder = make_task('random3'), LogRecorder()
     write_state(recorder, 0.0, 'flying:nmpc')
     for k, target in enumerate(task.targets(1.0)):
@@ -215,7 +215,7 @@ def test_landing_after_the_task_is_no_crash():
     assert result['success_rate'] == 1.0
 
 
-def test_each_controller_is_judged_by_the_poses_that_it_flew():
+def test_each_controller_has_the_metrics_of_its_poses():
     task = make_task('waypoints')
     recorder = LogRecorder()
     fly(recorder, task, duration=39.0)
@@ -228,7 +228,7 @@ def test_each_controller_is_judged_by_the_poses_that_it_flew():
     assert results['rl']['poses'][0]['target'] == [0, 1, 1, 0, -25, 0]
 
 
-def test_the_estimate_judges_where_there_is_no_truth():
+def test_metrics_use_the_estimate_without_truth():
     recorder = LogRecorder()
     recorder.write_target(pose_target(np.array([0, 0, 1, 0, 0, 0.0]), 0.0))
     for t in np.arange(0, 8.1, 0.005):
@@ -255,7 +255,7 @@ def test_tracking_reports_every_round():
         == [False, True, True, True, True]
 
 
-def test_a_trajectory_that_came_in_windows_is_judged_as_one():
+def test_windows_of_a_trajectory_have_the_metrics_of_one():
     task = make_task('lemniscate')
     log = flown(task)
     expected = metrics(log, task)['trajectory']

@@ -1,4 +1,4 @@
-"""The page about flights that nobody gave a target, or that broke off early."""
+"""The report of flights without targets or with an early end."""
 
 import io
 import json
@@ -58,13 +58,13 @@ def test_metadata_of_any_kind_do_not_hide_the_flight(tmp_path, meta):
     assert results_of(runs)['run'] and '>Pose<' in make_page(runs, results_of(runs))
 
 
-def test_metadata_nested_too_deeply_are_told(tmp_path):
+def test_metadata_nested_too_deeply_give_a_warning(tmp_path):
     bag = record(tmp_path / 'bag', task='hover')
     (bag / 'metadata.yaml').write_text('a: ' + '[' * 5000)
     assert 'metadata.yaml is not readable' in read_bag(bag).warnings
 
 
-def test_numbers_too_close_for_a_histogram_leave_the_page(tmp_path):
+def test_numbers_too_close_for_a_histogram_do_not_prevent_the_page(tmp_path):
     bag = record(tmp_path / 'bag', task='hover', targets=1)
     log = read_bag(bag)
     log.command_t = log.command_received = np.arange(10.0, 13.0)
@@ -81,7 +81,7 @@ def test_flights_with_and_without_targets_stand_on_one_page(tmp_path):
     assert (tmp_path / 'page.html').stat().st_size > 10_000
 
 
-def test_a_fault_that_the_supervisor_named_stands_in_the_page(tmp_path):
+def test_a_fault_of_the_supervisor_is_on_the_page(tmp_path):
     with BagWriter(tmp_path / 'bag', {'task': 'hover', 'seed': 0}) as writer:
         for k in range(80):
             t = 10 + 0.05 * k
@@ -99,7 +99,7 @@ def test_a_fault_that_the_supervisor_named_stands_in_the_page(tmp_path):
     page = tmp_path / 'page.html'
     run_report([tmp_path / 'bag'], page, console=Console(file=io.StringIO()))
     text = page.read_text()
-    for told in ('fault: rotor2_lost at', '<td>landing</td><td>rotor2_lost</td>',
+    for expected in ('fault: rotor2_lost at', '<td>landing</td><td>rotor2_lost</td>',
                  'fault: joint3_slipped at', 'nmpc.refused.stale stamp'):
-        assert told in text, told
+        assert expected in text, expected
     assert '<b>' not in text and text.count('<td>rotor2_lost</td>') == 1

@@ -1,4 +1,4 @@
-"""Bags are what ``ros2 bag record`` of Jazzy writes: metadata, type hashes, compression."""
+"""Bags have the format of ``ros2 bag record`` of Jazzy: metadata, type hashes, compression."""
 
 from importlib.util import find_spec
 import json
@@ -157,36 +157,36 @@ def test_rosbag2_itself_reads_every_message(kind, request):
 
 @pytest.mark.skipif(not shutil.which('ros2') or find_spec('ros2bag') is None,
                     reason='no `ros2 bag` in this environment')
-def test_ros2_bag_tells_and_plays(packed):
-    told = subprocess.run(['ros2', 'bag', 'info', str(packed)], capture_output=True, text=True,
+def test_ros2_bag_info_and_play_accept_a_bag(packed):
+    output = subprocess.run(['ros2', 'bag', 'info', str(packed)], capture_output=True, text=True,
                           timeout=60, check=True).stdout
-    assert '/imu/data_raw' in told and 'mcap' in told
+    assert '/imu/data_raw' in output and 'mcap' in output
     subprocess.run(['ros2', 'bag', 'play', '--rate', '10', str(packed)], capture_output=True,
                    timeout=60, check=True)
 
 
-def test_the_tree_of_frames_stands_in_the_bag_as_the_estimate_and_the_joints_say(tmp_path):
+def test_the_frames_in_the_bag_agree_with_estimate_and_joints(tmp_path):
     robot = RobotParameters.load()
     with BagWriter(tmp_path / 'bag', namespace='robot1', description=description()) as writer:
         fly(writer, make_task('hover'), duration=2.0, start=1.7e9)
-    heard = {}
+    messages = {}
     with AnyReader([tmp_path / 'bag']) as reader:
         for connection, t, data in reader.messages():
-            heard.setdefault(connection.topic, []).append(
+            messages.setdefault(connection.topic, []).append(
                 (t, reader.deserialize(data, connection.msgtype)))
-    assert len(heard['/tf_static']) == len(heard['/robot1/robot_description']) == 1
-    assert heard['/robot1/robot_description'][0][1].data == description()
-    length = 1e-9 * (heard['/robot1/odom'][-1][0] - heard['/robot1/odom'][0][0])
-    assert 48 * length <= len(heard['/tf']) <= 51 * length + 1      # 50 a second
+    assert len(messages['/tf_static']) == len(messages['/robot1/robot_description']) == 1
+    assert messages['/robot1/robot_description'][0][1].data == description()
+    length = 1e-9 * (messages['/robot1/odom'][-1][0] - messages['/robot1/odom'][0][0])
+    assert 48 * length <= len(messages['/tf']) <= 51 * length + 1      # 50 a second
     topics = {entry['topic_metadata']['name']: entry['topic_metadata']
               for entry in information(tmp_path / 'bag')['topics_with_message_count']}
     assert topics['/tf_static']['offered_qos_profiles'][0]['durability'] == 'transient_local'
-    fixed = {frame.child_frame_id: frame for frame in heard['/tf_static'][0][1].transforms}
+    fixed = {frame.child_frame_id: frame for frame in messages['/tf_static'][0][1].transforms}
     stamped = {message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec: message
-               for _, message in heard['/robot1/odom']}
+               for _, message in messages['/robot1/odom']}
     angles = {message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec: message.position
-              for _, message in heard['/robot1/joint_states']}
-    for _, message in heard['/tf'][::20]:
+              for _, message in messages['/robot1/joint_states']}
+    for _, message in messages['/tf'][::20]:
         frames = {**fixed, **{frame.child_frame_id: frame for frame in message.transforms}}
         assert {frame.header.frame_id for frame in frames.values()} <= {'world', *frames}
         base, module = frames['base_link'].header.stamp, frames['module1'].header.stamp
@@ -217,7 +217,7 @@ def placed(frames, name):
     return axes, at
 
 
-def test_odd_joint_states_cost_frames_and_nothing_else(tmp_path):
+def test_unusable_joint_states_cost_only_frames(tmp_path):
     kind = 'sensor_msgs/msg/JointState'
     odd = BAG.new(kind)
     odd.name, odd.position = ['gimbal1'], BAG.doubles([0.1])
@@ -230,7 +230,7 @@ def test_odd_joint_states_cost_frames_and_nothing_else(tmp_path):
         assert writer.counts['/tf'] == 0 and writer.counts['/odom'] == 2
 
 
-def test_a_description_that_is_none_is_refused_in_one_line(tmp_path):
+def test_an_unusable_description_is_refused_in_one_line(tmp_path):
     for text in ('hello', '<robot><joint name="a" type="prismatic"/></robot>',
                  '<robot><joint name="a" type="fixed"/></robot>'):
         with pytest.raises(ParameterError, match='robot description: not usable'):

@@ -1,4 +1,4 @@
-"""Targets that are refused, with the reason, and those that are flown."""
+"""Refused targets, with the reason, and accepted ones."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def why(position, quaternion=LEVEL, stamp=0.0, now=None):
     ((0, 0, 30), LEVEL, 'the fence'), ((1e300, 0, 1), LEVEL, 'the fence'),
     ((np.nan, 0, 1), LEVEL, 'finite'), ((0, 0, 1), 2 * LEVEL, 'unit quaternion'),
     ((0, 0, 1), 0 * LEVEL, 'unit quaternion')])
-def test_what_cannot_be_flown_is_refused_in_one_line(position, quaternion, text):
+def test_invalid_targets_are_refused_in_one_line(position, quaternion, text):
     reason = why(position, quaternion)
     assert text in reason and '\n' not in reason and 'expected' in reason + 'expected' * (
         text == 'finite')
@@ -33,7 +33,7 @@ def test_what_cannot_be_flown_is_refused_in_one_line(position, quaternion, text)
 
 @pytest.mark.parametrize('position, quaternion', [
     ((0, 0, 0.3), LEVEL), ((2, -2, 0.6), UPSIDE_DOWN), ((0, 0, 1), -LEVEL)])
-def test_what_can_be_flown_is_taken(position, quaternion):
+def test_valid_targets_are_accepted(position, quaternion):
     assert why(position, quaternion) == ''
 
 
@@ -63,7 +63,7 @@ def test_a_trajectory_is_checked_point_by_point():
     assert CHECKS.why_not(target).startswith('point 2: z = -1 m')
 
 
-def test_a_row_that_cannot_be_flown_is_named(tmp_path):
+def test_a_row_with_an_invalid_target_is_named(tmp_path):
     file = tmp_path / 'task.csv'
     file.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,0\n0,0,0.05,180,0,0\n')
     with pytest.raises(TaskError, match=r'task.csv: row 3: z = 0.05 m, expected at least'):
@@ -90,7 +90,7 @@ def test_a_row_beyond_the_reach_of_the_controller_is_named(tmp_path, reach, row)
         read_poses(file, reach)
 
 
-def test_what_is_in_reach_is_judged_from_the_robot():
+def test_the_reach_counts_from_the_robots_position():
     here = np.array([10.0, 0, 1])
     near, far = (PoseTarget(np.array([x, 0, 1.0]), LEVEL) for x in (16.0, 17.0))
     assert out_of_reach(near, here, 6.5, 0.0) == ''

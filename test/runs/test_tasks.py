@@ -1,4 +1,4 @@
-"""Tasks: what INTERFACES promises of each."""
+"""Tasks: the properties in INTERFACES."""
 
 import numpy as np
 import pytest
@@ -122,7 +122,7 @@ def test_torque_impulses_last_50_ms_and_rise_in_steps_of_two_and_a_half():
         assert impulse == pytest.approx(0.05 * level, rel=1e-6)
 
 
-def test_a_force_task_ends_when_control_is_lost_and_says_at_which_level():
+def test_a_force_task_ends_when_control_is_lost_and_reports_the_level():
     task = make_task('force')
     held = pose_target(task.poses[0])
     player = TaskPlayer(task, 0.0)

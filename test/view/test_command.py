@@ -1,4 +1,4 @@
-"""`beetle_omni view`: what it refuses, in one line, and how it runs as a program."""
+"""`beetle_omni view`: refusals in one line, and the program."""
 
 import os
 from pathlib import Path
@@ -26,7 +26,7 @@ def bag(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize('arguments, told', [
+@pytest.mark.parametrize('arguments, message', [
     (['none'], 'none: no such bag'), (['BAG', 'none'], 'none: no such bag'),
     (['text.mcap'], 'not an MCAP file'), (['BAG', '--allow-targets'], '--allow-targets'),
     (['BAG', '--namespace', 'a'], '--namespace'), (['BAG', '--domain-id', '3'], '--domain-id'),
@@ -34,14 +34,14 @@ def bag(tmp_path_factory):
     (['--at', '3'], '--at'), (['--paused'], '--paused'), (['--port', '0'], '--port'),
     (['BAG', '--host', '300.1.1.1'], '--host 300.1.1.1')])
 def test_unusable_input_is_one_line_and_status_2(bag, tmp_path, monkeypatch, capfd, arguments,
-                                                 told):
+                                                 message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'text.mcap').write_text('no bag at all')
     given = [str(bag) if argument == 'BAG' else argument for argument in arguments]
     assert cli.main(['view', *given]) == 2
     captured = capfd.readouterr()
     lines = captured.err.splitlines()
-    assert len(lines) == 1 and told in lines[0], captured
+    assert len(lines) == 1 and message in lines[0], captured
     assert not captured.out
 
 
@@ -74,7 +74,7 @@ def test_help_and_flights_without_it_load_no_viewer():
     assert done.returncode == 0, done.stderr
 
 
-def test_fly_hands_on_who_looks_and_who_may_ask(monkeypatch, tmp_path):
+def test_fly_passes_on_the_options_of_the_viewer(monkeypatch, tmp_path):
     fly_module = pytest.importorskip('beetle_omni_ros.nodes.fly')
     given = {}
     monkeypatch.setattr(fly_module, 'run_fly', lambda **arguments: given.update(arguments) or 0)

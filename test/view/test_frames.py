@@ -1,4 +1,4 @@
-"""Rows of a run: newest values, interpolation, windows, and what plots make of them."""
+"""Rows of a run: newest values, interpolation, windows, plots."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def test_the_rows_of_a_bag_are_what_the_bag_holds(bag):
         np.testing.assert_allclose(row[COLUMNS['thrust']], log.command_thrust[k], atol=1.0)
 
 
-def test_a_recording_is_read_beside_what_is_shown(bag):
+def test_a_recording_is_read_during_its_display(bag):
     recording = Recording(bag, 'mine')
     try:
         recording.wait(60.0, whole=True)
@@ -80,7 +80,7 @@ def test_an_unusable_bag_is_refused_in_one_line(tmp_path):
         list(parts(tmp_path / 'empty'))
 
 
-def test_the_estimate_stands_for_a_truth_that_nobody_knows():
+def test_the_estimate_replaces_an_unknown_truth():
     sampler = Sampler()
     assert not sampler.placed and sampler.row(1.0)[T] == 1.0
     write_odom(sampler, 1.0, [1, 2, 3], UP, None, None)
@@ -163,7 +163,7 @@ def test_a_plot_has_a_line_at_the_present_and_no_gaps():
     assert plots.window(plots.PLOTS[-1], [first], 2.0) is None      # no battery
 
 
-def test_runs_are_told_apart_by_their_names(tmp_path):
+def test_runs_have_distinct_names(tmp_path):
     assert names([tmp_path / 'a' / 'rl', tmp_path / 'a' / 'nmpc']) == ['rl', 'nmpc']
     assert names([tmp_path / 'a' / 'rl', tmp_path / 'b' / 'rl']) == ['a/rl', 'b/rl']
     assert len(set(names([tmp_path / 'a', tmp_path / 'a']))) == 2

@@ -1,4 +1,4 @@
-"""The page in a real headless browser: it renders, it moves, and what is dragged there arrives."""
+"""The page in a headless browser: rendering, motion, and dragged targets."""
 
 from concurrent.futures import ThreadPoolExecutor
 import threading
@@ -33,7 +33,7 @@ def bag(tmp_path_factory):
 
 @pytest.fixture
 def drawn():
-    """Run what draws a page in a thread; stops it afterwards."""
+    """Run the drawing of a page in a thread, and stop it afterwards."""
     pages = []
 
     def start(page, drawer):
@@ -47,7 +47,7 @@ def drawn():
 
 
 class Graph:
-    """Stands for a ROS graph in which the robot hovers."""
+    """Stand-in for a ROS graph with a hovering robot."""
 
     def __init__(self, refuses=''):
         self.targets, self.selected, self.refuses, self.t = [], [], refuses, 100.0
@@ -73,7 +73,7 @@ class Graph:
 
 
 def pixel(client, point):
-    """Where a point in world is on the page."""
+    """Position of a point in world on the page."""
     camera = client.camera
     seen = rotations.matrix(np.roll(camera.wxyz, -1)).T @ (point - camera.position)
     scale = camera.image_height / 2 / np.tan(camera.fov / 2) / seen[2]
@@ -93,7 +93,7 @@ def test_a_recording_is_rendered_and_moves_with_the_slider(bag, drawn):
         page = Page(['a', 'b'], Model.load(), ROBOT, port=8300)
         player = drawn(page, Player(page, recordings, start=6.0, play=False))
         player.look()
-        with opened(page.url) as (browser, asked):
+        with opened(page.url) as (browser, requests):
             rendered(browser)
             first = at_rest(browser)
             # The slider's number, as somebody would type it.
@@ -109,7 +109,7 @@ def test_a_recording_is_rendered_and_moves_with_the_slider(bag, drawn):
             player._play.value = True
             until(lambda: player.time > 14.5, 'a time that runs')
             assert all(url.startswith((page.url, page.url.replace('localhost', '127.0.0.1'),
-                                       'blob:', 'data:')) for url in asked), asked
+                                       'blob:', 'data:')) for url in requests), requests
     finally:
         for recording in recordings:
             recording.close()
@@ -140,7 +140,7 @@ def test_a_target_that_is_dragged_with_the_mouse_arrives(drawn):
         assert 100.0 < target.stamp <= graph.t
 
 
-def test_a_refused_target_is_told_and_taken_back(drawn):
+def test_a_refused_target_is_reported_and_reset(drawn):
     page = Page(['live'], Model.load(), ROBOT, title='Flight', port=8340)
     graph = Graph(refuses='target_pose: 1 rejected, 9 m from the robot')
     live = drawn(page, Live(page, graph, ROBOT, allow_targets=True))
@@ -155,7 +155,7 @@ def test_a_refused_target_is_told_and_taken_back(drawn):
         until(lambda: live._sampler.target is None, 'the target before')
 
 
-def test_without_leave_the_page_can_ask_for_nothing(drawn):
+def test_without_permission_the_page_has_no_controls_for_targets(drawn):
     page = Page(['live'], Model.load(), ROBOT, title='Flight', port=8360)
     live = drawn(page, Live(page, Graph(), ROBOT, allow_targets=False))
     with opened(page.url) as (browser, _):

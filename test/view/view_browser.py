@@ -1,4 +1,4 @@
-"""A headless browser that is installed already, and what is seen in it."""
+"""A headless browser, and pictures of its page."""
 
 from contextlib import contextmanager
 import io
@@ -20,7 +20,7 @@ PATIENCE = 120.0        # [s] on a busy computer
 
 
 def chromium():
-    """Path of a browser; skips the test where there is none."""
+    """Path of an installed browser; skips the test if there is none."""
     path = os.environ.get('CHROMIUM') or next(filter(None, map(shutil.which, NAMES)), None)
     if path is None:
         pytest.skip(f"no browser: none of {', '.join(NAMES)} in PATH, no variable CHROMIUM")
@@ -29,7 +29,7 @@ def chromium():
 
 @contextmanager
 def opened(url, width=900, height=560):
-    """Open a page; yields it and the list of what it asked for."""
+    """Open a page; yield it and the list of its requests."""
     playwright = pytest.importorskip('playwright.sync_api', reason='no playwright: pip install '
                                      'playwright; its own browsers are not needed')
     path = chromium()
@@ -37,31 +37,31 @@ def opened(url, width=900, height=560):
         browser = run.chromium.launch(executable_path=path, args=list(FLAGS))
         page = browser.new_page(viewport={'width': width, 'height': height})
         page.set_default_timeout(1e3 * PATIENCE)
-        asked = []
-        page.on('request', lambda request: asked.append(request.url))
+        requests = []
+        page.on('request', lambda request: requests.append(request.url))
         page.goto(url)
         page.add_style_tag(content='.mantine-Notifications-root {opacity: 0.01}')
         try:
-            yield page, asked
+            yield page, requests
         finally:
             browser.close()
 
 
 def picture(page):
-    """(H, W, 3) of the page, without the panel on its right."""
+    """Picture (H, W, 3) of the page, without the panel on its right."""
     image = Image.open(io.BytesIO(page.screenshot())).convert('RGB')
     return np.asarray(image, dtype=float)[:, :-PANEL]
 
 
 def rendered(page):
-    """Wait for a picture of many colours, faded in."""
+    """Wait for a picture with many colours."""
     until(lambda: len(np.unique(picture(page).reshape(-1, 3), axis=0)) > 200,
           'a picture of many colours')
     page.wait_for_timeout(2000)
 
 
 def until(condition, what, patience=PATIENCE):
-    """Wait for something that is true; returns it."""
+    """Wait for a true value; return it."""
     deadline = time.monotonic() + patience
     while time.monotonic() < deadline:
         if value := condition():
