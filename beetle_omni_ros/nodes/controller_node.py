@@ -189,14 +189,7 @@ class NoParameters:
 
 
 def node_parameters(entry: ControllerEntry, selectable: bool) -> type:
-    """
-    Make the parameter class of a controller's node: controller, robot file and controller file.
-
-    Args:
-        entry: registry entry of the controller.
-        selectable: whether the parameter ``controller`` selects the controller.
-
-    """
+    """Make the parameter class of a controller's node: controller, robot and controller file."""
     base = entry.parameter_class or NoParameters
     more = {'robot_file': ('', 'robot file of the controller; empty: the shipped one'),
             entry.file_key: ('', f"controller file; empty: {entry.parameters_file or 'none'}")}

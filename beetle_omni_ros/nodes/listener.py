@@ -25,12 +25,7 @@ STREAMS = {'mocap/pose': 'position', 'imu/data_raw': 'specific_force',
 
 def listen(seconds: float, namespace: str = '', discovery: str | None = None) -> ObservedGraph:
     """
-    Join the graph and record its messages.
-
-    Args:
-        seconds: duration [s].
-        namespace: namespace of the robot's topics.
-        discovery: range, see :mod:`discovery`; default this computer only.
+    Join the graph and record its messages for ``seconds``.
 
     Raises:
         ParameterError: invalid namespace or range of discovery.

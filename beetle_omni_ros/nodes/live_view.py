@@ -43,11 +43,7 @@ class LiveGraph:
     """
     ROS side of the page; implements :class:`~beetle_omni_ros.view.live.Graph`.
 
-    Args:
-        namespace: namespace of the robot's topics.
-        domain: ROS domain; None: ``ROS_DOMAIN_ID``.
-        discovery: range, see :mod:`discovery`.
-        writable: whether targets and the selection of a controller are sent.
+    Targets and selections of a controller are sent only if ``writable``.
 
     Raises:
         ParameterError: invalid namespace or range of discovery.
@@ -156,19 +152,7 @@ def run_live(*, namespace: str = '', domain_id: int | None = None, discovery: st
              dark: bool = False, allow_targets: bool = False,
              console: Console | None = None) -> None:
     """
-    Show a running graph until Ctrl-C.
-
-    Args:
-        namespace: namespace of the robot's topics.
-        domain_id: ROS domain; None: ``ROS_DOMAIN_ID``.
-        discovery: range; None: this computer only.
-        robot: robot file; None: the shipped one.
-        urdf: robot description; None: the shipped one.
-        host: address at which the page is served.
-        port: first port that is tried.
-        dark: whether the page starts with dark colours.
-        allow_targets: whether the page may publish targets and select controllers.
-        console: output of the address.
+    Show a running graph until Ctrl-C; arguments are the options of `beetle_omni view`.
 
     Raises:
         ParameterError: unusable input.

@@ -19,11 +19,6 @@ class RealTimePacing:
     """
     Ticks on the steady clock, stamps in ROS time; starts with the first call of :meth:`due`.
 
-    Args:
-        tick: period [s].
-        steady: steady clock [s].
-        ros: clock of the stamps [s].
-
     Attributes:
         ticks: number of ticks so far.
         lost_ticks: ticks skipped after stalls; the simulation stopped meanwhile.

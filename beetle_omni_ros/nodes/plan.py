@@ -31,15 +31,9 @@ Parameters = dict[str, dict]        # node name -> parameters that differ from t
 
 def bridge_parameters(folder: Path, robot: dict) -> dict[str, dict]:
     """
-    Return the parameters of simulator and bridges that share pseudo-terminals.
+    Return node name -> parameters of simulator and bridges that share pseudo-terminals.
 
-    Args:
-        folder: folder of the names of the two pseudo-terminals.
-        robot: parameters with the robot file of estimator, controllers and bridges.
-
-    Returns:
-        Node name -> parameters.
-
+    The names of the pseudo-terminals are in ``folder``; ``robot`` holds the parameter robot_file.
     """
     servos, board = str(Path(folder) / 'servo_bus'), str(Path(folder) / 'motor_board')
     return {'sim_node': {'actuators': 'emulated', 'servo_port': servos, 'board_port': board},
@@ -176,17 +170,10 @@ def controller_nodes(active: str, *, robot_file: str = '', policy: str = '',
                      allow_other_robot: bool = False, standby: bool = True
                      ) -> tuple[Parameters, dict[str, str]]:
     """
-    Return the parameters of the controllers' nodes.
+    Return the parameters of the controllers' nodes; arguments as in :class:`GraphOptions`.
 
     A standby policy that is not for this robot is omitted, because a node that refuses its
     parameters ends the shared process.
-
-    Args:
-        active: a name, or ``package.module:Class``.
-        robot_file: as in :class:`GraphOptions`; also the following ones.
-        policy: policy file.
-        allow_other_robot: whether a policy for other robot parameters may fly.
-        standby: whether standby controllers run.
 
     Returns:
         Node name -> parameters, the active one first; omitted standby controller -> reason.

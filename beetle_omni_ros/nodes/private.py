@@ -96,12 +96,6 @@ def open_lock(name: str):
     """
     Open a file of :func:`folder` for locking, without truncation and without following links.
 
-    Args:
-        name: file name without folder.
-
-    Returns:
-        The file, readable and writable, at its beginning.
-
     Raises:
         OSError: no folder, or the file is a link, special, or of another user.
 

@@ -64,15 +64,7 @@ def profile(qos: Qos) -> QoSProfile:
 
 
 def message(topic: str, value: Any, frame: str | None = None) -> Any:
-    """
-    Make the message of a value.
-
-    Args:
-        topic: name, see :func:`~beetle_omni_ros.messages.topics.topic_of`.
-        value: value of the topic's class.
-        frame: frame_id; default: the topic's.
-
-    """
+    """Make the message of a topic's value; ``frame`` replaces the topic's frame_id."""
     made = topic_of(topic).write(RCLPY, value)
     if frame is not None:
         made.header.frame_id = frame
@@ -85,15 +77,7 @@ def parameter_request(name: str, value: Any) -> SetParameters.Request:
 
 
 class Publisher:
-    """
-    Publishes the values of one topic.
-
-    Args:
-        node: publishing node.
-        topic: relative name.
-        qos: quality of service; default: the table's.
-
-    """
+    """Publishes the values of a topic; ``qos`` replaces the quality of service of the table."""
 
     def __init__(self, node: Node, topic: str, qos: Qos | None = None):
         entry, self._topic = topic_of(topic), topic
@@ -114,13 +98,7 @@ def subscribe(node: Node, topic: str, handle: Callable[[Any], None], *, qos: Qos
     """
     Subscribe a topic without checks of age.
 
-    Args:
-        node: subscribing node.
-        topic: relative name.
-        handle: called with each value.
-        qos: quality of service; default: the table's.
-        read: message -> value; default: the table's ``take``.
-
+    ``qos`` replaces the quality of service of the table, ``read`` its ``take``.
     """
     entry = topic_of(topic)
     take = read or entry.take

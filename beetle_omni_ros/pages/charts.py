@@ -90,15 +90,9 @@ class Numbers:
 
     def add(self, values: np.ndarray, log: bool = False) -> dict:
         """
-        Add a series.
+        Add a series (N,), NaN for missing values; return its position and scale.
 
-        Args:
-            values: (N,) values, NaN for missing ones.
-            log: whether to store logarithms; only positive values are kept.
-
-        Returns:
-            Position and scale of the series for the script.
-
+        With ``log``, logarithms are stored and only positive values are kept.
         """
         values = np.asarray(values, dtype=float)
         if log:

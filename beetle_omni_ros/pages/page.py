@@ -29,16 +29,10 @@ def verdict_head(word: str, colour: str, sentence: str, picture: str = '') -> st
 def page(title: str, subtitle: str, grids: list[Grid], notes: list[str],
          sections: list[str], head: str = '') -> str:
     """
-    Return a page of tables, notes and sections.
+    Return a page of tables, notes below them and sections.
 
-    Args:
-        title: title of the page.
-        subtitle: line below the title.
-        grids: tables.
-        notes: sentences below the tables.
-        sections: HTML of :func:`section`.
-        head: HTML above the tables, such as :func:`verdict_head`.
-
+    ``sections`` are HTML of :func:`section`; ``head`` is HTML above the tables, such as
+    :func:`verdict_head`.
     """
     items = ''.join(f'<li>{escape(note)}</li>' for note in notes)
     return frame(title, subtitle, f"""{head}<section>{''.join(map(html, grids))}

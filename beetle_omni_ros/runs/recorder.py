@@ -62,13 +62,9 @@ class Recorder:
 
     def write_compute(self, t, controller: str, **times) -> None:
         """
-        Record the CPU time of a controller's steps since its start.
+        Record the CPU time of a controller's steps since its start, reported at ``t`` [s].
 
-        Args:
-            t: time of the report [s].
-            controller: name of the controller.
-            times: median, p99, max [ms], deadline_misses, count.
-
+        ``times`` are median, p99, max [ms], deadline_misses, count.
         """
         self.write_diagnostic(t, f'{controller}_node: {COMPUTE_STATUS}',
                               {key: times[name] for key, name in COMPUTE_KEYS.items()})

@@ -27,11 +27,7 @@ def run_report(paths: list[Path], output: Path, *, json_path: Path | None = None
     """
     Read runs, print their result table and write the page.
 
-    Args:
-        paths: bags, or folders of bags.
-        output: HTML file.
-        json_path: file of the results.
-        console: output of the table.
+    ``paths`` are bags, or folders of bags.
 
     Returns:
         The results: ``meta`` and one key for each run and controller.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import zip_longest
+
 from rich.console import Console
 
 from beetle_omni_ros.pages.table import ABSENT, Grid, print_grids
@@ -42,16 +44,20 @@ def grids(results: dict, *, with_poses: bool | None = None) -> list[Grid]:
     """
     task = str(results.get('meta', {}).get('task', ''))
     by_label = {name: result for name, result in results.items() if name != 'meta'}
+
+    def having(key):
+        return {name: result for name, result in by_label.items() if key in result}
+
     made = [_summary(by_label, task)]
-    if any('trajectory' in result for result in by_label.values()):
-        made.append(_tracking(by_label, task))
+    if tracked := having('trajectory'):
+        made.append(_tracking(tracked, task))
     for kind, unit in (('force', 'N'), ('torque', 'N_m')):
-        if any(kind in result for result in by_label.values()):
-            made.append(_levels(_with(by_label, kind), kind, unit))
-    if any('payload' in result for result in by_label.values()):
-        made.append(_payloads(_with(by_label, 'payload')))
-    if any('hover' in result for result in by_label.values()):
-        made.append(_hover(by_label))
+        if disturbed := having(kind):
+            made.append(_levels(disturbed, kind, unit))
+    if loaded := having('payload'):
+        made.append(_payloads(loaded))
+    if hovered := having('hover'):
+        made.append(_hover(hovered))
     for group in _same_poses(by_label):
         count = len(next(iter(group.values()))['poses'])
         if with_poses or (with_poses is None and 1 < count <= MANY_POSES):
@@ -109,17 +115,12 @@ def _reached(result):
     return f"{sum(pose['reached'] for pose in result['poses'])} of {len(result['poses'])}"
 
 
-def _with(by_label, key):
-    return {name: result for name, result in by_label.items() if key in result}
-
 
 def _tracking(by_label, task):
     header = ['', 'round', 'position mean ± std (max) [m]', 'orientation mean ± std (max) [deg]']
     rows = []
     for name, result in by_label.items():
-        tracking = result.get('trajectory')
-        if not tracking:
-            continue
+        tracking = result['trajectory']
         for k, part in enumerate(tracking['rounds']):
             rows.append([name, str(k + 1), *_tracking_cells(part)])
         rows.append([name, 'all', *_tracking_cells(tracking)])
@@ -142,18 +143,17 @@ def _levels(by_label, kind, unit):
     text = unit.replace('_', ' ')
     header = [f'{kind} [{text}]'] + [f'{name}: {what}' for name in by_label
                                      for what in ('peak position [m]', 'peak orientation [deg]')]
-    steps = sorted({entry[f'level_{unit}'] for result in by_label.values()
-                    for entry in result.get(kind, {}).get('levels', [])})
+    levels = [{entry[f'level_{unit}']: entry for entry in result[kind].get('levels', [])}
+              for result in by_label.values()]
     rows = []
-    for step in steps:
+    for step in sorted(set().union(*levels)):
         row = [f'{step:g}']
-        for result in by_label.values():
-            entry = next((e for e in result.get(kind, {}).get('levels', [])
-                          if e[f'level_{unit}'] == step), None)
+        for entries in levels:
+            entry = entries.get(step)
             row += [_number(entry['peak_position_m'], 3) + (' lost' if entry['lost'] else ''),
                     _number(entry['peak_orientation_deg'], 1)] if entry else [ABSENT, ABSENT]
         rows.append(row)
-    lost = [result.get(kind, {}).get(f'lost_at_{unit}') for result in by_label.values()]
+    lost = [result[kind].get(f'lost_at_{unit}') for result in by_label.values()]
     rows.append(['lost at'] + [cell for level in lost for cell in
                                ('never' if level is None else f'{level:g} {text}', '')])
     return Grid(f'Disturbance: {kind}', header, rows)
@@ -162,11 +162,8 @@ def _levels(by_label, kind, unit):
 def _payloads(by_label):
     header = ['payload [kg]'] + [f'{name}: {what}' for name in by_label
                                  for what in ('height error [m]', 'orientation [deg]')]
-    count = max(len(result.get('payload', [])) for result in by_label.values())
     rows = []
-    for k in range(count):
-        entries = [result['payload'][k] if k < len(result.get('payload', [])) else None
-                   for result in by_label.values()]
+    for entries in zip_longest(*(result['payload'] for result in by_label.values())):
         mass = next(entry['payload_kg'] for entry in entries if entry)
         rows.append([f'{mass:g}'] + [cell for entry in entries for cell in (
             [_number(entry['height_error_m'], 4), _number(entry['orientation_deg'], 2)]
@@ -176,8 +173,7 @@ def _payloads(by_label):
 
 def _hover(by_label):
     header = ['', 'position mean ± std (max) [m]', 'orientation mean ± std (max) [deg]']
-    rows = [[name, *_tracking_cells(result['hover'])] for name, result in by_label.items()
-            if 'hover' in result]
+    rows = [[name, *_tracking_cells(result['hover'])] for name, result in by_label.items()]
     return Grid('Hover after 8 s', header, rows)
 
 

@@ -48,12 +48,7 @@ def out_of_reach(target: Target, position: np.ndarray, reach: float, now: float)
     """
     Check the distance of a target from the robot; returns as :meth:`TargetChecks.why_not`.
 
-    Args:
-        target: pose, or trajectory, of which the point at ``now`` is checked.
-        position: (3,) position of the robot in world [m].
-        reach: largest distance for the active controller [m].
-        now: present time [s].
-
+    The target at ``now`` [s] must be within ``reach`` [m] of ``position`` (3,) in world [m].
     """
     away = float(np.linalg.norm(target.at(now).position - position))
     return '' if away <= reach else (f'{away:.4g} m from the robot, expected at most {reach:g} m: '
@@ -61,14 +56,7 @@ def out_of_reach(target: Target, position: np.ndarray, reach: float, now: float)
 
 
 class TargetChecks:
-    """
-    Checks targets of one robot.
-
-    Args:
-        robot: robot parameters, for the geometry.
-        limits: limits; default: params/targets.yaml.
-
-    """
+    """Checks targets of one robot, by default with the limits of params/targets.yaml."""
 
     def __init__(self, robot: RobotParameters, limits: TargetLimits | None = None):
         self._p = p = limits or TargetLimits.load()

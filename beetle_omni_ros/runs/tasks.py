@@ -140,13 +140,9 @@ class TaskPlayer:
     def update(self, now: float, position: np.ndarray | None = None,
                quaternion: np.ndarray | None = None) -> Moment:
         """
-        Return the state of the task at ``now``.
+        Return the state of the task at ``now`` [s].
 
-        Args:
-            now: present time [s].
-            position: (3,) position of the robot in world [m], to detect a loss of control.
-            quaternion: (4,) orientation of the robot.
-
+        Pose (3,) in world [m] and (4,) of the robot serve to detect a loss of control.
         """
         index = int(np.searchsorted(self._ends, now - self.start + 1e-6, side='right'))
         if position is not None and self._lost(position, quaternion, index):

@@ -19,11 +19,7 @@ WORLD_NEWTON_PER_METRE = 40.0   # external force that is drawn as one metre
 
 def rotor_frames(robot: RobotParameters, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Compute the frames of the rotors.
-
-    Args:
-        robot: robot parameters.
-        tilt: (4,) angles of the tilt joints [rad].
+    Compute the frames of the rotors at tilt angles (4,) [rad].
 
     Returns:
         (4, 3) centres [m] and (4, 3, 3) axes as columns, x outward along the arm, z along the
@@ -39,16 +35,9 @@ def rotor_frames(robot: RobotParameters, tilt: np.ndarray) -> tuple[np.ndarray, 
 
 def thrust_arrows(robot: RobotParameters, tilt: np.ndarray, thrust: np.ndarray) -> np.ndarray:
     """
-    Compute begin and end of each rotor's thrust arrow.
+    Return begin and end of each rotor's thrust arrow, (4, 2, 3) in base_link [m].
 
-    Args:
-        robot: robot parameters.
-        tilt: (4,) angles [rad].
-        thrust: (4,) [N]; NaN: no arrow.
-
-    Returns:
-        (4, 2, 3) points in base_link [m].
-
+    ``tilt`` (4,) is in rad, ``thrust`` (4,) in N; NaN: no arrow.
     """
     centres, axes = rotor_frames(robot, tilt)
     length = np.nan_to_num(thrust) / NEWTON_PER_METRE
@@ -59,12 +48,8 @@ def torque_arcs(robot: RobotParameters, tilt: np.ndarray, thrust: np.ndarray) ->
     """
     Compute arcs for the reaction torque of each rotor on the body, -spin ratio f about its axis.
 
-    The angle of an arc is proportional to the torque and has its direction.
-
-    Args:
-        robot: robot parameters.
-        tilt: (4,) angles [rad].
-        thrust: (4,) [N]; NaN: no arc.
+    The angle of an arc is proportional to the torque and has its direction. ``tilt`` (4,) is in
+    rad, ``thrust`` (4,) in N; NaN: no arc.
 
     Returns:
         (4 * (SEGMENTS + 2), 2, 3) lines in base_link [m].

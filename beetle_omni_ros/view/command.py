@@ -28,18 +28,7 @@ def run_view(runs: list[Path], *, robot: Path | None = None, urdf: Path | None =
              host: str, port: int, dark: bool = False, start: float = 0.0,
              play: bool = True, console: Console | None = None) -> None:
     """
-    Play recorded runs until Ctrl-C.
-
-    Args:
-        runs: rosbag2 folders or their files; the first is drawn solid, the others transparent.
-        robot: robot file, for the positions of forces; None: the shipped one.
-        urdf: robot description; None: the shipped one.
-        host: address at which the page is served.
-        port: first port that is tried.
-        dark: whether the page starts with dark colours.
-        start: start of the playback [s].
-        play: whether playback starts at once.
-        console: output of the address.
+    Play recorded runs until Ctrl-C; arguments are the options of `beetle_omni view`.
 
     Raises:
         BagError: unusable run.

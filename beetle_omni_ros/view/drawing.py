@@ -84,13 +84,9 @@ class RobotDrawing:
 
     def show(self, row: np.ndarray, prefix: str = '', passed: float = 0.0) -> None:
         """
-        Draw the robot at a pose.
+        Draw the robot at a pose of the row, see :func:`~beetle_omni_ros.view.frames.pose`.
 
-        Args:
-            row: row of values, see :mod:`~beetle_omni_ros.view.frames`.
-            prefix: pose in the row, see :func:`~beetle_omni_ros.view.frames.pose`.
-            passed: time since the previous row, for the rotation of the rotors [s].
-
+        ``passed`` is the time since the previous row, for the rotation of the rotors [s].
         """
         placed = pose(row, prefix)
         self._root.visible = placed is not None

@@ -92,7 +92,7 @@ class Live:
         sampler = self._sampler
         self._publish()
         self._graph.take(sampler)
-        self._look_for_refusal()
+        self._check_refusal()
         if not sampler.placed:
             return
         if len(self._rows) and sampler.clock < self._rows.times[-1] - JUMP:
@@ -107,9 +107,9 @@ class Live:
         state = sampler.states[-1][1] if sampler.states else ''
         self._page.show([Shown(row, window, state, sampler.faults)], now, passed,
                         f'live: {now:.1f} s')
-        self._tell(state, row)
+        self._update_controls(state, row)
 
-    def _tell(self, state, row):
+    def _update_controls(self, state, row):
         text = 'live'
         if self._gizmo is not None:
             text = 'drag the target, or give numbers'
@@ -159,7 +159,7 @@ class Live:
             self._sampler.target = target
             self._graph.publish_target(target)
 
-    def _look_for_refusal(self):
+    def _check_refusal(self):
         if self._pending is None:
             self._sampler.input_warnings.clear()
             return

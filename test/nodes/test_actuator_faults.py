@@ -110,7 +110,7 @@ def robot(hangar, tmp_path):
         hangar.stack.close()
 
 
-# parameters of sim_node, switched on and off again; bridge, status and counter that tell of it
+# parameters of sim_node, set and reset; bridge, status and counter of the fault
 BEARABLE = [
     ({'servo_faults.bad_crc': 0.05}, {'servo_faults.bad_crc': 0.0}, 'joint', 'bus', 'corrupt'),
     ({'servo_faults.dropped': 0.05}, {'servo_faults.dropped': 0.0}, 'joint', 'bus', 'unanswered'),
@@ -149,7 +149,7 @@ def test_faults_that_drivers_recover_from_do_not_end_a_flight(robot):
     mechanic.sound = True
 
 
-# fault, mended; what joint_bridge_node or rotor_bridge_node says; whether it needs a reboot
+# fault, value without fault; state of the bridge; whether it needs a reboot
 LANDING = [
     ('servo_faults.silent', [2], [], 'lost: gimbal2', False),
     ('servo_faults.overload', [1], [], 'lost: gimbal1', True),

@@ -75,7 +75,7 @@ def test_a_volatile_target_is_recorded_without_an_incompatible_offer(bench, tmp_
 
 def test_a_target_latched_before_the_start_is_recorded(bench):
     publisher = bench.publisher(wire.profile(LATCHED))
-    publisher.publish(PoseStamped())        # nobody can listen yet
+    publisher.publish(PoseStamped())        # before the subscription
     end = time.monotonic() + SOON
     while not bench.written() and time.monotonic() < end:
         bench.spin(0.05)

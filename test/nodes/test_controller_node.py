@@ -78,7 +78,7 @@ def test_any_controller_sees_true_tilts_and_no_target_beyond_its_reach(make, mon
     assert seen[0].tilt == pytest.approx(health.true(np.zeros(4))) and seen[0].tilt.any()
     far = PoseTarget(np.array([9.0, 0.0, 1.0]), LEVEL, 1.0)
     node._mode = node._own_mode
-    node._check_target(far, math.nan)       # it does not say how far it flies
+    node._check_target(far, math.nan)       # its reach is not limited
     controller.reach = 3.0
     with pytest.raises(MessageError, match='expected at most 3 m'):
         node._check_target(far, math.nan)

@@ -20,7 +20,7 @@ from beetle_omni_ros.nodes.graph import Graph
 
 NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'supervisor_node')
 STEP = DriveParameters.load().step
-LOCAL_FLAGS = 3     # place in what termios tells
+LOCAL_FLAGS = 3     # index in the list of termios
 PATIENCE = 60       # [s]
 
 

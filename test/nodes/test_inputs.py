@@ -246,7 +246,7 @@ def _fly_with_an_intruder(bench, node):
         for other in ('', 'x' * 100_000, 'supervisor_node:00000000'):
             assert answer(other) == 'refused' and len(node.refusals[-1]) < 200
         assert f"expected '{own}'" in node.refusals[-1]
-    time.sleep(0.6)     # silence of the supervisor gives nobody else the actuators
+    time.sleep(0.6)     # other commands are refused even if the supervisor is silent
     assert answer('') == 'refused'
     assert bench.wait(lambda: any('command: ' in text and '2nd publisher' in text
                                   for text in texts))

@@ -219,7 +219,7 @@ def test_an_overheated_servo_is_lost_until_it_is_rebooted(active):
     assert emulated.torque_enabled.tolist() == [True, True, True, False]
     emulated.faults.overheated = set()
     witness.spin(0.3)
-    assert not emulated.torque_enabled[3], 'nobody asked for it'
+    assert not emulated.torque_enabled[3], 'no torque was requested'
     assert witness.trigger('reboot') == (True, 'restarting gimbal4')
     witness.until(lambda: torque_is_back(emulated, witness, HOME), 'not back')
 

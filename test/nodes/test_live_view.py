@@ -81,15 +81,15 @@ def test_messages_become_a_row(graph, listener):
 
 
 def test_a_target_arrives_latched_and_unchanged(graph, listener):
-    wished = PoseTarget(np.array([0.4, -0.2, 1.5]), TURNED, 12.25)
-    listener.publish_target(wished)
+    target = PoseTarget(np.array([0.4, -0.2, 1.5]), TURNED, 12.25)
+    listener.publish_target(target)
     received = []      # of a subscriber that comes later
     wire.subscribe(graph, 'target_pose', received.append)
     assert wait(lambda: received)
     found = received[0]
-    np.testing.assert_allclose(found.position, wished.position)
-    np.testing.assert_allclose(found.quaternion, wished.quaternion)
-    assert found.stamp == wished.stamp
+    np.testing.assert_allclose(found.position, target.position)
+    np.testing.assert_allclose(found.quaternion, target.quaternion)
+    assert found.stamp == target.stamp
 
 
 def test_the_supervisor_accepts_or_refuses_a_controller(graph, listener):

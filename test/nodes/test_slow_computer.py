@@ -61,7 +61,7 @@ def test_a_computer_that_is_too_slow_is_detected_before_arming(nodes, named):
     with pytest.raises(TooSlowError, match=named):
         flown(Nodes(**nodes), may_be_slow=False)
     with pytest.raises(FlightError, match='refuses to arm: not level') as raised:
-        flown(Nodes(**nodes))               # who may be slow tries
+        flown(Nodes(**nodes))               # with may_be_slow, it tries
     assert raised.type is FlightError
 
 

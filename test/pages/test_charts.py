@@ -10,7 +10,7 @@ import pytest
 
 from beetle_omni_ros.pages.charts import data_block, Numbers, STEPS
 
-# On a busy computer the time of an example says nothing.
+# On a busy computer the time of an example is meaningless.
 BUSY = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 FLOATS = st.one_of(st.floats(-1e6, 1e6), st.just(np.nan), st.just(np.inf))
 

@@ -107,7 +107,7 @@ def test_the_lowest_point_is_reported_with_its_pose():
             dip = 0.4 if k == 1 and 3 < t - target.stamp < 3.1 else 0.0
             write_truth(recorder, t, np.array([0, 0, 0.7 - dip]), target.quaternion, np.zeros(3),
                         np.zeros(3))
-    # on the ground before and after, which says nothing of the flight
+    # on the ground before and after, which is not part of the flight
     write_truth(recorder, 30.0, np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
     result = metrics(recorder.log(), task)
     assert result['lowest'] == {'height_m': pytest.approx(0.3), 'pose': 1}

@@ -96,7 +96,7 @@ def test_a_recording_is_rendered_and_moves_with_the_slider(bag, drawn):
         with opened(page.url) as (browser, requests):
             rendered(browser)
             first = at_rest(browser)
-            # The slider's number, as somebody would type it.
+            # The slider's number, as typed by a user.
             field = browser.locator('.mantine-NumberInput-input').first
             until(lambda: browser.get_by_text('a: 6.0 s of').count(), 'the status')
             field.fill('14')
