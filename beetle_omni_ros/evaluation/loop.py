@@ -273,8 +273,8 @@ class FlightLoop:
 
     def _target_in_force(self):
         """Target of the supervisor, else an accepted target of a fault, else that of the task."""
-        if self._supervisor.wish is not None:
-            return self._supervisor.wish
+        if self._supervisor.target_override is not None:
+            return self._supervisor.target_override
         target = self._target if self._target is not None else self._hold
         other = self._processes.target(target)
         if other is None:

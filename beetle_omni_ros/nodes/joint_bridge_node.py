@@ -60,9 +60,9 @@ class JointBridgeNode(LifecycleFlightNode):
         self._joints = self.publisher('joint_states')
         self.listen('command', self._on_command, read=CommandSource(self).read,
                     max_age=COMMAND_AGE, stale_after=None, published=True)
-        self._bus_status = bus_status()
-        self.health.report('bus', lambda: self._bus_status(self.stage, self._published, self._bus,
-                                                           self._loop))
+        # loop, its cycles and missed cycles, and the time of the last bus status
+        self._counted = (None, 0, 0, time.monotonic())
+        self.health.report('bus', self._bus_status)
         self.health.report('latency', self._latency_status)
         for k, name in enumerate(JOINT_NAMES):
             self.health.report(name, lambda k=k: servo_status(self._loop, k))
@@ -199,41 +199,36 @@ class JointBridgeNode(LifecycleFlightNode):
         return 'waiting: no torque, not activated' if self.stage == INACTIVE \
             else 'waiting: not configured'
 
-    def _latency_status(self):
-        times = self._latency
-        return health.OK, f'{self._since} of command to its last byte written', {
-            **times.milliseconds(), 'count': times.count}
-
-
-def bus_status():
-    """Make a function that returns the bus's status, with rates since its last call."""
-    last = {'cycles': 0, 'missed': 0, 'time': time.monotonic(), 'loop': None}
-
-    def status(stage, text, bus, loop):
+    def _bus_status(self):
+        loop, bus, text, now = self._loop, self._bus, self._published, time.monotonic()
         if loop is None:
-            return (health.WARN if stage == ACTIVE else health.OK), text, {'stage': stage}
-        if loop is not last['loop']:
-            last.update(cycles=0, missed=0, loop=loop)
-        now = time.monotonic()
+            return (health.WARN if self.stage == ACTIVE else health.OK), text, {
+                'stage': self.stage}
+        before, cycles, missed, then = self._counted
+        if loop is not before:
+            cycles = missed = 0
         link = bus.statistics
         values = {
-            'stage': stage, 'cycles': loop.cycles, 'missed_cycles': loop.missed,
-            'rate_hz': (loop.cycles - last['cycles']) / max(now - last['time'], 1e-3),
+            'stage': self.stage, 'cycles': loop.cycles, 'missed_cycles': loop.missed,
+            'rate_hz': (loop.cycles - cycles) / max(now - then, 1e-3),
             'connected': bus.connected, 'goals_written': loop.written,
             'goals_stale': loop.stale, 'goals_clipped': bus.clipped,
             'incomplete': loop.incomplete, 'transactions': link.transactions,
             'unanswered': link.unanswered, 'corrupt': link.corrupt, 'refused': link.refused,
             'connections': link.connections}
-        missed = loop.missed - last['missed']
-        last.update(cycles=loop.cycles, missed=loop.missed, time=now)
+        missed = loop.missed - missed
+        self._counted = (loop, loop.cycles, loop.missed, now)
         if text.startswith('lost'):
             return health.ERROR, text, values
-        if not bus.connected or missed:
-            return health.WARN, f'{missed} cycles missed' if bus.connected else 'no connection', \
-                values
-        return health.OK, text, values
+        if not bus.connected:
+            return health.WARN, 'no connection', values
+        return (health.WARN, f'{missed} cycles missed', values) if missed else \
+            (health.OK, text, values)
 
-    return status
+    def _latency_status(self):
+        times = self._latency
+        return health.OK, f'{self._since} of command to its last byte written', {
+            **times.milliseconds(), 'count': times.count}
 
 
 def servo_status(loop, index):

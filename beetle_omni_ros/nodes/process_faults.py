@@ -10,7 +10,6 @@ import tempfile
 import time
 
 import numpy as np
-from rclpy.parameter_client import AsyncParameterClient
 
 from beetle_omni_ros.control.base import Command, PoseTarget
 from beetle_omni_ros.messages.conversions import read_command, read_odom
@@ -41,7 +40,6 @@ class Observer(Operator):
         self.thrust_at = self._down_since = -np.inf     # s, monotonic
         self._floor: float | None = None
         self.touched: float | None = None
-        self.client = lambda node: AsyncParameterClient(self._node, node)
         wire.subscribe(self._node, 'ground_truth/odom', self._on_truth, qos=SENSOR, read=read_odom)
         wire.subscribe(self._node, 'command', self._on_command, qos=SENSOR, read=read_command)
 

@@ -90,7 +90,7 @@ class SupervisorNode(FlightNode):
             s.stamp, s.specific_force, s.angular_velocity), max_age=SENSOR_AGE)
         self.listen('mocap/pose', lambda s: supervisor.on_mocap(
             s.stamp, s.position, s.quaternion), max_age=SENSOR_AGE)
-        self.listen('rotor_states', lambda told: supervisor.on_rotors(told.stamp, told.speed),
+        self.listen('rotor_states', lambda r: supervisor.on_rotors(r.stamp, r.speed),
                     stale_after=None)
         self.listen('battery_state', lambda battery: supervisor.on_battery(battery.voltage))
         for name in self._controllers:
@@ -153,8 +153,8 @@ class SupervisorNode(FlightNode):
         if state != self._state:
             self._state = state
             self._states.publish(state)
-        if supervisor.wish is not self._override:
-            self._override = supervisor.wish
+        if supervisor.target_override is not self._override:
+            self._override = supervisor.target_override
             self._targets.publish(TargetOverride.of(self._override))
         if supervisor.health is not self._health:
             self._health = supervisor.health

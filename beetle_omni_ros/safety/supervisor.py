@@ -249,7 +249,7 @@ class Supervisor(Inputs):
         return self._health
 
     @property
-    def wish(self) -> Target | None:
+    def target_override(self) -> Target | None:
         """Target of the controllers that replaces the operator's target, or None."""
         return self._landing_way if self.state == LANDING else None
 
