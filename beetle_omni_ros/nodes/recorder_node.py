@@ -17,6 +17,7 @@ from beetle_omni_ros.runs.bag import BagError, BagWriter
 from beetle_omni_ros.runs.rosbag2_writer import COMPRESSIONS
 
 FLUSH_PERIOD = 0.4      # s; a crash loses only messages after the last flush
+HELD = 1000             # messages at most that wait for the first simulated time
 TARGETS = 'target_pose', 'target_trajectory'    # with any quality of service
 
 
@@ -51,6 +52,7 @@ class RecorderNode(FlightNode):
             raise ParameterError(f"key 'bag': {error}") from None
         self._written = self._lost = 0
         self._failure = None
+        self._held = []     # (topic, type, CDR) from before the first simulated time
         prefix = self.get_namespace().rstrip('/') + '/'
         for name, topic in {**ALL, **topics}.items():
             kind, write = wire.message_class(topic.type), self._writer(prefix + name, topic.type)
@@ -67,14 +69,22 @@ class RecorderNode(FlightNode):
 
     def _writer(self, topic, message_type):
         def write(data, _=None):
-            if self._failure:
-                return
-            try:
-                self._bag.write_raw(topic, message_type, data, self.now())
-                self._written += 1
-            except BagError as error:
-                self._give_up(error)
+            self._held.append((topic, message_type, data))
+            # Before the first /clock the time is 0: a bag that begins in 1970 cannot be viewed.
+            if len(self._held) > HELD or self.now():
+                self._write_held()
         return write
+
+    def _write_held(self):
+        held, self._held = self._held, []
+        try:
+            for message in held:
+                if self._failure:
+                    return
+                self._bag.write_raw(*message, self.now())
+                self._written += 1
+        except BagError as error:
+            self._give_up(error)
 
     def waits_for(self):
         """Return what is recorded where; a recorder needs no particular input."""
@@ -108,6 +118,7 @@ class RecorderNode(FlightNode):
         bag = getattr(self, '_bag', None)
         try:
             if bag:
+                self._write_held()
                 bag.close()
         except BagError as error:
             print(f'recorder_node: error: {error}', file=sys.stderr)

@@ -4,6 +4,7 @@ import re
 import time
 from types import SimpleNamespace
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 import numpy as np
@@ -15,6 +16,7 @@ pytest.importorskip('serial')
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import MultiDOFJointTrajectory
@@ -34,6 +36,7 @@ from beetle_omni_ros.nodes.rotor_bridge_node import RotorBridgeNode
 from beetle_omni_ros.nodes.sim_node import SimNode
 from beetle_omni_ros.nodes.supervisor_node import SupervisorNode
 from beetle_omni_ros.nodes.viewer_node import ViewerNode
+from beetle_omni_ros.runs.bag import read_messages
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 SOON = 10       # s; a busy test machine must not look like a fault
@@ -287,5 +290,26 @@ def test_read_only_parameters_cannot_be_set_in_flight(ros_domain, tmp_path, kind
                 answer = node.set_parameters([Parameter(name, value=node.get_parameter(
                     name).value)])[0]
                 assert not answer.successful and 'read-only' in answer.reason, name
+    finally:
+        bench.close()
+
+
+def test_messages_from_before_the_first_simulated_time_are_recorded_with_that_time(
+        ros_domain, tmp_path):
+    bench = Bench(ros_domain, 'use_sim_time:=true', f'bag:={tmp_path}/bag')
+    try:
+        node = bench.add(RecorderNode())
+        bench.publisher(String, 'supervisor/state', wire.profile(LATCHED)).publish(
+            String(data='disarmed'))
+        assert bench.wait(lambda: node._held) and not node.now()
+        bench.publisher(Clock, '/clock', wire.profile(EVENT)).publish(
+            Clock(clock=Time(sec=1_700_000_000)))
+        assert bench.wait(node.now)
+        bench.publisher(String, 'reference/state', wire.profile(LATCHED)).publish(
+            String(data='waiting'))
+        assert bench.wait(lambda: not node._held)
+        node.close()
+        assert [(one.topic, one.received) for one in read_messages(tmp_path / 'bag')] == [
+            ('/supervisor/state', 1.7e9), ('/reference/state', 1.7e9)]
     finally:
         bench.close()
