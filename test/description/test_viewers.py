@@ -4,6 +4,7 @@ import json
 import re
 import xml.etree.ElementTree as ElementTree
 
+import numpy as np
 import pytest
 from rosbags.interfaces import Nodetype
 from synthetic_flights import fly
@@ -60,7 +61,7 @@ def test_each_path_of_the_foxglove_layout_leads_to_a_value():
             assert int(index[1]) < (8 if topic == 'command' else 4)
     for topic in panels['3D!robot']['topics']:
         assert topic.lstrip('/') in TYPES
-    assert panels['3D!robot']['layers']['robot']['topic'] == '/robot_description'
+    assert panels['3D!robot']['topics']['/robot_description']['visible']
 
 
 def test_every_panel_of_the_foxglove_layout_is_placed_once():
@@ -149,7 +150,34 @@ RVIZ_TOOLS = {f'rviz_default_plugins/{name}' for name in (
 RVIZ_ORBIT = {'Class', 'Name', 'Target Frame', 'Distance', 'Enable Stereo Rendering',
               'Focal Point', 'Focal Shape Fixed Size', 'Focal Shape Size', 'Near Clip Distance',
               'Invert Z Axis', 'Pitch', 'Yaw', 'Value'}
-FOXGLOVE = {'3D', 'DiagnosticSummary', 'Plot', 'StateTransitions', 'Tab'}
+# Of Foxglove Studio 1.48 (@foxglove/studio-base) and Lichtblick 1.10, which continues its source.
+# Only showLine and lineSize are younger than 1.48, which ignores them.
+TITLE = {'foxglovePanelTitle'}
+FOXGLOVE = {
+    '3D': {'cameraState', 'followMode', 'followTf', 'layers', 'publish', 'scene', 'topics',
+           'transforms'},
+    'DiagnosticSummary': {'hardwareIdFilter', 'minLevel', 'pinnedIds', 'sortByLevel',
+                          'topicToRender'},
+    'Plot': {'isSynced', 'legendDisplay', 'maxXValue', 'maxYValue', 'minXValue', 'minYValue',
+             'paths', 'showLegend', 'showPlotValuesInLegend', 'showXAxisLabels',
+             'showYAxisLabels', 'sidebarDimension', 'xAxisVal'},
+    'StateTransitions': {'isSynced', 'paths'},
+    'Tab': {'activeTabIdx', 'tabs'}}
+FOXGLOVE_PATH = {
+    'Plot': {'color', 'enabled', 'label', 'lineSize', 'showLine', 'timestampMethod', 'value'},
+    'StateTransitions': {'color', 'enabled', 'label', 'timestampMethod', 'value'}}
+FOXGLOVE_CAMERA = {'distance', 'far', 'fovy', 'near', 'perspective', 'phi', 'target',
+                   'targetOffset', 'targetOrientation', 'thetaOffset'}
+FOXGLOVE_TOPIC = {
+    'geometry_msgs/msg/PoseStamped': {'arrowScale', 'axisScale', 'color', 'covarianceColor',
+                                      'frameLocked', 'showCovariance', 'type', 'visible'},
+    'std_msgs/msg/String': {'frameLocked', 'visible'},
+    'visualization_msgs/msg/MarkerArray': {'color', 'namespaces', 'selectedIdVariable',
+                                           'showOutlines', 'visible'}}
+FOXGLOVE_FRAMES = {'axisScale', 'editable', 'enablePreloading', 'labelSize', 'lineColor',
+                   'lineWidth', 'showLabel'}
+FOXGLOVE_GRID = {'color', 'divisions', 'frameId', 'frameLocked', 'instanceId', 'label', 'layerId',
+                 'lineWidth', 'order', 'position', 'rotation', 'size', 'visible'}
 FOLLOW = {'follow-pose', 'follow-position', 'follow-none'}
 
 
@@ -173,13 +201,22 @@ def test_foxglove_knows_every_panel_and_how_it_follows():
     layout = json.loads((VIEWERS / 'foxglove.json').read_text())
     assert layout.keys() == {'configById', 'globalVariables', 'userNodes', 'playbackConfig',
                              'layout'}
-    assert {name.partition('!')[0] for name in layout['configById']} <= FOXGLOVE
     scene = layout['configById']['3D!robot']
     assert scene['followMode'] in FOLLOW
-    assert {layer['layerId'] for layer in scene['layers'].values()} <= {
-        'foxglove.Grid', 'foxglove.Urdf', 'foxglove.TiledMap'}
-    for panel in layout['configById'].values():
+    assert scene['cameraState'].keys() <= FOXGLOVE_CAMERA
+    assert scene['scene'].keys() <= {'backgroundColor', 'transforms'}
+    assert scene['scene']['transforms'].keys() <= FOXGLOVE_FRAMES
+    for topic, settings in scene['topics'].items():
+        assert settings.keys() <= FOXGLOVE_TOPIC[TYPES[topic.lstrip('/')]], topic
+    # A URDF layer of 1.48 reads URLs only; every version shows the topic /robot_description.
+    for name, layer in scene['layers'].items():
+        assert layer['layerId'] == 'foxglove.Grid' and layer['instanceId'] == name
+        assert layer.keys() <= FOXGLOVE_GRID
+    for name, panel in layout['configById'].items():
+        kind = name.partition('!')[0]
+        assert panel.keys() <= FOXGLOVE[kind] | TITLE, name
         for path in panel.get('paths', ()):
+            assert path.keys() <= FOXGLOVE_PATH[kind], path['value']
             assert path['timestampMethod'] in ('headerStamp', 'receiveTime')
             stamped = 'header' in dict(TYPESTORE.fielddefs[TYPES[split(path['value'])[0]]][1])
             assert stamped or path['timestampMethod'] == 'receiveTime', path['value']
@@ -207,9 +244,10 @@ def test_a_bag_holds_the_frames_and_topics_of_all_layouts(tmp_path):
     urdf = description(share_path(SHIPPED))
     with BagWriter(tmp_path / 'bag', description=urdf) as writer:
         fly(writer, make_task('waypoints'), duration=2.0)
-    held, parents = {}, {}
+    held, newest, parents = {}, {}, {}
     for message in read_messages(tmp_path / 'bag'):
         held[message.topic] = message.type
+        newest[message.topic] = message
         if message.topic in ('/tf', '/tf_static'):
             for transform in from_bytes(message.data, message.type).transforms:
                 parents[transform.child_frame_id] = transform.header.frame_id
@@ -235,3 +273,11 @@ def test_a_bag_holds_the_frames_and_topics_of_all_layouts(tmp_path):
     assert missing <= {name for name in told if name.endswith('/state')}, missing
     for name in told - missing:
         assert held[f'/{name}'] == TYPES[name]
+    for panel in layout.values():
+        for path in panel.get('paths', ()):
+            topic, fields = split(path['value'])
+            if topic in told - missing:
+                value = from_bytes(newest[f'/{topic}'].data, TYPES[topic])
+                for field in re.findall(r'\w+', fields):
+                    value = value[int(field)] if field.isdigit() else getattr(value, field)
+                assert isinstance(value, str) or np.isfinite(value), path['value']
