@@ -1,4 +1,4 @@
-"""Flights by formula: chosen motion, chosen tilts and thrusts, readings that follow from them."""
+"""Analytic flights: prescribed motion, tilts and thrusts, and the corresponding readings."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def waves(t, seed, width, size, highest=0.5):
 
 
 class Motion:
-    """What happens, on a 200 Hz grid; ``thrust`` and ``tilt`` are what the robot really has."""
+    """True motion on a 200 Hz grid with true thrusts and tilts."""
 
     def __init__(self, seed=0, duration=16.0):
         self.t = t = np.arange(0, duration, STEP)
@@ -73,7 +73,7 @@ class Motion:
                                          for r in ROBOT.rotors.positions], axis=1)
 
     def flight(self, imu_delay=0.0, pose_delay=0.0, joint_delay=0.0, imu=None, pose=None):
-        """Readings, late by what is given; ``imu`` (N, 6) and ``pose`` change them."""
+        """Readings with delays; ``imu`` (N, 6) and ``pose`` (rotations) replace the true ones."""
         imu = np.concatenate([self.specific_force, self.rate], axis=1) if imu is None else imu
         thrust = self.thrust + ROBOT.rotors.time_constant * self.thrust_rate
         attitude = (self.attitude if pose is None else pose).as_quat()
@@ -81,7 +81,7 @@ class Motion:
         sign = np.sign((pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1))
         pose[1:, 3:] *= np.cumprod(sign)[:, None]
         shift = P.command_delay + STEP / 2       # held: half a step late on average
-        # What acts at t was sent before; times of sending, for what must act when.
+        # Commands have the times at which they must be sent to act at t.
         return Flight('made', 0.0, self.t[-1], self.t + imu_delay,
                       imu, self.t[::2] + pose_delay, pose, self.t + joint_delay, self.tilt,
                       self.t - shift,
@@ -90,35 +90,35 @@ class Motion:
 
 
 def gusts(motion, seed, size=0.1, lag=0.5):
-    """(N, 3) acceleration [m/s^2] by a coloured force that goes with nothing."""
+    """(N, 3) acceleration [m/s^2] by a coloured, independent force."""
     keep = np.exp(-STEP / lag)
     white = np.random.default_rng(seed).standard_normal((len(motion.t), 3))
     return size * lfilter([np.sqrt(1 - keep**2)], [1, -keep], white, axis=0)
 
 
 def pushed(motion, push):
-    """Readings where the rotors' forces and ``push`` (N, 3) in world make the acceleration."""
+    """Readings of an acceleration by the rotors' forces and ``push`` (N, 3) in world axes."""
     thrust = np.einsum('ni,nij->nj', motion.thrust, motion.normals) / ROBOT.mass
     force = thrust + motion.attitude.inv().apply(push)
     return motion.flight(imu=np.concatenate([force, motion.rate], axis=1))
 
 
 def model(flight):
-    """The package's residual of a flight."""
+    """FlightModel of a flight."""
     return FlightModel(flight, ROBOT, BODY, KEYS, P)
 
 
 def solved(made, names, groups, base=None, start=None, iterations=3):
     """
-    Deviations of the named keys that make the residual least.
+    Deviations of the named keys that minimise the residual.
 
     Args:
         made: FlightModel.
-        names: of keys.
-        groups: that count, such as 'BA'.
-        iterations: of Gauss and Newton.
-        base: group -> residual that the formulas leave without any effect.
-        start: deviations to begin with.
+        names: fitted keys.
+        groups: used groups of channels, such as 'BA'.
+        base: group -> residual without any effect, which is subtracted.
+        start: initial deviations.
+        iterations: number of Gauss-Newton steps.
 
     """
     theta = dict.fromkeys(names, 0.0) | (start or {})

@@ -1,4 +1,4 @@
-"""Recordings of simulated flights, read as bags are, and changes to their arrays."""
+"""Recordings of simulated flights, and changes to their arrays."""
 
 from copy import deepcopy
 from functools import cache
@@ -29,7 +29,7 @@ def _flown(conditions):
 
 
 def recording(conditions='nominal'):
-    """24 s over three poses, as of another day: stamps of a real clock."""
+    """24 s over three poses, with stamps of a real clock."""
     made = deepcopy(_flown(conditions))
     for topic in made.times:
         made.times[topic] = made.times[topic] + 1.78e9
@@ -38,7 +38,7 @@ def recording(conditions='nominal'):
 
 
 def late_half(made, topic):
-    """Where the second half of a topic begins, as a mask (N,)."""
+    """Mask (N,) of the second half of a topic."""
     received = made.received[topic]
     return received > 0.5 * (received[0] + received[-1])
 

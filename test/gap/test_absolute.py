@@ -1,4 +1,4 @@
-"""A residual beyond what sensors make is a gap, and a name must hold on flights held out."""
+"""Residuals above the noise ceiling, and named effects that held-out flights must confirm."""
 
 from types import SimpleNamespace
 
@@ -37,7 +37,7 @@ def test_a_slow_error_does_not_pass_for_noise():
 
 
 def runs(size, seed=0, count=160):
-    """Errors of free runs about ``size`` times their floor."""
+    """Errors of free runs of about ``size`` noise floors."""
     scatter = np.random.default_rng(seed).uniform(0.8, 1.2, (3, count, 5))
     return [Runs(size * scatter, np.full(count, 'hover', dtype=object), np.ones((3, 5)))]
 

@@ -1,4 +1,4 @@
-"""Effects of servos and rotors, simulated by plain small steps, are recovered."""
+"""Effects of servos and rotors, simulated with small explicit steps, are recovered."""
 
 from dataclasses import replace
 from functools import cache
@@ -20,14 +20,14 @@ JOINT = ROBOT.joints
 
 
 def steps(t):
-    """(N, 4) commands that jump and wander, in rad."""
+    """(N, 4) commands that jump and drift [rad]."""
     rng = np.random.default_rng(3)
     jumps = rng.uniform(-0.6, 0.6, (30, 4))
     return jumps[np.minimum((t / 0.45).astype(int), 29)] + 0.2 * np.sin(7 * t)[:, None]
 
 
 def flight(angles):
-    """Readings of such joints; commands are stamped when they are sent."""
+    """Readings of such joints; commands have the stamps of sending."""
     made = MOTION.flight()
     command = np.concatenate([steps(MOTION.t), made.command[:, 4:]], axis=1)
     return replace(made, joint=angles, command_t=MOTION.t, command=command)

@@ -1,4 +1,4 @@
-"""The how-to page on adding an effect: its code, as it stands in the text."""
+"""The code of the how-to page on adding an effect works as printed."""
 
 from dataclasses import replace
 from pathlib import Path

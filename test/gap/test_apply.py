@@ -1,4 +1,4 @@
-"""What is written to a robot file beside the named effects."""
+"""Values that are written to a robot file with the named effects."""
 
 from dataclasses import replace
 

@@ -24,7 +24,7 @@ CHANNELS = BODY + OTHERS
 
 
 def problem(flights=2):
-    """What a fit says of its samples, all flights' channels in a row."""
+    """Channel and flight of the samples of a fit."""
     where = np.repeat(np.arange(CHANNELS), LENGTH)
     return SimpleNamespace(p=P, priors={}, where=np.tile(where, flights),
                            flight=np.repeat(np.arange(flights), len(where)))
@@ -36,15 +36,15 @@ def noise(count, seed):
 
 def flown(seed, gusts, wanted):
     """
-    Angular acceleration of one axis, and the residual of a right model, of a robot in gusts.
+    Angular acceleration of one axis and residual of a valid model, of a robot in gusts.
 
-    As found in flights that hide nothing: below 1 Hz the commands hold the gust, and what moves is
-    against it; above, sensors' noise moves the robot through its controller, and no gust does.
+    As in flights without effects: below 1 Hz the commands compensate the gust, and the motion
+    opposes it. Above, sensor noise moves the robot through its controller, without a gust.
 
     Args:
-        seed: of everything random.
-        gusts: rms [rad/s^2].
-        wanted: rms of the planned motion [rad/s^2].
+        seed: seed of all random numbers.
+        gusts: RMS [rad/s^2].
+        wanted: RMS of the planned motion [rad/s^2].
 
     """
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Each body effect, put on the readings by an independent formula, is recovered."""
+"""Each body effect, added to the readings by an independent formula, is recovered."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def on_rotors(force):
 
 
 def thrust_change(part):
-    """Force and torque of thrusts that change by a part (N, 4) of themselves, with reaction."""
+    """Force and torque of a relative change of thrusts (N, 4), with reaction torque."""
     push = (part * MOTION.thrust)[:, :, None] * MOTION.normals
     force, torque = on_rotors(push)
     ratio = ROBOT.rotors.torque_to_thrust_ratio
@@ -87,7 +87,7 @@ def ratio(x):
 
 
 def momentum(x):
-    """Of the rotors (N, 4, 3), along spin times thrust direction."""
+    """Momentum of the rotors (N, 4, 3), along spin times thrust direction."""
     return x * (SPIN * speeds())[:, :, None] * MOTION.normals
 
 
@@ -144,7 +144,7 @@ def made():
 
 
 def without(made, force, torque):
-    """The residual that is left where the readings hold a force [N] and torque [N m] more."""
+    """Residual if the readings contain a further force [N] and torque [N m]."""
     size = MOTION.specific_force.shape
     more = np.concatenate([np.broadcast_to(force, size) / ROBOT.mass,
                            np.broadcast_to(torque, size) / ROBOT.inertia], axis=1)

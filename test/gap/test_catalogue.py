@@ -1,4 +1,4 @@
-"""Every name of the interfaces is in the catalogue, with what a person needs to use it."""
+"""Every name of the interfaces is in the catalogue, with a complete description."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The whole way: bags in; verdict, JSON, page and robot file out."""
+"""`beetle_omni gap` from bags to verdict, JSON, page and robot file."""
 
 from dataclasses import replace
 from io import StringIO
@@ -33,7 +33,7 @@ def quiet():
 
 @pytest.fixture(scope='module')
 def made(tmp_path_factory):
-    """Results of two short flights in a wind of which the robot file knows nothing."""
+    """Results of two short flights in a wind that is not in the robot file."""
     folder = tmp_path_factory.mktemp('gap')
     (folder / 'poses.csv').write_text(POSES)
     robot = RobotParameters.load()

@@ -1,4 +1,4 @@
-"""Each consumer acts on each effect, leaves it with a reason, or refuses it: all of them tried."""
+"""Each consumer models each effect, ignores it with a reason, or refuses it."""
 
 from dataclasses import replace
 from functools import cache
@@ -26,14 +26,14 @@ ROBOT, WORLD = RobotParameters.load(), SimulatorParameters.load()
 
 
 def number(robot, key):
-    """Number of a robot file at a dotted key."""
+    """Value of a robot file at a dotted key."""
     for part in key.split('.'):
         robot = getattr(robot, part)
     return np.array(robot, dtype=float)
 
 
 def with_effect(name):
-    """The robot with an effect of realistic size; numbers of the file shrink by that."""
+    """The robot with an effect of typical size; values of the file decrease by it."""
     values = {}
     for parameter, spec in CATALOGUE[name].parameters.items():
         if spec.form:
@@ -59,7 +59,7 @@ def states(count=30):
 
 
 def nmpc(robot):
-    """Model, limits and delays of the NMPC, what it makes of the tilts, and the allocation."""
+    """Model, limits and delays of the NMPC, its tilt commands, and the allocation."""
     effects.check('nmpc', robot.effects)
     x, u = states()
     derivative = dynamics.full_model(robot)
@@ -90,7 +90,7 @@ def training(robot):
 
 
 def plant(robot):
-    """Readings of the simulated robot after some tilting and thrusting near the floor."""
+    """Readings of the simulated robot after some tilting and thrusting near the ground."""
     made = Simulator(robot, WORLD, seed=2)
     made.reset([0.0, 0.0, 0.6], [0.1, 0.05, 0.0, 1.0])
     read = []
@@ -107,7 +107,7 @@ def plant(robot):
 
 @cache
 def samples():
-    """Stamps, specific forces, rates and poses of a second of turning and shaking."""
+    """Stamps, specific forces, rates and poses of a second of rotation and vibration."""
     t = np.arange(0.005, 1.0, 0.005)
     angle = 0.5 * np.sin(3 * t)
     force = np.stack([np.sin(9 * t), 9.8 * np.sin(angle), 9.8 * np.cos(angle)], axis=1)
@@ -128,7 +128,7 @@ def estimator(robot):
 
 
 def buses(robot):
-    """When tilts and thrusts of one command act."""
+    """Delays of tilts and thrusts of one command."""
     link = CommandLink(robot, WORLD.actuators, draw('nominal', WORLD, np.random.default_rng(0)))
     link.push(Command(0.0, np.ones(4), np.full(4, 5.0)), 0.0)
     acting = []
@@ -144,7 +144,7 @@ def flight_model():
 
 
 def gap(name):
-    """Whether a fit's number of the effect changes the residual."""
+    """Whether a key of the effect changes the residual."""
     made = flight_model()
     limit = isinstance(CATALOGUE[name].starts, LimitStarts)     # far above this calm flight
     theta = {key.name: np.log(0.05 if limit else 1 - key.typical) if key.relative

@@ -1,4 +1,4 @@
-"""How much an effect explains is not counted against tolerances that no robot has."""
+"""Implausible tolerances are not counted against the gain of an effect; gates of a gain."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -23,7 +23,7 @@ LAG, OTHER = 'rotor_lag.time_constant', 'inertia.inertia[0]'
 
 
 class Straight(Problem):
-    """A residual that is a straight line of two tolerances."""
+    """A residual that is linear in two tolerances."""
 
     def __init__(self, truth, overlap):
         self.keys, self.p = KEYS, P
@@ -66,7 +66,7 @@ def test_a_slow_fit_leaves_nothing_for_others_to_gain():
 
 
 class Rough(Straight):
-    """A line of two tolerances beside a friction whose slope promises what it does not hold."""
+    """Two linear tolerances beside a friction whose slope is misleading."""
 
     FRICTION = 'joint_friction.coulomb'
 
@@ -80,7 +80,7 @@ class Rough(Straight):
         return made
 
     def start(self):
-        """State at which friction is already right; its slope says one way is down."""
+        """State with the right friction and a slope that points away from it."""
         theta, names = {self.FRICTION: 0.005}, [LAG, OTHER, self.FRICTION]
         slopes = self.slopes(theta, names)
         slopes[:2000, :2] = self.columns
@@ -99,7 +99,7 @@ def test_a_rough_slope_need_not_hold_up_the_others(split):
 
 
 def before(truth, overlap=0.0):
-    """Objective without effects: as fitted, and with believable tolerances only."""
+    """Objective without effects: as fitted, and with plausible tolerances only."""
     problem = Straight(truth, overlap)
     search = Search.__new__(Search)
     search.p = P
@@ -226,7 +226,7 @@ def test_each_bus_is_late_within_its_own_range(tilt, thrust, usual):
 
 
 class Capped(Problem):
-    """A speed that is cut off in one block of eight; in each of the others one bad reading."""
+    """A speed limit that acts in one block of eight; each other block has one outlier."""
 
     KEY = 'joint_velocity_limit.velocity_limit'
 

@@ -1,4 +1,4 @@
-"""What noise and gusts alone make of a free run: of each flight its own, and nothing else."""
+"""Noise floors of free runs, with the gusts of each flight."""
 
 from dataclasses import replace
 

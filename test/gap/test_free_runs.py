@@ -1,4 +1,4 @@
-"""Free runs: the model alone, from measured states on."""
+"""Free runs: simulation from measured states."""
 
 from flights import model, Motion, P
 import numpy as np

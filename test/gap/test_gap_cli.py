@@ -1,4 +1,4 @@
-"""The command line of gap: which runs are fitted and which judge."""
+"""The command line of gap: fitted and held-out runs."""
 
 import pytest
 

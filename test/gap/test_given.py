@@ -1,4 +1,4 @@
-"""How recordings are spoken of, and that each is given once."""
+"""Names of recordings, and recordings that are given twice."""
 
 from pathlib import Path
 

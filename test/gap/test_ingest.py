@@ -1,4 +1,4 @@
-"""Recordings that cannot be judged are refused in one line that says why."""
+"""Unusable recordings are refused in one line with the reason."""
 
 from dataclasses import replace
 

@@ -9,7 +9,7 @@ import pytest
 
 from beetle_omni_ros.identify.gap.analysis import Analysis
 from beetle_omni_ros.identify.gap.candidates import Candidate, Found, Trial
-from beetle_omni_ros.identify.gap.certainty import excitation, Visibility
+from beetle_omni_ros.identify.gap.certainty import Detectability, excitation
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.noise import Noise
@@ -34,13 +34,13 @@ def servo():
 
 
 def decided(accepted, still, rivals=(), everything=700.0):
-    """An analysis that a search ended with."""
+    """An analysis with a verdict after a search."""
     names = [n for t in accepted for n in t.candidate.keys]
     state = SimpleNamespace(names=names)
     found = Found(accepted=list(accepted), state=state, cost=(1000.0, 700.0, everything),
                   low_excitation=still, rivals={t.candidate.label: list(rivals) for t in accepted})
-    a = Analysis(keys=KEYS, found=found, rest=NOTHING,
-                 visible={'mass': Visibility(50.0, {}), 'rotor_drag': Visibility(1.0, {})})
+    detectability = {'mass': Detectability(50.0, {}), 'rotor_drag': Detectability(1.0, {})}
+    a = Analysis(keys=KEYS, found=found, remainder=NOTHING, detectability=detectability)
     a.problem = SimpleNamespace(time=np.zeros(1000), priors={})
     decide(a, P)
     return a
@@ -51,7 +51,7 @@ def problem(flight):
 
 
 def hovering(push=0.0):
-    """Readings of a robot that hangs in the air, pushed by a slow gust [m/s^2]."""
+    """Readings of a hovering robot in a slow gust [m/s^2]."""
     rng = np.random.default_rng(1)
     kernel = np.hanning(100)
     gust = np.stack([np.convolve(x, kernel / np.linalg.norm(kernel), 'same')

@@ -1,4 +1,4 @@
-"""Modules load their joints, whether the robot file describes them or an effect does."""
+"""Modules load their joints, both as described in the robot file and as an effect."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Floors of coloured noise: of what a channel spreads by, whatever its colour."""
+"""Floors of coloured noise limit the standard deviation of a channel whatever its spectrum."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def coloured(spread, keep, seed=0):
 
 
 def learnt(ratio, keep):
-    """Noise of residuals that spread by so many floors, and those residuals."""
+    """Noise of residuals with a standard deviation of ``ratio`` floors, and the residuals."""
     rest = {g: np.stack([coloured(ratio * FLOORS[g], keep, 10 * k)
                          for k in range(len(names))], axis=1) for g, names in CHANNELS.items()}
     rest['B'][:, 3:] *= P.floors[1] / P.floors[0]

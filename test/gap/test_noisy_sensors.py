@@ -1,4 +1,4 @@
-"""Sensors as noisy as the publication's: what noise must not pass for."""
+"""Sensors as noisy as in the publication: their noise causes no effect."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def noisy(tilt=0.0, position=0.0, **late):
 
 
 def at(made, series):
-    """Truth (N, n) of 200 Hz at the times of a model's grid."""
+    """Series (N, n) at 200 Hz at the times of a model's grid."""
     return np.stack([np.interp(made.signals.t, MOTION.t, x) for x in series.T], axis=1)
 
 
@@ -110,7 +110,7 @@ def test_a_module_may_be_heavier_about_its_joint_than_the_servo_says():
 
 
 def pruned(monkeypatch, name, value, loss):
-    """How many entries are left of one that a fit lacks by ``loss`` of chi2."""
+    """Number of remaining entries after pruning one whose removal costs ``loss`` of chi2."""
     trial = Trial(Candidate(name.split('.')[0], (name,), label=name), 99.0, {name: value})
     search = Search.__new__(Search)
     search.p = P

@@ -1,4 +1,4 @@
-"""Forces outside the catalogue: found by what they go with, and not found in gusts."""
+"""Forces outside the catalogue are found by their correlations, and not found in gusts."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -29,7 +29,7 @@ NOTHING = Remainder(0.0, 0.0, [], [], 'body', {})
 
 
 def problem(push):
-    """The fit's problem of a flight with a force that accelerates by ``push`` (N, 3) in world."""
+    """Problem of a flight with a force that causes the acceleration ``push`` (N, 3) in world."""
     made = Problem([model(pushed(MOTION, push))], KEYS, tolerances(P), P)
     # Turns are not those that the thrusts make: only forces are looked at.
     made.models[0]._mask = np.ones(len(made.models[0]._mask))
@@ -47,7 +47,7 @@ def best(push):
 
 
 def field():
-    """A jet across the room, blowing along x where y is small."""
+    """A jet across the room, along x where y is small."""
     y = MOTION.position[:, 1]
     return np.outer(np.exp(-0.5 * (y / 0.4)**2), [0.6, 0.2, 0.0])
 
@@ -85,7 +85,8 @@ def decided(accepted=(), found=(), line=SpectralLine(0.0, 0.0, 0.0), left=0.0, t
                    cost=(1000.0, 1000.0 - 200.0 * len(names),
                          1000.0 - 200.0 * len(names) - left),
                    trials={t.candidate.label: t for t in trials})
-    a = Analysis(keys=KEYS, found=search, rest=NOTHING, patterns=list(found), spectral_line=line)
+    a = Analysis(keys=KEYS, found=search, remainder=NOTHING, patterns=list(found),
+                 spectral_line=line)
     a.problem = SimpleNamespace(time=np.zeros(1000), priors={})
     decide(a, P)
     return a

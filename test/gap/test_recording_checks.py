@@ -1,4 +1,4 @@
-"""Damaged recordings are refused with the topic, the cause in words and the moment."""
+"""Damaged recordings are refused with topic, cause and time."""
 
 import struct
 import warnings
@@ -46,7 +46,7 @@ def spiked(made, topic, rows, column, value):
 
 
 def mirrored(made):
-    """A left-handed world: y reversed, and what a driver makes of that for the quaternion."""
+    """A left-handed world: y reversed, and the quaternion of a driver for it."""
     made = columns(made, POSE, 0, 3, lambda v: v * [1, -1, 1])
     return columns(made, POSE, 3, 7, lambda v: v * [-1, 1, -1, 1])
 
@@ -124,7 +124,7 @@ def drifting(made):
 
 
 def later_and_later(made, topic, most):
-    """Stamped on arrival, at the end of a queue that fills."""
+    """Stamps of arrival, at the end of a queue that fills."""
     t = made.times[topic]
     by = most * (t - t[0]) / (t[-1] - t[0])
     made.times[topic] = t + by
@@ -142,7 +142,7 @@ def without_gravity(made):
 
 
 def silent_clock(made):
-    """Times of recording that follow the damaged stamps: only motion shows the fault."""
+    """Times of recording that follow the damaged stamps: only the motion shows the fault."""
     made.received = {}
     return made
 

@@ -1,4 +1,4 @@
-"""Two forms of one response make a set where the response has a shape that neither holds."""
+"""Two approximations of one response form a set if the response has neither form."""
 
 from types import SimpleNamespace
 
@@ -23,7 +23,7 @@ def trial(entry, gain):
 
 
 def rivals(monkeypatch, accepted, other, beside, instead):
-    """Who joins ``accepted`` (220 of chi2) in a set; ``other`` gains so much beside, instead."""
+    """Members of the set of ``accepted`` (220 of chi2), given the gains of ``other``."""
     own = trial(accepted, 220.0)
     found = Found(accepted=[own], trials={own.candidate.label: own})
     left = trial(other, beside)

@@ -1,4 +1,4 @@
-"""Each effect of sensors and timing, put on the readings, is recovered."""
+"""Each effect of sensors and timing, added to the readings, is recovered."""
 
 from dataclasses import replace
 

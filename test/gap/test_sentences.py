@@ -1,4 +1,4 @@
-"""The sentence, the headline and the numbers of a finding, from results alone."""
+"""Sentence, headline and tables from results."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""What flights could not have shown is listed, also what acts in one regime alone."""
+"""Undetectable effects are listed, also those of one regime."""
 
 from types import SimpleNamespace
 
@@ -8,7 +8,7 @@ import pytest
 
 from beetle_omni_ros.identify.gap.analysis import Analysis
 from beetle_omni_ros.identify.gap.candidates import candidates
-from beetle_omni_ros.identify.gap.certainty import visibility
+from beetle_omni_ros.identify.gap.certainty import detectability
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.keys import tolerances
 from beetle_omni_ros.identify.gap.verdict import hidden, not_met
@@ -21,15 +21,15 @@ def test_the_ground_shows_near_the_ground_alone(higher, seen):
     made = model(motion.flight())
     problem = Problem([made], KEYS, tolerances(P), P)
     state = problem.state({}, [name for name, key in KEYS.items() if not key.form])
-    visible = visibility(problem, state, list(problem.priors), candidates(KEYS, [made]))
+    visible = detectability(problem, state, list(problem.priors), candidates(KEYS, [made]))
     assert {'ground_effect', 'tilt_thrust_loss', 'propeller_gyroscopic_torque'} <= set(visible)
-    a = Analysis(visible=visible)
+    a = Analysis(detectability=visible)
     assert ('ground_effect' not in not_met(a, P)) == seen
     assert 'ground_effect' not in hidden(a, P)
 
 
 def test_an_entry_in_one_of_its_forms_is_out_of_sight_in_none():
-    a = Analysis(visible={name: SimpleNamespace(sigma=sigma) for name, sigma in (
+    a = Analysis(detectability={name: SimpleNamespace(sigma=sigma) for name, sigma in (
         ('rotor_drag', 1.0), ('joint_offset[1]', 1.0), ('joint_offset[2]', 90.0),
         ('ground_effect', 1.0), ('mass', np.inf))})
     assert hidden(a, P) == ['rotor_drag'] and not_met(a, P) == ['ground_effect']

@@ -1,4 +1,4 @@
-"""Work on several cores gives what one core gives, whatever happens to a worker."""
+"""Calls on several cores have the results of one core, even if a worker dies."""
 
 import os
 from pathlib import Path

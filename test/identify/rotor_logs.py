@@ -1,4 +1,4 @@
-"""Made bench logs: the published rotor map with the noise of a force-torque stand."""
+"""Artificial bench logs: the published rotor map with the noise of a force-torque stand."""
 
 import csv
 

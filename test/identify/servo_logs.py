@@ -1,4 +1,4 @@
-"""Made response logs: an independent simulation of a servo, sampled as a real log is."""
+"""Artificial response logs: an independent simulation of a servo, sampled like a real log."""
 
 import csv
 
@@ -22,7 +22,7 @@ def sweep(duration=10.0, periods=(1.8, 2.6), amplitudes=(1.0, 1.7), rate=100.0):
 
 def servo(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0, stiction=0.0,
           stribeck=0.1, backlash=0.0, velocity_limit=np.inf, torque_limit=np.inf, offset=0.0):
-    """Positions (N,) [rad] of a servo that gets each command when it is logged and holds it."""
+    """Positions (N,) [rad] of a servo that holds each command from its logged time on."""
     # It has been moving before the log: a straight run-up of a second.
     lead = np.arange(-1.0, 0.0, t[1] - t[0])
     first = command[0] + (command[1] - command[0]) / (t[1] - t[0]) * lead
@@ -51,7 +51,7 @@ def servo(t, command, *, frequency=47.0, damping=0.63, delay=0.015, coulomb=0.0,
 
 
 def noisy(positions, rng, sigma=0.0012, slow=0.001):
-    """Readings: jitter, a slow error as of a rough gear, whole counts."""
+    """Readings with jitter, a slow error as of a rough gear, and rounding to counts."""
     drift = np.zeros(len(positions))
     kicks = rng.normal(size=len(positions)) * slow * np.sqrt(1 - 0.95**2)
     for k in range(1, len(drift)):
@@ -61,7 +61,7 @@ def noisy(positions, rng, sigma=0.0012, slow=0.001):
 
 
 def log_of(t, command, servos, seed=0, name='made.csv'):
-    """JointLog of several servos (keyword dicts) behind one command."""
+    """JointLog of several servos (keyword dicts) with one command."""
     rng = np.random.default_rng(seed)
     measured = np.array([noisy(servo(t, command, **values), rng) for values in servos])
     return JointLog(name, t, tuple(range(1, len(servos) + 1)), measured,

@@ -1,4 +1,4 @@
-"""The inference engine against independent oracles; it knows no robot."""
+"""Inference against independent oracles; it is independent of the robot."""
 
 import ast
 from pathlib import Path

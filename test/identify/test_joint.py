@@ -1,4 +1,4 @@
-"""Servos are recovered from made logs, and the real ones predicted."""
+"""Servos are recovered from artificial logs, and real ones are predicted."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,12 +32,12 @@ def logs():
 
 @pytest.fixture(scope='module')
 def models(logs):
-    """What is identified from each."""
+    """Models identified from each log."""
     return {name: identify_joints(log, PUBLISHED) for name, log in logs.items()}
 
 
 def judged(models):
-    """(model, true value, name of the term) of every number that is known."""
+    """(model, true value, name of the term) of every known parameter."""
     for model, servo in zip(models, SERVOS, strict=True):
         for term, key in TRUE.items():
             if key in servo:
@@ -111,7 +111,7 @@ def test_samples_of_the_judging_part_are_never_looked_at():
 
 
 def replace_end(log):
-    """The log with nonsense in its last part."""
+    """The log with invalid readings in its last part."""
     measured = log.measured.copy()
     measured[:, log.end_of(shipped().servo.fitted):] = 0.3
     return replace(log, measured=measured)

@@ -1,4 +1,4 @@
-"""A recorded run as a response log: the same rows as a CSV file of it would have."""
+"""A bag as a response log has the same rows as the equivalent CSV file."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Response logs against a robot file: what changed is named, and a corrected file shows no gap."""
+"""Response logs against a robot file: changes are named, and a corrected file shows no gap."""
 
 from dataclasses import replace
 import json
@@ -38,7 +38,7 @@ def stiffness(frequency=FREQUENCY):
 
 
 def robot(**effects):
-    """Robot file that holds the servos of ``made`` and further effects."""
+    """Robot file with the servos of ``made`` and further effects."""
     kp = stiffness()
     torque = tuple(kp * band for band in (*BANDS, 0.0, 0.0))
     own = {'joint_bandwidth': {'kp': kp, 'kd': 2 * DAMPING * FREQUENCY * INERTIA},
@@ -72,7 +72,7 @@ def names(result):
 
 @pytest.fixture(scope='module')
 def against_shipped():
-    """A log and its results against the shipped file, which knows nothing of it."""
+    """A log and its results against the shipped file."""
     log = made(1)
     return log, judged(log, SHIPPED)
 

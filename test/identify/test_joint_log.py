@@ -1,4 +1,4 @@
-"""Unusable response logs are refused in one line that says where and what."""
+"""Unusable response logs are refused in one line with place and reason."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The rotor map is recovered from made bench logs, and bad logs are refused."""
+"""The rotor map is recovered from artificial bench logs, and bad logs are refused."""
 
 import numpy as np
 import pytest

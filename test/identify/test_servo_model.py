@@ -1,4 +1,4 @@
-"""The servo model agrees with closed forms and with a plain simulation of its own."""
+"""The servo model agrees with closed forms and with an independent simulation."""
 
 import numpy as np
 import pytest

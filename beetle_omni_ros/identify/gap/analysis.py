@@ -11,10 +11,10 @@ from beetle_omni_ros.identify.gap.bags import Recording
 from beetle_omni_ros.identify.gap.body import BodyModel
 from beetle_omni_ros.identify.gap.candidates import candidates, Found, Trial
 from beetle_omni_ros.identify.gap.certainty import (
+    Detectability,
+    detectability,
     deviations,
     undetectable_limits,
-    Visibility,
-    visibility,
 )
 from beetle_omni_ros.identify.gap.fit import Problem
 from beetle_omni_ros.identify.gap.ingest import Flight
@@ -55,8 +55,8 @@ class Analysis:
         keys: all keys by name.
         found: result of the search.
         widths: key -> half width of its 95 % interval, as deviation.
-        visible: label -> detectability of a candidate.
-        rest: regression of the unexplained residual.
+        detectability: label -> detectability of a candidate.
+        remainder: regression of the unexplained residual.
         patterns: tests of forces outside the catalogue, largest gain first.
         spectral_line: the sharpest line of the residual.
         where: channels and regimes, largest residual first.
@@ -70,8 +70,8 @@ class Analysis:
         findings: remarks of the checks.
         partial: effects that explain a part and are not named.
         damages: damages of the recordings.
-        unseen: limits, friction, play and effects of one regime that these flights would not show;
-            set for no gap.
+        undetectable: limits, friction, play and effects of one regime that these flights would
+            not show; set for no gap.
         damaged: recording of the first damage and that damage, for the page.
         above_ceiling: channels whose residual exceeds its ceiling after the fit.
 
@@ -82,8 +82,8 @@ class Analysis:
     keys: dict[str, Key] = field(default_factory=dict)
     found: Found = field(default_factory=Found)
     widths: dict[str, float] = field(default_factory=dict)
-    visible: dict[str, Visibility] = field(default_factory=dict)
-    rest: Remainder = field(default_factory=Remainder)
+    detectability: dict[str, Detectability] = field(default_factory=dict)
+    remainder: Remainder = field(default_factory=Remainder)
     patterns: list[Pattern] = field(default_factory=list)
     spectral_line: SpectralLine = SpectralLine(0.0, 0.0, 0.0)
     where: list[dict] = field(default_factory=list)
@@ -98,7 +98,7 @@ class Analysis:
     partial: list[Trial] = field(default_factory=list)
     damages: list[Damage] = field(default_factory=list)
     above_ceiling: list[ExcessNoise] = field(default_factory=list)
-    unseen: list[str] = field(default_factory=list)
+    undetectable: list[str] = field(default_factory=list)
     damaged: tuple[Recording, Damage] | None = None
 
     @property
@@ -151,15 +151,15 @@ def _find(a, progress):
     involved, free = search._involved(accepted), search._free(accepted)
     progress('certainty')
     a.widths = deviations(a.problem, a.found.state, involved, free)
-    a.visible = visibility(a.problem, a.found.state, search.always, tried)
-    a.rest = remainder(a.problem, a.found.state, involved)
+    a.detectability = detectability(a.problem, a.found.state, search.always, tried)
+    a.remainder = remainder(a.problem, a.found.state, involved)
     a.patterns = patterns(a.problem, a.found.state, involved)
     a.spectral_line = spectral_line(a.problem, a.found.theta)
     a.where = _where(a)
     a.above_ceiling = channels_above_ceiling(models, a.found.theta, p)
     decide(a, p)
     if a.verdict == 'no_gap':
-        a.unseen = [*not_met(a, p), *undetectable_limits(a.problem, a.found.state)]
+        a.undetectable = [*not_met(a, p), *undetectable_limits(a.problem, a.found.state)]
     progress('free runs')
     _falsify(a, search.wide)
 

@@ -100,7 +100,7 @@ def excitation(problem: Problem) -> float:
 
 
 @dataclass(frozen=True)
-class Visibility:
+class Detectability:
     """
     Detectability of one candidate.
 
@@ -114,8 +114,8 @@ class Visibility:
     rivals: dict[str, float]
 
 
-def visibility(problem: Problem, state: State, always: list[str],
-               candidates: list[Candidate]) -> dict[str, Visibility]:
+def detectability(problem: Problem, state: State, always: list[str],
+                  candidates: list[Candidate]) -> dict[str, Detectability]:
     """Label -> detectability of each candidate that is linear at its neutral value."""
     s = state.slopes
     data = s.T @ s
@@ -149,7 +149,7 @@ def visibility(problem: Problem, state: State, always: list[str],
         for o in smooth:
             if o.name in CATALOGUE[c.name].confused_with and o.label != c.label:
                 rivals[o.label] = left(c.keys, o.keys)
-        result[c.label] = Visibility(left(c.keys, ()), rivals)
+        result[c.label] = Detectability(left(c.keys, ()), rivals)
     return result
 
 
@@ -159,7 +159,7 @@ def undetectable_limits(problem: Problem, state: State) -> list[str]:
 
     They have no slope where they do not act, so the residual itself is compared.
     """
-    unseen = []
+    undetectable = []
     for name in LIMITS:
         own = [key for key in problem.keys.values() if key.effect == name]
         # The typical size is a share by which a limit is lower, or a value of friction or play.
@@ -167,5 +167,5 @@ def undetectable_limits(problem: Problem, state: State) -> list[str]:
                  else key.typical for key in own}
         change = problem.residual({**state.theta, **theta}) - state.r
         if np.sqrt(change @ change) < problem.p.decidable:
-            unseen.append(name)
-    return unseen
+            undetectable.append(name)
+    return undetectable

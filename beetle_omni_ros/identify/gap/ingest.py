@@ -128,7 +128,8 @@ def prepare(recording: Recording, robot: RobotParameters, p: GapParameters,
         keep = (t > begin - 1.0) & (t < end + 0.5)
         cut[topic] = t[keep] - begin, values[keep]
     pose = cut['mocap/pose'][1].copy()
-    pose[:, 3:] = _continuous(pose[:, 3:])
+    norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    pose[:, 3:] = aligned(pose[:, 3:] / np.where(norm > 1e-6, norm, 1.0))
     flight = Flight(name, begin, end - begin, *cut['imu/data_raw'], cut['mocap/pose'][0], pose,
                     *cut['joint_states'], *cut['command'], *cut['battery_state'],
                     findings=findings)
@@ -199,23 +200,18 @@ def _without_gaps(name, series, begin, end, p, findings):
     return max(pieces, key=lambda piece: piece[1] - piece[0])
 
 
-def _continuous(quaternion):
-    """Normalised quaternions with continuous signs."""
-    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    return aligned(quaternion / np.where(norm > 1e-6, norm, 1.0))
-
-
 def _check_robot(flight, robot, p):
     """Refuse a flight of a completely different robot."""
     total = np.median(np.linalg.norm(flight.imu[:, :3], axis=1))
     if total < 0.3 * robot.gravity:
         raise _unusable(flight.name, 'imu/data_raw', f'specific force is {total:.2f} m/s^2, '
                         f'near {robot.gravity:.2f} m/s^2 expected')
-    asked = np.median(flight.command[:, 4:].sum(axis=1)) / robot.mass
+    commanded = np.median(flight.command[:, 4:].sum(axis=1)) / robot.mass
     # Thrusts may partly cancel each other, so only too small a sum is impossible.
-    if asked < (1 - p.wrong_robot) * total or asked > 3 * total:
+    if commanded < (1 - p.wrong_robot) * total or commanded > 3 * total:
         raise _unusable(flight.name, 'command', 'the robot file does not fit: commanded thrust '
-                        f'over its mass is {asked:.1f} m/s^2, the IMU measures {total:.1f} m/s^2')
+                        f'over its mass is {commanded:.1f} m/s^2, the IMU measures '
+                        f'{total:.1f} m/s^2')
 
 
 def check_apart(runs: list[Path]) -> None:

@@ -247,13 +247,13 @@ class Search:
     def _trials_with(self, accepted, point):
         """A trial of each other entry beside the accepted ones."""
         free = self._free(accepted)
-        asked = [(e, k) for e in self.entries if (self._free([e]) & ~free).any()
+        tried = [(e, k) for e in self.entries if (self._free([e]) & ~free).any()
                  for k in range(self._starts(e))]
-        points = [point, *(self._start_point(point, [e], k) for e, k in asked)]
-        models = [accepted, *([*accepted, e] for e, _ in asked)]
+        points = [point, *(self._start_point(point, [e], k) for e, k in tried)]
+        models = [accepted, *([*accepted, e] for e, _ in tried)]
         solved = self._solve(points, models, QUICK)
         best: dict = {}
-        for (entry, _), p, chi2 in zip(asked, solved.points[1:], solved.chi2[1:], strict=True):
+        for (entry, _), p, chi2 in zip(tried, solved.points[1:], solved.chi2[1:], strict=True):
             gain = (solved.chi2[0] - chi2) / self.scatter
             if entry not in best or gain > best[entry].gain:
                 best[entry] = self._trial(entry, gain, HeldOut(np.zeros(FIT.blocks)), p)
@@ -312,12 +312,12 @@ class Search:
         models = [accepted, *([o for o in accepted if o != e] for e in each)]
         points = [point, *(self._restricted(m, point) for m in models[1:])]
         solved = self._solve(points, models)
-        unseen = self._unseen(solved.points, models)
+        held_out = self._held_out_costs(solved.points, models)
         return [self._trial(e, (chi2 - solved.chi2[0]) / self.scatter,
-                            HeldOut((cost - unseen[0]) / self.scatter), solved.points[0])
-                for e, chi2, cost in zip(each, solved.chi2[1:], unseen[1:], strict=True)]
+                            HeldOut((cost - held_out[0]) / self.scatter), solved.points[0])
+                for e, chi2, cost in zip(each, solved.chi2[1:], held_out[1:], strict=True)]
 
-    def _unseen(self, points, models):
+    def _held_out_costs(self, points, models):
         """(M, FIT.blocks) chi2 of each block, predicted by models fitted without it."""
         every = self.blocks.sum(axis=0)
         rows = np.repeat(np.arange(len(models)), FIT.blocks)

@@ -46,7 +46,7 @@ def gap_page(a: Analysis, result: dict) -> str:
                 section('Detectability', 'Standard deviations that an effect of typical size '
                         'would show, alone and beside the most similar entry. Below '
                         f'{a.problem.p.decidable:g} it would not be named.',
-                        html(_visible(result))),
+                        html(_detectability(result))),
                 section('Tolerances', 'Deviations of this robot from the robot file within '
                         'manufacturing tolerance. They are fitted and not named; --tolerances '
                         'writes masses, gains, lags and rotor positions to the robot file.',
@@ -147,7 +147,7 @@ def _bars(a) -> Figure:
     return figure
 
 
-def _visible(result):
+def _detectability(result):
     rows, seen = [], set()
     for row in sorted(result['candidates'], key=lambda r: r['sigma_of_realistic_size'] or 1e9):
         sigma = row['sigma_of_realistic_size']

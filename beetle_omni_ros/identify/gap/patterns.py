@@ -54,7 +54,7 @@ class Pattern:
 
 def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:
     """Tests of all hypotheses, largest gain first; the fitted keys are projected out."""
-    asked = [hypotheses(model, state.theta) for model in problem.models]
+    by_flight = [hypotheses(model, state.theta) for model in problem.models]
     rows = problem.where < 6
     fitted = state.slopes[rows][:, [state.index[name] for name in names]]
     used = (fitted**2).sum(axis=0) > 1e-6
@@ -64,9 +64,9 @@ def patterns(problem: Problem, state: State, names: list[str]) -> list[Pattern]:
     r = state.r[rows]
     r = r - fitted @ np.linalg.lstsq(fitted, r, rcond=None)[0]
     result = []
-    for text in asked[0]:
+    for text in by_flight[0]:
         white, plain = zip(*(_in_residual(problem, model, each[text])
-                             for model, each in zip(problem.models, asked, strict=True)),
+                             for model, each in zip(problem.models, by_flight, strict=True)),
                            strict=True)
         x = np.concatenate(white)
         known = np.linalg.lstsq(fitted, x, rcond=None)[0]

@@ -69,9 +69,9 @@ class FlightModel:
             volts = s.voltage * self.robot.battery.full_voltage
             most = np.interp(volts, [row.voltage for row in rows],
                              [row.thrust_max for row in rows])
-            asked = self.flight.command[np.clip(np.searchsorted(
+            commanded = self.flight.command[np.clip(np.searchsorted(
                 self.flight.command_t, s.t) - 1, 0, None), 4:].max(axis=1)
-            bad |= asked > p.limit_margin * most
+            bad |= commanded > p.limit_margin * most
         # Rotor lag: a limit also affects the following samples.
         memory = round(5 * self.robot.rotors.time_constant / p.grid)
         spread = np.convolve(bad, np.ones(memory))[:len(bad)] > 0
@@ -157,10 +157,12 @@ class FlightModel:
         for k, theta in enumerate(sets):
             groups.setdefault(tuple(theta.get(name, 0.0) for name in SHIFTS), []).append(k)
         residuals: list = [None] * len(sets)
+        first, count = self._starts[0], self._length * len(self._starts)
         for members in groups.values():
             runs = self._servos([sets[k] for k in members], sets[members[0]])
             for k, run in zip(members, runs, strict=True):
-                residuals[k] = self.filters['J'](self._reading(sets[k]) - run.reshape(-1, 4))
+                read = self.signals.joints(sets[k])[3][first:first + count]
+                residuals[k] = self.filters['J'](read - run.reshape(-1, 4))
         return residuals
 
     def smooth_tilts(self, theta: dict[str, float]) -> None:
@@ -180,13 +182,8 @@ class FlightModel:
         self._cache.clear()
         self._last = (None, {})
 
-    def _reading(self, theta):
-        """Encoder readings (K, 4) in the servo windows, one window after the other."""
-        first, count = self._starts[0], self._length * len(self._starts)
-        return self.signals.joints(theta)[3][first:first + count]
-
     def _servos(self, sets, at):
-        """Simulated servos (P, W, M, 4) of each set, begun and loaded as measured under ``at``."""
+        """Simulated servos (P, W, M, 4) of each set, with initial states and loads at ``at``."""
         windows, edges = self._windows(at)
         targets = [targets_at(self.signals, theta, edges) for theta in sets]
         runs = simulate(self.robot, windows, np.array(targets), sets, self.modules)

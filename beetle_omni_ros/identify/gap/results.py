@@ -45,15 +45,15 @@ def results(a: Analysis, robot: RobotParameters, p: GapParameters, meta: dict) -
         'modules_of_the_file': bool(a.models[0] and a.models[0][0].modules),
         'meta': {**meta, 'version': __version__}}
     if a.problem is not None:
-        count = len(a.problem.time)
+        count, remainder = len(a.problem.time), a.remainder
         before, after, floor = a.found.cost
         result |= {'explained': a.found.explained if a.found.accepted else None,
                    'excess': {'samples': count, 'before': before, 'after': after,
                               'everything': floor},
-                   'hidden': [*hidden(a, p), *a.unseen], 'tolerances': _tolerances(a),
-                   'remainder': {'gain': a.rest.gain, 'positive': a.rest.positive,
-                                 'frame': a.rest.frame, 'channels': dict(a.rest.channels),
-                                 'terms': dict(a.rest.terms)},
+                   'hidden': [*hidden(a, p), *a.undetectable], 'tolerances': _tolerances(a),
+                   'remainder': {'gain': remainder.gain, 'positive': remainder.positive,
+                                 'frame': remainder.frame, 'channels': dict(remainder.channels),
+                                 'terms': dict(remainder.terms)},
                    'patterns': [asdict(pattern) for pattern in a.patterns],
                    'rhythm': asdict(a.spectral_line)}
     result['summary'] = summary(result)
@@ -141,7 +141,7 @@ def _candidates(a):
     result = []
     taken = {t.candidate.label for t in a.found.accepted}
     for label, trial in sorted(a.found.trials.items(), key=lambda lt: -lt[1].gain):
-        seen = a.visible.get(label)
+        seen = a.detectability.get(label)
         row = {'name': trial.candidate.name, 'accepted': label in taken,
                'evidence': evidence(a, trial), 'reason': trial.reason,
                'sigma_of_realistic_size': seen.sigma if seen else None,
@@ -228,17 +228,17 @@ def _horizons(result):
 
 
 def _evidence(rows, most):
-    asked = any(r['sigma_of_realistic_size'] is not None for r in rows)
+    detectability = any(r['sigma_of_realistic_size'] is not None for r in rows)
     shown = [[_label(r) + (f" ({r['form']})" if r.get('form') else ''),
               f"{r['evidence']['delta_chi2']:.0f}",
-              *([_cell(r['sigma_of_realistic_size'])] if asked else []),
+              *([_cell(r['sigma_of_realistic_size'])] if detectability else []),
               'accepted' if r['accepted'] else r['reason']] for r in rows[:most]]
     note = 'gain of chi2: decrease of the squared residual over noise beside the accepted ' \
            'entries; of an accepted entry: increase without it. (2): second form of an entry.'
-    if asked:
+    if detectability:
         note += ' detectability: standard deviations that a typical size would show.'
     return Grid(CANDIDATES,
-                ['entry', 'gain of chi2', *(['detectability [sigma]'] if asked else []),
+                ['entry', 'gain of chi2', *(['detectability [sigma]'] if detectability else []),
                  'decision'], shown, note=note)
 
 
@@ -272,45 +272,30 @@ def _spans(interval):
 
 def summary(result: dict) -> str:
     """The verdict as one or two sentences."""
-    return _SENTENCES[result['verdict']](result)
-
-
-def _bad_data(result):
-    text = result['reason'] if result['reason'].endswith('?') else f'{result["reason"]}.'
+    verdict = result['verdict']
+    if verdict in ('named', 'named_set'):
+        parts = [_effect_text(effect) for effect in result['effects']]
+        explain = 'explain' if len(parts) > 1 else 'explains'
+        return f'{_capital(listed(parts))} {explain} the disagreement. {_closing(result)}'
+    if verdict == 'no_gap':
+        undetectable = result.get('hidden') or []
+        text = 'Model and measurement agree to within noise and manufacturing tolerance.'
+        if not undetectable:
+            return f'{text} Every known effect of typical size would have been detected.'
+        return (f'{text} An effect of typical size of {listed(undetectable, "or")} would not have '
+                'been detected in these data.')
+    reason = result['reason']
+    if verdict == 'not_decidable':
+        return f'These data cannot decide: {reason}.'
+    if verdict == 'unknown':
+        partial = [' or '.join(e['names']) for e in result.get('partial') or []
+                   if e['names'][0] not in reason]
+        tried = f' {_capital(listed(partial))} would explain a part.' if partial else ''
+        return f'No known effect explains the disagreement: {reason}.{tried}'
     further = len(result['bad_data']) - 1
-    if further > 0:
-        text += f' {further} more {"fault is" if further == 1 else "faults are"} listed below.'
-    return text
-
-
-def _no_gap(result):
-    unseen = result.get('hidden') or []
-    text = 'Model and measurement agree to within noise and manufacturing tolerance.'
-    if not unseen:
-        return f'{text} Every known effect of typical size would have been detected.'
-    return (f'{text} An effect of typical size of {listed(unseen, "or")} would not have been '
-            'detected in these data.')
-
-
-def _named(result):
-    parts = [_effect_text(effect) for effect in result['effects']]
-    explain = 'explain' if len(parts) > 1 else 'explains'
-    return f'{_capital(listed(parts))} {explain} the disagreement. {_closing(result)}'
-
-
-def _unknown(result):
-    partial = [' or '.join(e['names']) for e in result.get('partial') or []
-               if e['names'][0] not in result['reason']]
-    tried = f' {_capital(listed(partial))} would explain a part.' if partial else ''
-    return f'No known effect explains the disagreement: {result["reason"]}.{tried}'
-
-
-def _not_decidable(result):
-    return f'These data cannot decide: {result["reason"]}.'
-
-
-_SENTENCES = {'bad_data': _bad_data, 'no_gap': _no_gap, 'named': _named, 'named_set': _named,
-              'unknown': _unknown, 'not_decidable': _not_decidable}
+    return (reason if reason.endswith('?') else f'{reason}.') + (
+        f' {further} more {"fault is" if further == 1 else "faults are"} listed below.'
+        if further > 0 else '')
 
 
 def listed(words: list[str], last: str = 'and') -> str:

@@ -166,10 +166,10 @@ class Search:
     def _propose(self, state, cost, accepted):
         """Trials of all candidates beside the accepted ones; the best are fitted."""
         taken, free = {c.label for c in accepted}, self._free(accepted)
-        asked = [c for c in self.candidates
-                 if c.label not in taken and not any(key in free for key in c.keys)]
-        self._proposals = Proposals(self.problem, asked, state, cost, self._involved(accepted),
-                                    free)
+        candidates = [c for c in self.candidates
+                      if c.label not in taken and not any(key in free for key in c.keys)]
+        self._proposals = Proposals(self.problem, candidates, state, cost,
+                                    self._involved(accepted), free)
         self._baseline = state
         return self._proposals.fit_best()
 

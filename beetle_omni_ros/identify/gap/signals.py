@@ -219,8 +219,8 @@ class Signals:
         delay = self.delays(theta)[1]
 
         def make():
-            mean = self._cached(('asked', delay), theta, names[1:2],
-                                lambda: self._asked(delay, limit))
+            mean = self._cached(('commands', delay), theta, names[1:2],
+                                lambda: self._mean_commands(delay, limit))
             tau = self.robot.rotors.time_constant * np.exp(lag + np.array(own))
             keep = np.exp(-self._step / tau)
             lagged = np.stack([lfilter([1 - k], [1, -k], column, zi=k * column[:1])[0]
@@ -230,15 +230,15 @@ class Signals:
             return force, (mean[places + 1] - force) / tau
         return self._cached(('thrust', delay), theta, names, make)
 
-    def _asked(self, delay, limit):
+    def _mean_commands(self, delay, limit):
         """Mean thrust commands (K, 4) between the steps of the rotor filter [N]."""
         rotors, h = self.robot.rotors, self._step
         # Recorded commands are already within the limit of the robot file.
         most = rotors.thrust_max * np.exp(limit) if limit else np.inf
-        asked = np.clip(self._command[:, 4:], rotors.thrust_min, most)
+        commanded = np.clip(self._command[:, 4:], rotors.thrust_min, most)
         edges = self._begin + h * np.arange(round((self.t[-1] - self._begin) / h) + 3)
         return np.diff(held_at(edges - delay, self._command_t, *integral(
-            self._command_t, asked)), axis=0) / h
+            self._command_t, commanded)), axis=0) / h
 
     def tilt_targets(self, edges, delay):
         """(K, 4) mean tilt commands between ``edges`` (K + 1,) [s], delayed by ``delay``."""

@@ -29,7 +29,7 @@ def not_met(a: Analysis, p: GapParameters) -> list[str]:
 
 def _undetectable(a, p):
     best: dict[str, float] = {}
-    for label, seen in a.visible.items():
+    for label, seen in a.detectability.items():
         name = label.partition(' ')[0].partition('[')[0]
         best[name] = max(best.get(name, 0.0), seen.sigma)
     return [name for name, sigma in best.items() if sigma < p.decidable]
@@ -48,9 +48,9 @@ def decide(a: Analysis, p: GapParameters) -> None:
     left = max(after - floor - small, 0.0)
     explained = (before - after) / max(before - after + left, 1e-9)
     undetectable = hidden(a, p)
-    seen = {label.partition(' ')[0].partition('[')[0] for label in a.visible}
+    seen = {label.partition(' ')[0].partition('[')[0] for label in a.detectability}
     share = len(undetectable) / max(sum(not CATALOGUE[name].one_regime for name in seen), 1)
-    repeatable = _repeatable(a.rest, p)
+    repeatable = _repeatable(a.remainder, p)
     unmodelled = _unmodelled_force(a, before - after, p)
     sets = [[t, *found.rivals.get(t.candidate.label, [])] for t in found.accepted]
     names = [len({t.candidate.name for t in members}) for members in sets]
@@ -60,11 +60,11 @@ def decide(a: Analysis, p: GapParameters) -> None:
         a.reason = _low_excitation_reason(sets, forces, undetectable)
         found.accepted[:] = [t for t in found.accepted if t not in forces]
     elif found.accepted:
-        part = a.rest.gain / max(before - after, 1e-9)
+        part = a.remainder.gain / max(before - after, 1e-9)
         if left > p.least_left and explained < p.enough or unmodelled \
                 or repeatable and part > p.remainder_share or a.above_ceiling:
             a.verdict, a.partial = 'unknown', list(found.accepted)
-            rest = unmodelled or (a.above_ceiling[0].text if a.above_ceiling else a.rest.text)
+            rest = unmodelled or (a.above_ceiling[0].text if a.above_ceiling else a.remainder.text)
             known = ', '.join(dict.fromkeys(t.candidate.name for t in found.accepted))
             a.reason = (f'{rest}, even with {known} ({explained:.0%} of what all known effects '
                         'could explain)')
@@ -79,7 +79,7 @@ def decide(a: Analysis, p: GapParameters) -> None:
         a.verdict = 'unknown'
         a.reason = f'{a.above_ceiling[0].text}, and no known effect explains it'
     elif repeatable or unmodelled or left > 0.05 * count:
-        a.verdict, a.reason = 'unknown', unmodelled or a.rest.text
+        a.verdict, a.reason = 'unknown', unmodelled or a.remainder.text
     elif share > p.most_hidden:
         a.verdict = 'not_decidable'
         a.reason = (f'{len(undetectable)} known effects of typical size would not be detected in '

@@ -35,20 +35,20 @@ THRUST_UNITS = {1e3: 'in millinewtons, not N', 1e3 / 9.80665: 'in grams, not N',
 def joint_damages(recording: Recording, m: Motion, robot: RobotParameters,
                   limits: RecordingLimits) -> list[Damage]:
     """Contradictions between encoders and tilt commands."""
-    asked, read = (x - x.mean(axis=0) for x in (m.tilt_command, m.tilt))
+    commanded, read = (x - x.mean(axis=0) for x in (m.tilt_command, m.tilt))
     count, limit = 0.5 * len(m.t), robot.joints.position_limit
-    moving = np.sqrt((np.gradient(asked, m.t, axis=0)**2).mean(axis=0)) > limits.least_motion[2]
-    moving |= np.ptp(read, axis=0) > 2 * limit
+    rate = np.sqrt((np.gradient(commanded, m.t, axis=0)**2).mean(axis=0))
+    moving = (rate > limits.least_motion[2]) | (np.ptp(read, axis=0) > 2 * limit)
     units, swaps, signs, unlike = [], [], [], []
     for i in np.flatnonzero(moving):
         total = (read[:, i]**2).sum()
-        usual = ((read[:, i] - asked[:, i])**2).sum()
-        if usual < (1 - limits.least_agreement) * max(total, (asked[:, i]**2).sum()):
+        usual = ((read[:, i] - commanded[:, i])**2).sum()
+        if usual < (1 - limits.least_agreement) * max(total, (commanded[:, i]**2).sum()):
             continue
         tried = []
         for j, (unit, sign) in product(range(4), product(
                 {*ANGLE_UNITS, *(1 / u for u in ANGLE_UNITS)}, (1, -1))):
-            left = ((read[:, i] - sign * unit * asked[:, j])**2).sum() / max(total, 1e-12)
+            left = ((read[:, i] - sign * unit * commanded[:, j])**2).sum() / max(total, 1e-12)
             price = PRIOR * ((j != i) + (unit != 1.0) + (sign < 0))
             tried.append((-0.5 * count * np.log(max(left, FLOOR)) - price, j, unit, sign, left))
         tried.sort(key=lambda one: -one[0])

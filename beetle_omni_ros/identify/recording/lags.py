@@ -38,13 +38,13 @@ def lag_damages(recording: Recording, limits: RecordingLimits) -> list[Damage]:
     stamps, values = series_of(recording, 'mocap/pose')
     turned = _body_rate(matrices(_orientation(stamps, values[:, 3:], grid)))
     rate = held(recording, 'imu/data_raw', grid)[:, 3:]
-    tilt, asked = (kernel(held(recording, topic, grid)[:, :4], 1)
-                   for topic in ('joint_states', 'command'))
+    tilt, commanded = (kernel(held(recording, topic, grid)[:, :4], 1)
+                       for topic in ('joint_states', 'command'))
     t = grid[kernel.margin:len(grid) - kernel.margin]
     pairs = (('mocap/pose', 'imu/data_raw', 'the pose', 'the gyroscope', limits.sensor_lag,
               np.linalg.norm(kernel(turned), axis=1), np.linalg.norm(kernel(rate), axis=1)),
              ('joint_states', 'command', 'encoders', 'commands', limits.servo_lag,
-              np.linalg.norm(tilt, axis=1), np.linalg.norm(asked, axis=1)))
+              np.linalg.norm(tilt, axis=1), np.linalg.norm(commanded, axis=1)))
     gaps = silent(recording, t, 0.0)
     result = []
     for topic, other, what, whose, allowed, late, early in pairs:
