@@ -1,10 +1,10 @@
 """
-The gap workflow's blind campaign: ``python benchmarks/gap_campaign.py --set fast --seed 0``.
+Blind campaign of the gap workflow: ``python benchmarks/gap_campaign.py --set fast --seed 0``.
 
-Flights with hidden effects are made by ``benchmarks/gap_data`` (an own robot, controller and
-formulas), the workflow is run on each in a process that is given bags and a robot file only, and
-its answers are judged against the sealed labels, beside three plain baselines. Flights and
-answers are kept; the same command goes on where it was left.
+``benchmarks/gap_data`` makes flights with hidden effects, with its own robot, controller and
+formulas. The workflow runs on each flight in a process that gets only bags and a robot file. Its
+answers and those of three simple baselines are compared with the labels. Flights and answers are
+kept; the same command continues an interrupted campaign.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def choose_workflows(given: argparse.Namespace) -> list[Workflow]:
-    """Those of the command line, then the baselines."""
+    """Workflows of the command line, then the baselines."""
     if given.flights_only:
         return []
     texts = given.workflow or [WORKFLOW]
@@ -91,7 +91,7 @@ def choose_workflows(given: argparse.Namespace) -> list[Workflow]:
 
 
 def check_exists(workflow: Workflow) -> None:
-    """Refuse a Python workflow that is not there, before any flight is made."""
+    """Refuse a missing Python workflow before any flight is made."""
     module = workflow.text.partition(':')[0]
     if '{' in workflow.text:
         return
@@ -105,10 +105,10 @@ def check_exists(workflow: Workflow) -> None:
 
 def select(cases, only: str | None):
     """
-    Cases that fit a list of kinds, difficulties and effects: of each sort that it names, one.
+    Cases of the listed kinds, difficulties and effects.
 
     Raises:
-        WorkflowError: a name of no sort.
+        WorkflowError: unknown name.
 
     """
     if only is None:
@@ -184,7 +184,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def command_of(given: argparse.Namespace) -> str:
-    """What makes the same numbers again, without the folders of this computer."""
+    """Command that reproduces the numbers, without local folders."""
     words = ['python', 'benchmarks/gap_campaign.py', '--set', given.set, '--seed',
              str(given.seed)]
     for option in ('cases', 'only', 'command_age'):
@@ -197,7 +197,7 @@ def command_of(given: argparse.Namespace) -> str:
 
 
 def write(report: dict, output: Path) -> None:
-    """The three files of a report, and the table on standard output."""
+    """Write the three files of a report, and print the table."""
     output.mkdir(parents=True, exist_ok=True)
     (output / 'report.json').write_text(json.dumps(report, indent=1))
     (output / 'report.html').write_text(html(report))

@@ -1,9 +1,9 @@
 """
-Does `beetle_omni gap` notice damaged recordings? ``python benchmarks/gap_damage.py``.
+Detection of damaged recordings by `beetle_omni gap`: ``python benchmarks/gap_damage.py``.
 
-Clean flights are made in process and kept. Each kind of damage (``gap_damage_kinds``) is done to
-their bags, message by message, and the gap finder is asked about the damaged bags. False data must
-never pass as no gap or as an effect, and the cause must be told in words.
+Undamaged flights are made in this process and kept. Each kind of damage (``gap_damage_kinds``) is
+applied to their bags, message by message, and the gap finder runs on them. Damaged data must never
+result in no gap or in an effect, and the cause must be stated.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def on_cores(text: str, jobs: int, calls: list[tuple], console: Console):
-    """Yield results of (function, arguments...) as they come, with their number and a bar."""
+    """Yield numbered results of (function, arguments...) as they finish, with a progress bar."""
     def numbered(k, function, *arguments):
         return k, function(*arguments)
 
@@ -80,7 +80,7 @@ def on_cores(text: str, jobs: int, calls: list[tuple], console: Console):
 
 
 def fly_all(orders: list, jobs: int, console: Console) -> list[Path]:
-    """Make flights that are not there yet; their bags, in order."""
+    """Make missing flights; return their bags in order."""
     for k, ended in on_cores('flights', jobs, [(make_flight, order) for order in orders],
                              console):
         if ended:
@@ -91,17 +91,17 @@ def fly_all(orders: list, jobs: int, console: Console) -> list[Path]:
 @dataclass(frozen=True)
 class Case:
     """
-    One question.
+    One test case.
 
     Attributes:
-        name: of the kind of damage; None: the flights as they are.
-        bags: two that are fitted, one that judges.
+        name: kind of damage; None: undamaged flights.
+        bags: two fitted bags and the held-out one.
         other: bag of another flight.
-        seed: of what is random in the damage.
-        everywhere: damage all flights, whatever the kind's scope.
-        place: folder for the damaged bags; its name tells nothing.
-        timeout: [s] for the answer.
-        keep: leave the damaged bags there.
+        seed: seed of the damage.
+        everywhere: whether all flights are damaged, whatever the scope of the kind.
+        place: folder of the damaged bags, with a neutral name.
+        timeout: largest time of the analysis [s].
+        keep: whether the damaged bags are kept.
 
     """
 
@@ -115,7 +115,7 @@ class Case:
     keep: bool
 
     def key(self, code: str) -> str:
-        """What an answer depends on."""
+        """Key of a kept answer."""
         damage = KINDS[self.name].key() if self.name else ''
         bags = ' '.join(str(bag) for bag in (*self.bags, self.other))
         return f'{code} {self.name} {damage} {self.seed} {self.everywhere} {bags}'
@@ -123,11 +123,11 @@ class Case:
 
 def answered(case: Case, code: str, fresh: bool) -> dict:
     """
-    The answer to a case, a kept one where there is one.
+    The answer to a case, from the kept ones if possible.
 
     Returns:
-        as :func:`~gap_damage_kinds.ask.ask`, with ``onset`` [s] in the first flight or None, and
-        ``begin``, the first stamp [s] of that flight.
+        see :func:`~gap_damage_kinds.ask.ask`, with ``onset`` [s] in the first flight or None, and
+        ``begin``, the first stamp of that flight [s].
 
     """
     file = case.place.with_suffix('.json')
@@ -140,7 +140,7 @@ def answered(case: Case, code: str, fresh: bool) -> dict:
 
 
 def ask_damaged(case: Case) -> dict:
-    """Damage a set of flights, ask, and clear up; see :func:`answered`."""
+    """Damage a set of flights, analyse it, and clean up; see :func:`answered`."""
     shutil.rmtree(case.place, ignore_errors=True)
     case.place.mkdir(parents=True)
     other, onset, begin, paths = Recording.read(case.other), None, 0.0, []
@@ -159,7 +159,7 @@ def ask_damaged(case: Case) -> dict:
 
 
 def flight_sets(given: argparse.Namespace, console: Console) -> list[list[Path]]:
-    """Bags in sets: two fitted, one that judges."""
+    """Sets of bags: two fitted ones and a held-out one."""
     if given.runs:
         return [given.runs[k:k + FLIGHTS] for k in range(0, len(given.runs), FLIGHTS)]
     orders = [o for s in sets_of(given.folder / 'flights', given.flights, given.seed) for o in s]
@@ -168,7 +168,7 @@ def flight_sets(given: argparse.Namespace, console: Console) -> list[list[Path]]
 
 
 def run_kinds(given: argparse.Namespace, console: Console) -> int:
-    """Every kind on every set; tables and files."""
+    """Analyse every kind of damage on every set; write tables and files."""
     sets, code = flight_sets(given, console), ask.code_key()
     cases = [Case(name, tuple(sets[k]), sets[(k + 1) % len(sets)][1], given.seed,
                   given.everywhere, place_of(given.folder, name, k), given.timeout, given.keep)
@@ -195,18 +195,18 @@ def run_kinds(given: argparse.Namespace, console: Console) -> int:
 
 
 def place_of(folder: Path, name: str | None, k: int) -> Path:
-    """Folder of a case; its name tells nothing."""
+    """Folder of a case, with a neutral name."""
     return folder / 'asked' / hashlib.sha256(f'{name} {k}'.encode()).hexdigest()[:8]
 
 
 def named(asked: dict) -> tuple[str, ...]:
-    """Every name that the undamaged flights get."""
+    """All effects that are named in undamaged flights."""
     effects = (asked['answer'] or {}).get('effects') or ()
     return tuple(name for effect in effects for name in effect['names'])
 
 
 def check(bag: Path) -> str:
-    """Load a flight as the gap finder does; why it is refused, or ''."""
+    """Load a flight like the gap finder; return the reason of a refusal, or ''."""
     from beetle_omni_ros.identify.gap.bags import BagError
     from beetle_omni_ros.identify.gap.ingest import load_flight, UnusableFlight
     from beetle_omni_ros.identify.gap.parameters import GapParameters
@@ -219,7 +219,7 @@ def check(bag: Path) -> str:
 
 
 def run_undamaged(given: argparse.Namespace, console: Console) -> int:
-    """Load undamaged flights; print those that are refused."""
+    """Load undamaged flights; print refused ones."""
     orders = undamaged(given.folder / 'undamaged', given.undamaged, given.seed)
     bags = fly_all(orders, given.jobs, console) + given.runs
     refused = {}
@@ -232,7 +232,7 @@ def run_undamaged(given: argparse.Namespace, console: Console) -> int:
 
 
 def command_of(given: argparse.Namespace) -> str:
-    """What makes the same numbers again."""
+    """Command that reproduces the numbers."""
     words = ['python', 'benchmarks/gap_damage.py', '--flights', str(given.flights), '--seed',
              str(given.seed)]
     words += ['--kinds', given.kinds] if given.kinds else []
@@ -241,7 +241,7 @@ def command_of(given: argparse.Namespace) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Ask about damaged flights, or load undamaged ones."""
+    """Analyse damaged flights, or load undamaged ones."""
     given = parse(arguments)
     if given.list:
         for kind in KINDS.values():

@@ -1,10 +1,10 @@
 """
-The gap workflow from end to end, as `make gap` shows it: `python benchmarks/gap_demo.py`.
+The complete gap workflow, also as `make gap`: `python benchmarks/gap_demo.py`.
 
-A plant gets an effect that the workflow is not told. Three flights of it are recorded under the
-NMPC, `beetle_omni gap` runs on the bags, and the robot file that it writes is tried: held-out free
-runs before and after, and the lemniscate under the NMPC with the old and with the corrected model.
-The first effect is flown in real time through the ROS graph and both buses, the others by
+A plant has an effect that is not in the robot file. Three of its flights under the NMPC are
+recorded, and `beetle_omni gap` analyses the bags. The robot file that it writes is tested by
+held-out free runs, and by the lemniscate under the NMPC with the old and the corrected model. The
+first effect is flown in real time through the ROS graph and both buses. The others use
 `beetle_omni evaluate --bag`, which is the same loop and faster, on all cores.
 """
 
@@ -25,19 +25,18 @@ from beetle_omni_ros.evaluation.command import run_evaluate
 from beetle_omni_ros.identify.gap.command import gap_results
 from beetle_omni_ros.robot.resources import share_path
 
-# What is hidden, sizes as gap.md calls realistic or somewhat above: where an effect costs the
-# NMPC nothing, correcting it gains nothing.
+# Hidden effects of typical size or somewhat larger, so that they affect the NMPC.
 HIDDEN = {
     'tilt_thrust_loss': 'tilt_thrust_loss: {loss_at_60deg: 0.08}',
     'rotor_drag': 'rotor_drag: {coefficient: 1.2}',
     'joint_command_latency': 'joint_command_latency: {delay: 0.045}',
 }
 WIDTH = 120                 # columns that the table needs
-FLIGHTS, POSES = 3, 7       # of 8 s each: the last flight judges
+FLIGHTS, POSES = 3, 7       # poses of 8 s; the last flight is held out
 
 
 def poses(path: Path, seed: int) -> Path:
-    """Write a task of random poses with large turns, clear of the floor."""
+    """Write a task of random poses with large rotations, clear of the ground."""
     random = np.random.default_rng(seed)
     rows = ['x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg']
     for _ in range(POSES):
@@ -69,15 +68,15 @@ def record(folder: Path, name: str, k: int, through_ros: bool = False) -> None:
         run_evaluate(controllers=['nmpc'], **given)
 
 
-def lemniscate(plant: Path, believed: Path) -> float:
+def lemniscate(plant: Path, model: Path) -> float:
     """Mean position error of the NMPC on the lemniscate [m]; nan after a crash."""
-    found = run_evaluate(controllers=['nmpc'], task='lemniscate', plant=plant, robot=believed,
+    found = run_evaluate(controllers=['nmpc'], task='lemniscate', plant=plant, robot=model,
                          console=Console(quiet=True))['nmpc']
     return float('nan') if found['crashed'] else found['trajectory']['position_mean_m']
 
 
 def on_all_cores(calls: dict, console: Console) -> dict:
-    """Call each; results by the names of ``calls``, which are said as they are done."""
+    """Results by the names of ``calls``, whose progress is printed."""
     def named(name, function, arguments):
         return name, function(*arguments)
 
@@ -90,7 +89,7 @@ def on_all_cores(calls: dict, console: Console) -> dict:
 
 
 def show(names: list[str], folder: Path, through_ros: bool, console: Console) -> dict:
-    """Each hidden effect from flights to the corrected model; what came of it, by name."""
+    """Analyse each hidden effect from flights to the corrected model; return results by name."""
     plants = {name: plant_file(folder, name) for name in names}
     corrected = {name: folder / f'{name}_robot.yaml' for name in names}
     numbers = range(1, FLIGHTS + 1)
@@ -128,7 +127,7 @@ def show(names: list[str], folder: Path, through_ros: bool, console: Console) ->
 
 
 def main():
-    """Show each effect; print one table; exit status 1 when one was not named."""
+    """Analyse each effect and print a table; exit status 1 if one was not named."""
     arguments = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     arguments.add_argument('--effects', default=','.join(HIDDEN), help='default: all')
     arguments.add_argument('--no-ros', action='store_true', help='no flights in real time')

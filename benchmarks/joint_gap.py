@@ -1,11 +1,11 @@
 """
-How often `beetle_omni gap LOG.csv` names what changed in the servos, and nothing else.
+Detection of servo changes by `beetle_omni gap LOG.csv`, and false detections.
 
 `python benchmarks/joint_gap.py --cases 60 --seed 1 --json joint_gap.json`. The real log is
-judged against the shipped robot file, which is then corrected. Each case is a made log: a free
-run of the corrected servos with one change, plus the residual of the real log (as it is, shifted
-in a circle, or in blocks of a second drawn anew), rounded to encoder counts. It is judged against
-the corrected file.
+compared with the shipped robot file, which is then corrected. Each case is an artificial log: a
+simulation of the corrected servos with one change, plus the residual of the real log, rounded to
+encoder counts. The residual is used unchanged, circularly shifted, or in blocks of a second drawn
+at random. The log is compared with the corrected file.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 
 LOG = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'joint_response_100Hz.csv'
 COUNT = 2 * np.pi / 4096    # [rad] of the encoder
-BLOCK = 1.0                 # [s] of residual that is drawn at a time
+BLOCK = 1.0                 # [s] of a drawn block of the residual
 KINDS = ('nothing', 'one zero', 'two zeros', 'gains', 'delay', 'friction')
 
 
@@ -44,14 +44,14 @@ def judged(log: JointLog, robot: RobotParameters) -> dict:
 
 
 def corrected(robot: RobotParameters, made: dict) -> RobotParameters:
-    """Robot as `--apply` writes it."""
+    """Robot as written by `--apply`."""
     return replace(robot, effects={
         name: {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
         for name, values in effects_with(robot, made['effects']).items()})
 
 
 def changed(robot: RobotParameters, kind: str, rng: np.random.Generator):
-    """(robot with a change, what must be named, as a set of (name, joint or None), words)."""
+    """(robot with a change, set of (name, joint or None) that must be named, description)."""
     effects = {name: dict(values) for name, values in robot.effects.items()}
 
     def sized(low, high):
@@ -74,7 +74,7 @@ def changed(robot: RobotParameters, kind: str, rng: np.random.Generator):
         for gain in ('kp', 'kd'):
             if which.startswith('both') or which == gain:
                 effects['joint_bandwidth'][gain] *= factor
-        if which.endswith('friction'):      # the dead band stays, not the torque
+        if which.endswith('friction'):      # constant dead band instead of constant torque
             _scale(effects, np.full(4, factor))
         return replace(robot, effects=effects), {('joint_bandwidth', None)}, \
             f'{which} x {factor:.2f}'
@@ -99,7 +99,7 @@ def _scale(effects, factors):
 
 
 def drawn(residual: np.ndarray, period: float, rng: np.random.Generator) -> np.ndarray:
-    """Noise (J, N) from a residual (J, N) [rad]: as it is, shifted in a circle, or in blocks."""
+    """Noise (J, N) from a residual (J, N) [rad]: unchanged, circularly shifted, or in blocks."""
     way, size = rng.integers(3), round(BLOCK / period)
     if way == 0:
         return residual
@@ -112,7 +112,7 @@ def drawn(residual: np.ndarray, period: float, rng: np.random.Generator) -> np.n
 
 
 def made_log(log: JointLog, robot: RobotParameters, residual, rng) -> JointLog:
-    """Log of a robot's servos behind the commands of a real one."""
+    """Log of a robot's servos with the commands of a real one."""
     joints = np.arange(len(log.joints))
     positions = simulate(log, joints, file_sets(robot, log.joints)) \
         + drawn(residual, log.period, rng)
@@ -121,7 +121,7 @@ def made_log(log: JointLog, robot: RobotParameters, residual, rng) -> JointLog:
 
 
 def scored(made: dict, wanted: set) -> dict:
-    """What of the wanted is named (alone, or in a set), and what else."""
+    """Which wanted entries are named (alone, or in a set), and which others."""
     named = [({(name, effect.get('joint')) for name in effect['names']}) for effect in
              made['effects']]
     found = {w for w in wanted if any(w in names for names in named)}
@@ -132,7 +132,7 @@ def scored(made: dict, wanted: set) -> dict:
 
 
 def run(log: JointLog, cases: int, seed: int, console: Console) -> dict:
-    """The real log, its own correction, and ``cases`` made logs in turn of each kind."""
+    """Results of the real log, its own correction, and ``cases`` artificial logs of each kind."""
     shipped = RobotParameters.load()
     first = judged(log, shipped)
     robot = corrected(shipped, first)

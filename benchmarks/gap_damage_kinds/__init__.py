@@ -1,1 +1,1 @@
-"""Damaged recordings: what can be wrong with a bag, and who notices (see gap_damage.py)."""
+"""Kinds of damage of a bag, and whether the gap finder detects them (see gap_damage.py)."""

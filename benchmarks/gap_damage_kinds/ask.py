@@ -1,4 +1,4 @@
-"""Asks the gap finder about bags, in a process of its own."""
+"""Run the gap finder on bags, in its own process."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def ask(fitted: list[Path], judging: Path, output: Path, timeout: float) -> dict
     Run `beetle_omni gap`.
 
     Args:
-        fitted: bags.
-        judging: the held-out bag.
+        fitted: fitted bags.
+        judging: held-out bag.
         output: file for the JSON.
-        timeout: [s].
+        timeout: largest time [s].
 
     Returns:
         ``status`` (124 after the timeout), ``answer`` (JSON or None), ``seconds``, ``crash``
@@ -50,7 +50,7 @@ def ask(fitted: list[Path], judging: Path, output: Path, timeout: float) -> dict
 
 
 def kept(file: Path, key: str) -> dict | None:
-    """An earlier answer to the same question, or None."""
+    """A kept answer to the same question, or None."""
     try:
         found = json.loads(file.read_text())
     except (OSError, ValueError):
@@ -65,7 +65,7 @@ def keep(file: Path, key: str, result: dict) -> None:
 
 
 def code_key() -> str:
-    """Of the package's code and parameters: others answer otherwise."""
+    """Hash of the package's code and parameters, on which answers depend."""
     digest = hashlib.sha256()
     for folder in (PACKAGE / 'beetle_omni_ros', PACKAGE / 'params'):
         for file in sorted(folder.rglob('*')):
@@ -75,7 +75,7 @@ def code_key() -> str:
 
 
 def _environment():
-    """This process's, with the package beside this file before any that is installed."""
+    """Environment of this process, with the package of this tree first."""
     paths = [str(PACKAGE), *os.environ.get('PYTHONPATH', '').split(os.pathsep)]
     return {**os.environ, 'PYTHONPATH': os.pathsep.join(p for p in paths if p), 'NO_COLOR': '1',
             'OMP_NUM_THREADS': os.environ.get('OMP_NUM_THREADS', '1')}

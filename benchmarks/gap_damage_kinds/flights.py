@@ -1,4 +1,4 @@
-"""Clean flights in process, kept in a folder."""
+"""Undamaged flights, made in this process and kept in a folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.tasks import make_task, pose_target, Segment, Task
 
 POSES = 7       # of 8 s each
-FLIGHTS = 3     # of a set: two are fitted, the last judges
+FLIGHTS = 3     # of a set: two fitted ones and a held-out one
 WAYS = (('nmpc', 'nominal'), ('rl', 'published'), ('nmpc', 'published'), ('rl', 'nominal'))
 TASKS = ('poses', 'mixture', 'poses', 'hover', 'lemniscate')
 
@@ -22,14 +22,14 @@ TASKS = ('poses', 'mixture', 'poses', 'hover', 'lemniscate')
 @dataclass(frozen=True)
 class Order:
     """
-    One flight that is wanted.
+    One flight to make.
 
     Attributes:
-        folder: of the bag.
+        folder: folder of the bag.
         controller: 'nmpc' or 'rl'.
         conditions: 'nominal' or 'published'.
-        task: in ``TASKS``.
-        seed: of the conditions; flights of one set have the same robot.
+        task: key of ``TASKS``.
+        seed: seed of the conditions; flights of one set have the same robot.
         poses: seed of the poses.
 
     """
@@ -43,7 +43,7 @@ class Order:
 
 
 def sets_of(folder: Path, count: int, seed: int) -> list[list[Order]]:
-    """Sets of flights, each by its own controller, conditions and seed."""
+    """Sets of flights, each with its controller, conditions and seed."""
     made = []
     for k in range(count):
         controller, conditions = WAYS[k % len(WAYS)]
@@ -55,7 +55,7 @@ def sets_of(folder: Path, count: int, seed: int) -> list[list[Order]]:
 
 
 def undamaged(folder: Path, count: int, seed: int) -> list[Order]:
-    """Single flights of every controller, condition and task in turn."""
+    """Single flights of all controllers, conditions and tasks in turn."""
     made = []
     for k in range(count):
         controller, conditions = WAYS[k % len(WAYS)]
@@ -67,10 +67,10 @@ def undamaged(folder: Path, count: int, seed: int) -> list[Order]:
 
 def make_flight(order: Order) -> str:
     """
-    Fly, where the bag is not there yet.
+    Fly, unless the bag exists.
 
     Returns:
-        how the flight ended; empty: as it should.
+        reason of a failed flight, or ''.
 
     """
     done = order.folder / 'done.json'
@@ -87,7 +87,7 @@ def make_flight(order: Order) -> str:
 
 
 def poses(seed: int, count: int = POSES) -> np.ndarray:
-    """(count, 6) poses with large turns, clear of the floor: x, y, z [m], angles [deg]."""
+    """(count, 6) poses with large rotations, clear of the ground: x, y, z [m], angles [deg]."""
     random = np.random.default_rng(seed)
     low = [-1.5, -1.5, 1.0, -150.0, -80.0, -180.0]
     high = [1.5, 1.5, 2.0, 150.0, 80.0, 180.0]

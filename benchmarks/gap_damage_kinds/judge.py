@@ -1,4 +1,4 @@
-"""Whether the damage was noticed, and what was said about it."""
+"""Whether a damage was detected, and its stated cause, topic and time."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ BAD_DATA = 3        # exit status
 @dataclass(frozen=True)
 class Judged:
     """
-    What came of one kind of damage on one set of flights.
+    Result for one kind of damage on one set of flights.
 
     Attributes:
-        verdict: of the JSON, or what happened in its place.
+        verdict: verdict of the JSON, or the event in its place.
         status: exit status.
-        names: every effect that was named.
-        false_names: effects of body, rotors, joints and commands that were named, and are not
-            named on the same flights undamaged.
-        cause: the cause stands in words; None where there is none.
-        topic: the right topic stands beside it; None without a cause.
-        onset: the moment stands beside it; None where the damage has none.
+        names: all named effects.
+        false_names: named effects of body, rotors, joints and commands that are not named on the
+            same flights without damage.
+        cause: whether the cause is stated; None if there is none.
+        topic: whether the right topic is stated with it; None without a cause.
+        onset: whether the time is stated with it; None if the damage has none.
         right: see :func:`judge`.
-        said: the statement that holds the cause, or the reason.
-        seconds: that the answer took.
+        said: statement with the cause, or the reason.
+        seconds: time of the analysis.
 
     """
 
@@ -46,7 +46,7 @@ class Judged:
     seconds: float
 
     def plain(self) -> dict:
-        """As data."""
+        """As plain data."""
         return asdict(self)
 
 
@@ -59,11 +59,10 @@ def judge(kind: Kind, asked: dict, known: tuple[str, ...] = ()) -> Judged:
     verdict but ``bad_data``, with status 0 and no false name.
 
     Args:
-        kind: of damage.
-        asked: see :func:`~gap_damage_kinds.ask.ask`; beside that, ``onset`` of the damage [s] by
-            the undamaged stamps, or None, and ``begin``, the first of these stamps [s], from
-            which moments may count.
-        known: names that the undamaged flights get.
+        kind: kind of damage.
+        asked: see :func:`~gap_damage_kinds.ask.ask`, with ``onset`` of the damage [s] by the
+            undamaged stamps, or None, and ``begin``, the first of these stamps [s].
+        known: effects that are named in the undamaged flights.
 
     """
     answer = asked['answer'] or {}
@@ -88,18 +87,18 @@ def judge(kind: Kind, asked: dict, known: tuple[str, ...] = ()) -> Judged:
 
 
 def verdict_of(asked: dict) -> str:
-    """The verdict, or what happened in its place."""
+    """The verdict, or the event in its place."""
     answer = asked['answer'] or {}
     return answer.get('verdict') or ('timeout' if asked['status'] == TIMEOUT else 'no answer')
 
 
 def statements(answer: dict, folder: str) -> list[dict]:
     """
-    Everything said: ``text``, and ``topic`` and ``at_s`` where they are told.
+    All statements: ``text``, and ``topic`` and ``at_s`` if present.
 
     Args:
         answer: the JSON.
-        folder: of the bags; it is left out, for its name is not the finder's words.
+        folder: folder of the bags, which is removed from the texts.
 
     """
     def words(text):
@@ -113,7 +112,7 @@ def statements(answer: dict, folder: str) -> list[dict]:
 
 
 def on_topic(kind: Kind, statement: dict) -> bool:
-    """Whether a statement tells one of the right topics."""
+    """Whether a statement names one of the right topics."""
     if not kind.topics:
         return True
     if statement['topic']:
@@ -122,14 +121,14 @@ def on_topic(kind: Kind, statement: dict) -> bool:
 
 
 def told_moment(asked: dict, told: list[dict]) -> bool | None:
-    """Whether a statement of the cause tells its onset; None without one."""
+    """Whether a statement of the cause has its onset; None without one."""
     if asked['onset'] is None:
         return None
     return any(near(s, asked['onset'], asked['begin']) for s in told)
 
 
 def near(statement: dict, onset: float, begin: float) -> bool:
-    """Whether a statement tells the moment, by the stamps or since the first of them."""
+    """Whether a statement has the time, by the stamps or since the first of them."""
     if isinstance(statement['at_s'], (int, float)):
         times = [statement['at_s']]
     else:

@@ -1,4 +1,4 @@
-"""What a kind of damage is, and the list of all."""
+"""Class of a kind of damage, and the list of all."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ ALL, FIRST = 'all', 'first'
 @dataclass(frozen=True)
 class Kind:
     """
-    One way to damage a recording.
+    One kind of damage.
 
     Attributes:
-        name: in tables.
+        name: name in tables.
         description: one line.
-        change: damages a recording that is its own; takes a random generator and a recording
-            of another flight; returns the onset [s] by the undamaged stamps, or None.
-        topics: where a right answer finds it; empty: anywhere.
-        causes: alternatives; each a pattern, or several that must all stand in one statement.
-        scope: ALL flights of a set (how something is built or set up), or only the FIRST
-            fitted one (what happens once).
-        harm: LIE (data are false: never no gap), REPAIRABLE (nothing false is left once some
-            messages are sorted or left out: no gap is right if the damage is told), or HARMLESS
-            (a control: not to be refused).
+        change: function that damages its own recording; it takes a random generator and a
+            recording of another flight, and returns the onset [s] by the undamaged stamps, or
+            None.
+        topics: right topics; empty: any.
+        causes: alternatives; each a pattern, or several that must all be in one statement.
+        scope: ALL flights of a set (set-up), or only the FIRST fitted one (single events).
+        harm: LIE (data are false: never no gap), REPAIRABLE (no false data after messages are
+            sorted or dropped: no gap is right if the damage is stated), or HARMLESS (a control
+            that must not be refused).
 
     """
 
@@ -50,12 +50,12 @@ class Kind:
         Damage a copy.
 
         Args:
-            recording: stays as it is.
-            other: of another flight; stays as it is.
-            seed: of what is random in the damage.
+            recording: original, not modified.
+            other: recording of another flight, not modified.
+            seed: seed of the damage.
 
         Returns:
-            the damaged recording; onset [s] by the undamaged stamps, None without a moment.
+            the damaged recording; onset [s] by the undamaged stamps, or None.
 
         """
         made = recording.copy()
@@ -71,7 +71,7 @@ class Kind:
         return f'{zlib.crc32(b" ".join(parts)):08x}'
 
     def told_by(self, statement: str) -> bool:
-        """Whether a statement holds the words of the cause."""
+        """Whether a statement contains the words of the cause."""
         return any(all(re.search(pattern, statement, re.IGNORECASE) for pattern in patterns)
                    for patterns in self.causes)
 
@@ -80,7 +80,7 @@ KINDS: dict[str, Kind] = {}
 
 
 def damage(description: str, *topics: str, causes=(), scope: str = ALL, harm: str = LIE):
-    """Enter a function under its own name; a cause may be one pattern or several."""
+    """Register a function under its name; a cause is one pattern or several."""
     causes = tuple((cause,) if isinstance(cause, str) else tuple(cause) for cause in causes)
 
     def enter(change):

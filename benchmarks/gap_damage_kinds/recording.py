@@ -1,4 +1,4 @@
-"""A bag as messages that can be changed one by one, and written again."""
+"""A bag as messages that can be changed singly, and written again."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Message:
     One message.
 
     Attributes:
-        name: in ``TOPICS``, or the whole topic where it is none of ours.
-        topic: full name, as recorded.
+        name: name in ``TOPICS``, or the whole topic if it is not there.
+        topic: full recorded name.
         type: ROS type.
         received: time of recording [s].
 
@@ -46,19 +46,19 @@ class Message:
         self._data, self._content = data, None
 
     def __copy__(self) -> Message:
-        """Return one that changes alone."""
+        """A copy that can be changed independently."""
         return Message(self.topic, self.type, self.data, self.received)
 
     @property
     def content(self):
-        """The message of rosbags' type store; what is changed there is written."""
+        """The message of rosbags' type store; changes of it are written."""
         if self._content is None:
             self._content = TYPESTORE.deserialize_cdr(self._data, self.type)
         return self._content
 
     @property
     def data(self) -> bytes:
-        """CDR as it stands."""
+        """Unchanged CDR."""
         if self._content is None:
             return self._data
         return bytes(TYPESTORE.serialize_cdr(self._content, self.type))
@@ -75,7 +75,7 @@ class Message:
         stamp.sec, stamp.nanosec = divmod(nanoseconds(t), SECOND)
 
     def numbers(self) -> list[np.ndarray]:
-        """Values of this topic as they are changed together, see ``Recording.values``."""
+        """Values of this topic, see ``Recording.values``."""
         m = self.content
         if self.name == MOCAP:
             p, q = m.pose.position, m.pose.orientation
@@ -89,7 +89,7 @@ class Message:
         return [*m.position[self._order(JOINT_NAMES)], *m.effort[self._order(ROTOR_NAMES)]]
 
     def put_numbers(self, values: np.ndarray) -> None:
-        """Set what :meth:`numbers` gives."""
+        """Set the values of :meth:`numbers`."""
         m, values = self.content, [float(value) for value in values]
         if self.name == MOCAP:
             p, q = m.pose.position, m.pose.orientation
@@ -120,9 +120,9 @@ class Recording:
     The messages of one bag, in the order of recording.
 
     Attributes:
-        messages: in the order in which they are written.
-        meta: what is known of the flight.
-        keep: part of the file's bytes that is left; below 1 the bag is cut off.
+        messages: messages in the order of writing.
+        meta: metadata of the flight.
+        keep: kept share of the file's bytes; below 1 the bag is cut off.
 
     """
 
@@ -135,8 +135,8 @@ class Recording:
         Read a bag.
 
         Args:
-            path: of a rosbag2 folder.
-            withheld: topics that are left out: what a simulator or an estimate knew.
+            path: path of a rosbag2 folder.
+            withheld: ignored topics, with knowledge of a simulator or an estimate.
 
         """
         found = (Message(m.topic, m.type, m.data, m.received) for m in read_messages(path))
@@ -157,13 +157,13 @@ class Recording:
         return Path(path)
 
     def copy(self) -> Recording:
-        """Return one that changes alone."""
+        """A copy that can be changed independently."""
         made = Recording([copy(m) for m in self.messages], dict(self.meta))
         made.keep = self.keep
         return made
 
     def counts(self) -> Counter:
-        """Messages by topic."""
+        """Number of messages by topic."""
         return Counter(m.topic for m in self.messages)
 
     def on(self, name: str) -> list[Message]:
@@ -171,7 +171,7 @@ class Recording:
         return [m for m in self.messages if m.name == name]
 
     def drop(self, *names: str) -> None:
-        """Leave topics out."""
+        """Remove topics."""
         self.messages = [m for m in self.messages if m.name not in names]
 
     def in_order(self) -> None:
@@ -193,8 +193,8 @@ class Recording:
 
         Returns:
             MoCap (N, 7) position [m] and quaternion xyzw; IMU (N, 6) specific force [m/s^2] and
-            rates [rad/s]; joints (N, 8) positions [rad] and velocities [rad/s], (N, 4) where
-            these are not recorded; commands (N, 8) tilts [rad] and thrusts [N].
+            rates [rad/s]; joints (N, 8) positions [rad] and velocities [rad/s], (N, 4) without
+            recorded velocities; commands (N, 8) tilts [rad] and thrusts [N].
 
         """
         return np.array([m.numbers() for m in self.on(name)], dtype=float)
@@ -205,7 +205,7 @@ class Recording:
             m.put_numbers(row)
 
     def moment(self, part: float) -> float:
-        """Time [s] by the stamps at which ``part`` of the recording is over."""
+        """Stamp [s] at which ``part`` of the recording is over."""
         stamps = [m.stamp for m in (self.on(MOCAP)[0], self.on(MOCAP)[-1])]
         return stamps[0] + part * (stamps[1] - stamps[0])
 
@@ -219,7 +219,7 @@ def _meta(path):
 
 
 def _cut(folder, keep):
-    """Leave the first bytes, as a recorder that was killed does."""
+    """Keep the first bytes, as after a recorder was killed."""
     (folder / 'metadata.yaml').unlink()
     for file in folder.glob('*.mcap'):
         data = file.read_bytes()

@@ -1,4 +1,4 @@
-"""The table, and the files."""
+"""Tables and files of the results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GOAL = 0.9      # of causes in words
 
 
 def totals(results: dict[str, list[Judged]], kinds: dict[str, Kind]) -> dict:
-    """Counts over all kinds that are damage, and over the controls."""
+    """Counts over all kinds of damage, and over the controls."""
     bad = [(kinds[n], j) for n, row in results.items() for j in row if kinds[n].harm != HARMLESS]
     lies = [j for kind, j in bad if kind.harm == LIE]
     controls = [j for n, row in results.items() for j in row if kinds[n].harm == HARMLESS]
@@ -58,7 +58,7 @@ def goals(t: dict) -> list[tuple[str, str, bool]]:
 
 
 def rows(results: dict[str, list[Judged]], kinds: dict[str, Kind]) -> list[list[str]]:
-    """One for each kind: name, verdicts, named falsely, cause, topic, onset, right, seconds."""
+    """A row for each kind: name, verdicts, false names, cause, topic, onset, right, seconds."""
     made = []
     for name, row in results.items():
         verdicts = ', '.join(j.verdict for j in row)
@@ -100,7 +100,7 @@ def write(results: dict[str, list[Judged]], kinds: dict[str, Kind], meta: dict,
 
 
 def markdown(results: dict[str, list[Judged]], kinds: dict[str, Kind], meta: dict) -> str:
-    """Totals, table, and what was said."""
+    """Totals, table and statements."""
     lines = ['# Damaged recordings', '', f"`{meta['command']}`", '', '| total | | |',
              '| --- | --- | --- |']
     lines += [f'| {name} | {count} | {MARKS[reached]} |'
