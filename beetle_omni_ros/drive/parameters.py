@@ -9,15 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter, ParameterError
+from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile
 from beetle_omni_ros.robot.yaml_file import quoted
 
 BUTTONS = ('arm', 'land', 'hold', 'home')
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveParameters:
+class DriveParameters(ParameterFile, file='drive.yaml'):
     """Content of params/drive.yaml."""
 
     speed: float = parameter(doc='largest speed of the target', unit='m/s', low=0.01, high=5)
@@ -44,11 +43,6 @@ class DriveParameters:
                 raise ParameterError(f"key 'buttons.{name}': expected {', '.join(BUTTONS)} with "
                                      f'a number from 0 to 63, found {quoted(number)}')
         check_poses(self.poses, "key 'poses.")
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> DriveParameters:
-        """Read a file; without a path, the shipped one."""
-        return schema.load(cls, path if path else share_path('params/drive.yaml'))
 
 
 def check_poses(poses: dict, where: str) -> None:

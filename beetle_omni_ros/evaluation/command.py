@@ -15,10 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from beetle_omni_ros import __version__
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import guidance_of, reach_of
-from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.control.registry import ControllerOptions
-from beetle_omni_ros.estimation.ekf import ErrorStateEkf
-from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.messages.topics import topics_with
 from beetle_omni_ros.robot.parameters import RobotParameters
@@ -30,14 +27,9 @@ from beetle_omni_ros.runs.json_file import write_json
 from beetle_omni_ros.runs.log import FlightLog
 from beetle_omni_ros.runs.pose_file import check_steps
 from beetle_omni_ros.runs.recorder import LogRecorder, Tee
-from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.runs.tasks import make_task, Task
-from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.faults.listed import load_faults
-from beetle_omni_ros.sim.parameters import SimulatorParameters
-from beetle_omni_ros.sim.simulator import Simulator
 
 
 def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotParameters,
@@ -72,15 +64,9 @@ def fly(controller: str, task: Task, *, robot: RobotParameters, plant: RobotPara
                 bag, meta=meta, topics=tuple(topics_with([name])), compression=compression,
                 description=description(), epoch=int(time())))
             recorder = Tee(memory, writer)
-        estimator = EkfParameters.load().of_robot(robot)
-        supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
-                                tuple(dict.fromkeys((*registry.names(), name))))
-        simulator = Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed)
-        loop = FlightLoop(
-            simulator, ErrorStateEkf(estimator, robot.gravity), aboard, supervisor, recorder,
-            estimator.imu.gyroscope_noise, faults, TargetChecks(robot).why_not)
-        supervisor.select(name)
-        stayed = loop.fly(task, progress)
+        loop = FlightLoop.shipped(robot, plant, aboard, recorder, conditions=conditions,
+                                  seed=seed, faults=faults)
+        simulator, stayed = loop.simulator, loop.fly(task, progress)
         recorder.write_meta({'crashed': not stayed, 'ended': loop.ending,
                              'broken': simulator.broken})
         if simulator.truth.impact is not None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import (
     checked,
     Controller,
@@ -23,16 +24,21 @@ from beetle_omni_ros.control.base import (
     State,
     Target,
 )
+from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf
+from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
 from beetle_omni_ros.evaluation.compute import collector_off, ComputeTimer
 from beetle_omni_ros.evaluation.processes import Processes
 from beetle_omni_ros.messages.values import Odom, Wrench
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
-from beetle_omni_ros.runs.target_checks import out_of_reach
+from beetle_omni_ros.robot.parameters import RobotParameters
+from beetle_omni_ros.runs.target_checks import out_of_reach, TargetChecks
 from beetle_omni_ros.runs.tasks import Task, TaskPlayer
+from beetle_omni_ros.safety.parameters import SupervisorParameters
 from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.sim.faults import Fault
+from beetle_omni_ros.sim.parameters import SimulatorParameters
 from beetle_omni_ros.sim.readings import Frame
 from beetle_omni_ros.sim.simulator import Simulator
 
@@ -62,6 +68,7 @@ class FlightLoop:
         check_target: function that returns why the target of a fault is refused, or ''.
 
     Attributes:
+        simulator, supervisor: the arguments.
         refusals: reasons of refused targets.
 
     """
@@ -76,8 +83,8 @@ class FlightLoop:
         self._other_target: Target | None = None     # of a fault
         self._accepts_other = False
         self.refusals: list[str] = []
-        self._simulator, self._estimator = simulator, estimator
-        self._controllers, self._supervisor, self._recorder = controllers, supervisor, recorder
+        self.simulator, self._estimator = simulator, estimator
+        self._controllers, self.supervisor, self._recorder = controllers, supervisor, recorder
         self._timers = {name: ComputeTimer(c.period) for name, c in controllers.items()}
         self._every = {name: max(1, round(c.period / simulator.tick))
                        for name, c in controllers.items()}
@@ -89,6 +96,33 @@ class FlightLoop:
         self._health = ALL_HEALTHY
         self._crashed = False
         self._ending = ''
+
+    @classmethod
+    def shipped(cls, robot: RobotParameters, plant: RobotParameters,
+                controllers: dict[str, Controller], recorder, *, conditions: str, seed: int,
+                faults: Sequence[Fault] = ()) -> FlightLoop:
+        """
+        Loop with the shipped parameters, in which the first controller is selected.
+
+        Args:
+            robot: robot of estimator and supervisor.
+            plant: simulated robot.
+            controllers: name -> controller.
+            recorder: recorder of the loop.
+            conditions: 'nominal' or 'published'.
+            seed: seed of the simulation.
+            faults: faults of the loop.
+
+        """
+        estimator, active = EkfParameters.load().of_robot(robot), next(iter(controllers))
+        supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot),
+                                tuple(dict.fromkeys((*registry.names(), active))))
+        loop = cls(
+            Simulator(plant, SimulatorParameters.load(), conditions=conditions, seed=seed),
+            ErrorStateEkf(estimator, robot.gravity), controllers, supervisor, recorder,
+            estimator.imu.gyroscope_noise, faults, TargetChecks(robot).why_not)
+        supervisor.select(active)
+        return loop
 
     @property
     def compute(self) -> dict[str, dict]:
@@ -120,38 +154,38 @@ class FlightLoop:
             return self._play(task, progress)
 
     def _play(self, task, progress):
-        player = TaskPlayer(task, self._simulator.time)
+        player = TaskPlayer(task, self.simulator.time)
         self.start_faults()
-        reported = self._simulator.time
+        reported = self.simulator.time
         while True:
-            truth = self._simulator.truth
-            moment = player.update(self._simulator.time, truth.position, truth.quaternion)
+            truth = self.simulator.truth
+            moment = player.update(self.simulator.time, truth.position, truth.quaternion)
             if moment.target is not None:
                 self.aim(moment.target)
-                if self._simulator.charge < SWAP_CHARGE or self._supervisor.vehicle.battery_low:
-                    self._simulator.swap_battery()
+                if self.simulator.charge < SWAP_CHARGE or self.supervisor.vehicle.battery_low:
+                    self.simulator.swap_battery()
             if moment.changed:
-                self._simulator.set_wrench(moment.force_world, moment.torque_body)
-                self._simulator.set_payload(moment.payload)
+                self.simulator.set_wrench(moment.force_world, moment.torque_body)
+                self.simulator.set_payload(moment.payload)
                 self._recorder.write('disturbance', Wrench(
-                    self._simulator.time, moment.force_world, moment.torque_body))
+                    self.simulator.time, moment.force_world, moment.torque_body))
             if moment.finished or self._crashed:
                 break
             self.step()
-            if self._simulator.time - reported >= COMPUTE_REPORT:
+            if self.simulator.time - reported >= COMPUTE_REPORT:
                 reported += COMPUTE_REPORT
                 self._report_compute()
-                progress(min(1.0, (self._simulator.time - player.start) / task.duration))
+                progress(min(1.0, (self.simulator.time - player.start) / task.duration))
         self._report_compute()
         progress(1.0)
-        return not (self._crashed or moment.lost or self._simulator.broken)
+        return not (self._crashed or moment.lost or self.simulator.broken)
 
     def start_faults(self) -> None:
         """Start the time of the faults."""
         if self._faults:
-            self._simulator.set_faults([fault for fault in self._faults if not fault.is_process])
+            self.simulator.set_faults([fault for fault in self._faults if not fault.is_process])
             self._processes.set_faults([fault for fault in self._faults if fault.is_process],
-                                       self._simulator.time)
+                                       self.simulator.time)
 
     def aim(self, target: Target) -> None:
         """Set the target in force."""
@@ -161,7 +195,7 @@ class FlightLoop:
     @property
     def now(self) -> float:
         """Time on the flight computer's clock [s]."""
-        return self._simulator.time + self._processes.clock_step
+        return self.simulator.time + self._processes.clock_step
 
     def take_off(self) -> None:
         """
@@ -171,21 +205,21 @@ class FlightLoop:
             FlightError: no take-off.
 
         """
-        while self._simulator.time < SETTLE_TIME:
+        while self.simulator.time < SETTLE_TIME:
             self.step()
-        answer = self._supervisor.arm(self._simulator.time)
+        answer = self.supervisor.arm(self.simulator.time)
         if not answer:
             raise FlightError(answer.text)
-        while self._supervisor.state != 'flying':
+        while self.supervisor.state != 'flying':
             self.step()
-            if self._simulator.time > TAKEOFF_TIMEOUT or self._supervisor.state == 'disarmed':
-                events = [event.text for event in self._supervisor.events]
+            if self.simulator.time > TAKEOFF_TIMEOUT or self.supervisor.state == 'disarmed':
+                events = [event.text for event in self.supervisor.events]
                 raise FlightError(f'no take-off within {TAKEOFF_TIMEOUT:g} s, supervisor in '
-                                  f"'{self._supervisor.state}' ({'; '.join(events[-3:])})")
+                                  f"'{self.supervisor.state}' ({'; '.join(events[-3:])})")
 
     def step(self) -> Frame:
         """Run one tick of the simulator and of every process that is due in it."""
-        simulator, processes = self._simulator, self._processes
+        simulator, processes = self.simulator, self._processes
         frame = processes.frame(simulator.step())
         self._ticks += 1
         now = frame.time
@@ -198,9 +232,9 @@ class FlightLoop:
             if state is not None:
                 self._send_estimate(state, estimate, now)
         for late in processes.requests(None, now):
-            self._request(self._supervisor.active, late, now)
+            self._request(self.supervisor.active, late, now)
         if not processes.supervisor_waits:
-            self._execute(self._supervisor.update(now), now)
+            self._execute(self.supervisor.update(now), now)
             self._note_state(now)
         return frame
 
@@ -219,7 +253,7 @@ class FlightLoop:
         elif self._command is None or command.stamp > self._command.stamp \
                 or command.stamp < self._command.stamp - CLOCK_SET_BACK:
             self._command = command
-            self._simulator.command(replace(
+            self.simulator.command(replace(
                 command, stamp=command.stamp - self._processes.clock_step))
             self._recorder.write('command', command, now)
 
@@ -251,8 +285,8 @@ class FlightLoop:
         """Step the controllers that are due; before the first target hold the take-off's pose."""
         if self._target is None and not self._state_name.startswith('flying'):
             self._hold = PoseTarget(state.position, state.quaternion, state.stamp)
-        if self._supervisor.health is not self._health:
-            self._health = self._supervisor.health
+        if self.supervisor.health is not self._health:
+            self._health = self.supervisor.health
             for controller in self._controllers.values():
                 forward_health(controller, self._health)
         state = corrected(state, self._health)
@@ -261,7 +295,7 @@ class FlightLoop:
                 continue
             command = checked(name, self._timers[name].call(controller.step, state,
                                                             self._target_in_force()))
-            if name == self._supervisor.active:
+            if name == self.supervisor.active:
                 for passed in self._processes.requests(command, now):
                     self._request(name, passed, now)
             else:
@@ -273,8 +307,8 @@ class FlightLoop:
 
     def _target_in_force(self):
         """Target of the supervisor, else an accepted target of a fault, else that of the task."""
-        if self._supervisor.target_override is not None:
-            return self._supervisor.target_override
+        if self.supervisor.target_override is not None:
+            return self.supervisor.target_override
         target = self._target if self._target is not None else self._hold
         other = self._processes.target(target)
         if other is None:
@@ -284,21 +318,21 @@ class FlightLoop:
             self._other_target = other
             reason = self._check_target(other) or out_of_reach(
                 other, self._estimator.estimate.position,
-                reach_of(self._controllers[self._supervisor.active]), self.now)
+                reach_of(self._controllers[self.supervisor.active]), self.now)
             self._accepts_other = not reason
             self.refusals += [reason] if reason else []
         return self._other_target if self._accepts_other else target
 
     def _note_state(self, now):
-        reported = self._supervisor.reported_state
-        name = self._supervisor.state if self._supervisor.state != 'flying' else reported
+        reported = self.supervisor.reported_state
+        name = self.supervisor.state if self.supervisor.state != 'flying' else reported
         if reported != self._recorded_state:
             self._recorded_state = reported
             self._recorder.write('supervisor/state', reported, now)
         if name != self._state_name:
             if self._state_name.startswith(('flying', 'fallback')) \
                     and name in ('landing', 'emergency_stop', 'disarmed'):
-                last = [e.text for e in self._supervisor.events][-1:]
+                last = [e.text for e in self.supervisor.events][-1:]
                 self._ending = f'{name} at {now:.1f} s: {last[0] if last else "unknown"}'
             if self._state_name.startswith(('flying', 'fallback', 'landing')) \
                     and name in ('disarmed', 'emergency_stop'):
@@ -310,5 +344,5 @@ class FlightLoop:
 
     def _report_compute(self):
         for name, summary in self.compute.items():
-            self._recorder.write_compute(self._simulator.time, name, **summary)
+            self._recorder.write_compute(self.simulator.time, name, **summary)
 

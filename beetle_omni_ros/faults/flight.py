@@ -8,22 +8,15 @@ import numpy as np
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.control.base import PoseTarget
-from beetle_omni_ros.control.hover import HoverController
-from beetle_omni_ros.estimation.ekf import ErrorStateEkf
-from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.evaluation.loop import FlightLoop
 from beetle_omni_ros.faults.watch import FlightWatch
 from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.runs.recorder import Tee
-from beetle_omni_ros.runs.target_checks import TargetChecks
 from beetle_omni_ros.safety.events import INFO
 from beetle_omni_ros.safety.parameters import SupervisorParameters
-from beetle_omni_ros.safety.supervisor import Supervisor
 from beetle_omni_ros.sim.faults import Fault
 from beetle_omni_ros.sim.faults.listed import FaultList, FlightPlan
-from beetle_omni_ros.sim.parameters import SimulatorParameters
-from beetle_omni_ros.sim.simulator import Simulator
 
 STARTS = ('hover', 'moving', 'upside_down')      # default
 ALL_STARTS = (*STARTS, 'random')
@@ -55,23 +48,15 @@ class Flight:
             recorder: recorder of the loop; by default nothing is recorded.
 
         """
-        nominal = RobotParameters.load()
-        estimator = EkfParameters.load().of_robot(nominal)
-        safety = SupervisorParameters.load()
+        nominal, envelope = RobotParameters.load(), SupervisorParameters.load().envelope
         aboard = {entry.name: entry.make(nominal) for entry in map(
             registry.find, dict.fromkeys([controller, registry.pilot()]))}
-        name = next(iter(aboard))
-        self.supervisor = Supervisor(safety, nominal, HoverController(nominal),
-                                     tuple(dict.fromkeys((*registry.names(), name))))
-        self.simulator = Simulator(true_robot or nominal, SimulatorParameters.load(),
-                                   conditions=conditions, seed=seed)
-        self.loop = FlightLoop(
-            self.simulator, ErrorStateEkf(estimator, nominal.gravity), aboard, self.supervisor,
-            Tee() if recorder is None else recorder, estimator.imu.gyroscope_noise, strike,
-            TargetChecks(nominal).why_not)
-        self.supervisor.select(name)
+        self.loop = FlightLoop.shipped(
+            nominal, true_robot or nominal, aboard, Tee() if recorder is None else recorder,
+            conditions=conditions, seed=seed, faults=strike)
+        self.simulator, self.supervisor = self.loop.simulator, self.loop.supervisor
         self.random = np.random.default_rng(seed)
-        self._fence = safety.envelope.half_width, safety.envelope.height
+        self._fence = envelope.half_width, envelope.height
 
     def aim(self, position, quaternion=(0.0, 0.0, 0.0, 1.0)) -> None:
         """Set the target pose: (3,) in world [m], (4,) xyzw."""

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -109,23 +106,12 @@ class RotorLogParameters:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class IdentifyParameters:
+class IdentifyParameters(ParameterFile, file='identify.yaml'):
     """See params/identify.yaml, which gives the source of each number."""
 
     log: JointLogLimits = parameter(doc='response logs')
     servo: ServoFitParameters = parameter(doc='servo models')
     rotor: RotorLogParameters = parameter(doc='rotor maps')
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> IdentifyParameters:
-        """
-        Read a file; default the shipped one.
-
-        Raises:
-            ParameterError: with file and key.
-
-        """
-        return schema.load(cls, path or share_path('params/identify.yaml'))
 
 
 @cache

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite
-from pathlib import Path
 
 import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget, Target
-from beetle_omni_ros.robot import rotations, schema
+from beetle_omni_ros.robot import rotations
 from beetle_omni_ros.robot.parameters import RobotParameters
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 UNIT_TOLERANCE = 0.02   # of a quaternion's squared length
 
 
 @dataclass(frozen=True, kw_only=True)
-class TargetLimits:
+class TargetLimits(ParameterFile, file='targets.yaml'):
     """Limits of a target; params/targets.yaml gives the reasons."""
 
     half_width: float = parameter(18.0, doc='largest |x| and |y|', unit='m', low=0.5, high=1000)
@@ -37,11 +35,6 @@ class TargetLimits:
     oldest: float = parameter(10.0, doc='largest age of a stamp', unit='s', low=0.1, high=1e5)
     farthest_ahead: float = parameter(1.0, doc='largest time of a stamp ahead of the clock',
                                       unit='s', low=0.01, high=1e5)
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> TargetLimits:
-        """Read a file; without a path, the shipped one."""
-        return schema.load(cls, path if path else share_path('params/targets.yaml'))
 
 
 def out_of_reach(target: Target, position: np.ndarray, reach: float, now: float) -> str:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter, ParameterError
+from beetle_omni_ros.robot.schema import parameter, ParameterError, ParameterFile
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +178,7 @@ class PublishedParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulatorParameters:
+class SimulatorParameters(ParameterFile, file='simulator.yaml'):
     """Content of params/simulator.yaml."""
 
     plant: PlantParameters = parameter(doc='time steps, floor and dimensions')
@@ -193,14 +190,3 @@ class SimulatorParameters:
     rotor_speed: RotorSpeedParameters = parameter(doc='rotor speed telemetry')
     crash: CrashParameters = parameter(doc='limits of the robot at contacts')
     published: PublishedParameters = parameter(doc='randomisation of --conditions published')
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> SimulatorParameters:
-        """
-        Read a simulator file; without a path, the shipped one.
-
-        Raises:
-            ParameterError: unusable file; the message has file, key and the expected value.
-
-        """
-        return schema.load(cls, path if path else share_path('params/simulator.yaml'))

@@ -110,7 +110,7 @@ def test_a_robot_that_cannot_lift_off_says_so(poses, tmp_path):
 def test_a_flight_that_the_supervisor_ends_says_when_and_why(poses, monkeypatch):
     small = SimulatorParameters.load()
     small = replace(small, battery=replace(small.battery, capacity=0.04))
-    monkeypatch.setattr(command.SimulatorParameters, 'load', lambda: small)
+    monkeypatch.setattr(SimulatorParameters, 'load', lambda: small)
     monkeypatch.setattr(loop, 'SWAP_CHARGE', 0.0)
     text = io.StringIO()
     results = command.run_evaluate(controllers=['nmpc'], task=str(poses),
@@ -134,7 +134,7 @@ def test_an_empty_pack_is_swapped_at_the_next_target(charge, tmp_path, monkeypat
     monkeypatch.setattr(loop, 'SWAP_CHARGE', charge)
     small = SimulatorParameters.load()
     small = replace(small, battery=replace(small.battery, capacity=CAPACITY))
-    monkeypatch.setattr(command.SimulatorParameters, 'load', lambda: small)
+    monkeypatch.setattr(SimulatorParameters, 'load', lambda: small)
     task = make_task('random2')
     log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)
     assert not log.meta['crashed']

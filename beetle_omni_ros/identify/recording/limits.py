@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 
 @dataclass(frozen=True, eq=False)
-class RecordingLimits:
+class RecordingLimits(ParameterFile, file='recording.yaml'):
     """See params/recording.yaml, which gives the source of each number."""
 
     shortest_period: float = parameter(
@@ -89,17 +86,6 @@ class RecordingLimits:
     blocks: int = parameter(low=0, unit='1', doc='Number of separately checked parts of a flight.')
     permuted: float = parameter(
         low=0, unit='1', doc='Largest ratio of squared errors for another order of the thrusts.')
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> RecordingLimits:
-        """
-        Read a file of limits; default the shipped one.
-
-        Raises:
-            ParameterError: with file and key.
-
-        """
-        return schema.load(cls, path or share_path('params/recording.yaml'))
 
 
 @cache

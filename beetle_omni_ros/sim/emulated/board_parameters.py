@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from beetle_omni_ros.robot import schema
-from beetle_omni_ros.robot.resources import share_path
-from beetle_omni_ros.robot.schema import parameter
+from beetle_omni_ros.robot.schema import parameter, ParameterFile
 
 
 @dataclass(frozen=True, kw_only=True)
-class EmulatedBoardParameters:
+class EmulatedBoardParameters(ParameterFile, file='emulated_board.yaml'):
     """Parameters of the firmware contract and of the emulated sensors."""
 
     system: int = parameter(doc='MAVLink system ID', low=1, high=255)
@@ -48,8 +45,3 @@ class EmulatedBoardParameters:
     rpm_at_1_newton: float = parameter(doc='speed of a rotor at 1 N', unit='1/min', low=1,
                                        high=1e5)
     idle_temperature: float = parameter(doc='temperature of the ESCs', unit='C', low=-40, high=150)
-
-    @classmethod
-    def load(cls, path: str | Path | None = None) -> EmulatedBoardParameters:
-        """Read a file; without a path, the shipped params/emulated_board.yaml."""
-        return schema.load(cls, path or share_path('params/emulated_board.yaml'))
