@@ -56,6 +56,10 @@ class StateLimits:
                                low=0.01, high=1)
     stale_after: float = parameter(0.05, doc='older estimates are refused', unit='s', low=0.005,
                                    high=1)
+    jump_attitude: float = parameter(1.0, doc='a lone larger jump of the attitude is refused',
+                                     unit='rad', low=0.1, high=3.2)
+    jump_position: float = parameter(1.0, doc='a lone larger jump of the position is refused',
+                                     unit='m', low=0.05, high=100)
     joint_timeout: float = parameter(0.2, doc='silence of the joint feedback: landing', unit='s',
                                      low=0.02, high=5)
     imu_timeout: float = parameter(0.05, doc='silence of the raw IMU', unit='s', low=0.01, high=1)

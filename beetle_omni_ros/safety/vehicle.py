@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from itertools import chain
-from math import isfinite, nan, sqrt
+from math import dist, isfinite, nan, sqrt
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from beetle_omni_ros.safety.ramp import inclination
 
 TRACKING = ('tracking', 'dead_reckoning')   # statuses with a usable estimate
 UNIT_TOLERANCE = 0.02                       # of a quaternion's squared length
+JUMP = 'implausible jump'
 ABSURD = 1e4                                # [m, m/s, rad/s] beyond any robot; no overflow
 
 
@@ -41,6 +42,7 @@ class Vehicle:
         self._parameters, self._cells = parameters, robot.battery.cells
         limits = parameters.state
         self.state: State | None = None
+        self._offered: State | None = None      # the estimate before, accepted or not
         self.status = ''
         self.tilt, self.tilt_velocity, self.tilt_stamp = np.zeros(4), np.zeros(4), -np.inf
         self.modelled_tilt: np.ndarray | None = None    # (4,) of silent joints [rad]
@@ -241,6 +243,12 @@ class Vehicle:
             return 'repeated or older stamp'
         if status not in TRACKING:
             return f"status '{status}'"
+        before, self._offered = self._offered, state
+        if before is not None and 0 < state.stamp - before.stamp <= limits.timeout and (
+                dist(before.position, state.position) > limits.jump_position
+                or rotations.geodesic_angle(before.quaternion, state.quaternion)
+                > limits.jump_attitude):
+            return JUMP
         return ''
 
 

@@ -10,7 +10,8 @@ from gap_damage_kinds.recording import COMMAND, IMU, JOINTS, MOCAP
 CLOCK = r'clock|stamp|\btime'
 STEP = (r'jump|\bstep|\bback|decreas|monoton|order|forward|ahead|\blat|\bearl|shift|offset|leap|'
         r'behind')
-EPOCH = 1_780_000_000.0     # [s], some day in 2026
+ANOTHER_DAY = 40 * 86400.0      # [s] later
+BOOTED = 5.0                    # [s] from the start of a board to its first message
 
 
 def stepped(bag, name, part, by):
@@ -96,8 +97,7 @@ def moved(bag, by):
 def joint_stamps_1970(bag, random, other):
     """A board without a clock."""
     t = bag.stamps(JOINTS)
-    moved(bag, EPOCH)
-    bag.put_stamps(JOINTS, t)
+    bag.put_stamps(JOINTS, t - t[0] + BOOTED)
 
 
 @damage('MoCap stamps an hour ahead', MOCAP, causes=[
@@ -115,23 +115,28 @@ def received_hour_late(bag, random, other):
         m.received += 3600.0
 
 
+def _count_in_seconds(bag, topic, unit):
+    """Put stamps, counted in 1/unit s, into the 32 bits of their seconds."""
+    for m, t in zip(bag.on(topic), bag.stamps(topic), strict=True):
+        m.content.header.stamp.sec = (round(t * unit) + 2**31) % 2**32 - 2**31
+        m.content.header.stamp.nanosec = 0
+
+
 @damage('MoCap nanoseconds in the seconds of the stamp', MOCAP, causes=[
     (CLOCK, r'nanosec|unit|overflow|order|jump|\bback|monoton|\brange|implausib|factor|apart')])
 def mocap_stamps_nanoseconds(bag, random, other):
     """They do not fit in 32 bits and wrap."""
-    for m, t in zip(bag.on(MOCAP), bag.stamps(MOCAP), strict=True):
-        wrapped = (round(t * 1e9) + 2**31) % 2**32 - 2**31
-        m.content.header.stamp.sec, m.content.header.stamp.nanosec = wrapped, 0
+    _count_in_seconds(bag, MOCAP, 1e9)
 
 
 @damage('joint milliseconds in the seconds of the stamp', JOINTS, causes=[
     (CLOCK, r'millisec|unit|factor|1000|scale|\brate|fast|slow|drift|apart|jump|overlap')])
 def joint_stamps_milliseconds(bag, random, other):
-    """A thousand times too fast."""
-    bag.put_stamps(JOINTS, bag.stamps(JOINTS) * 1000.0)
+    """A thousand times too fast; today's date wraps."""
+    _count_in_seconds(bag, JOINTS, 1e3)
 
 
 @damage('control: the same flight on another day', harm=HARMLESS)
 def another_day(bag, random, other):
-    """Stamps and times of recording as on a real robot: seconds since 1970."""
-    moved(bag, EPOCH)
+    """Stamps and times of recording of another date."""
+    moved(bag, ANOTHER_DAY)

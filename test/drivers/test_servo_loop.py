@@ -156,7 +156,7 @@ def test_many_threads_offer_goals_and_none_is_left_over():
     for thread in threads:
         thread.join()
     loop.offer(goal(-1))
-    wait_for(lambda: bus.goals[-1] == -1)
+    wait_for(lambda: bus.goals[-1:] == [-1])
     with loop.exclusive() as mine:
         count = loop.cycles
         assert mine is bus

@@ -349,6 +349,42 @@ def test_bad_estimates_are_refused_and_counted(change, reason):
     assert puppet.supervisor.vehicle.state is good
 
 
+@pytest.mark.parametrize('change, refused', [
+    ({'position': np.array([1.5, 0, 0])}, True), ({'position': np.array([0.5, 0, 0])}, False),
+    ({'quaternion': rotations.from_rpy(1.5, 0, 0)}, True),
+    ({'quaternion': rotations.from_rpy(0, -0.5, 0)}, False)])
+def test_a_lone_jump_of_the_estimate_is_refused_and_a_lasting_one_is_accepted(change, refused):
+    puppet = Puppet()
+    puppet.run(0.1)
+    vehicle = puppet.supervisor.vehicle
+    good = vehicle.state
+    jumped = [replace(good, stamp=puppet.now + k * TICK, **{
+        name: good.position + value if name == 'position' else value
+        for name, value in change.items()}) for k in (1, 2)]
+    assert puppet.supervisor.on_state(jumped[0]) is not refused
+    assert vehicle.state is (good if refused else jumped[0])
+    assert puppet.supervisor.on_state(jumped[1])
+    assert vehicle.state is jumped[1]
+
+
+def test_random_estimates_move_no_joint_before_the_descent_on_raw_sensors():
+    puppet, random = flown(), np.random.default_rng(1)
+    before = puppet.command
+    puppet.alive.discard('estimate')
+    for _ in range(40):
+        row = random.standard_normal(13)
+        puppet.supervisor.on_state(replace(
+            puppet.supervisor.vehicle.state, stamp=puppet.now, position=3 * row[:3],
+            velocity=3 * row[3:6], quaternion=rotations.normalized(row[6:10]),
+            angular_velocity=3 * row[10:]))
+        puppet.run(TICK)
+        if puppet.supervisor.state == 'landing':
+            break
+        assert np.max(np.abs(puppet.command.tilt - before.tilt)) < 0.1
+    assert puppet.supervisor.state == 'landing'
+    assert 'estimator_lost' in puppet.supervisor.faults
+
+
 def test_command_of_an_unknown_controller_is_counted_and_not_executed():
     puppet = flown()
     assert not puppet.supervisor.on_command('pid', hover_command(puppet.now), puppet.now)
