@@ -21,6 +21,7 @@ from beetle_omni_ros.robot.schema import ParameterError
 from beetle_omni_ros.robot.urdf import Model
 from beetle_omni_ros.view import plots
 from beetle_omni_ros.view.arrows import WORLD_NEWTON_PER_METRE
+from beetle_omni_ros.view.client import served_with_script
 from beetle_omni_ros.view.drawing import FORCE, RobotDrawing, wxyz
 from beetle_omni_ros.view.frames import known, pose
 
@@ -99,7 +100,8 @@ class Page:
         try:
             with socket.socket() as probe:      # if bind fails, viser would wait forever
                 probe.bind((host, 0))
-            with contextlib.redirect_stdout(io.StringIO()):     # viser prints its own addresses
+            # viser prints its own addresses
+            with served_with_script(), contextlib.redirect_stdout(io.StringIO()):
                 self.server = viser.ViserServer(host, port, label='beetle_omni', verbose=False)
         except (OSError, OverflowError, RuntimeError, UnicodeError) as error:
             raise ParameterError(f'--host {host} --port {port}: cannot be served there '
