@@ -21,6 +21,9 @@ from beetle_omni_ros.view.recording import Recording
 pytestmark = [pytest.mark.timeout(600), pytest.mark.flaky(reruns=1)]
 UP, ROBOT = np.array([0.0, 0, 0, 1]), RobotParameters.load()
 STRANGE, NEAR = 25, 0.02    # share of 255; [m]
+ANTIALIASED = """() => [...document.querySelectorAll('canvas')].map(
+    canvas => canvas.getContext('webgl2')).filter(gl => gl).map(
+    gl => gl.getContextAttributes().antialias)"""
 
 
 @pytest.fixture(scope='module')
@@ -95,6 +98,8 @@ def test_a_recording_is_rendered_and_moves_with_the_slider(bag, drawn):
         player.look()
         with opened(page.url) as (browser, requests):
             rendered(browser)
+            # The CPU draws this page.
+            assert set(browser.evaluate(ANTIALIASED)) == {False}
             first = at_rest(browser)
             # The slider's number, as typed by a user.
             field = browser.locator('.mantine-NumberInput-input').first
