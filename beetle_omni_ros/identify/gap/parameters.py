@@ -180,8 +180,6 @@ class GapParameters:
     least_duration: float = _time('Least duration of a flight.', 1)
     longest_gap: float = _time('Longest silence of a sensor.', 0.01)
     most_lost: float = _share('Largest share of a flight in silences.')
-    least_rotation: float = parameter(
-        doc='Least RMS of the rate.', unit='rad/s', low=0, high=10)
 
     log_chance: float = parameter(
         doc='Significance level of an entry in a joint log.', unit='1', low=1e-9, high=0.5)
