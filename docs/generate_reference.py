@@ -35,9 +35,9 @@ MADE = '<!-- Made by docs/generate_reference.py; changes by hand are lost. -->\n
 
 # Parameter file -> class that reads it, what it holds.
 FILES = {
-    'robot.yaml': ('robot.parameters:RobotParameters', 'What the robot is.'),
+    'robot.yaml': ('robot.parameters:RobotParameters', 'The robot.'),
     'robot_weak_and_heavy.yaml': ('robot.parameters:RobotParameters',
-                                  'A robot with less thrust and more mass than it is told.'),
+                                  'A robot with less thrust and more mass than in robot.yaml.'),
     'nmpc.yaml': ('control.nmpc_parameters:NmpcParameters', 'The NMPC.'),
     'nmpc_published.yaml': ('control.nmpc_parameters:NmpcParameters',
                             'The NMPC with the settings of the publication.'),
@@ -145,7 +145,7 @@ def parameters() -> str:
             'The files of `params/` hold the values below. A comment beside each number gives '
             'its source.\nA value outside its range and an unknown key are refused. '
             'In ROS, `ros2 param describe` shows unit\nand range. '
-            '[The nodes](nodes.md#parameters) says which source overrides which.\n']
+            '[Nodes](nodes.md#parameters) lists which source overrides which.\n']
     seen: dict[str, str] = {}
     for name, (kind, what) in FILES.items():
         text.append(f'\n## {name}\n\n{what}\n\n')

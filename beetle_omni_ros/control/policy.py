@@ -39,10 +39,10 @@ class PolicyParameters(GuidanceParameters, ParameterFile, file='rl.yaml'):
     allow_other_robot: bool = parameter(
         False, doc='fly a policy that was trained for other robot parameters', read_only=True)
     trajectory_lookahead: float = parameter(
-        0.0, doc="a trajectory's reference is taken so far ahead of the state", unit='s', low=0,
-        high=1)
+        0.0, doc='time after the state at which the reference of a trajectory is evaluated',
+        unit='s', low=0, high=1)
     action_limit: float = parameter(
-        100.0, doc='a larger output is a fault and not cut to the limits of the actuators',
+        100.0, doc='a larger output is a fault and is not clipped to the limits of the actuators',
         unit='1', low=1, high=1e6)
     reach: float = parameter(6.5, doc='a target farther from the robot is refused', unit='m',
                              low=0.5, high=1000, read_only=True)

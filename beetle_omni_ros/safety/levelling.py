@@ -31,12 +31,13 @@ class LevellingParameters:
 
     rate: float = parameter(0.8, doc='angular rate of the body', unit='rad/s', low=0.05, high=5)
     joint_rate: float = parameter(
-        5.0, doc='joint rate that the way allows for', unit='rad/s', low=0.5, high=50)
-    margin: float = parameter(0.1, doc='distance that tilts keep from their stops', unit='rad',
-                              low=0, high=1)
+        5.0, doc='joint rate for which turns of the body are planned', unit='rad/s', low=0.5,
+        high=50)
+    margin: float = parameter(
+        0.1, doc='smallest distance of the tilts from their stops', unit='rad', low=0, high=1)
     missing_thrust: float = parameter(
-        20.0, doc='time that a second without one hover thrust of lift is worth', unit='s',
-        low=0, high=1000)
+        20.0, doc='cost of one second without one hover thrust of lift, as time', unit='s', low=0,
+        high=1000)
 
 
 class Way:

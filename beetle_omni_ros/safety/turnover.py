@@ -30,18 +30,22 @@ class TurnoverParameters:
     """Tuning of the turnover; params/supervisor.yaml gives the reasons."""
 
     lost_lift: float = parameter(
-        0.3, doc='a way to level that loses more lift, in hover thrusts of one rotor, waits until '
-        'a joint has turned over', unit='s', low=0, high=100)
-    room: float = parameter(0.3, doc='distance that tilts keep from their stops meanwhile',
-                            unit='rad', low=0, high=0.8)
-    farthest: float = parameter(1.0, doc='largest turn to the attitude in which the rotor rests',
-                                unit='rad', low=0, high=3.15)
-    settling_time: float = parameter(0.5, doc='in the attitude, before the rotor comes to rest',
-                                     unit='s', low=0, high=10)
-    fading_time: float = parameter(0.5, doc='in which the rotor comes to rest, and comes back',
-                                   unit='s', low=0.02, high=10)
-    arrived: float = parameter(0.2, doc='distance at which the joint has turned over', unit='rad',
-                               low=0.01, high=1)
+        0.3, doc='lost lift of a turn to level, in hover thrusts of one rotor, above which a '
+        'joint turns over first', unit='s', low=0, high=100)
+    room: float = parameter(
+        0.3, doc='smallest distance of the other tilts from their stops meanwhile', unit='rad',
+        low=0, high=0.8)
+    farthest: float = parameter(
+        1.0, doc='largest turn to the attitude in which the rotor is stopped', unit='rad', low=0,
+        high=3.15)
+    settling_time: float = parameter(
+        0.5, doc='time in this attitude before the rotor stops', unit='s', low=0, high=10)
+    fading_time: float = parameter(
+        0.5, doc='duration of the decrease of its thrust to zero, and of the increase afterwards',
+        unit='s', low=0.02, high=10)
+    arrived: float = parameter(
+        0.2, doc='distance from the target at which the joint has turned over', unit='rad',
+        low=0.01, high=1)
     time_limit: float = parameter(4.0, doc='longest time for one joint', unit='s', low=0.5,
                                   high=60)
 

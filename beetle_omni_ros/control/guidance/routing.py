@@ -32,15 +32,17 @@ ANOTHER = 0.3       # change of the target that starts a new search [rad]
 class RoutingParameters:
     """When an intermediate attitude is used, and for how long."""
 
-    tilt: float = parameter(3.4, doc='a shortest turn that winds a joint beyond is not flown if '
-                                     'there is a better way; 100: always flown', unit='rad',
-                            low=0.5, high=100)
-    aim: float = parameter(3.2, doc='within which the way round keeps the joints if it can',
-                           unit='rad', low=0.5, high=100)
-    near: float = parameter(0.8, doc='so near to the attitude in between it is passed',
-                            unit='rad', low=0.05, high=3)
-    duration: float = parameter(1.5, doc='longest way to the attitude in between', unit='s',
-                                low=0.1, high=100)
+    tilt: float = parameter(
+        3.4, doc='largest tilt along the shortest turn, above which an intermediate attitude is '
+        'searched; 100: never', unit='rad', low=0.5, high=100)
+    aim: float = parameter(
+        3.2, doc='largest tilt by way of the intermediate attitude, if possible', unit='rad',
+        low=0.5, high=100)
+    near: float = parameter(
+        0.8, doc='distance at which the intermediate attitude is reached', unit='rad', low=0.05,
+        high=3)
+    duration: float = parameter(
+        1.5, doc='longest time to the intermediate attitude', unit='s', low=0.1, high=100)
 
 
 class Routing:

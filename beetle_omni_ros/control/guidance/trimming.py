@@ -22,15 +22,14 @@ LONGEST_STEP = 0.1      # [s] between two states; after a longer gap no update
 class TrimmingParameters:
     """Rate of the integral, and the criteria of a steady error."""
 
-    rate: float = parameter(1.0, doc='of the integral; 0: off', unit='1/s', low=0, high=5)
-    distance: float = parameter(0.06, doc='by which the target may be moved', unit='m', low=0,
-                                high=1)
+    rate: float = parameter(1.0, doc='rate of the integral; 0: off', unit='1/s', low=0, high=5)
+    distance: float = parameter(0.06, doc='largest shift of the target', unit='m', low=0, high=1)
     angle: float = parameter(0.15, doc='the same, attitude', unit='rad', low=0, high=1)
-    near_distance: float = parameter(0.12, doc='an error below may be a steady one', unit='m',
-                                     low=0, high=10)
+    near_distance: float = parameter(
+        0.12, doc='a smaller error may be a steady error', unit='m', low=0, high=10)
     near_angle: float = parameter(0.3, doc='the same, attitude', unit='rad', low=0, high=3)
-    speed: float = parameter(0.15, doc='a robot that moves faster is on its way', unit='m/s',
-                             low=0, high=10)
+    speed: float = parameter(
+        0.15, doc='a faster robot is still on its way', unit='m/s', low=0, high=10)
     turn_rate: float = parameter(0.6, doc='the same, turning', unit='rad/s', low=0, high=10)
 
 

@@ -23,19 +23,24 @@ from beetle_omni_ros.robot.schema import parameter
 class TurningParameters:
     """Modified target positions in large turns."""
 
-    angle: float = parameter(1.0, doc='from the target: while farther off, ...', unit='rad',
-                             low=0.1, high=4)
-    height: float = parameter(1.0, doc='... a target is shown at least so high, in world, ...',
-                              unit='m', low=-1000, high=1000)
-    distance: float = parameter(2.0, doc='... and to who is upside down no farther away',
-                                unit='m', low=0.1, high=1000)
-    settled: float = parameter(0.5, doc='from the target: while farther off, ...', unit='rad',
-                               low=0.1, high=4)
-    depth: float = parameter(0.1, doc='... who sinks so far below start and target ...', unit='m',
-                             low=0, high=1000)
-    outlook: float = parameter(0.3, doc='... within this time ...', unit='s', low=0, high=5)
-    climb: float = parameter(2.0, doc='... sees the target so far above; 0: never', unit='m',
-                             low=0, high=10)
+    angle: float = parameter(
+        1.0, doc='attitude error above which height and distance apply', unit='rad', low=0.1,
+        high=4)
+    height: float = parameter(
+        1.0, doc='smallest height of the modified target, in world', unit='m', low=-1000,
+        high=1000)
+    distance: float = parameter(
+        2.0, doc='largest distance of the modified target if the robot is upside down', unit='m',
+        low=0.1, high=1000)
+    settled: float = parameter(
+        0.5, doc='attitude error above which depth, outlook and climb apply', unit='rad', low=0.1,
+        high=4)
+    depth: float = parameter(
+        0.1, doc='predicted depth below start and target at which the target is raised', unit='m',
+        low=0, high=1000)
+    outlook: float = parameter(0.3, doc='time of this prediction', unit='s', low=0, high=5)
+    climb: float = parameter(
+        2.0, doc='height by which the target is raised; 0: never', unit='m', low=0, high=10)
 
 
 class Turning:

@@ -47,19 +47,23 @@ HEADINGS = 24     # number of compared level attitudes
 class UnwindingParameters:
     """Criteria of a pose that is not reached because the joints are wound."""
 
-    attempts: int = parameter(2, doc='for one target; 0: never', low=0, high=100)
-    tilt: float = parameter(2.4, doc='a joint beyond is wound', unit='rad', low=0.5, high=10)
-    angle: float = parameter(0.14, doc='attitude error from which the target counts as missed',
-                             unit='rad', low=0.01, high=3)
+    attempts: int = parameter(2, doc='attempts for one target; 0: never', low=0, high=100)
+    tilt: float = parameter(
+        2.4, doc='a joint beyond this tilt is wound', unit='rad', low=0.5, high=10)
+    angle: float = parameter(
+        0.14, doc='attitude error above which the target is missed', unit='rad', low=0.01, high=3)
     distance: float = parameter(0.08, doc='the same, position', unit='m', low=0.005, high=10)
-    progress: float = parameter(0.8, doc='an error below this part of the least so far is '
-                                         'progress', low=0, high=1)
-    patience: float = parameter(0.8, doc='missed without progress, less the time held', unit='s',
-                                low=0.05, high=100)
-    height: float = parameter(1.2, doc='of the way through level at least, in world', unit='m',
-                              low=-1000, high=1000)
-    duration: float = parameter(1.5, doc='longest way to level, and to half of a long turn back',
-                                unit='s', low=0.1, high=100)
+    progress: float = parameter(
+        0.8, doc='an error below this share of the smallest error so far is progress', low=0,
+        high=1)
+    patience: float = parameter(
+        0.8, doc='time with missed target without progress, minus the time within the limits',
+        unit='s', low=0.05, high=100)
+    height: float = parameter(
+        1.2, doc='smallest height of the level attitude, in world', unit='m', low=-1000, high=1000)
+    duration: float = parameter(
+        1.5, doc='longest time to the level attitude, and to half of a long turn back', unit='s',
+        low=0.1, high=100)
 
 
 class _Stop(NamedTuple):
