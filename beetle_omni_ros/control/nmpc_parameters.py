@@ -17,13 +17,13 @@ class HorizonParameters:
     """Length and grid of the horizon."""
 
     intervals: np.ndarray = parameter(
-        [0.02, 0.03, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.2], unit='s',
-        doc='lengths of the shooting intervals, first to last; together the horizon',
-        low=0.005, high=0.5, read_only=True)
+        [0.02, 0.03, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.2], unit='s', doc='lengths of the '
+        'shooting intervals, first to last; their sum is the horizon', low=0.005, high=0.5,
+        read_only=True)
 
     change_time: float = parameter(
-        0.1, doc='the cost of command leads counts at least this long in each interval', unit='s',
-        low=0, high=1, read_only=True)
+        0.1, doc='smallest duration of an interval in the cost of command leads', unit='s', low=0,
+        high=1, read_only=True)
 
     def __post_init__(self):
         """Refuse a grid with too many stages for the solver."""
@@ -40,27 +40,32 @@ class ModelParameters:
                                  unit='s', low=0.002, high=0.5, read_only=True)
     rotor_lag: bool = parameter(True, doc='thrust as a state with the rotor time constant '
                                 '(21 states) instead of a direct input (17)', read_only=True)
-    command_delay: float = parameter(0.01, doc='from the state stamp to the actuators; predicted '
-                                     'and cancelled', unit='s', low=0, high=0.1)
+    command_delay: float = parameter(
+        0.01, doc='delay from the state stamp to the actuators, which is predicted', unit='s',
+        low=0, high=0.1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LimitParameters:
     """Constraints of the optimisation."""
 
-    velocity: float = parameter(3.0, doc='of each component of the world velocity', unit='m/s',
-                                low=0.05, high=20)
-    rate: float = parameter(6.0, doc='of each component of the body rate', unit='rad/s', low=0.1,
-                            high=50)
-    tilt: float = parameter(3.96, doc='of the tilt targets', unit='rad', low=0.1, high=20)
-    tilt_rate: float = parameter(7.0, doc='of the tilts, as a bound on the lead of their targets',
-                                 unit='rad/s', low=0.1, high=1000)
+    velocity: float = parameter(
+        3.0, doc='largest component of the world velocity', unit='m/s', low=0.05, high=20)
+    rate: float = parameter(
+        6.0, doc='largest component of the body rate', unit='rad/s', low=0.1, high=50)
+    tilt: float = parameter(
+        3.96, doc='largest tilt target, to each side', unit='rad', low=0.1, high=20)
+    tilt_rate: float = parameter(
+        7.0, doc='largest tilt rate, as a bound on the lead of the tilt targets', unit='rad/s',
+        low=0.1, high=1000)
     tilt_rate_intervals: int = parameter(
-        5, doc='intervals in which tilt_rate is kept; 0: none', low=0, high=60, read_only=True)
-    thrust_max: float = parameter(20.0, doc='upper bound inside the optimisation', unit='N',
-                                  low=0.1, high=200)
-    soft: bool = parameter(True, doc='velocity and rate limits give way at a cost, which keeps '
-                           'the QP feasible', read_only=True)
+        5, doc='number of first intervals with this bound; 0: none', low=0, high=60,
+        read_only=True)
+    thrust_max: float = parameter(
+        20.0, doc='largest thrust inside the optimisation', unit='N', low=0.1, high=200)
+    soft: bool = parameter(
+        True, doc='velocity and rate limits may be exceeded at a cost, which keeps the QP '
+        'feasible', read_only=True)
     slack_linear: float = parameter(10.0, doc='cost of exceeding a soft limit', unit='', low=0,
                                     high=1e6, read_only=True)
     slack_quadratic: float = parameter(100.0, doc='cost of exceeding a soft limit, squared', low=0,
@@ -97,28 +102,32 @@ class NmpcWeights:
 class DisturbanceParameters:
     """Disturbance estimates; a bandwidth of 0 switches one off."""
 
-    force_bandwidth: float = parameter(3.0, doc='of the external force', unit='rad/s', low=0,
-                                       high=50)
-    torque_bandwidth: float = parameter(4.0, doc='of the external torque', unit='rad/s', low=0,
-                                        high=50)
-    tilt_bandwidth: float = parameter(3.0, doc='of the servo offsets', unit='rad/s', low=0,
-                                      high=50)
-    tilt_correction: float = parameter(0.2, doc='part of a measured tilt error that corrects the '
-                                       'tilt model each step', low=0, high=1)
-    force_limit: float = parameter(60.0, doc='largest estimate', unit='N', low=0, high=1000)
-    torque_limit: float = parameter(5.0, doc='largest estimate', unit='N m', low=0, high=100)
-    tilt_limit: float = parameter(0.3, doc='largest estimate', unit='rad', low=0, high=2)
+    force_bandwidth: float = parameter(
+        3.0, doc='bandwidth of the external force', unit='rad/s', low=0, high=50)
+    torque_bandwidth: float = parameter(
+        4.0, doc='bandwidth of the external torque', unit='rad/s', low=0, high=50)
+    tilt_bandwidth: float = parameter(
+        3.0, doc='bandwidth of the servo offsets', unit='rad/s', low=0, high=50)
+    tilt_correction: float = parameter(
+        0.2, doc='share of a measured tilt error that corrects the tilt model in each step', low=0,
+        high=1)
+    force_limit: float = parameter(60.0, doc='largest estimated force', unit='N', low=0, high=1000)
+    torque_limit: float = parameter(
+        5.0, doc='largest estimated torque', unit='N m', low=0, high=100)
+    tilt_limit: float = parameter(
+        0.3, doc='largest estimated servo offset', unit='rad', low=0, high=2)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolverParameters:
     """Numerics."""
 
-    tolerance: float = parameter(1e-6, doc='residual at which a QP counts as solved', low=1e-12,
-                                 high=1e-2, read_only=True)
-    max_iterations: int = parameter(30, doc='of the interior-point method', low=1, high=500,
-                                    read_only=True)
-    compile: bool = parameter(True, doc='use a C compiler where there is one', read_only=True)
+    tolerance: float = parameter(
+        1e-6, doc='largest residual of a solved QP', low=1e-12, high=1e-2, read_only=True)
+    max_iterations: int = parameter(
+        30, doc='largest number of iterations of the interior-point method', low=1, high=500,
+        read_only=True)
+    compile: bool = parameter(True, doc='use a C compiler if there is one', read_only=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,8 +141,8 @@ class NmpcParameters(ParameterFile, file='nmpc.yaml'):
     disturbance: DisturbanceParameters = group(DisturbanceParameters, 'offset-free control')
     solver: SolverParameters = group(SolverParameters, 'numerics')
     unwind: float = parameter(
-        4.0, doc='a tilt reference takes its turn within +-pi unless that is farther than the '
-        'nearest legal turn by more than this; 0: always nearest, 6.3: always within +-pi',
+        4.0, doc='tilt references are within +-pi, unless the nearest legal turn is closer to '
+        'the present tilt by more than this; 0: always nearest, 6.3: always within +-pi',
         unit='rad', low=0, high=6.3)
     reach: float = parameter(10.0, doc='a target farther from the robot is refused', unit='m',
                              low=0.5, high=1000, read_only=True)

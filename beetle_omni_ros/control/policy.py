@@ -26,8 +26,9 @@ DEFAULT = 'policies/rl.onnx'
 class EstimateParameters:
     """Parameters of the disturbance estimate."""
 
-    command_delay: float = parameter(0.01, doc='from the state stamp to the actuators', unit='s',
-                                     low=0, high=0.1, read_only=True)
+    command_delay: float = parameter(
+        0.01, doc='delay from the state stamp to the actuators', unit='s', low=0, high=0.1,
+        read_only=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -47,10 +47,12 @@ class HoldingParameters(ParameterFile, file='degraded.yaml'):
                                      unit='m/s^2, rad/s^2', low=0, high=20)
     turn_rate: float = parameter(6.0, doc='rate of turns of the body', unit='rad/s', low=0.1,
                                  high=50)
-    coast_time: float = parameter(0.1, doc='duration at the initial rate that gives the angle '
-                                  'in which a turn stops', unit='s', low=0, high=1)
-    escape_time: float = parameter(1.5, doc='hold time of the attitude of an escape, before a '
-                                   'landing turns on', unit='s', low=0.01, high=20)
+    coast_time: float = parameter(
+        0.1, doc='time by which the rate is multiplied to give the angle in which a turn stops',
+        unit='s', low=0, high=1)
+    escape_time: float = parameter(
+        1.5, doc='time for which the attitude of an escape is held before a landing turns the '
+        'body further', unit='s', low=0.01, high=20)
     holding_margin: float = parameter(1.0, doc='margin at which a target attitude is not replaced',
                                       unit='m/s^2, rad/s^2', low=0, high=20)
 
