@@ -72,11 +72,11 @@ SHARED = {'controller_node': 'nmpc_node, rl_node', 'health': 'every node', 'oper
 
 # Topics that viewers and clocks need, which no other part of the package reads.
 OTHERS = {
-    '/clock': ('rosgraph_msgs/Clock', 'SENSOR', 'simulated time, where it is simulated'),
-    '/tf': ('tf2_msgs/TFMessage', 'EVENT', 'frames that move: `world`, `base_link`, each '
+    '/clock': ('rosgraph_msgs/Clock', 'SENSOR', 'simulated time, with `--clock simulated`'),
+    '/tf': ('tf2_msgs/TFMessage', 'EVENT', 'moving frames: `world`, `base_link`, each '
             'tilting module; 50 Hz, in each bag'),
     '/tf_static': ('tf2_msgs/TFMessage', 'LATCHED',
-                   'frames that stay: rotors, main body, end effector, IMU'),
+                   'fixed frames: rotors, main body, end effector, IMU'),
     'robot_description': ('std_msgs/String', 'LATCHED', 'URDF for viewers'),
     'markers': ('visualization_msgs/MarkerArray', 'EVENT', 'targets and thrusts for viewers')}
 
@@ -243,10 +243,10 @@ def topics() -> str:
                                        for node in nodes[topic][way]) for way in ('from', 'to')),
              qos if nodes[topic]['from'] else ''] for topic, (_, qos, _) in known.items()]
     return (f'# Topics\n\n{MADE}\n'
-            'Names are relative; a launch argument sets a namespace. On the robot the drivers of '
-            'MoCap and IMU\npublish what `sim_node` publishes in the simulation. `recorder_node` '
-            'subscribes to every topic\nof a bag but the frames, which it makes of `odom` and '
-            '`joint_states`.\n`viewer_node` publishes for viewers.\n\n'
+            'Names are relative; a launch argument sets a namespace. On the robot, the drivers of '
+            'MoCap and IMU\npublish `mocap/pose` and `imu/data_raw` in place of `sim_node`. '
+            '`recorder_node` subscribes to every\ntopic of a bag except the frames, which it '
+            'computes from `odom` and `joint_states`.\n\n'
             + table(['topic', 'type', 'meaning'], said)
             + '\n## Publishers and subscribers\n\n'
             + table(['topic', 'published by', 'subscribed by', 'quality of service'], ends)
@@ -255,11 +255,12 @@ def topics() -> str:
             '- Axes follow REP-103: x forward, y left, z up. `world` is the frame of the MoCap, '
             'with z up.\n'
             '- `base_link` is at the centre of gravity.\n'
-            '- Quaternions stand in the order (x, y, z, w).\n'
+            '- Quaternions are (x, y, z, w).\n'
             '- A command is one `sensor_msgs/JointState` with `name = [gimbal1..4, rotor1..4]`. '
             '`position` holds\n  the four tilt targets [rad], then four NaN. `effort` holds four '
             'NaN, then the four thrust targets\n  [N]. `velocity` is empty.\n'
-            '- The stamp of a command is the time of the state estimate that it answers.\n')
+            '- The stamp of a command is the time of the state estimate from which it was '
+            'computed.\n')
 
 
 def _options(command) -> list[list[str]]:
@@ -332,26 +333,25 @@ def effects() -> str:
     apart: dict[tuple, list] = {}
     for (name, key), found in treatments.items():
         if not found.acts:
-            apart.setdefault((CONSUMERS[key], 'refuses' if found.error else 'leaves',
+            apart.setdefault((CONSUMERS[key], 'refuses' if found.error else 'ignores',
                               found.reason), []).append(f'[{name}](#{name})')
     text = [f'# Effects\n\n{MADE}\n'
-            'An effect is a term that reality may add to the model. A robot file switches an '
-            'effect on by naming\nit under `effects:`, for example `effects: {thrust_coefficient: '
-            '{scale: 0.93}}`. [The gap\nfinder](../gap.md) searches the same entries. [Add an '
-            'effect](../how-to/add_an_effect.md) shows how\na new one is declared.\n\n'
+            'An effect is a deviation of the robot from the model. The key `effects` of a robot '
+            'file switches\neffects on, for example `effects: {thrust_coefficient: {scale: '
+            '0.93}}`. [The gap\nfinder](../gap.md) searches the same entries. [Add an '
+            'effect](../how-to/add_an_effect.md) shows how\nto add an entry.\n\n'
             '*Typical* is a realistic deviation from the neutral value. *Smallest* is the '
-            'smallest deviation\nworth naming. Where the neutral value is the number of the robot '
-            'file, both are fractions of it.\nA robot file may leave out a parameter that has a '
-            '*default*.\n\n## Who acts on what\n\n'
-            'A consumer acts on an effect, leaves it to another, or refuses a robot file that has '
-            'it. The test\n`test/gap/test_consumers.py` tries every pair. The reasons are '
-            'below the table.\n\n'
+            'smallest relevant\ndeviation. If the neutral value is the number of the robot '
+            'file, both are fractions of this number.\nA robot file may leave out a parameter '
+            'that has a *default*.\n\n## Consumers\n\n'
+            'A consumer acts on an effect, ignores it, or refuses a robot file that has it. The '
+            'reasons are\nbelow the table. `test/gap/test_consumers.py` tests every pair.\n\n'
             + table(['effect', 'layer', 'acts through', *CONSUMERS.values()],
                     [[f'[{name}](#{name})', entry.layer, _acts(entry),
                       *('acts' if (found := treatments[name, key]).acts
-                        else 'refuses' if found.error else 'leaves' for key in CONSUMERS)]
+                        else 'refuses' if found.error else 'ignores' for key in CONSUMERS)]
                      for name, entry in CATALOGUE.items()])
-            + '\n' + table(['consumer', '', 'effects', 'why'],
+            + '\n' + table(['consumer', '', 'effects', 'reason'],
                            [[who, what, ', '.join(names), reason]
                             for (who, what, reason), names in sorted(apart.items())])]
     for name, entry in CATALOGUE.items():
@@ -415,8 +415,8 @@ def faults() -> str:
     return (f'# The listed faults\n\n{MADE}\n'
             f'`beetle_omni faults` flies the {len(rows)} faults of `params/faults.yaml`. '
             '[Faults](../faults.md) explains\nkinds, outcomes and campaigns. '
-            '[Safety](../safety.md) holds the outcomes that were flown.\n\n'
-            + table(['fault', 'what happens', 'expected', 'strikes'], rows))
+            '[Safety](../safety.md) lists the measured outcomes.\n\n'
+            + table(['fault', 'event', 'expected', 'kinds'], rows))
 
 
 PAGES = {'parameters.md': parameters, 'topics.md': topics, 'command_line.md': command_line,
