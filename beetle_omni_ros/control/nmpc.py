@@ -108,7 +108,7 @@ class NmpcController:
             try:
                 return CompiledRti(**options, extra=(advance,))
             except CompilerError as error:
-                log.warning('NMPC runs interpreted, about five times slower: %s', error)
+                log.warning('NMPC runs interpreted, about four times slower: %s', error)
         return InterpretedRti(**options)
 
     def reset(self) -> None:

@@ -245,7 +245,7 @@ class Supervisor(Inputs):
 
     @property
     def health(self) -> ActuatorHealth:
-        """Set the health of the actuators, also of controllers that accept it."""
+        """Health of the actuators, which controllers receive, too."""
         return self._health
 
     @property
