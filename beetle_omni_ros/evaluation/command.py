@@ -113,17 +113,11 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
                for entry in entries]
     flown = task if isinstance(task, Task) else make_task(task, seed, min(reaches))
     task = flown.name
+    injected = load_faults(faults) if faults else []
     meta = {'task': task, 'conditions': conditions, 'seed': seed,
             'robot': str(robot) if robot else 'params/robot.yaml',
-            'plant': str(plant) if plant else None, 'version': __version__}
-    for given in options.values():
-        if given.policy:
-            meta['policy'] = str(given.policy)
-    if others := {entry.name: entry.spec for entry in entries if entry.spec}:
-        meta['controllers'] = others
-    injected = load_faults(faults) if faults else []
-    if injected:
-        meta['faults'] = [str(fault) for fault in injected]
+            'plant': str(plant) if plant else None, 'version': __version__,
+            **_optional_meta(entries, options, injected)}
     results: dict = {'meta': meta}
     columns = (TextColumn('{task.description}'), BarColumn(),
                TextColumn('{task.percentage:>3.0f} %'), TimeElapsedColumn(), TimeRemainingColumn())
@@ -145,6 +139,19 @@ def run_evaluate(*, controllers: list[str], task: str | Task, conditions: str = 
     if json_path:
         write_json(json_path, results)
     return results
+
+
+def _optional_meta(entries, options, faults):
+    """Facts that only some runs have: policy file, controllers of others, injected faults."""
+    meta: dict = {}
+    for given in options.values():
+        if given.policy:
+            meta['policy'] = str(given.policy)
+    if others := {entry.name: entry.spec for entry in entries if entry.spec}:
+        meta['controllers'] = others
+    if faults:
+        meta['faults'] = [str(fault) for fault in faults]
+    return meta
 
 
 def _reach(entry, robot, options):

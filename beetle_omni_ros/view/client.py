@@ -63,9 +63,10 @@ def served_with_script() -> Iterator[None]:
     """Let a viser server that is created in this context serve the page with the script."""
     server = viser.infra.WebsockServer
 
-    def with_script(*args, http_server_root: Path, **kwargs):
-        return server(*args, http_server_root=_Folder(http_server_root),  # type: ignore[arg-type]
-                      **kwargs)
+    def with_script(*args, **kwargs):
+        if 'http_server_root' in kwargs:    # a keyword of viser's internal call
+            kwargs['http_server_root'] = _Folder(kwargs['http_server_root'])
+        return server(*args, **kwargs)
 
     viser.infra.WebsockServer = with_script     # type: ignore[assignment, misc]
     try:
