@@ -6,8 +6,6 @@ process by the signal, without a traceback. Later each program handles it itself
 module Python prints a traceback, so nothing slow may be imported before it.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from importlib import import_module
 import signal

@@ -1,7 +1,5 @@
 """Check of the motor board by its driver, which listens for some seconds and does not arm."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import time
 

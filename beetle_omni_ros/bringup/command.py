@@ -1,7 +1,5 @@
 """`beetle_omni check`: checks ports, servos, motor board and topics, and prints remedies."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

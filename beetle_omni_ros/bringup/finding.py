@@ -1,7 +1,5 @@
 """Findings: what a check found about one item, and the remedy."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """Messages and publishers observed in the ROS graph for some seconds; does not need ROS."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field
 from statistics import median

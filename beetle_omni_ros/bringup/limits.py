@@ -1,7 +1,5 @@
 """Limits of `beetle_omni check`; read from params/check.yaml."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Check of a serial port: existence, permission, processes that use it, latency timer."""
 
-from __future__ import annotations
-
 import grp
 import os
 from pathlib import Path

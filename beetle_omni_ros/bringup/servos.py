@@ -1,7 +1,5 @@
 """Check of the servo bus by pings and reads only: nothing moves and no setting changes."""
 
-from __future__ import annotations
-
 import time
 
 from beetle_omni_ros.bringup.finding import (

@@ -1,7 +1,5 @@
 """Check of the sensor topics in ROS: publishers, rates, ages and clocks."""
 
-from __future__ import annotations
-
 from statistics import fmean
 
 from beetle_omni_ros.bringup.finding import FAIL, Finding, OK, reported, WARN

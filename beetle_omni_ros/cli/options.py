@@ -1,7 +1,5 @@
 """Options, exit statuses and input checks that several subcommands share."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import sys
 from typing import Annotated, Optional

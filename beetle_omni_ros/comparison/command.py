@@ -1,7 +1,5 @@
 """`beetle_omni compare`: flies every experiment with several controllers and writes the page."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import platform
 import sys

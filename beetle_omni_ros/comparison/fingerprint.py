@@ -1,7 +1,5 @@
 """Fingerprint of everything that determines the numbers of a flight."""
 
-from __future__ import annotations
-
 from functools import cache
 import hashlib
 from importlib import metadata

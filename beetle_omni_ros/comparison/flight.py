@@ -4,8 +4,6 @@ One flight of a comparison, with its metrics and the samples for the figures.
 This runs in a worker, perhaps on another computer, and prints or writes nothing.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 import platform
 import time

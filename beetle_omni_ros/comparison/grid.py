@@ -5,8 +5,6 @@ A cell is a list of texts and numbers. A number is a path in the JSON, so that p
 cannot differ.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from html import escape
 from math import isfinite

@@ -1,7 +1,5 @@
 """Tables of a comparison, in the publication's layout where it has them."""
 
-from __future__ import annotations
-
 from html import escape
 
 from beetle_omni_ros.comparison.grid import Cell, Column, GAZEBO, Grid, Number, OURS, REAL

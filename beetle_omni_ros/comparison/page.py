@@ -1,7 +1,5 @@
 """The comparison as one self-contained HTML page, and as Markdown with pictures."""
 
-from __future__ import annotations
-
 from base64 import b64encode
 from dataclasses import dataclass, field
 from html import escape

@@ -5,8 +5,6 @@ A flight is one controller, task, set of conditions and seed. It is the unit of 
 the cache.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

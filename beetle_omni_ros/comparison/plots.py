@@ -1,7 +1,5 @@
 """Figures of poses, waypoints, disturbances, payload, the lemniscate and a hover."""
 
-from __future__ import annotations
-
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 import numpy as np

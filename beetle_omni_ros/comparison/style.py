@@ -1,7 +1,5 @@
 """Names, texts and line styles of controllers and conditions on the page."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from zlib import crc32

@@ -4,8 +4,6 @@ Numbers of a comparison, summarised over all flights of one task, conditions and
 The summary is part of the JSON file, and the page takes each of its numbers from it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from math import isfinite
 

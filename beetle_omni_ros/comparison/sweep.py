@@ -5,8 +5,6 @@ Both use joblib with the same function and arguments, so that the numbers are eq
 stored as soon as it is finished.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import json

@@ -1,7 +1,5 @@
 """Fast calls of one CasADi function with numpy arrays, compiled or interpreted."""
 
-from __future__ import annotations
-
 import ctypes
 
 import casadi as ca

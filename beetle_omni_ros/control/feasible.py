@@ -1,7 +1,5 @@
 """Replacement of targets for a robot with failed actuators."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

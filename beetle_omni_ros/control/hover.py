@@ -16,8 +16,6 @@ slow thrust response. The tilt targets move at a limited rate from the executed 
 whose joint is still turning gives only the thrust that is useful in its present direction.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import exp, expm1, inf, sqrt
 

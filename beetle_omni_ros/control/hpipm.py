@@ -1,7 +1,5 @@
 """A thin ctypes binding of HPIPM's optimal-control QP, as shipped in the casadi wheel."""
 
-from __future__ import annotations
-
 import ctypes
 from ctypes import byref, c_double, c_int, c_size_t, c_void_p
 from pathlib import Path

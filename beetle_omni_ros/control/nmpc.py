@@ -1,7 +1,5 @@
 """Nonlinear model predictive control by real-time iteration."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import logging
 

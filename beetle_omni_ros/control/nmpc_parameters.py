@@ -1,7 +1,5 @@
 """Parameters of the NMPC, as read from params/nmpc.yaml or nmpc_published.yaml."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

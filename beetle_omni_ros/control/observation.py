@@ -5,8 +5,6 @@ Inputs are in SI units without scaling; scaling is part of the policy file. All 
 base_link, so that they do not depend on position, and on heading only by the attitude columns.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

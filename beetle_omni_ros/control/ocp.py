@@ -10,8 +10,6 @@ reached (beyond the lead that a moving reference needs). With the reference atti
 linear in the state, so its Gauss-Newton Hessian is exact.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import casadi as ca

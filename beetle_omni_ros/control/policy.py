@@ -1,7 +1,5 @@
 """A trained policy as a controller."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import isfinite
 

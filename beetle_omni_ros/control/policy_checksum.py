@@ -7,8 +7,6 @@ metadata. The module parses only the outermost layer of the file, so that no oth
 needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import hashlib
 from pathlib import Path

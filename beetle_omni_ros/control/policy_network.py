@@ -1,7 +1,5 @@
 """A policy file as a function: loaded, checked and warmed up."""
 
-from __future__ import annotations
-
 import logging
 from math import isfinite
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From a target to the NMPC's reference over its horizon."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Real-time iteration: one Gauss-Newton QP a cycle around a stored, shifted trajectory."""
 
-from __future__ import annotations
-
 from ctypes import c_double, c_int, c_void_p, POINTER
 
 import numpy as np

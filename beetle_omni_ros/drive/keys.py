@@ -1,7 +1,5 @@
 """Shifts of the goal by keys and joystick axes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Parameters of driving by hand: limits of the target, axes, buttons, named poses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path

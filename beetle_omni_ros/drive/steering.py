@@ -1,7 +1,5 @@
 """Target of a robot driven by hand, which moves to a goal at limited speed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

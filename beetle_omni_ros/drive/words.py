@@ -1,7 +1,5 @@
 """Parser of typed commands: `up 0.3`, `roll 180`, `goto 1 0 1 0 0 90`, `home`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, radians

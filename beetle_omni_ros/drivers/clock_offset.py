@@ -7,8 +7,6 @@ and all bounds are intersected. The estimate is the centre of this interval, and
 most half the width, for any delays.
 """
 
-from __future__ import annotations
-
 import math
 
 

@@ -6,8 +6,6 @@ MAVLink's common.xml and its C headers contain ESC_INFO and ESC_STATUS, the dial
 release that contains them has priority.
 """
 
-from __future__ import annotations
-
 import struct
 
 from pymavlink.dialects.v20 import common

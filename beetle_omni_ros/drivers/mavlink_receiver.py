@@ -6,8 +6,6 @@ it drops the length announced by the corrupt header, up to 280 bytes with the va
 them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Arms and disarms the motor board by the state of the supervisor."""
 
-from __future__ import annotations
-
 from beetle_omni_ros.drivers.motor_board import ArmCommand, MotorBoard
 from beetle_omni_ros.drivers.motor_board_messages import BLOCKS_ARMING
 

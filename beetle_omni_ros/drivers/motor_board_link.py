@@ -1,7 +1,5 @@
 """Serves the port of the motor board in a thread: reading, timing, reconnecting."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import os
 import select

@@ -1,7 +1,5 @@
 """Messages of the motor board as dataclasses, converted from MAVLink."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 import math
 

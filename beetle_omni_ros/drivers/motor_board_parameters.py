@@ -1,7 +1,5 @@
 """Parameters of the link to the motor board; read from params/motor_board.yaml."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from beetle_omni_ros.robot.schema import parameter, ParameterFile

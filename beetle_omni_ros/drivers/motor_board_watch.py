@@ -1,7 +1,5 @@
 """State of the motor board from its messages, and events about changes."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace

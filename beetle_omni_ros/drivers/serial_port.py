@@ -5,8 +5,6 @@ pyserial opens and configures the port. Reading and writing use its descriptor, 
 write waits in a busy loop, without a time limit, if the output buffer is full.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import select

@@ -1,7 +1,5 @@
 """Driver of the servo bus for the joint bridge: tilt goals, feedback, health."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import time
 

@@ -7,8 +7,6 @@ without a byte means that the driver died with torque on. The servos' own watchd
 them.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

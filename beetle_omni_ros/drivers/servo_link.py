@@ -1,7 +1,5 @@
 """Transactions with servos by dynamixel_sdk: each call exchanges packets and checks them."""
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 from dataclasses import dataclass
 

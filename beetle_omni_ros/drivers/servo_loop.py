@@ -1,7 +1,5 @@
 """The 200 Hz loop of the servo bus in a thread; new goals are written at once."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from contextlib import contextmanager

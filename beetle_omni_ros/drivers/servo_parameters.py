@@ -1,7 +1,5 @@
 """Parameters of the servo bus; read from params/servo_bus.yaml."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

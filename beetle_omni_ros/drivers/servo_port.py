@@ -1,7 +1,5 @@
 """The port of the DYNAMIXEL SDK, without its busy waits, wall clock and blocking writes."""
 
-from __future__ import annotations
-
 import os
 import select
 import termios

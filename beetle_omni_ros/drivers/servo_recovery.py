@@ -5,8 +5,6 @@ A restarted servo has lost gains, watchdog, torque and turn count. :func:`recove
 which the bus advances by one step in a tick, so that no tick is late.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 from beetle_omni_ros.drivers import servo_registers as registers

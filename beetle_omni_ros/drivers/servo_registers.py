@@ -5,8 +5,6 @@ Source: emanual.robotis.com/docs/en/dxl/x/xc330-t181 (addresses, sizes, units), 
 (errors). Indirect addresses (168 on) are left out, because they depend on the firmware version.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import pi
 

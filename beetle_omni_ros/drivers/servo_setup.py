@@ -1,7 +1,5 @@
 """Search, examination and configuration of servos."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

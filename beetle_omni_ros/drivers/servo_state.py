@@ -1,7 +1,5 @@
 """State of each servo, feedback and health."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import struct
 

@@ -6,8 +6,6 @@ turn. An angle beyond +-(2 pi - travel) then has a second solution, one turn awa
 travel. With a travel of +-3.96 rad, readings beyond +-2.32 rad (0.74 pi) are ambiguous.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import ceil, floor, pi
 

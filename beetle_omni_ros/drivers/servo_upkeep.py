@@ -1,7 +1,5 @@
 """Upkeep of the running bus: silent servos, recovery, health registers, reconnection."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import time
 

@@ -1,7 +1,5 @@
 """`beetle_omni evaluate`: flies tasks in one process with one or several controllers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """CPU time of controller steps."""
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 import gc
 import time

@@ -1,7 +1,5 @@
 """Messages between the processes of an in-process flight, with faults and queues."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Parallel flights, and the summaries of their results."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 

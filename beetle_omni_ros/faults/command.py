@@ -1,7 +1,5 @@
 """`beetle_omni faults`: flies listed faults, landings or healthy flights; writes one page."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 import json

@@ -1,7 +1,5 @@
 """Landings from random attitudes, and healthy flights with their alarms."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np

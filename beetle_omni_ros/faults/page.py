@@ -1,7 +1,5 @@
 """Results of a campaign as tables: Markdown and one self-contained page."""
 
-from __future__ import annotations
-
 from beetle_omni_ros.pages.page import frame, section
 from beetle_omni_ros.pages.table import Grid, html, markdown
 

@@ -1,7 +1,5 @@
 """One flight of the campaign: take-off, start of the fault, flight with the fault, landing."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Outcome of a flight with a fault, from the true motion and the commanded thrust."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`beetle_omni film`: draws recorded flights as a film."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Writes frames as a GIF with one palette, or as an MP4."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Frames of a film: panels side by side, captions, and a chart of the position error."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 

@@ -1,7 +1,5 @@
 """Motion that a model predicts from the commands of a flight, restarted periodically."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

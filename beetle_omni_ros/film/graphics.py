@@ -1,7 +1,5 @@
 """Selection of an off-screen OpenGL back end."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

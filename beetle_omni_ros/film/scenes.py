@@ -1,7 +1,5 @@
 """Content of the panels of a film, sampled at the times of its frames."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

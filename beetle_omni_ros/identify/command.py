@@ -1,7 +1,5 @@
 """`beetle_omni identify`: from measured logs to numbers, a page and a robot file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """CSV tables with units in the column names, and errors with row and column."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import csv
 from dataclasses import dataclass

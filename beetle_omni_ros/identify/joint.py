@@ -1,7 +1,5 @@
 """Identification of the tilt servos from the first part of a response log."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

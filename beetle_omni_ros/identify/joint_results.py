@@ -1,7 +1,5 @@
 """Results of a joint identification: numbers, sentences, tables, figures and a robot file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import matplotlib

@@ -5,8 +5,6 @@ A robot file has one stiffness, damping, delay and limit for all joints, but fri
 each joint. A fit with these parameters can be written to the file.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

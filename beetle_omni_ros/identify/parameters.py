@@ -1,7 +1,5 @@
 """Parameters of the identification; params/identify.yaml has their values and sources."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Robot files that extend another one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import yaml

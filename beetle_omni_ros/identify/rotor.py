@@ -5,8 +5,6 @@ The measured thrust is noisy, the duty is exact. A regression of duty on noisy t
 biased, so the inverse of the polynomial is fitted and residuals are thrusts.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bench logs of one rotor on a force-torque stand, and their voltage plateaus."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -8,8 +8,6 @@ determines only ratios to the stiffness Kp, so friction, load and torque limit a
 position error at which the servo has this torque.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import ctypes
 from dataclasses import dataclass

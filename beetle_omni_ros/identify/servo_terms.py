@@ -6,8 +6,6 @@ without a block predict this block better with the candidate. The sum over the b
 its scatter, and the term must have a relevant size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

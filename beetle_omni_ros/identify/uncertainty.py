@@ -6,8 +6,6 @@ and held, all others are fitted, until the increase of chi2 is that of 95 %. The
 divided by the scatter of the gradient of chi2 between blocks, which is 1 for white residuals.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

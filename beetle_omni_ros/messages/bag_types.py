@@ -1,7 +1,5 @@
 """Message classes and CDR serialisation of bags, by rosbags' type store for Jazzy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any

@@ -7,8 +7,6 @@ attributes of a message, so that ``read_*`` of :mod:`~beetle_omni_ros.messages.c
 it.
 """
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import fields

@@ -8,8 +8,6 @@ The numbers of the latter are arrays over N messages, so vectors have the shape 
 because ROS serialises another Python type in a float field as garbage without an error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from math import floor, isfinite, isnan
 from typing import Any, Protocol, TypeVar

@@ -1,7 +1,5 @@
 """Filter on commands: actuators execute those of the supervisor only."""
 
-from __future__ import annotations
-
 import secrets
 from typing import Any
 

@@ -4,8 +4,6 @@ Several nodes in one process: ``python -m beetle_omni_ros.nodes.composed NODE...
 NODE is an executable, a registered controller name, or ``package.module:Class`` of a controller.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 import sys
 

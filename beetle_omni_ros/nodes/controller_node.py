@@ -1,7 +1,5 @@
 """ROS node of any registered controller: state and target in, command out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, make_dataclass, replace
 import math
 

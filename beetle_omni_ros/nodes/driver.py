@@ -1,7 +1,5 @@
 """`beetle_omni drive`: targets from the keyboard, a joystick or lines of text."""
 
-from __future__ import annotations
-
 from contextlib import contextmanager, ExitStack, nullcontext
 import os
 from pathlib import Path

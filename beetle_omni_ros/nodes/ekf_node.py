@@ -1,7 +1,5 @@
 """ROS node of the state estimator."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from beetle_omni_ros.estimation.ekf import ErrorStateEkf

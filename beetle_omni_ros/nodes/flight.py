@@ -1,7 +1,5 @@
 """The sequence of one flight: start, arm, take off, fly the task, land."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import sys
 import time

@@ -1,7 +1,5 @@
 """`beetle_omni fly`: fly the ROS graph, record a bag, and print the results from the bag."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, ExitStack
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The nodes of one flight as processes of this computer: start, CPU time, stop."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import signal

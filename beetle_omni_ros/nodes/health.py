@@ -1,7 +1,5 @@
 """Diagnostics of one node: rates, ages, rejected messages, compute times, faults."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """ROS node of the tilt servos: commands to the bus, measured angles from it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 import time

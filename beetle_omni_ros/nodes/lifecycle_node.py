@@ -1,7 +1,5 @@
 """A flight node with the lifecycle states of ROS 2."""
 
-from __future__ import annotations
-
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 from beetle_omni_ros.nodes.node import FlightNode

@@ -1,7 +1,5 @@
 """Records the traffic of a graph for some seconds, for `beetle_omni check`; publishes nothing."""
 
-from __future__ import annotations
-
 from functools import partial
 import time
 

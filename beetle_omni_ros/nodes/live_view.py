@@ -1,7 +1,5 @@
 """`beetle_omni view` without RUN: shows a running graph and sends the operator's targets to it."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from contextlib import ExitStack, suppress
 from functools import partial

@@ -1,7 +1,5 @@
 """Base class of the package's nodes: parameters, checked inputs, diagnostics."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import time
 

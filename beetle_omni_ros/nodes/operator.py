@@ -1,7 +1,5 @@
 """ROS client of an operator: services, parameters, states and diagnostics of a flight."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 import time
 

@@ -1,7 +1,5 @@
 """Due times and stamps of the simulator's ticks, in real and in simulated time."""
 
-from __future__ import annotations
-
 # Ticks that are caught up after a stall of the computer; more would delay the next ones.
 CATCH_UP_TICKS = 8
 EARLY = 0.3             # part of a tick that the timer may come before the tick

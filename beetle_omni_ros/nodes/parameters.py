@@ -5,8 +5,6 @@ ROS ignores an override of an undeclared key, and a bad value causes a traceback
 of the parameter files refuse both at the start of the node, in one line that names the key.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import types
 from typing import get_args, get_origin, get_type_hints, Union

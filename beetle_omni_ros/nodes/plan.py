@@ -4,8 +4,6 @@ Plan of a ROS graph: its nodes, their parameters and their processes, as data.
 `beetle_omni fly`, the launch file and `composed` start graphs by such a plan. It needs no ROS.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Flights with faults of the ROS graph: killed or stopped processes, foreign publishers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """ROS node that records a flight into a bag, like ``ros2 bag record -s mcap``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import sys
 

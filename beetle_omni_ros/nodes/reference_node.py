@@ -1,7 +1,5 @@
 """ROS node that publishes the targets, disturbances and payloads of a task."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

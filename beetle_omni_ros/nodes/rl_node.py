@@ -1,7 +1,5 @@
 """ROS node of the trained policy."""
 
-from __future__ import annotations
-
 from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.controller_node import ControllerNode
 

@@ -1,7 +1,5 @@
 """ROS node of the motor board: thrusts to the rotors, battery and rotor speeds from it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 import math
 import time

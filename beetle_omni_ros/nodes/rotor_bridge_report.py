@@ -1,7 +1,5 @@
 """Diagnostics of rotor_bridge_node: targets, board and link, latency, rotors."""
 
-from __future__ import annotations
-
 from collections import Counter
 from functools import partial
 import math

@@ -1,7 +1,5 @@
 """Runs nodes in one process: start, spin, stop; errors are one line and an exit status."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import contextmanager
 import ctypes

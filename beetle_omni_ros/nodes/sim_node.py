@@ -1,7 +1,5 @@
 """ROS node of the simulated robot, with topics or emulated serial devices as actuators."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from math import degrees
 import time

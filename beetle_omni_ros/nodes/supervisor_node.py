@@ -1,7 +1,5 @@
 """ROS node of the supervisor, between the controllers and the actuators."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ The wheels contain the generators that make a message package from its definitio
 compiled once and kept in the cache of the compiled controllers.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stdout
 import hashlib

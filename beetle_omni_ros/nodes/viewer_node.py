@@ -1,7 +1,5 @@
 """ROS node for RViz and Foxglove: robot description, frames and markers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from geometry_msgs.msg import Point, TransformStamped

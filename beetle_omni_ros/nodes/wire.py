@@ -1,7 +1,5 @@
 """rclpy side of the table of topics: message classes, quality of service, both ends."""
 
-from __future__ import annotations
-
 from array import array
 from collections import deque
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Style of figures, and figures as part of a page."""
 
-from __future__ import annotations
-
 import base64
 from io import BytesIO
 from typing import Any

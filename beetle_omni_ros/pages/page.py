@@ -1,7 +1,5 @@
 """HTML structure and style of a page."""
 
-from __future__ import annotations
-
 from html import escape
 from importlib.resources import files
 

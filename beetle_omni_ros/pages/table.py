@@ -1,7 +1,5 @@
 """Tables of text for the terminal, as Markdown and as HTML."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape

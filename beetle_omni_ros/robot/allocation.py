@@ -10,8 +10,6 @@ B and the hover wrench include the known effects of the robot file: mass, thrust
 coefficients, wind.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import atan2, copysign, cos, hypot, pi, sin
 

@@ -11,8 +11,6 @@ for the remaining wrench (active set). A rotor with a fixed thrust pushes along 
 share. The others are solved for the remaining wrench.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations
 

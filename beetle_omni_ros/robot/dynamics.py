@@ -7,8 +7,6 @@ The NMPC predicts with it, C code is generated from it, and identification fits 
 model is independent of it.
 """
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 

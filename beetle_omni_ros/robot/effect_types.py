@@ -1,7 +1,5 @@
 """Types of which the catalogue of effects consists."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any

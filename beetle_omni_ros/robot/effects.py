@@ -13,8 +13,6 @@ its kind:
 - Sensor effects are in :attr:`RobotParameters.sensors`. The gap finder fits them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 

@@ -1,7 +1,5 @@
 """Effects on the forces and torques of the body; see :mod:`beetle_omni_ros.robot.effects`."""
 
-from __future__ import annotations
-
 import casadi as ca
 
 from beetle_omni_ros.robot.effect_types import Effect, EffectParameter, Treatment, vector

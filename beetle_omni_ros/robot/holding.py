@@ -15,8 +15,6 @@ cannot be pushed. An example is level flight with a lost rotor: the opposite rot
 so that its tilt has no effect.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

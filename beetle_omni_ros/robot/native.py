@@ -1,7 +1,5 @@
 """Compilation of CasADi functions: generated C code, compiled once and cached."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import hashlib
 import logging

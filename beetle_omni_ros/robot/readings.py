@@ -1,7 +1,5 @@
 """Readings of sensors and devices, simulated or real: stamps of capture [s], SI units."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ duty is interpolated at equal fractions of the largest thrust, because all measu
 same duty. No cubic is therefore used beyond its measured thrusts.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.robot.parameters import RotorParameters

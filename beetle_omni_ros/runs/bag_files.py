@@ -1,7 +1,5 @@
 """Reading of the MCAP files of a rosbag2 folder without ROS, also of truncated files."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reading of flights from bags: into a log, or incrementally into a recorder."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Container, Iterator
 from dataclasses import replace

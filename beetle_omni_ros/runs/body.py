@@ -1,7 +1,5 @@
 """Motion of the robot and its errors from the targets, over windows and intervals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

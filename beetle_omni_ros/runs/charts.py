@@ -1,7 +1,5 @@
 """Charts of a report: pose, errors, commands, compute time, estimate, battery, disturbances."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.control.base import PoseTarget

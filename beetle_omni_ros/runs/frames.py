@@ -1,7 +1,5 @@
 """`/tf`, `/tf_static` and `robot_description` in a bag, from its odometry and joint states."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import isfinite
 import struct

@@ -1,7 +1,5 @@
 """Result files in strict JSON."""
 
-from __future__ import annotations
-
 import json
 from math import isfinite
 import os

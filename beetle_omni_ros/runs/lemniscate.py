@@ -10,8 +10,6 @@ quintic smoothstep over the ramps before the first and after the last round, so 
 same speed.
 """
 
-from __future__ import annotations
-
 from math import cos, pi, sin
 
 import numpy as np

@@ -5,8 +5,6 @@ Times are float seconds on the flight's clock: ROS time in the graph, from 0 in 
 loop.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 
 import numpy as np

@@ -5,8 +5,6 @@ A pose lasts 8 s. U, the mean error over 7.0 to 7.5 s, measures the accuracy of 
 mean error over 1.0 to 7.0 s, measures how fast the pose is reached (docs/reference/metrics.md).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

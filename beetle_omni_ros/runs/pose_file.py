@@ -1,7 +1,5 @@
 """Pose files: CSV with one target pose a line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import csv
 from functools import cache

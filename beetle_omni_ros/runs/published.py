@@ -6,8 +6,6 @@ Overactuated Tiltable-Quadrotors: tables of continuous pose reaching in simulati
 (100 random poses) and in the real world (five waypoints), and the text on tracking.
 """
 
-from __future__ import annotations
-
 RANDOM_POSES = {
     'NMPC': {'mean': {'U_position_m': 0.02, 'U_orientation_deg': 40.99,
                       'L_position_m': 0.31, 'L_orientation_deg': 51.75},

@@ -1,7 +1,5 @@
 """`beetle_omni report`: a self-contained HTML page with several runs side by side."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import sys
 

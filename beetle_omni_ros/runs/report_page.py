@@ -1,7 +1,5 @@
 """The page of `beetle_omni report`: outcome, flight in 3D, tables, charts, faults."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from html import escape
 from pathlib import Path

@@ -1,7 +1,5 @@
 """rosbags' writer, adapted to the format of ``ros2 bag record`` of Jazzy."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterator
 from io import BytesIO

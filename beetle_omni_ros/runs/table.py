@@ -1,7 +1,5 @@
 """Result tables of flights."""
 
-from __future__ import annotations
-
 from itertools import zip_longest
 
 from rich.console import Console

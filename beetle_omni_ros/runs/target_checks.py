@@ -1,7 +1,5 @@
 """Checks of targets, for messages and for rows of a pose file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import isfinite
 

@@ -1,7 +1,5 @@
 """Tasks: targets, external wrenches and payloads over time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Model of the battery: rest voltage by charge, internal resistance, thrust limit."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from math import sqrt
 

@@ -1,7 +1,5 @@
 """Link of the commands to the actuators: checks, delay, timeout."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 
 import numpy as np

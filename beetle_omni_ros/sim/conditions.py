@@ -1,7 +1,5 @@
 """Conditions of a flight: variation of the robot, biases and latencies, drawn from a seed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Detection of touchdowns and of crashes that break the robot."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.robot import rotations

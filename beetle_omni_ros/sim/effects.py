@@ -7,8 +7,6 @@ equations are implemented again in numpy, independently of CasADi. All others us
 the catalogue.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.robot import dynamics, native, rotations

@@ -1,7 +1,5 @@
 """MuJoCo geometry of the robot for pictures, with the dimensions of the plant."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import mujoco

@@ -6,8 +6,6 @@ and the end-effector. The main body is the difference. The frame is base_link, w
 centre of gravity with all tilts at zero.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

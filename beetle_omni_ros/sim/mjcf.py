@@ -1,7 +1,5 @@
 """MuJoCo model of the robot: free base, four hinged modules, actuators, floor."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

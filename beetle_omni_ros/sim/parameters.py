@@ -1,7 +1,5 @@
 """Parameters of the simulator; read from params/simulator.yaml."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The multibody plant: MuJoCo's equations of motion."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import mujoco

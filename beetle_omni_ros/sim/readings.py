@@ -1,7 +1,5 @@
 """Inputs and outputs of the simulator in a tick. Times are seconds since reset."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Sensor models: noise, bias, resolution and latency."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

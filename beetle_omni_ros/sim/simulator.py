@@ -1,7 +1,5 @@
 """The simulated robot with the interface of a real one: commands in, sensor readings out."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace

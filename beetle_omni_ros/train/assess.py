@@ -5,8 +5,6 @@ This is a quick independent measurement during training. The reference is ``beet
 evaluate``, with the multibody plant, the estimator and the floor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields, replace
 

@@ -1,7 +1,5 @@
 """Rotations and random numbers of a batch in torch; rows are robots."""
 
-from __future__ import annotations
-
 import torch
 
 

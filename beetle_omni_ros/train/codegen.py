@@ -6,8 +6,6 @@ of the numbers it steps a whole batch: in plain torch on any device, or in one T
 which each GPU thread keeps its robot in registers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """`beetle_omni train`: trains a policy from a parameter file and exports it to ONNX."""
 
-from __future__ import annotations
-
 from contextlib import redirect_stdout
 import io
 import os

@@ -6,8 +6,6 @@ The physics is the robot's own model (:mod:`train.model`). Observations are thos
 the host, so that a whole rollout can be captured as one CUDA graph.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict

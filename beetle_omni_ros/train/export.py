@@ -1,7 +1,5 @@
 """Export of a trained actor to an ONNX file with its policy contract."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import copy
 from dataclasses import replace

@@ -8,8 +8,6 @@ includes the reaction of the tilting modules and their shift of the centre of ma
 policy does not hold level attitudes on the multibody plant.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import exp
 

@@ -7,8 +7,6 @@ frame, gravity in both frames, sines and cosines of the tilts, and errors on sca
 centimetres. They do not depend on the heading of the world frame.
 """
 
-from __future__ import annotations
-
 import copy
 
 from rsl_rl.models import MLPModel

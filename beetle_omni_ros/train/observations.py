@@ -1,7 +1,5 @@
 """Observations of actor and critic for a batch of robots, as :mod:`control.observation`."""
 
-from __future__ import annotations
-
 import torch
 
 from beetle_omni_ros.robot import dynamics as model

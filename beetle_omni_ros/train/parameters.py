@@ -1,7 +1,5 @@
 """Parameters of the training; params/train.yaml has the shipped values and their sources."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -5,8 +5,6 @@ On a GPU with Triton all substeps run in one kernel, elsewhere in plain torch. B
 from the same CasADi function (:mod:`codegen`).
 """
 
-from __future__ import annotations
-
 import atexit
 from collections.abc import Callable
 import importlib.util

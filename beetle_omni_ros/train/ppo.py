@@ -7,8 +7,6 @@ rsl-rl's ``PPO.update`` without a wait, with the adaptation of the learning rate
 update and the rollout are compiled and captured. On other devices the same code runs uncaptured.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import log, pi
 

@@ -8,8 +8,6 @@ begin with stored states, until these are flown well. This is prioritised sampli
 states, similar to that of steps in T. Schaul et al., Prioritized experience replay (2016).
 """
 
-from __future__ import annotations
-
 import torch
 
 from beetle_omni_ros.train import batch

@@ -7,8 +7,6 @@ error is the geodesic angle, because a difference of Euler angles is discontinuo
 parameters mark "own" are additions.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Folder of a training run: its parameter file and its checkpoints."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import re
 

@@ -1,7 +1,5 @@
 """Training loop: schedule, progress, TensorBoard, checkpoints, resume, several processes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Random initial states, targets and differences between robots, for a whole batch."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,5 @@
 """Geometry of the arrows of forces and torques, in base_link."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.robot import rotations

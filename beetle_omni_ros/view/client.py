@@ -6,8 +6,6 @@ docs/explanation/viewer.md. The client requests it when it creates its canvas. v
 for it, therefore a script at the beginning of the page changes the request.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import contextlib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`beetle_omni view RUN...`: playback of recorded runs in the browser."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack, suppress
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """One robot in the 3D scene: links, joints, rotors and arrows."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rows of displayed values, and a run as a table of rows over time."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from typing import Any
 

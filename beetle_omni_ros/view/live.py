@@ -1,7 +1,5 @@
 """Display of a running graph, with targets and controller selection by the user."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import threading
 import time

@@ -1,7 +1,5 @@
 """The page in the browser: 3D scene, panel and plots."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import contextlib
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Playback of recorded runs over each other."""
 
-from __future__ import annotations
-
 import threading
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The plots beside the scene, and their data in a window around the present time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A recorded run, read by a separate process while its first seconds are already displayed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 import os

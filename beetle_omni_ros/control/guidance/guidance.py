@@ -6,8 +6,6 @@ dives in large turns and for steady errors. Guidance is optional: a controller m
 :class:`Guidance`, or may be wrapped by a :class:`Guided`.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

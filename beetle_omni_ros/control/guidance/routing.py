@@ -9,8 +9,6 @@ end at other angles. This module searches such an attitude for each new target, 
 first target.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from math import isfinite, sqrt
 

@@ -6,8 +6,6 @@ cause a steady error of some millimetres and degrees. The integral of this error
 target. The integral is slow compared with the policy, bounded, and only active near the target.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import hypot, inf, sqrt
 

@@ -7,8 +7,6 @@ upside down, the distance to the target is limited. If the robot will sink below
 the target is raised further until the prediction ends.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from math import dist, inf
 

@@ -6,8 +6,6 @@ from the path of world's z in the body frame, except for full turns. The number 
 follows from the initial tilts.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -20,8 +20,6 @@ attitude half way is the first target, because a policy may choose either direct
 a turn, and the wrong one winds the joints differently.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import dist, inf

@@ -1,7 +1,5 @@
 """Analysis of checked flights: fit, search, free runs, verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

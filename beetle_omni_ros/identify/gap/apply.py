@@ -1,7 +1,5 @@
 """The robot file with the named effects; removing their keys undoes it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from datetime import datetime, timezone

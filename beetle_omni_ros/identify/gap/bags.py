@@ -1,7 +1,5 @@
 """The measured topics of a bag as arrays, in the order of recording; needs no ROS."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field

@@ -8,8 +8,6 @@ the gust. A parameter of the robot is the same at all frequencies. Source: Forss
 Closed-loop identification revisited, Automatica 35, 1999 (bias by frequency).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Body equations with every effect's parameters as symbols, for many samples at once."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import casadi as ca

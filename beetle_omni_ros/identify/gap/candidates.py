@@ -1,7 +1,5 @@
 """Catalogue entries as candidates of a fit: free keys, form and starting points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Confidence intervals, excitation, and detectability of effects in these data."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

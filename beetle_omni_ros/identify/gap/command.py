@@ -1,7 +1,5 @@
 """`beetle_omni gap`: from recorded flights to verdict, numbers, page and corrected robot file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Criteria of acceptance beside the gain: held-out blocks, closed-loop bias, physical bounds."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bands import differs_between_bands, project_out

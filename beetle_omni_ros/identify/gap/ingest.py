@@ -1,7 +1,5 @@
 """From a recording to a checked flight, or the reason why it is unusable."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 import hashlib
 from pathlib import Path

@@ -6,8 +6,6 @@ of the differences between servos on one bus is 10 % and 3 ms about their mean, 
 slow log does not separate delay and stiffness.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

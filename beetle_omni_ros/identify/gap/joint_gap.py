@@ -1,7 +1,5 @@
 """Gap analysis of the joint layer alone, from a response log of the servos."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import matplotlib

@@ -8,8 +8,6 @@ held-out blocks of the log confirm it, and if it exceeds the differences between
 type.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

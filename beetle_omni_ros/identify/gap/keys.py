@@ -7,8 +7,6 @@ in logarithms this direction is a straight line. A key is 'effect.parameter' or
 'effect.parameter[index]'.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 from typing import Any

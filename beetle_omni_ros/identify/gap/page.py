@@ -1,7 +1,5 @@
 """The HTML page of an analysis."""
 
-from __future__ import annotations
-
 import matplotlib
 from matplotlib.figure import Figure
 import numpy as np

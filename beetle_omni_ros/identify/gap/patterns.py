@@ -7,8 +7,6 @@ swinging mass. All six body channels are judged together on held-out blocks. A p
 no function of the state; it is found as a line in the spectrum.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Trials of one step of the search: linear estimates of all candidates, fits of the best."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.identify.gap.candidates import Candidate, Trial

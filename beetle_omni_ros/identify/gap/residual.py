@@ -9,8 +9,6 @@ It has four groups of channels. Each group has measured inputs, so that errors d
 - J: encoders minus servos simulated from the commands.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.identify.gap.body import BodyModel

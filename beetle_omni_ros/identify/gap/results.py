@@ -1,7 +1,5 @@
 """The analysis as JSON (docs: INTERFACES), as tables, and as one sentence."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 import math
 

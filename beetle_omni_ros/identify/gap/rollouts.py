@@ -5,8 +5,6 @@ Nothing is fitted here. Errors after 0.1, 0.5 and 1.0 s are divided by noise flo
 that uncertain initial states, noisy readings and gusts cause in a perfect model.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Forward selection and backward elimination of candidates with cross-validation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Operations on sampled series: filters, gaps, integrals, rotations."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

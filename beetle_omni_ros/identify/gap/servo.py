@@ -6,8 +6,6 @@ model of the controllers. Each window begins at the measured state. The memory o
 shorter than the warm-up, after which samples count.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measured states of a flight, given delays and mounting of the sensors."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Regression of the unexplained residual on generic features: whether it is repeatable."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cross-validation by blocks of the data."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

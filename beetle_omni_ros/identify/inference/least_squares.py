@@ -6,8 +6,6 @@ method is Levenberg-Marquardt within bounds. A robust loss is applied to the res
 (:func:`huber`, :func:`soft_l1`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any

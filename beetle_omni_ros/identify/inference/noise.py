@@ -1,7 +1,5 @@
 """Coloured noise: autoregressions of residuals, and whitening filters."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

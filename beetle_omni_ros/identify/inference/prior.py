@@ -1,7 +1,5 @@
 """Gaussian priors of fitted parameters."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

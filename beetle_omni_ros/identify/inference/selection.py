@@ -1,7 +1,5 @@
 """Forward selection and backward elimination, independent of fit and criterion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 

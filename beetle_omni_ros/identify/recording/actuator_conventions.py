@@ -5,8 +5,6 @@ Encoders follow tilt commands, and thrust commands accelerate the body. The hypo
 weighted as in :mod:`~beetle_omni_ros.identify.recording.conventions`.
 """
 
-from __future__ import annotations
-
 from itertools import permutations, product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """All checks of one recording, and repairs."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, Recording

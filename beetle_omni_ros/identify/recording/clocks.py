@@ -5,8 +5,6 @@ The age of a message is its time of recording minus its stamp. Computer load inc
 all topics, so each age is compared with the median age of the other topics at that time.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import NEEDED, Recording

@@ -6,8 +6,6 @@ minus gravity. Each hypothesis is a combination of common mistakes. Its weight i
 with Gaussian errors of unknown size, times a prior against each deviation from the convention.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import permutations, product
 

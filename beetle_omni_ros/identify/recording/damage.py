@@ -1,7 +1,5 @@
 """A damage of a recording: cause in words, time and probability."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ Clock errors that stamps alone do not show, by correlation of two sensors in tim
 The compared magnitudes of rate and tilt rate do not depend on axes, signs or units.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import Recording

@@ -1,7 +1,5 @@
 """Limits of a valid recording; params/recording.yaml has their values and sources."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The motion as each sensor measures it, on a common grid and with a common low-pass edge."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Figure of a damaged topic and the topic that it is compared with."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.identify.gap.bags import Recording

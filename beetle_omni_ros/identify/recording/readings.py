@@ -1,7 +1,5 @@
 """Impossible readings: frozen, repeated, clipped, spikes, quaternions of wrong norm, noise."""
 
-from __future__ import annotations
-
 from collections.abc import Container
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Faults of the emulated motor board and of its cable."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import heapq
 import random

@@ -5,8 +5,6 @@ All times are arguments [s] on a clock without steps. Each call first advances t
 time, so that the results do not depend on the frequency of calls.
 """
 
-from __future__ import annotations
-
 import math
 
 from beetle_omni_ros.sim.emulated import mavlink

@@ -1,7 +1,5 @@
 """Measurements of the emulated motor board and the rates of their messages."""
 
-from __future__ import annotations
-
 import math
 
 from beetle_omni_ros.sim.emulated import mavlink

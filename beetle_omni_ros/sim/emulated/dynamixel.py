@@ -9,8 +9,6 @@ is that of the rest of the packet. In instruction and parameters an ``FD`` is st
 ``FF FF FD``, so that the header is unique.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum

@@ -1,7 +1,5 @@
 """Faults of the emulated devices as parameters: permanent levels, and single events."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import numpy as np

@@ -5,8 +5,6 @@ The source is mavlink.io (packet serialization, common message set). The library
 not used, so that tests can compare both.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import struct
 

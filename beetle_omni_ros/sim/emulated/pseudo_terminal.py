@@ -1,7 +1,5 @@
 """A serial port without hardware: a pseudo-terminal with a fixed path, which can be unplugged."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import select

@@ -6,8 +6,6 @@ One emulated XC330-T181-T: control table, checks of writes, and protections.
 servo has the one that is worse for a driver, and a comment states it.
 """
 
-from __future__ import annotations
-
 from math import floor, inf
 
 from beetle_omni_ros.sim.emulated import servo_table as table

@@ -1,7 +1,5 @@
 """The emulated servo bus: servos and faults on a pseudo-terminal."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 import heapq

@@ -1,7 +1,5 @@
 """Answers of the servos on one line to packets; without input and output."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Faults of rotors and servos."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import exp
 

@@ -1,7 +1,5 @@
 """Faults of the flight stack's processes, for the in-process loop."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Starts and ends faults by their times."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import inf
 

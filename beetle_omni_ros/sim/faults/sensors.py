@@ -1,7 +1,5 @@
 """Faults of motion capture and IMU."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Faults of the commands and the battery, and external loads."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from beetle_omni_ros.sim.faults.base import Effect, Late, Number, share, vector
