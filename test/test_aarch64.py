@@ -20,7 +20,7 @@ def aarch64():
     return module
 
 
-def test_the_wheels_are_those_of_every_requirement_of_a_flight(aarch64):
+def test_wheels_exist_for_every_requirement_of_a_flight(aarch64):
     names = {re.split(r'[\[<>=;!~ ]', one)[0] for group in aarch64.requirements().values()
              for one in group}
     assert {'casadi', 'mujoco', 'onnxruntime', 'numpy', 'scipy', 'rosbags', 'pymavlink',
@@ -34,7 +34,7 @@ def test_the_tests_exist_and_cover_each_part_of_the_flight_path(aarch64):
         'estimation', 'control', 'safety', 'drivers'}
 
 
-def test_dependencies_are_followed_to_the_end_and_the_first_of_alternatives_is_taken(aarch64):
+def test_dependencies_are_resolved_transitively_with_the_first_alternative(aarch64):
     known = {'a': {'Depends': 'b (>= 1), c | d'}, 'b': {'Pre-Depends': 'e:any'}, 'c': {}, 'd': {},
              'e': {'Depends': 'a, missing'}}
     assert aarch64.closure(known, ['a']) == ['a', 'b', 'c', 'e']

@@ -250,7 +250,7 @@ def test_unusable_input_of_train_is_one_line(arguments, said, inputs, monkeypatc
     refused(['train', *arguments], said, inputs, monkeypatch, capsys)
 
 
-def test_there_are_150_of_each_kind_and_every_subcommand_is_among_them():
+def test_there_are_150_inputs_of_each_kind_for_every_subcommand():
     commands = {row[0][0] for row in ROWS if not row[0][0].startswith('-')}
     assert len(ROWS) + len(TRAINING) >= 150
     assert commands >= {'fly', 'evaluate', 'compare', 'faults', 'report', 'gap', 'identify',

@@ -51,7 +51,7 @@ def test_help_needs_neither_ros_nor_any_heavy_module():
     assert done.returncode == 0, done.stderr
 
 
-def test_the_controllers_are_listed_with_what_is_known_of_them(capsys, tmp_path):
+def test_controllers_are_listed_with_their_properties(capsys, tmp_path):
     file = tmp_path / 'controllers.json'
     assert cli.main(['controllers', '--json', str(file)]) == 0
     listed = json.loads(file.read_text())
@@ -60,7 +60,7 @@ def test_the_controllers_are_listed_with_what_is_known_of_them(capsys, tmp_path)
     assert listed['nmpc']['guidance'] == 'none' and listed['nmpc']['flies_degraded']
 
 
-def test_version(capsys):
+def test_the_version_is_printed(capsys):
     assert cli.main(['--version']) == 0
     assert capsys.readouterr().out.strip() == f'beetle_omni {__version__}'
 
@@ -93,7 +93,7 @@ def test_unusable_input_is_refused_before_the_flight(capsys, tmp_path, command):
     assert sorted(p.name for p in tmp_path.iterdir()) == ['poses.csv']
 
 
-def test_a_policy_that_is_none_is_refused_before_anything_flies(capsys, tmp_path):
+def test_an_invalid_policy_is_refused_before_the_flight(capsys, tmp_path):
     path = tmp_path / 'policy.onnx'
     path.write_bytes(b'no network')
     for names in ('rl', 'nmpc,rl'):
@@ -130,7 +130,7 @@ def test_compare_refuses_unusable_input_before_anything_flies(
     assert not list(tmp_path.rglob('*.html')) and not list(tmp_path.rglob('*.npz'))
 
 
-def test_fly_refuses_a_controller_that_nobody_registered(capsys, tmp_path):
+def test_fly_refuses_an_unregistered_controller(capsys, tmp_path):
     pytest.importorskip('rclpy')
     line = refused(capsys, 'fly', '--controller', 'nmpc_publish', '--bag', tmp_path / 'bag')
     assert "controller 'nmpc_publish': expected one of nmpc, rl, rl_memory" in line
@@ -164,7 +164,7 @@ def test_report_writes_one_page_that_needs_no_network(capsys, bag, tmp_path):
     assert '3 of 15' in capsys.readouterr().out
 
 
-def test_report_shows_a_bag_that_a_crash_cut_off(capsys, bag, tmp_path):
+def test_report_shows_a_bag_truncated_by_a_crash(capsys, bag, tmp_path):
     data = (bag / 'flight.mcap').read_bytes()
     (tmp_path / 'cut').mkdir()
     (tmp_path / 'cut' / 'cut.mcap').write_bytes(data[:len(data) * 2 // 3])
@@ -173,7 +173,7 @@ def test_report_shows_a_bag_that_a_crash_cut_off(capsys, bag, tmp_path):
     assert 'cut off' in (tmp_path / 'page.html').read_text()
 
 
-def test_report_refuses_what_is_no_flight(capsys, bag, tmp_path):
+def test_report_refuses_paths_without_flight(capsys, bag, tmp_path):
     out = ['-o', tmp_path / 'page.html']
     assert 'no such bag' in refused(capsys, 'report', tmp_path / 'none', *out)
     with BagWriter(tmp_path / 'imu_only') as writer:

@@ -33,7 +33,7 @@ def files(root):
             for path in root.rglob('*') if path.is_file()}
 
 
-def test_it_writes_three_files_and_the_second_time_nothing(tmp_path):
+def test_the_first_call_writes_three_files_and_the_second_none(tmp_path):
     done = install(tmp_path)
     assert done.returncode == 0, done.stderr
     written = files(tmp_path)
@@ -45,7 +45,7 @@ def test_it_writes_three_files_and_the_second_time_nothing(tmp_path):
     assert 'pilot - rtprio' in written[LIMITS]
 
 
-def test_uninstalling_leaves_nothing_of_it_and_all_else(tmp_path):
+def test_uninstalling_removes_exactly_the_installed_files(tmp_path):
     other = tmp_path / 'etc/udev/rules.d/10-other.rules'
     other.parent.mkdir(parents=True)
     other.write_text('# another\n')
@@ -68,7 +68,7 @@ def test_the_rules_name_both_ports_and_set_the_latency_timer(tmp_path):
         assert re.fullmatch(r'(?:[A-Z_]+(?:\{\w+\})?(?:==|\+=|=)"[^"]*"(?:, |$))+', line), line
 
 
-def test_the_service_opens_the_bridges_and_arms_nothing(tmp_path):
+def test_the_service_starts_the_bridges_without_arming(tmp_path):
     robot = tmp_path / 'robot.yaml'
     robot.touch()
     done = install(tmp_path, '--workspace', '/home/pilot/ws', '--robot', str(robot))
@@ -89,7 +89,7 @@ def test_the_service_opens_the_bridges_and_arms_nothing(tmp_path):
         assert not re.search(r'Unknown|Invalid|Failed to parse|ignoring', said), said
 
 
-def test_without_service_only_rules_and_limits_are_there(tmp_path):
+def test_without_service_only_rules_and_limits_are_installed(tmp_path):
     assert install(tmp_path).returncode == 0
     assert install(tmp_path, '--no-service').returncode == 0
     assert set(files(tmp_path)) == {RULES, LIMITS}
@@ -113,7 +113,7 @@ def test_help_names_every_option():
         assert option in said
 
 
-def test_shell_scripts_are_clean():
+def test_shellcheck_accepts_the_shell_scripts():
     checker = Path(sys.executable).with_name('shellcheck')
     if not checker.is_file():
         pytest.skip('no shellcheck here')
@@ -129,7 +129,7 @@ def commands(dockerfile):
                     if line.startswith('RUN '))
 
 
-def test_the_image_with_ros_is_built_by_the_lines_of_the_page():
+def test_the_image_with_ros_contains_the_commands_of_the_page():
     run = commands(DEPLOY / 'Dockerfile').replace(' --no-cache-dir', '')
     page = (ROOT / 'docs/how-to/install.md').read_text()
     block = re.search(r'```sh\n(sudo apt install python3-venv.*?)```', page, re.S)[1]
@@ -150,7 +150,7 @@ def test_the_images_can_draw_without_a_screen(image):
 
 
 @pytest.mark.parametrize('image', ['Dockerfile', 'Dockerfile.python'])
-def test_the_linter_of_images_finds_nothing(image):
+def test_hadolint_accepts_the_images(image):
     linter = shutil.which('hadolint', path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     if linter is None:
         pytest.skip('no hadolint here')

@@ -62,7 +62,7 @@ def test_an_own_trajectory_is_followed_by_both_controllers():
     assert {'nmpc', 'rl'} == set(errors) and max(map(float, errors.values())) < 100
 
 
-def test_an_own_robot_flies_known_and_unknown(poses):
+def test_an_own_robot_flies_with_known_and_unknown_parameters(poses):
     printed = run('own_robot.py', poses)
     assert printed.startswith('3.4 kg') and 'unknown robot' in printed
 
@@ -73,13 +73,13 @@ def test_a_bag_becomes_arrays(bags):
     assert 'warning' not in printed
 
 
-def test_two_bags_tell_what_the_model_misses(bags):
+def test_two_bags_reveal_the_missing_effect(bags):
     printed = run('gap_two_bags.py', *bags)
     before, after = re.search(r'gap ([\d.]+) before, ([\d.]+) after', printed).groups()
     assert 'named' in printed and 'wind' in printed and float(after) < float(before)
 
 
-def test_each_example_is_a_screen_and_is_run_here():
+def test_each_example_is_short_and_has_a_test():
     text = Path(__file__).read_text()
     for path in EXAMPLES.glob('*.py'):
         assert len(path.read_text().splitlines()) <= SCREEN, path.name
@@ -96,7 +96,7 @@ def test_the_public_names_are_there_and_import_nothing_heavy():
                           check=False).returncode == 0
 
 
-def test_robot_reads_a_file_and_stays_a_room():
+def test_robot_is_a_class_and_a_subpackage():
     assert beetle_omni_ros.robot().mass == pytest.approx(3.0386)
     heavy = beetle_omni_ros.robot(ROOT / 'params' / 'robot_weak_and_heavy.yaml')
     assert heavy.mass == pytest.approx(3.19053)

@@ -31,7 +31,7 @@ def test_a_damaged_file_is_refused_in_one_line(benchmark, tmp_path, kind):
     assert refused or kind in ('mcap', 'messages', 'metadata')   # read up to the damage
 
 
-def test_what_is_no_refusal_is_found(benchmark, tmp_path):
+def test_an_input_without_refusal_is_a_finding(benchmark, tmp_path):
     def read(path, _name):
         return int(path.read_text())
 

@@ -22,7 +22,7 @@ def benchmark():
 
 
 @pytest.mark.parametrize('kind', ['board', 'servos', 'messages'])
-def test_hostile_packets_and_messages_are_taken_or_refused(benchmark, kind):
+def test_malicious_packets_and_messages_are_accepted_or_refused(benchmark, kind):
     findings = benchmark.fuzz(benchmark.KINDS[kind], 1500, 1)
     assert not findings, findings
 

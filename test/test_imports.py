@@ -79,7 +79,7 @@ def wrong_rooms(room, names):
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: str(path.relative_to(SOURCE)))
-def test_a_room_imports_only_rooms_below_it(path):
+def test_a_subpackage_imports_only_lower_subpackages(path):
     room = room_of(path)
     assert room in ALLOWED, f'{path}: room {room} has no line in ALLOWED'
     wrong = wrong_rooms(room, [name for name, _ in imports(path)])
@@ -87,7 +87,7 @@ def test_a_room_imports_only_rooms_below_it(path):
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: str(path.relative_to(SOURCE)))
-def test_special_libraries_stay_in_their_room(path):
+def test_special_libraries_are_imported_in_their_subpackage_only(path):
     room = room_of(path)
     for name, line in imports(path):
         top = name.split('.')[0]
@@ -95,7 +95,7 @@ def test_special_libraries_stay_in_their_room(path):
         assert room == home, f'{path}:{line}: {top} is imported only in {home}/'
 
 
-def test_the_rule_catches_what_it_forbids():
+def test_the_import_rule_detects_violations():
     assert wrong_rooms('control', [f'{PACKAGE}.sim.plant.Plant']) == ['sim.plant.Plant']
     assert wrong_rooms('safety', [f'{PACKAGE}.control.nmpc.NmpcController'])
     assert wrong_rooms('runs', [f'{PACKAGE}.estimation'])

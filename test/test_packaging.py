@@ -143,14 +143,14 @@ def test_every_folder_of_code_is_installed(setup_arguments):
     assert folders == set(setup_arguments['packages'])
 
 
-def test_every_file_beside_the_code_is_installed(setup_arguments):
+def test_every_data_file_is_installed(setup_arguments):
     patterns = setup_arguments['package_data']['']
     for path in (ROOT / PACKAGE).rglob('*'):
         if path.is_file() and path.suffix not in ('.py', '.pyc'):
             assert any(path.match(pattern) for pattern in patterns), f'{path}: add to setup.py'
 
 
-def test_data_files_are_where_ros_looks(setup_arguments):
+def test_data_files_are_in_the_folders_of_ros(setup_arguments):
     installed = {f'{folder}/{Path(file).name}': ROOT / file
                  for folder, files in setup_arguments['data_files'] for file in files}
     assert all(path.is_file() for path in installed.values())
@@ -189,7 +189,7 @@ def test_each_parameter_file_is_read_by_its_class():
         assert isinstance(kind.load(share_path(f'params/{name}')), kind)
 
 
-def test_checkout_wins_over_an_installation(tmp_path, monkeypatch):
+def test_a_checkout_has_precedence_over_an_installation(tmp_path, monkeypatch):
     other = tmp_path / 'share' / PACKAGE
     (other / 'params').mkdir(parents=True)
     (other / 'package.xml').touch()

@@ -38,11 +38,11 @@ def test_memory_threads_and_files_that_grow_are_found(soak, changed, grows):
     assert found.memory_MB_per_hour == pytest.approx(changed['slope'], abs=0.1)
 
 
-def test_too_few_samples_say_nothing(soak):
+def test_too_few_samples_give_no_finding(soak):
     assert soak.growth('composed', samples(soak, 0.0), 3580.0) is None
 
 
-def test_a_process_is_read_and_a_dead_one_is_not(soak):
+def test_a_process_is_sampled_until_it_ends(soak):
     own = soak.read_sample(os.getpid(), 1.0)
     assert own.memory > 10 and own.threads >= 1 and own.files >= 3
     assert soak.read_sample(999_999_999, 1.0) is None

@@ -53,7 +53,7 @@ def test_an_interrupt_at_a_random_moment_shows_no_traceback():
     assert statuses <= {-signal.SIGINT, 130, 2} and -signal.SIGINT in statuses
 
 
-def test_little_is_loaded_before_an_interrupt_is_answered():
+def test_few_modules_are_loaded_before_interrupts_are_handled():
     loaded = subprocess.run(
         [sys.executable, '-S', '-c', 'import sys; before = set(sys.modules)\n'
          'import beetle_omni_ros.start; print(*sorted(set(sys.modules) - before))'],
@@ -62,7 +62,7 @@ def test_little_is_loaded_before_an_interrupt_is_answered():
     assert len(loaded) < 30, loaded
 
 
-def test_an_interrupt_that_a_program_lets_through_is_status_130(tmp_path):
+def test_an_unhandled_interrupt_gives_status_130(tmp_path):
     process = launch(tmp_path, INTERRUPTED)
     assert process.communicate(timeout=10) == ('', '') and process.returncode == 130
 

@@ -64,7 +64,7 @@ def outcomes(tmp_path):
     return done.stdout
 
 
-def test_only_what_failed_while_the_computer_stood_still_is_skipped(outcomes):
+def test_only_failures_during_a_stall_of_the_computer_are_skipped(outcomes):
     lines = [line for line in outcomes.splitlines()
              if line.startswith(('PASSED', 'FAILED', 'SKIPPED'))]
     kinds = sorted((line.split()[0], line) for line in lines)
@@ -79,7 +79,7 @@ def test_only_what_failed_while_the_computer_stood_still_is_skipped(outcomes):
     assert ('nodes.py::test_broken' in failed) != (len(skipped) == 2)
 
 
-def test_a_stall_is_seen_with_its_length():
+def test_a_stall_is_detected_with_its_duration():
     heart = Heartbeat()
     try:
         time.sleep(0.5)

@@ -33,7 +33,7 @@ def board_with(emulated, bad, **changes):
     return found
 
 
-def test_a_good_board_is_well_and_stays_disarmed(emulated):
+def test_a_good_board_passes_and_stays_disarmed(emulated):
     found = board_with(emulated, {})
     assert list(found) == ALL
     assert found['battery'].values['cell_V'] == pytest.approx(4.2, abs=0.01)
@@ -41,7 +41,7 @@ def test_a_good_board_is_well_and_stays_disarmed(emulated):
     assert not emulated.armed
 
 
-def test_an_old_start_of_another_program_is_no_loss(emulated):
+def test_an_old_start_of_another_program_is_not_counted_as_loss(emulated):
     for _ in range(2):      # each leaves the board with a gap in the sequence
         board(emulated.port, seconds=0.3)
     assert emulated._parser.lost > 10
@@ -64,26 +64,26 @@ def test_a_failed_esc_is_named(emulated):
     assert found['ESC of rotor 2'].found == 'offline'
 
 
-def test_losses_are_told_each_way(emulated):
+def test_losses_are_reported_for_each_direction(emulated):
     emulated.faults.corrupt_in = 0.5
     emulated.faults.drop_out = 0.05
     board_with(emulated, {'link to the board': 'fail', 'link from the board': 'warn'},
                seconds=2.0)
 
 
-def test_a_firmware_of_another_contract_is_refused(emulated, monkeypatch):
+def test_firmware_with_another_protocol_version_is_refused(emulated, monkeypatch):
     monkeypatch.setattr(motor_board_messages, 'CONTRACT_VERSION', 2)
     found = board_with(emulated, {'board firmware': 'fail'})
     assert 'contract 1, this driver uses 2' in found['board firmware'].found
 
 
-def test_other_numbers_of_the_computer_are_noticed(emulated):
+def test_a_difference_in_settings_of_the_computer_is_reported(emulated):
     found = board_with(emulated, {'board hears us': 'fail', 'board clock': 'fail'},
                        host_component=190)
     assert 'host_component' in found['board hears us'].remedy
 
 
-def test_a_mute_board_and_a_foreign_one_end_the_list(emulated):
+def test_a_silent_or_foreign_board_ends_the_checks(emulated):
     found = board_with(emulated, {'motor board': 'fail'}, seconds=0.5, board_component=7)
     assert 'component 7' in found['motor board'].remedy
     emulated.faults.mute = True

@@ -75,7 +75,7 @@ def test_a_fault_ends_with_status_1(robot, tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.real_time
-def test_without_ros_the_rest_is_looked_at(robot, tmp_path, monkeypatch):
+def test_without_ros_the_other_parts_are_checked(robot, tmp_path, monkeypatch):
     _, _, arguments = robot
     for name in [name for name in sys.modules if name.startswith('beetle_omni_ros.nodes')]:
         monkeypatch.delitem(sys.modules, name)
@@ -90,7 +90,7 @@ def test_without_ros_the_rest_is_looked_at(robot, tmp_path, monkeypatch):
 
 
 @pytest.mark.real_time
-def test_a_port_that_the_bridge_has_is_not_opened(robot, tmp_path):
+def test_a_port_in_use_by_the_bridge_is_not_opened(robot, tmp_path):
     bus, _, _ = robot
     graph = ObservedGraph(0, 1.0, {}, {'joint_bridge': 'ready'},
                   {'joint_bridge_node: gimbal2': Status(2, 'overload', {})})

@@ -40,13 +40,13 @@ def sys_root(tmp_path):
     return tmp_path / 'sys'
 
 
-def test_a_port_that_is_free_is_well(terminal):
+def test_a_free_port_passes(terminal):
     finding = port_finding('port', terminal)
     assert finding.level == 'ok'
     assert terminal in finding.found and os.path.realpath(terminal) in finding.found
 
 
-def test_an_absent_port_names_those_that_are_there(tmp_path, sys_root):
+def test_a_missing_port_lists_the_existing_ports(tmp_path, sys_root):
     finding = port_finding('port', '/dev/beetle_servos', sys_root)
     assert finding.level == 'fail' and '/dev/beetle_servos: no such port' in finding.found
     assert '/dev/ttyUSB0: FTDI USB <-> Serial (0403:6014, serial FT4THV5O)' in finding.remedy
@@ -54,7 +54,7 @@ def test_an_absent_port_names_those_that_are_there(tmp_path, sys_root):
     assert 'no USB serial port is present' in finding.remedy
 
 
-def test_a_link_to_nothing_and_a_file_are_no_ports(tmp_path):
+def test_a_dangling_link_and_a_regular_file_are_refused_as_ports(tmp_path):
     (tmp_path / 'link').symlink_to('/dev/ttyUSB77')
     assert '/dev/ttyUSB77' in port_finding('port', str(tmp_path / 'link')).found
     (tmp_path / 'file').touch()
@@ -82,8 +82,8 @@ def as_group(monkeypatch, name, members, mode):
     ('dialout', True, 0o660, 'log out and in again'),
     ('dialout', False, 0o600, 'udev rule'),
     ('root', False, 0o660, 'udev rule')])
-def test_a_port_without_permission_says_how_to_get_it(terminal, monkeypatch, group, joined, mode,
-                                                      remedy):
+def test_a_port_without_permission_is_reported_with_the_remedy(terminal, monkeypatch, group,
+                                                               joined, mode, remedy):
     user = pwd.getpwuid(os.geteuid()).pw_name
     as_group(monkeypatch, group, [user] if joined else [], mode)
     finding = port_finding('port', terminal)
@@ -124,7 +124,7 @@ def other_process(program, *arguments):
     return process, process.stdout.readline().strip()
 
 
-def test_the_process_that_has_the_port_is_named(terminal):
+def test_the_process_that_uses_the_port_is_named(terminal):
     process, _ = other_process('import sys; f = open(sys.argv[1], "rb", 0); '
                                'print("open", flush=True); sys.stdin.read()', terminal)
     try:
@@ -137,7 +137,7 @@ def test_the_process_that_has_the_port_is_named(terminal):
     assert port_finding('port', terminal).level == 'ok'
 
 
-def test_the_device_behind_a_pseudo_terminal_does_not_count():
+def test_the_device_behind_a_pseudo_terminal_is_not_a_user_of_the_port():
     process, name = other_process('import os, sys; a, b = os.openpty(); '
                                   'print(os.ttyname(b), flush=True); sys.stdin.read()')
     try:
@@ -150,7 +150,7 @@ def test_modem_manager_is_recognised():
     assert 'ModemManager' in room._free([(7, '/usr/sbin/ModemManager')])
 
 
-def test_the_latency_timer_is_read_where_there_is_one(sys_root):
+def test_the_latency_timer_is_read_if_it_exists(sys_root):
     finding = latency_finding('timer', '/dev/ttyUSB0', 1, sys_root)
     assert finding.level == 'fail' and finding.values == {'latency_timer_ms': 16}
     assert 'latency_timer' in finding.remedy

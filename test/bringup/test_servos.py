@@ -26,7 +26,7 @@ def short(monkeypatch):
     monkeypatch.setattr(room, 'OTHER_IDS', (1, 7))
 
 
-def test_a_good_bus_is_well_and_its_numbers_are_told():
+def test_a_good_bus_passes_and_its_measurements_are_reported():
     with EmulatedServoBus(motion=JOINTS) as emulated:
         found = servos(emulated.port)
     assert levels(found) == {}
@@ -37,7 +37,7 @@ def test_a_good_bus_is_well_and_its_numbers_are_told():
     assert found['servo bus'].values['asked'] == 20
 
 
-def test_nothing_is_written():
+def test_the_check_writes_no_register():
     with EmulatedServoBus(motion=JOINTS) as emulated:
         emulated.set_state(np.full(4, 0.5), np.zeros(4), np.zeros(4))
         emulated.faults.silent = {4}
@@ -48,7 +48,7 @@ def test_nothing_is_written():
     assert told and {packet.instruction for packet in told} == {1, 2}    # ping and read
 
 
-def test_torque_that_somebody_left_on_stays_on_and_is_told():
+def test_torque_that_was_on_before_stays_on_and_is_reported():
     with running() as (bus, emulated):
         bus._link.close()       # the driver is gone, the guard is not in use
         found = servos(emulated.port)
@@ -72,7 +72,7 @@ def test_a_servo_with_another_id_is_found():
     assert 'id 7 at 1000000 bit/s' in found['gimbal3'].remedy
 
 
-def test_a_missing_servo_and_an_empty_bus():
+def test_a_missing_servo_and_an_empty_bus_are_reported():
     with EmulatedServoBus(motion=JOINTS) as emulated:
         emulated.faults.silent = {4}
         found = servos(emulated.port)
@@ -84,7 +84,7 @@ def test_a_missing_servo_and_an_empty_bus():
     assert 'supply' in found['servo bus'].remedy
 
 
-def test_old_firmware_and_another_model_are_told():
+def test_old_firmware_and_another_model_are_reported():
     with EmulatedServoBus(motion=JOINTS, firmware=44) as emulated:
         emulated.servos[0]['Model Number'] = 1060
         found = servos(emulated.port)
@@ -93,7 +93,7 @@ def test_old_firmware_and_another_model_are_told():
 
 
 @pytest.mark.parametrize(('volts', 'level'), [(6.0, 'fail'), (9.0, 'warn'), (13.5, 'fail')])
-def test_a_wrong_supply_is_told(volts, level):
+def test_a_wrong_supply_voltage_is_reported(volts, level):
     bad = {f'{name} supply': level for name in NAMES}
     with EmulatedServoBus(motion=JOINTS) as emulated:
         emulated.faults.supply_voltage = volts
@@ -101,7 +101,7 @@ def test_a_wrong_supply_is_told(volts, level):
     assert levels(found) == bad
 
 
-def test_a_servo_that_has_shut_down_is_told():
+def test_a_servo_that_has_shut_down_is_reported():
     with running(reboot_after_overload=False) as (bus, emulated):
         bus._link.close()
         emulated.servos[2].trip(0x20)
@@ -111,7 +111,7 @@ def test_a_servo_that_has_shut_down_is_told():
     assert 'gimbal3 torque' not in found
 
 
-def test_a_hot_servo_is_told():
+def test_a_hot_servo_is_reported():
     bad = {'gimbal4': 'fail', 'gimbal4 temperature': 'warn'}
     with EmulatedServoBus(motion=JOINTS) as emulated:
         emulated.servos[3]['Temperature Limit'] = 50    # and so it is at 60
@@ -120,7 +120,7 @@ def test_a_hot_servo_is_told():
     assert levels(found) == bad
 
 
-def test_an_ambiguous_turn_is_told_unless_it_is_confirmed():
+def test_an_ambiguous_turn_is_reported_unless_confirmed():
     angles = np.array([0.0, 2.8, 0.0, -1.0])
     with EmulatedServoBus(motion=JOINTS) as emulated:
         emulated.set_state(angles, np.zeros(4), np.zeros(4))
@@ -133,7 +133,7 @@ def test_an_ambiguous_turn_is_told_unless_it_is_confirmed():
     assert '-3.48 rad' in found['gimbal2 turn'].found
 
 
-def test_spoilt_answers_are_counted():
+def test_corrupted_answers_are_counted():
     with EmulatedServoBus(motion=JOINTS) as emulated:
         emulated.faults.bad_crc = 0.4
         found = servos(emulated.port)
@@ -141,7 +141,7 @@ def test_spoilt_answers_are_counted():
     assert found['servo bus'].values['missing'] > 2
 
 
-def test_an_absent_port_ends_the_list():
+def test_a_missing_port_ends_the_checks():
     (finding,) = servos('/dev/no_servos').values()
     assert finding.item == 'servo port' and finding.level == 'fail'
 

@@ -29,20 +29,20 @@ def judged(**streams):
     return named(check_topics(graph(**streams), LIMITS, ROBOT.gravity))
 
 
-def test_good_sensors_without_bridges_are_well():
+def test_good_sensors_without_bridges_pass():
     found = judged()
     assert levels(found) == {}
     assert found['mocap/pose rate'].values['rate_Hz'] == pytest.approx(100)
     assert 'joint_bridge_node does not run' in found['joint_states'].found
 
 
-def test_a_sensor_that_nobody_publishes_fails_with_the_domain():
+def test_a_sensor_without_publisher_fails_and_names_the_domain():
     found = judged(mocap=Stream())
     assert levels(found) == {'mocap/pose': 'fail'}
     assert 'ROS domain 5' in found['mocap/pose'].found
 
 
-def test_silence_and_another_type_are_told_apart():
+def test_silence_and_another_message_type_are_distinguished():
     found = judged(mocap=Stream(publishers=['vrpn']), imu=Stream(other_types=['a/msg/Imu']))
     assert 'although vrpn publishes it' in found['mocap/pose'].found
     assert 'published as a/msg/Imu' in found['imu/data_raw'].found
@@ -50,18 +50,18 @@ def test_silence_and_another_type_are_told_apart():
 
 @pytest.mark.parametrize(('rate', 'level'), [(100, 'ok'), (90, 'warn'), (50, 'fail'),
                                              (240, 'warn')])
-def test_rates_are_judged(rate, level):
+def test_rates_outside_their_limits_fail(rate, level):
     finding = judged(mocap=stream(rate, 0.01))['mocap/pose rate']
     assert finding.level == level and f'{rate}.0 Hz' in finding.found
 
 
-def test_a_battery_may_be_told_slowly_or_often():
+def test_any_rate_of_battery_messages_is_accepted():
     for rate in (10, 50):
         assert levels(judged(battery=stream(rate, 0.001))) == {}
     assert levels(judged(battery=stream(5, 0.001))) == {'battery_state rate': 'fail'}
 
 
-def test_a_pause_is_told():
+def test_a_pause_in_a_topic_is_reported():
     paused = stream(100, 0.01)
     paused.arrivals[200:] = [t + 0.15 for t in paused.arrivals[200:]]
     assert levels(judged(mocap=paused)) == {'mocap/pose rate': 'warn'}
@@ -71,19 +71,19 @@ def test_a_pause_is_told():
     (0.010, 0.004, 'ok', ''), (0.050, 0.001, 'warn', 'not synchronised'),
     (0.050, 0.100, 'warn', 'buffers'), (3600.0, 0.01, 'fail', 'not synchronised'),
     (0.150, 0.300, 'fail', 'buffers'), (-0.020, 0.001, 'fail', 'not synchronised')])
-def test_ages_tell_latency_from_clocks(age, jitter, level, said):
+def test_ages_distinguish_latency_from_a_clock_offset(age, jitter, level, said):
     finding = judged(mocap=stream(100, age, jitter))['mocap/pose age']
     assert finding.level == level and said in finding.remedy
     assert ('in the future' in finding.found) == (age < 0)
 
 
-def test_one_early_stamp_gives_a_fast_clock_away():
+def test_one_early_stamp_reveals_a_clock_that_is_ahead():
     late = stream(200, 0.02, 0.001)
     late.ages[17] = -0.002
     assert levels(judged(imu=late)) == {'imu/data_raw age': 'fail'}
 
 
-def test_units_twins_frozen_and_broken_messages_are_told():
+def test_wrong_units_duplicate_publishers_frozen_and_broken_messages_are_reported():
     in_g = judged(imu=stream(200, 0.001, size=1.0))
     assert levels(in_g) == {'imu/data_raw specific force': 'warn'}
     assert 'unit is g' in in_g['imu/data_raw specific force'].remedy
@@ -110,7 +110,7 @@ def running(state='ready', level=0):
     return made
 
 
-def test_a_running_bridge_is_judged_by_what_it_reports():
+def test_a_running_bridge_is_judged_by_its_reports():
     found = named(check_topics(running(level=2), LIMITS, ROBOT.gravity))
     assert levels(found) == {'joint_bridge gimbal1': 'fail'}
     assert found['joint_bridge gimbal1'].values == {'voltage': '11.9'}
@@ -121,7 +121,7 @@ def test_a_running_bridge_is_judged_by_what_it_reports():
         assert found['joint_bridge state'].found == state
 
 
-def test_a_port_that_a_bridge_has_is_left_to_it():
+def test_a_port_in_use_by_a_bridge_is_not_opened():
     busy = Finding('servo port', 'fail', 'p: used by process 5 (x)', 'stop it', {'holders': 1})
     port, state, gimbal = bridge_findings(busy, 'joint_bridge', running())
     assert [port.level, state.level, gimbal.level] == ['ok'] * 3

@@ -65,7 +65,7 @@ def looked_up(numbers, key):
     return numbers
 
 
-def test_every_number_of_the_page_is_that_of_the_json(whole):
+def test_every_number_on_the_page_equals_that_in_the_json(whole):
     _, page, numbers, _ = whole
     shown = Page(page).numbers
     assert len(shown) > 800
@@ -76,7 +76,7 @@ def test_every_number_of_the_page_is_that_of_the_json(whole):
         assert abs(float(text) - value) <= 0.5 * 10 ** -digits + 1e-12, key
 
 
-def test_summed_up_numbers_are_those_of_the_flights(whole):
+def test_summary_numbers_follow_from_the_flights(whole):
     _, page, numbers, _ = whole
     keys = {key for key, _ in Page(page).numbers}
     for conditions in ('nominal', 'published'):
@@ -101,7 +101,7 @@ def test_the_page_needs_no_network(whole):
         assert attributes.get('href', '#').startswith('#'), tag
 
 
-def test_each_table_says_seeds_and_commands_and_where_its_numbers_come_from(whole):
+def test_each_table_states_seeds_commands_and_source(whole):
     _, page, _, _ = whole
     tables = re.findall(r'<figure class="table">.*?</figure>', page, re.DOTALL)
     flown = [table for table in tables if 'conditions</figcaption>' in table]
@@ -120,7 +120,7 @@ def test_each_table_says_seeds_and_commands_and_where_its_numbers_come_from(whol
                      'lemniscate': ['published, real robot'], 'payload': [], 'hover': []}
 
 
-def test_published_numbers_stand_as_they_were_printed(whole):
+def test_published_numbers_keep_their_printed_form(whole):
     _, page, _, _ = whole
     shown = dict(Page(page).numbers)
     base = 'summary/tasks/random3/paper/published_nmpc'
@@ -132,7 +132,7 @@ def test_published_numbers_stand_as_they_were_printed(whole):
     assert np.mean(poses) == pytest.approx(mean, abs=5e-4)
 
 
-def test_markdown_names_pictures_that_are_there(whole):
+def test_pictures_named_in_the_markdown_exist(whole):
     folder, _, _, text = whole
     names = re.findall(r'!\[[^\]]*\]\(([^)]+)\)', text)
     assert len(names) > 12
@@ -141,7 +141,7 @@ def test_markdown_names_pictures_that_are_there(whole):
     assert {path.name for path in folder.glob('*.png')} == set(names)
 
 
-def test_flights_that_failed_or_fell_are_told_and_disturb_no_other(tmp_path):
+def test_failed_and_crashed_flights_are_reported_and_affect_no_other(tmp_path):
     fell = made('waypoints', duration=21.0)
     fell['metrics']['crashed'] = True
     lost = made('force', duration=13.0)
@@ -163,7 +163,7 @@ def test_flights_that_failed_or_fell_are_told_and_disturb_no_other(tmp_path):
     assert force['lost_at'] == [30.0] and force['withstood_min'] == 20.0
 
 
-def test_nothing_flown_is_still_a_page(tmp_path):
+def test_a_page_without_flights_is_written(tmp_path):
     flown = {Flight(task, 'nominal', controller, 0): FAILED for task in TASKS
              for controller in CONTROLLERS}
     page, numbers, _ = written(tmp_path, flown)

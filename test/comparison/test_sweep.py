@@ -43,7 +43,7 @@ def never(*arguments):
     raise AssertionError('flown again')
 
 
-def test_a_plan_holds_every_combination_once_and_begins_with_the_longest():
+def test_a_plan_contains_each_combination_once_longest_first():
     controllers = registry.compared()
     flights = plan(controllers, seeds=(0, 5))
     assert len(flights) == len(set(flights)) == \
@@ -66,12 +66,12 @@ def test_only_short_tasks_are_flown_with_several_seeds_unless_asked():
     ({'tasks': ['wayponts']}, 'wayponts'), ({'conditions': ['windy']}, 'windy'),
     ({'seeds': []}, '--seeds'), ({'seeds': [1, 1]}, '--seeds'),
     ({'controllers': ['nmpc', 'nmpc']}, '--controllers')])
-def test_what_cannot_be_planned_is_named(changes, named):
+def test_an_unusable_plan_is_refused_with_its_cause(changes, named):
     with pytest.raises(ParameterError, match=named):
         plan(**{'controllers': ['nmpc'], **changes})
 
 
-def test_processes_give_the_numbers_of_a_flight_in_this_process(poses, tmp_path):
+def test_worker_processes_give_the_same_numbers_as_this_process(poses, tmp_path):
     flights = plan(['hover', 'nmpc'], [poses], ['published'], [3])
     flown = sweep.sweep(flights, store=Store(tmp_path / 'kept'), jobs=2)
     assert list(flown) == flights
@@ -82,7 +82,7 @@ def test_processes_give_the_numbers_of_a_flight_in_this_process(poses, tmp_path)
 
 @pytest.mark.skipif(not HAS_RAY, reason='ray is not installed')
 @pytest.mark.timeout(180)
-def test_ray_gives_the_numbers_of_processes(poses, tmp_path):
+def test_ray_gives_the_same_numbers_as_processes(poses, tmp_path):
     flights = plan(['hover', 'nmpc'], [poses], ['nominal'], [0, 1])
     by_ray = sweep.sweep(flights, store=Store(tmp_path / 'ray'), backend='ray', jobs=2)
     by_processes = sweep.sweep(flights, store=Store(tmp_path / 'processes'), jobs=2)
@@ -94,7 +94,7 @@ def test_ray_gives_the_numbers_of_processes(poses, tmp_path):
     assert not ray.is_initialized()
 
 
-def test_without_ray_one_line_says_how_to_get_it(poses, tmp_path, monkeypatch):
+def test_without_ray_one_line_names_the_package(poses, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__('sys').modules, 'ray', None)
     with pytest.raises(ParameterError, match=r'beetle_omni_ros\[ray\]'):
         sweep.sweep(plan(['hover'], [poses]), store=Store(tmp_path), backend='ray')
@@ -105,7 +105,7 @@ def test_an_unknown_backend_is_refused(poses, tmp_path):
         sweep.sweep(plan(['hover'], [poses]), store=Store(tmp_path), backend='threads')
 
 
-def test_finished_flights_are_kept_and_only_missing_ones_are_flown(poses, tmp_path, monkeypatch):
+def test_finished_flights_are_cached_and_only_missing_ones_are_flown(poses, tmp_path, monkeypatch):
     store = Store(tmp_path / 'kept')
     flights = plan(['hover'], [poses], ['nominal'], [0, 1])
     first = sweep.sweep(flights[:1], store=store, jobs=1)
@@ -121,7 +121,7 @@ def test_finished_flights_are_kept_and_only_missing_ones_are_flown(poses, tmp_pa
         sweep.sweep(flights, store=store, jobs=1, fresh=True)
 
 
-def test_an_interrupted_sweep_keeps_what_was_finished(poses, tmp_path):
+def test_an_interrupted_sweep_keeps_finished_flights(poses, tmp_path):
     store = Store(tmp_path / 'kept')
     flights = plan(['hover'], [poses], ['nominal'], [0, 1, 2])
 
@@ -133,7 +133,7 @@ def test_an_interrupted_sweep_keeps_what_was_finished(poses, tmp_path):
     assert sum(store.load(flight) is not None for flight in flights) == 1
 
 
-def test_a_kept_flight_counts_only_for_what_it_was_flown_with(poses, tmp_path, monkeypatch):
+def test_a_cached_flight_is_reused_for_equal_inputs_only(poses, tmp_path, monkeypatch):
     store, flight = Store(tmp_path / 'kept'), Flight(poses, 'nominal', 'hover', 0)
     store.save(flight, {'failure': None, 'metrics': {}, 'trace': {}})
     assert store.load(flight) is not None
@@ -161,8 +161,8 @@ def test_another_policy_file_is_another_flight(tmp_path):
 @pytest.mark.parametrize('name, policy, flies', [
     ('rl.yaml', True, True), ('rl.yaml', False, False), ('nmpc.yaml', False, True),
     ('gap.yaml', True, False)])
-def test_parameters_that_no_flight_reads_do_not_fly_anything_again(tmp_path, monkeypatch, name,
-                                                                   policy, flies):
+def test_changes_of_unused_parameters_repeat_no_flight(tmp_path, monkeypatch, name,
+                                                       policy, flies):
     copy = Path(shutil.copytree(share_path('params'), tmp_path / 'params'))
     monkeypatch.setattr(fingerprint, 'share_path', lambda _: copy)
     before = fingerprint.code_fingerprint.__wrapped__(policy)
@@ -170,7 +170,7 @@ def test_parameters_that_no_flight_reads_do_not_fly_anything_again(tmp_path, mon
     assert (fingerprint.code_fingerprint.__wrapped__(policy) != before) == flies
 
 
-def test_other_controllers_import_nothing_that_is_left_out_of_their_fingerprint():
+def test_controllers_import_no_module_outside_their_fingerprint():
     code = 'import sys, beetle_omni_ros.control.nmpc, beetle_omni_ros.control.hover; ' \
         'print(*(name for name in sys.modules if name.startswith("beetle_omni_ros.control")))'
     loaded = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
@@ -181,7 +181,7 @@ def test_other_controllers_import_nothing_that_is_left_out_of_their_fingerprint(
     assert fingerprint.is_of_policies(Path('beetle_omni_ros/control/guidance/turning.py'))
 
 
-def test_a_cut_off_file_is_flown_again(poses, tmp_path):
+def test_a_flight_with_a_truncated_file_is_repeated(poses, tmp_path):
     store, flight = Store(tmp_path), Flight(poses, 'nominal', 'hover', 0)
     store.save(flight, {'failure': None, 'metrics': {'a': list(range(999))}, 'trace': {}})
     kept, = tmp_path.glob('*.npz')
@@ -189,7 +189,7 @@ def test_a_cut_off_file_is_flown_again(poses, tmp_path):
     assert store.load(flight) is None
 
 
-def test_a_failing_flight_is_a_result_with_its_reason_and_not_kept(poses, tmp_path, monkeypatch):
+def test_a_failed_flight_is_a_result_with_its_reason_and_not_cached(poses, tmp_path, monkeypatch):
     def fly(controller, *arguments, **options):
         if controller == 'nmpc':
             raise ZeroDivisionError('no way\nout')
@@ -207,7 +207,7 @@ def test_a_failing_flight_is_a_result_with_its_reason_and_not_kept(poses, tmp_pa
     assert len(list((tmp_path / 'out' / '.flights').glob('*.npz'))) == 1
 
 
-def test_a_worker_with_other_code_does_not_fly(monkeypatch):
+def test_a_worker_with_different_code_is_refused(monkeypatch):
     monkeypatch.setattr(flight_module, 'fly', never)
     flight = Flight('hover', 'nominal', 'hover', 0)
     result = flight_module.fly_flight(flight, make_task('hover'), code='another')

@@ -8,7 +8,7 @@ from beetle_omni_ros.control.base import TrajectoryTarget
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_one_moment_of_a_trajectory_is_a_sample_of_one(seed):
+def test_a_trajectory_at_one_time_is_a_sample_of_length_one(seed):
     rng = np.random.default_rng(seed)
     times = np.sort(rng.uniform(0, 10, 200))
     turns = Rotation.from_euler('xyz', np.cumsum(0.2 * rng.normal(size=(200, 3)), axis=0))

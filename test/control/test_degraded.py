@@ -66,7 +66,7 @@ def controller(request, nmpc):
 
 
 @pytest.mark.parametrize('health', [LOST, STUCK, WEAK])
-def test_recovers_from_hover_and_holds_the_attitude_to_fly_in(controller, health):
+def test_recovers_from_hover_and_holds_the_flight_attitude(controller, health):
     body = Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.5)
     body.broken = health
     body.fly(controller, PoseTarget(PLACE, LEVEL), 0.1)
@@ -79,7 +79,7 @@ def test_recovers_from_hover_and_holds_the_attitude_to_fly_in(controller, health
 
 
 @pytest.mark.parametrize('health', [LOST, STUCK, WEAK])
-def test_commands_keep_to_what_is_left_from_the_first_step(controller, health):
+def test_commands_use_the_remaining_actuators_from_the_first_step(controller, health):
     body = Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.2)
     controller.set_health(health)
     for _ in range(5):
@@ -89,7 +89,7 @@ def test_commands_keep_to_what_is_left_from_the_first_step(controller, health):
         np.testing.assert_array_equal(body.command.thrust, thrust)
 
 
-def test_a_repaired_controller_commands_as_one_that_never_failed(controller):
+def test_after_repair_the_commands_equal_those_without_a_fault(controller):
     fresh = Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.3).command
     controller.set_health(LOST)
     Body().fly(controller, PoseTarget(PLACE, LEVEL), 0.3)
@@ -100,7 +100,7 @@ def test_a_repaired_controller_commands_as_one_that_never_failed(controller):
     np.testing.assert_array_equal(fresh.thrust, again.thrust)
 
 
-def test_the_estimator_forgets_what_it_learnt_from_the_loss(nmpc):
+def test_the_disturbance_estimate_is_reset_after_an_actuator_loss(nmpc):
     nmpc.set_health(ALL_HEALTHY)
     nmpc.reset()
     body = Body().fly(nmpc, PoseTarget(PLACE, LEVEL), 0.5)
@@ -111,7 +111,7 @@ def test_the_estimator_forgets_what_it_learnt_from_the_loss(nmpc):
     assert np.linalg.norm(nmpc.disturbance[model.TORQUE]) < 0.01
 
 
-def test_the_plan_knows_the_bounds(nmpc):
+def test_the_plan_respects_the_bounds(nmpc):
     nmpc.set_health(ALL_HEALTHY)
     nmpc.reset()
     body = Body().fly(nmpc, PoseTarget(PLACE, LEVEL), 0.3)
@@ -121,7 +121,7 @@ def test_the_plan_knows_the_bounds(nmpc):
     assert nmpc.diagnostics()['unsolved'] == 0
 
 
-def test_a_feasible_pose_is_held_firmly_at_the_same_place():
+def test_a_feasible_pose_is_held_at_the_same_position():
     for health in (LOST, STUCK):
         target = PoseTarget(PLACE, rotations.from_rpy(1.4, 0.3, 0.7), 3.0)
         got = feasible_target(target, health, ROBOT)
@@ -131,7 +131,7 @@ def test_a_feasible_pose_is_held_firmly_at_the_same_place():
     assert feasible_target(target, ALL_HEALTHY, ROBOT) is target
 
 
-def test_a_trajectory_that_cannot_be_held_is_flown_in_one_attitude():
+def test_an_infeasible_trajectory_is_flown_in_one_attitude():
     times = np.linspace(0.0, 2.0, 5)
     quaternions = np.array([rotations.from_rpy(0.8 * t, 0.0, 0.0) for t in times])
     target = TrajectoryTarget(times, np.outer(times, [1.0, 0, 0]), quaternions,

@@ -23,7 +23,7 @@ def command(k):
 
 
 @pytest.mark.parametrize('delay', [0.01, 0.02, 0.035, 0.06])
-def test_every_command_within_the_delay_acts_from_its_own_time_on(delay):
+def test_each_command_within_the_delay_acts_from_its_own_time(delay):
     p = NmpcParameters.load()
     p = replace(p, model=replace(p.model, command_delay=delay))
     advance = FunctionCall(model.integrator(ROBOT), None)

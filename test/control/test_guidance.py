@@ -44,20 +44,20 @@ def rest(guided, command_of, steps=200):
         given = guided.step(state_at(0.01 * k, (0.02, 0, 1), command_of(given)), target)
 
 
-def test_any_controller_flies_without_a_steady_error_inside_it():
+def test_guidance_removes_the_steady_error_of_any_controller():
     keeper = Keeper()
     rest(Guided(keeper, Guidance(GuidanceParameters(), AXES)), lambda given: given)
     assert keeper.shown[-1].position[0] < -0.01         # against the error, by its integral
 
 
-def test_nothing_is_learnt_while_another_controller_flies():
+def test_the_trim_does_not_change_while_another_controller_is_active():
     keeper = Keeper()
     other = Command(0.0, np.full(4, 0.1), np.full(4, 7.0))
     rest(Guided(keeper, Guidance(GuidanceParameters(), AXES)), lambda given: other)
     assert np.array_equal(keeper.shown[-1].position, [0.0, 0.0, 1.0])
 
 
-def test_a_low_target_is_shown_higher_while_there_is_far_to_turn():
+def test_a_low_target_is_raised_during_a_large_rotation():
     keeper = Keeper()
     guided = Guided(keeper, Guidance(GuidanceParameters(), AXES))
     target = PoseTarget(np.array([0.0, 0.0, 0.5]), rotations.exp(np.array([1.5, 0.0, 0.0])))
@@ -65,7 +65,7 @@ def test_a_low_target_is_shown_higher_while_there_is_far_to_turn():
     assert keeper.shown[0].position[2] == GuidanceParameters().turning.height
 
 
-def test_trajectories_pass_as_they_are_and_health_is_told():
+def test_trajectories_pass_unchanged_and_actuator_health_is_forwarded():
     keeper = Keeper()
     guided = Guided(keeper, Guidance(GuidanceParameters(), AXES))
     way = TrajectoryTarget(np.array([0.0, 1.0]), np.zeros((2, 3)), np.tile(LEVEL, (2, 1)),
@@ -78,14 +78,14 @@ def test_trajectories_pass_as_they_are_and_health_is_told():
     assert not keeper.shown and guided.diagnostics() == {'unwound': 0, 'routed': 0}
 
 
-def test_the_reach_inside_is_the_reach_outside():
+def test_guidance_reports_the_reach_of_its_controller():
     keeper = Keeper()
     assert Guided(keeper, Guidance(GuidanceParameters(), AXES)).reach == np.inf
     keeper.reach = 3.0
     assert Guided(keeper, Guidance(GuidanceParameters(), AXES)).reach == 3.0
 
 
-def test_the_text_names_the_parts_that_are_on():
+def test_the_description_names_the_active_parts():
     p = GuidanceParameters()
     assert p.text == 'unwinding, routing, turning, trimming'
     off = replace(p, unwinding=replace(p.unwinding, attempts=0),

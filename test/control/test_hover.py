@@ -31,7 +31,7 @@ def start(attitude, position=HOME, mass_scale=1.0, torque_body=0.0):
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_hovers_still_at_any_attitude(seed):
+def test_hovers_at_rest_at_any_attitude(seed):
     attitude = unit(np.random.default_rng(seed), 4)
     plant, in_force = start(attitude)
     log = fly(plant, HoverController(ROBOT), PoseTarget(HOME, attitude), 2.0, in_force)
@@ -61,7 +61,7 @@ def test_approach_is_well_damped():
     assert error[-1] < 0.01
 
 
-def test_survives_directions_along_an_arm_where_a_rotor_carries_nothing():
+def test_hovers_with_thrust_along_an_arm_where_one_rotor_is_unloaded():
     """Gravity along arm 1: rotors 1 and 3 have no thrust and no defined direction."""
     arm = ROBOT.tilt_axes[0]
     axis = np.cross(arm, [0, 0, 1.0])
@@ -82,14 +82,14 @@ def test_survives_directions_along_an_arm_where_a_rotor_carries_nothing():
     assert np.abs(np.diff(tilts, axis=0)).max() <= PARAMETERS.tilt_rate * PERIOD + 1e-9
 
 
-def test_observer_removes_the_droop_of_a_wrong_mass():
+def test_the_observer_removes_the_steady_error_of_a_wrong_mass():
     level = np.array([0, 0, 0, 1.0])
     plant, in_force = start(level, mass_scale=1.1)
     log = fly(plant, HoverController(ROBOT), PoseTarget(HOME, level), 3.0, in_force)
     assert log[-1][0] < 0.01
 
 
-def test_takes_over_without_a_jump_from_whatever_command_is_in_force():
+def test_takes_over_without_a_jump_from_any_command_in_force():
     rng = np.random.default_rng(5)
     controller = HoverController(ROBOT)
     for _ in range(20):
@@ -102,7 +102,7 @@ def test_takes_over_without_a_jump_from_whatever_command_is_in_force():
             <= PARAMETERS.thrust_rate * PERIOD + 1e-9
 
 
-def test_learns_the_disturbance_while_another_controller_flies():
+def test_the_disturbance_estimate_converges_while_another_controller_is_active():
     """A hand-over in the presence of a wrong mass starts without a droop."""
     level = np.array([0, 0, 0, 1.0])
     plant, in_force = start(level, mass_scale=1.1)
@@ -116,7 +116,7 @@ def test_learns_the_disturbance_while_another_controller_flies():
     assert max(step[0] for step in log) < 0.01
 
 
-def test_a_distant_target_is_no_disturbance():
+def test_a_distant_target_does_not_change_the_disturbance_estimate():
     level = np.array([0, 0, 0, 1.0])
     plant, in_force = start(level)
     controller = HoverController(ROBOT)
@@ -124,7 +124,7 @@ def test_a_distant_target_is_no_disturbance():
     assert controller.diagnostics()['force_disturbance_m_s2'] < 0.1
 
 
-def test_repeated_stamp_repeats_the_command_and_a_pause_is_not_one_long_leap():
+def test_a_repeated_stamp_repeats_the_command_and_a_pause_limits_the_time_step():
     level = np.array([0, 0, 0, 1.0])
     plant, in_force = start(level)
     controller, target = HoverController(ROBOT), PoseTarget(HOME, rotations.exp([0.5, 0, 0]))

@@ -70,7 +70,7 @@ def test_hover_is_an_equilibrium(controller):
 
 @pytest.mark.parametrize('rpy', [(180, 0, 0), (0, 180, 0), (0, 0, 180), (90, 0, 0),
                                  (-60, 80, 170)])
-def test_reaches_turned_over_poses_exactly(controller, rpy):
+def test_reaches_inverted_poses_without_error(controller, rpy):
     target = PoseTarget(np.array([1.0, -1.0, 1.5]), rotations.from_rpy(*np.radians(rpy)))
     position, angle = errors(fly(controller, target, 6.0), target)
     assert position < 2e-3
@@ -83,7 +83,7 @@ def test_reaches_turned_over_poses_exactly(controller, rpy):
     {'effects': {'rotor_thrust_coefficient': {'scale': [0.95, 1.0, 1.03, 1.0]}}},
     {'effects': {'wind': {'force': [2.0, -1.0, 1.0]}}},
 ], ids=['weak rotors', 'heavy', 'uneven rotors', 'wind'])
-def test_an_unknown_steady_change_leaves_no_steady_error(controller, changes):
+def test_an_unknown_constant_disturbance_leaves_no_steady_error(controller, changes):
     target = PoseTarget(np.array([0.5, 0.0, 1.2]), rotations.from_rpy(0.6, -0.3, 0.2))
     plant = replace(ROBOT, **changes)
     position, angle = errors(fly(controller, target, 7.0, plant=plant), target)
@@ -100,7 +100,7 @@ def test_servo_offsets_and_torque_are_estimated(controller):
     assert np.allclose(controller.disturbance[3:6], disturbance[3:6], atol=1e-2)
 
 
-def test_a_moving_reference_is_tracked_with_its_future(controller):
+def test_a_moving_reference_is_tracked_with_preview(controller):
     time = np.arange(0, 8, 0.02)
     phase = 2 * np.pi * time / 8
     positions = np.stack([np.sin(phase), np.zeros_like(time), 1 + 0 * time], axis=1)
@@ -120,7 +120,7 @@ def test_commands_keep_the_limits_whatever_the_target(controller):
         assert np.all(np.abs(command.tilt) <= ROBOT.joints.position_limit)
 
 
-def test_reset_makes_the_same_flight_again(controller):
+def test_the_same_flight_results_after_reset(controller):
     target = PoseTarget(np.array([1.0, 0.0, 1.0]), rotations.from_rpy(1.0, 0, 0))
     first = fly(controller, target, 0.5)
     controller.reset()
@@ -128,7 +128,7 @@ def test_reset_makes_the_same_flight_again(controller):
     assert np.array_equal(first[-1][1], second[-1][1])
 
 
-def test_without_a_compiler_it_flies_the_same(controller, monkeypatch, caplog):
+def test_without_a_compiler_the_commands_are_the_same(controller, monkeypatch, caplog):
     monkeypatch.setenv('CC', 'no-such-compiler')
     target = PoseTarget(np.array([0.5, 0.0, 1.0]), rotations.from_rpy(0.8, 0, 0))
     interpreted = NmpcController(ROBOT, NmpcParameters.load())
@@ -150,7 +150,7 @@ def test_a_nan_state_repeats_the_plan_and_does_not_poison_the_next_cycles(contro
     assert errors(trace, moved) == pytest.approx((0, 0), abs=2e-2)
 
 
-def test_a_horizon_of_another_length_works_too():
+def test_a_horizon_of_another_length_works():
     horizon = HorizonParameters(change_time=0.05, intervals=np.linspace(0.05, 0.12, 14))
     parameters = NmpcParameters(horizon=horizon, solver=SolverParameters(compile=False))
     target = PoseTarget(np.array([0.5, 0.5, 1.2]), rotations.from_rpy(0.4, 0.4, 0))
@@ -159,7 +159,7 @@ def test_a_horizon_of_another_length_works_too():
     assert angle < 0.5
 
 
-def test_the_published_settings_stay_the_published_ones():
+def test_the_published_settings_are_unchanged():
     p = NmpcParameters.load(share_path('params/nmpc_published.yaml'))
     assert not p.model.rotor_lag
     assert p.horizon.intervals.tolist() == [0.1] * 20

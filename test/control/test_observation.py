@@ -27,7 +27,7 @@ def named(values, memory=True):
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_each_block_is_what_its_name_says(seed):
+def test_each_block_contains_the_quantity_of_its_name(seed):
     state, reference, previous, disturbance = drawn(seed)
     seen = named(observation(state, reference, previous, disturbance))
     body, goal = Rotation.from_quat(state.quaternion), Rotation.from_quat(reference.quaternion)
@@ -47,7 +47,7 @@ def test_each_block_is_what_its_name_says(seed):
         assert np.allclose(seen[name], values, atol=1e-12), name
 
 
-def test_the_sizes_are_the_published_ones_and_those_with_memory():
+def test_observation_sizes_with_and_without_memory():
     state, reference, previous, disturbance = drawn(0)
     assert observation(state, reference, previous).shape == (33,)
     assert observation(state, reference, previous, disturbance).shape == (39,)
@@ -77,7 +77,7 @@ def moved(turn, shift, state, reference, disturbance):
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_place_and_orientation_of_the_room_show_in_the_attitudes_alone(seed):
+def test_position_and_heading_of_the_world_frame_affect_attitude_entries_only(seed):
     state, reference, previous, disturbance = drawn(seed)
     turn = Rotation.random(random_state=100 + seed)
     here = named(observation(state, reference, previous, disturbance))
@@ -92,7 +92,7 @@ def test_place_and_orientation_of_the_room_show_in_the_attitudes_alone(seed):
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_a_heading_changes_no_height_of_an_axis(seed):
+def test_heading_does_not_change_the_vertical_components_of_axes(seed):
     state, reference, previous, disturbance = drawn(seed)
     turn = Rotation.from_rotvec([0, 0, 1.7])
     here = named(observation(state, reference, previous, disturbance))
@@ -103,7 +103,7 @@ def test_a_heading_changes_no_height_of_an_axis(seed):
         assert np.allclose(there[name][[2, 5]], here[name][[2, 5]], atol=1e-12)
 
 
-def test_following_perfectly_leaves_no_error():
+def test_perfect_tracking_gives_zero_error_entries():
     state, reference, previous, _ = drawn(3)
     reference = Reference(state.position, state.quaternion, state.velocity,
                           state.angular_velocity)

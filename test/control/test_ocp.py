@@ -67,7 +67,7 @@ def test_cost_gradient_and_hessian_belong_to_one_quadratic_cost(problem, seed):
     assert np.allclose(parts(z + step)[1], gradient + hessian @ step, atol=1e-8)
 
 
-def test_the_cost_vanishes_at_the_reference_and_ignores_the_quaternion_sign():
+def test_the_cost_is_zero_at_the_reference_for_both_quaternion_signs():
     problem = ocp.build(ROBOT, SERVO_LAG, True)
     _, _, d, reference = random_point(1, 21)
     reference[21:] = 0

@@ -74,7 +74,7 @@ def test_a_policy_that_repeats_its_last_action_takes_over_without_a_jump(tmp_pat
     assert np.allclose(taken.thrust, others.thrust, atol=1e-5)
 
 
-def test_before_the_first_command_it_stands_on_measured_tilts_and_hover_thrust(tmp_path):
+def test_before_the_first_command_measured_tilts_and_hover_thrust_are_the_last_action(tmp_path):
     policy = controller(write(tmp_path / 'p.onnx', weights=selecting(PREVIOUS)))
     command = policy.step(state(), TARGET)
     assert np.allclose(command.tilt, state().tilt, atol=1e-6)
@@ -92,14 +92,14 @@ def test_targets_are_cut_to_the_limits_of_the_actuators(tmp_path):
     assert policy.diagnostics()['steps_at_a_limit'] == 1
 
 
-def test_an_absurd_action_goes_out_for_the_supervisor_to_refuse(tmp_path):
+def test_an_action_far_outside_its_range_is_left_to_the_supervisor(tmp_path):
     policy = controller(write(tmp_path / 'p.onnx', bias=np.r_[np.zeros(7), 1e6]))
     command = policy.step(state(), TARGET)
     assert command.thrust[3] > 1e5
     assert policy.diagnostics()['faulty_actions'] == 1
 
 
-def test_an_action_that_is_no_number_goes_out_too(tmp_path):
+def test_a_nan_action_is_left_to_the_supervisor(tmp_path):
     policy = controller(write(tmp_path / 'p.onnx', poison=True))
     far = PoseTarget(np.array([0.0, 0.0, 5.0]), LEVEL)
     assert np.isfinite(policy.step(state(), TARGET).thrust).all()
@@ -137,7 +137,7 @@ def test_a_first_state_that_is_not_finite_gives_a_finite_command(tmp_path):
 
 
 @pytest.mark.parametrize('memory', [False, True])
-def test_the_same_states_give_the_same_commands_and_reset_forgets(tmp_path, memory):
+def test_the_same_states_give_the_same_commands_after_reset(tmp_path, memory):
     policy = controller(write(tmp_path / 'p.onnx', memory=memory, hidden=(32, 16), seed=4))
 
     def flight():
@@ -154,7 +154,7 @@ def test_the_same_states_give_the_same_commands_and_reset_forgets(tmp_path, memo
     assert np.array_equal(flight(), first)
 
 
-def test_the_policy_with_memory_sees_a_push_in_its_own_axes(tmp_path):
+def test_the_policy_with_memory_observes_a_push_in_body_axes(tmp_path):
     # action = disturbance_force / 20, on the rotors
     weights = np.zeros((39, 8))
     weights[33:36, 4:7] = 0.05 * np.eye(3)
@@ -172,7 +172,7 @@ def test_the_policy_with_memory_sees_a_push_in_its_own_axes(tmp_path):
     assert policy.diagnostics()['force_estimate_N'] == pytest.approx(6.0, abs=0.3)
 
 
-def test_a_trajectory_is_looked_ahead_at_and_a_pose_is_not(tmp_path):
+def test_preview_applies_to_trajectories_and_not_to_poses(tmp_path):
     # action = target_position / 4, on the rotors
     weights = np.zeros((33, 8))
     weights[6:9, 4:7] = 0.25 * np.eye(3)
@@ -201,13 +201,13 @@ def refusal(path, robot=ROBOT, **changed):
     return text
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_a_missing_policy_file_is_named(tmp_path):
     assert 'no such file' in refusal(tmp_path / 'none.onnx')
     assert 'no such file' in refusal(tmp_path)
     assert "package's share" in refusal('policies/none.onnx')
 
 
-def test_a_file_cut_short_at_any_place_is_refused(tmp_path):
+def test_a_truncated_policy_file_is_refused(tmp_path):
     whole = write(tmp_path / 'whole.onnx', hidden=(16,)).read_bytes()
     for share in np.linspace(0, 1, 40, endpoint=False):
         cut = tmp_path / 'cut.onnx'
@@ -215,7 +215,7 @@ def test_a_file_cut_short_at_any_place_is_refused(tmp_path):
         assert refusal(cut)
 
 
-def test_a_file_that_is_no_onnx_is_refused(tmp_path):
+def test_a_file_in_another_format_than_onnx_is_refused(tmp_path):
     for content in (b'', b'not a network', np.random.default_rng(0).bytes(5000)):
         path = tmp_path / 'garbage.onnx'
         path.write_bytes(content)
@@ -234,12 +234,12 @@ def test_a_file_that_is_no_onnx_is_refused(tmp_path):
     ({'metadata': {'actions': '["a"]'}}, ['actions']),
     ({'bias': np.full(8, np.nan)}, ['at rest', 'not finite']),
 ])
-def test_a_file_that_does_not_fit_is_refused_by_what_differs(tmp_path, options, named):
+def test_an_incompatible_policy_file_is_refused_with_the_difference(tmp_path, options, named):
     text = refusal(write(tmp_path / 'p.onnx', **options))
     assert all(part in text for part in named), text
 
 
-def test_another_robot_needs_to_be_allowed(tmp_path, caplog):
+def test_a_policy_of_another_robot_needs_permission(tmp_path, caplog):
     other = RobotParameters.load(share_path('params/robot_weak_and_heavy.yaml'))
     path = write(tmp_path / 'p.onnx')
     assert 'robot_hash' in refusal(path, robot=other)
@@ -249,7 +249,7 @@ def test_another_robot_needs_to_be_allowed(tmp_path, caplog):
     assert np.allclose(policy.step(state(), TARGET).thrust, ROBOT.hover_thrust)
 
 
-def test_the_batch_may_be_open(tmp_path):
+def test_a_dynamic_batch_dimension_is_accepted(tmp_path):
     import onnx
     path = write(tmp_path / 'p.onnx')
     network = onnx.load(path)
@@ -261,14 +261,14 @@ def test_the_batch_may_be_open(tmp_path):
     assert np.isfinite(controller(path).step(state(), TARGET).thrust).all()
 
 
-def test_a_contract_of_the_trainer_loads(tmp_path):
+def test_metadata_written_by_the_trainer_load(tmp_path):
     contract = PolicyContract.default(ROBOT, memory=True)
     path = write(tmp_path / 'p.onnx', memory=True, metadata=replace(
         contract, name='mine', training={'seed': 1}).to_metadata())
     assert controller(path).diagnostics()['policy'] == 'mine'
 
 
-def test_a_wound_robot_that_stays_off_its_pose_is_flown_through_level_but_not_off_a_trajectory(
+def test_wound_joints_lead_through_level_for_a_pose_but_not_for_a_trajectory(
         tmp_path):
     # the last two tilts asked for are z of the target's x and z axes in world
     policy = controller(write(tmp_path / 'p.onnx', weights=selecting([0, 1, 17, 20, 4, 5, 6, 7])),

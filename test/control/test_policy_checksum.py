@@ -65,7 +65,7 @@ def test_a_policy_without_checksum_is_refused_with_the_way_to_add_it(tmp_path):
     assert policy_checksum.main([str(path)]) == 0 and path.read_bytes() == before
 
 
-def test_a_checksum_is_not_renewed(tmp_path, capsys):
+def test_an_existing_checksum_is_not_replaced(tmp_path, capsys):
     path = write(tmp_path / 'p.onnx')
     model = onnx.load(path)
     model.graph.initializer[0].CopyFrom(numpy_helper.from_array(
@@ -92,7 +92,7 @@ def test_the_checksum_changes_no_action(tmp_path, path):
         assert network(seen.tolist()) == expected.tolist()
 
 
-def test_metadata_that_are_no_text_are_told_in_one_line(tmp_path):
+def test_metadata_that_are_not_text_are_refused_in_one_line(tmp_path):
     path = write(tmp_path / 'p.onnx', metadata={'name': 'abcdefgh'})
     data = path.read_bytes()
     path.write_bytes(data.replace(b'abcdefgh', b'abc\xff\xfeefg'))
@@ -109,5 +109,5 @@ def test_weights_in_another_file_are_refused(tmp_path, monkeypatch):
     refusal(path)
 
 
-def test_long_metadata_are_quoted_in_part(tmp_path):
+def test_long_metadata_are_truncated_in_messages(tmp_path):
     refusal(write(tmp_path / 'p.onnx', metadata={'robot': 'x' * 100_000, 'robot_hash': 'y'}))

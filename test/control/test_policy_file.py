@@ -16,7 +16,7 @@ ROBOT = RobotParameters.load()
 
 
 @pytest.mark.parametrize('memory', [False, True])
-def test_a_contract_survives_its_metadata(memory):
+def test_metadata_round_trip(memory):
     written = replace(PolicyContract.default(ROBOT, memory), training={'seed': 3, 'mass': [1, 2]},
                       metrics={'U_position_m': 0.01}, commit='abc', version='1', created='today')
     metadata = written.to_metadata()
@@ -69,7 +69,7 @@ def table(change):
     ({'observations': table(lambda rows: rows.pop())}, ['observations', 'previous_action']),
     ({'format': 'beetle_omni_policy/2'}, ['format', 'beetle_omni_policy/1', '/2']),
 ])
-def test_what_differs_is_named(metadata, named):
+def test_differences_are_named(metadata, named):
     text = refusal(**metadata)
     assert all(part in text for part in named), text
 
@@ -90,7 +90,7 @@ def test_what_differs_is_named(metadata, named):
     ({'training': 'x'}, ['training']), ({'metrics': '[]'}, ['metrics']),
     ({'observations': '[{"name": "velocity"}]'}, ['observations', 'size']),
 ])
-def test_metadata_that_cannot_be_read_are_named(metadata, named):
+def test_unreadable_metadata_are_refused_with_the_key(metadata, named):
     text = refusal(**metadata)
     assert all(part in text for part in named), text
 
@@ -104,19 +104,19 @@ def test_another_robot_is_refused_and_may_be_allowed():
     assert 'robot_hash' in warning and '\n' not in warning
 
 
-def test_what_is_no_robot_parameter_stays_refused_for_another_robot():
+def test_permission_for_another_robot_covers_robot_parameters_only():
     other = replace(ROBOT, mass=3.2)
     wrong = replace(PolicyContract.default(ROBOT), action_scale=np.ones(8))
     with pytest.raises(ParameterError, match='action_scale'):
         wrong.check(other, allow_other_robot=True)
 
 
-def test_a_sensor_that_the_estimator_corrects_is_no_other_robot():
+def test_sensor_effects_that_the_estimator_corrects_are_not_a_difference():
     turned = replace(ROBOT, effects={'imu_misalignment': {'rotation': (0.01, 0.0, 0.02)}})
     assert not PolicyContract.default(ROBOT).check(turned)
 
 
-def test_effects_alone_are_named():
+def test_a_difference_in_effects_only_is_named():
     corrected = replace(ROBOT, effects={'thrust_coefficient': {'scale': 0.93}})
     with pytest.raises(ParameterError, match='robot_hash.*effects thrust_coefficient'):
         PolicyContract.default(ROBOT).check(corrected)

@@ -61,7 +61,7 @@ def test_a_pose_is_held_under_the_effects_of_the_robot_file(effects):
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_joints_rest_within_half_a_turn_unless_that_is_far(seed):
+def test_joint_references_are_within_half_a_turn_unless_that_is_far(seed):
     rng = np.random.default_rng(seed)
     target = PoseTarget(np.zeros(3), rotations.normalized(rng.normal(size=4)))
     present = rng.uniform(-LIMIT, LIMIT, 4)
@@ -117,7 +117,7 @@ def test_a_trajectory_samples_its_own_derivatives():
         assert np.allclose(single.quaternion, now.quaternion[k])
 
 
-def test_before_and_after_its_time_a_trajectory_rests_at_its_ends():
+def test_outside_its_time_a_trajectory_rests_at_its_ends():
     target = lemniscate.target(3.0)
     for time, end in ((0.0, 0), (1e4, -1)):
         sample = target.at(time)

@@ -120,7 +120,7 @@ def module(tmp_path, monkeypatch):
     return name
 
 
-def test_every_shipped_controller_is_built_and_keeps_the_contract():
+def test_every_shipped_controller_is_built_and_satisfies_the_protocol():
     for name in registry.names():
         if name in registry.SHIPPED:
             entry = registry.find(name)
@@ -172,7 +172,7 @@ def test_parameters_options_and_attributes_of_a_class_are_used(module, tmp_path)
     ('{}_absent:My', "no module '.*_absent'"),
     ('{}_absent.py:My', 'no such file'),
     ('absent.{}:My', "no module 'absent'")])
-def test_what_is_wrong_with_a_class_is_said_in_one_line(module, spec, message):
+def test_an_unusable_class_is_refused_in_one_line(module, spec, message):
     with pytest.raises(ParameterError, match=message) as caught:
         registry.make(spec.format(module), ROBOT)
     assert '\n' not in str(caught.value)
@@ -181,13 +181,13 @@ def test_what_is_wrong_with_a_class_is_said_in_one_line(module, spec, message):
 @pytest.mark.parametrize('text, message', [
     ('import none_such\n', "needs the module 'none_such'"), ('1 +\n', 'raised SyntaxError'),
     ('raise ValueError("bad")\n', r'raised ValueError: bad \(broken.py, line 1\)')])
-def test_a_module_that_cannot_be_imported_says_why(tmp_path, text, message):
+def test_a_module_that_cannot_be_imported_is_refused_with_the_cause(tmp_path, text, message):
     (tmp_path / 'broken.py').write_text(text)
     with pytest.raises(ParameterError, match=message):
         registry.find(f'{tmp_path}/broken.py:My')
 
 
-def test_the_reach_of_any_controller_is_known_and_is_endless_where_it_does_not_say(
+def test_the_reach_of_a_controller_is_infinite_unless_declared(
         module, tmp_path):
     assert registry.find(f'{module}:Near').reach(ROBOT) == 3.0
     assert registry.find(f'{module}:MyController').reach(ROBOT) == np.inf
@@ -199,13 +199,13 @@ def test_the_reach_of_any_controller_is_known_and_is_endless_where_it_does_not_s
     assert registry.find('rl').reach(ROBOT) == registry.make('rl', ROBOT).reach
 
 
-def test_a_file_of_parameters_for_a_controller_without_is_refused(module, tmp_path):
+def test_a_parameter_file_for_a_controller_without_parameters_is_refused(module, tmp_path):
     with pytest.raises(ParameterError, match='reads no parameter file'):
         registry.make(f'{module}:MyController', ROBOT,
                       ControllerOptions(parameters=tmp_path / 'tuned.yaml'))
 
 
-def test_two_of_one_name_do_not_fly_together(module, tmp_path):
+def test_two_controllers_of_the_same_name_are_refused(module, tmp_path):
     with pytest.raises(ParameterError, match='both are called my_controller'):
         registry.find_all(['nmpc', f'{module}:MyController', f'{module}.py:MyController'])
 
@@ -223,7 +223,7 @@ def test_a_class_that_inherits_from_the_protocol_needs_no_constructor():
     assert isinstance(entry_of(Plain, 'x:Plain').make(ROBOT), Plain)
 
 
-def test_what_step_gives_is_checked():
+def test_the_return_value_of_step_is_checked():
     good = Command(0.0, np.zeros(4), np.ones(4))
     assert checked('x', good) is good
     for wrong, message in ((None, 'returned NoneType'), ((0, 1), 'returned tuple'),
@@ -233,7 +233,7 @@ def test_what_step_gives_is_checked():
             checked('x', wrong)
 
 
-def test_entry_points_of_other_packages_are_names(module, monkeypatch):
+def test_entry_points_of_other_packages_are_registered(module, monkeypatch):
     points = [metadata.EntryPoint('theirs', f'{module}:MyController', registry.GROUP),
               metadata.EntryPoint('nmpc', f'{module}:MyController', registry.GROUP)]
     monkeypatch.setattr(metadata, 'entry_points', lambda group: points)
@@ -245,7 +245,7 @@ def test_entry_points_of_other_packages_are_names(module, monkeypatch):
     assert registry.find('nmpc') is registry.SHIPPED['nmpc']    # stays the package's own
 
 
-def test_an_installed_package_brings_its_controllers(module, tmp_path):
+def test_controllers_of_an_installed_package_are_registered(module, tmp_path):
     info = tmp_path / 'theirs-0.1.dist-info'
     info.mkdir()
     (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: theirs\nVersion: 0.1\n')
@@ -258,21 +258,21 @@ def test_an_installed_package_brings_its_controllers(module, tmp_path):
     assert done.stdout == "['broken', 'theirs'] Holds still.\n", done.stderr
 
 
-def test_the_shipped_ones_are_entry_points_as_well():
+def test_the_shipped_controllers_are_entry_points():
     text = (ROOT / PACKAGE / 'control' / 'shipped.py').read_text()
     names = re.findall(r'^(\w+) = ControllerEntry\(', text, re.MULTILINE)   # as setup.py reads
     assert names == list(registry.SHIPPED)
     assert all(entry.name == name for name, entry in registry.SHIPPED.items())
 
 
-def test_names_of_nodes_and_controllers_do_not_meet():
+def test_names_of_nodes_and_controllers_do_not_collide():
     nodes = {node.removesuffix('_node') for node in NODES}
     assert nodes - set(registry.SHIPPED) <= set(RESERVED)
     with pytest.raises(ParameterError, match='not usable as a name'):
         ControllerEntry(name='My Controller', controller=object)
 
 
-def test_the_pilot_is_the_first_of_those_there_that_flies_with_actuators_missing():
+def test_the_fallback_is_the_first_controller_that_flies_with_lost_actuators():
     assert registry.pilot() == 'nmpc'
     assert registry.pilot(['rl', 'hover']) == 'hover'
     assert registry.pilot(['rl']) == ''
@@ -295,7 +295,7 @@ def names_together(path):
             yield f'{path.relative_to(ROOT)}:{node.lineno}: {sorted(together)}'
 
 
-def test_no_other_list_of_controllers_is_left():
+def test_the_registry_is_the_only_list_of_controllers():
     files = [*(ROOT / PACKAGE).rglob('*.py'), *(ROOT / 'launch').glob('*.py')]
     found = [line for path in files for line in names_together(path)]
     assert not found

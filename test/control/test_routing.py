@@ -51,8 +51,8 @@ def hovering(attitude):
 
 @settings(max_examples=60, deadline=None)
 @given(quaternions, quaternions, st.integers(0, 4))
-def test_a_way_round_winds_less_and_is_taken_where_the_shortest_turn_winds_too_far(start, end,
-                                                                                 wound):
+def test_a_detour_is_taken_where_the_shortest_rotation_exceeds_the_travel(start, end,
+                                                                        wound):
     tilt = hovering(start)
     if wound < 4:      # a joint and the opposite one, where a whole turn fits into the travel
         for joint in (wound, (wound + 2) % 4):
@@ -94,7 +94,7 @@ def state(stamp=0.0, quaternion=START, tilt=TILT):
     return State(stamp, PLACE, np.zeros(3), quaternion, np.zeros(3), tilt, np.zeros(4), stamp)
 
 
-def test_wound_joints_come_back_within_their_travel_on_the_way_that_is_shown():
+def test_wound_joints_return_within_their_travel_on_the_chosen_route():
     given = target(END)
     shown = Routing(P, AXES).target(state(), given)
     assert shown is not given and shown.position is given.position
@@ -102,7 +102,7 @@ def test_wound_joints_come_back_within_their_travel_on_the_way_that_is_shown():
     assert winding([START, shown.quaternion, END], TILT)[0] < 3.9
 
 
-def test_the_target_is_shown_once_the_attitude_in_between_is_near():
+def test_the_target_is_passed_on_near_the_intermediate_attitude():
     routing, given = Routing(P, AXES), target(END)
     between = routing.target(state(), given).quaternion
     for off, passed in ((P.near + 0.05, False), (P.near - 0.05, True)):
@@ -112,13 +112,13 @@ def test_the_target_is_shown_once_the_attitude_in_between_is_near():
     assert routing.routed == 1
 
 
-def test_who_does_not_get_there_in_time_sees_the_target():
+def test_the_target_is_passed_on_after_the_time_limit():
     routing, given = Routing(P, AXES), target(END)
     shown = [routing.target(state(0.01 * k), given) is given for k in range(300)]
     assert shown.index(True) == round(P.duration * 100) and all(shown[shown.index(True):])
 
 
-def test_a_way_is_looked_for_once_for_an_attitude_and_again_after_a_reset():
+def test_a_route_is_searched_once_for_each_attitude_and_again_after_reset():
     routing = Routing(P, AXES)
     assert routing.target(state(), target(END)).quaternion is not END
     routing.target(state(5.0), target(END))
@@ -135,18 +135,18 @@ def test_a_way_is_looked_for_once_for_an_attitude_and_again_after_a_reset():
 
 @pytest.mark.parametrize('changed', [{'quaternion': np.full(4, np.nan)},
                                      {'tilt': np.array([np.nan, 0.0, 0.0, 0.0])}], ids=str)
-def test_a_state_that_is_not_finite_begins_no_way_and_the_next_does(changed):
+def test_a_route_begins_at_the_first_finite_state(changed):
     routing, given = Routing(P, AXES), target(END)
     assert routing.target(state(**changed), given) is given
     assert routing.target(state(0.01), given) is not given
 
 
-def test_without_a_limit_nothing_is_shown_but_the_target():
+def test_without_a_limit_targets_pass_unchanged():
     given = target(END)
     assert Routing(replace(P, tilt=100.0), AXES).target(state(), given) is given
 
 
-def test_the_attitudes_are_spread_over_all_rotations():
+def test_the_attitude_samples_cover_all_rotations():
     attitudes = spread_attitudes(150)
     assert np.linalg.norm(attitudes, axis=1) == pytest.approx(np.ones(150))
     others = Rotation.random(2000, random_state=0).as_quat()

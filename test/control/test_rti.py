@@ -93,7 +93,7 @@ def test_the_first_command_is_that_of_an_independent_qp_solver(problem):
 
 
 @needs_compiler
-def test_compiled_and_interpreted_iterations_are_the_same(problem):
+def test_compiled_and_interpreted_iterations_agree(problem):
     x0, references, disturbance, bounds = setting()
     both = [CompiledRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES),
             InterpretedRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)]
@@ -112,7 +112,7 @@ def test_compiled_and_interpreted_iterations_are_the_same(problem):
 
 
 @needs_compiler
-def test_a_compiled_solver_is_built_once_and_found_again(problem, tmp_path, monkeypatch):
+def test_a_compiled_solver_is_built_once_and_cached(problem, tmp_path, monkeypatch):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     quick = tuple('-O0' if flag == '-O2' else flag for flag in native.FLAGS)
     monkeypatch.setattr(native, 'FLAGS', quick)
@@ -124,7 +124,7 @@ def test_a_compiled_solver_is_built_once_and_found_again(problem, tmp_path, monk
     assert len(list(native.cache_folder().iterdir())) == 2
 
 
-def test_an_unsolved_qp_leaves_the_plan_as_it_was(problem):
+def test_an_unsolved_qp_leaves_the_plan_unchanged(problem):
     x0, references, disturbance, bounds = setting()
     rti = InterpretedRti(problem, INTERVALS, SOFT, 1e-6, 50, REACHES)
     rti.fill(x0, np.r_[np.zeros(4), x0[17:]])

@@ -37,7 +37,7 @@ def wait(trimming, seconds, begin=0.0, target=TARGET, **where):
 
 @settings(max_examples=20, deadline=None)
 @given(SMALL, SMALL)
-def test_a_robot_that_flies_where_it_is_shown_and_a_little_beside_ends_at_its_target(way, turn):
+def test_a_constant_tracking_error_is_trimmed_to_zero(way, turn):
     """Its answer is quick against the integral: it follows with 0.3 s."""
     trimming = Trimming(P)
     position, lag = np.zeros(3), np.zeros(3)
@@ -58,14 +58,14 @@ def test_a_robot_that_flies_where_it_is_shown_and_a_little_beside_ends_at_its_ta
     {'turn': (0.01, 0, 0), 'angular_velocity': np.array([0, 0, 1.0])},
     {'position': np.full(3, np.nan)}, {'quaternion': np.full(4, np.nan)},
     {'velocity': np.full(3, np.inf)}, {'angular_velocity': np.full(3, np.nan)}])
-def test_who_is_on_the_way_or_no_number_teaches_nothing(where):
+def test_the_trim_does_not_change_in_motion_or_for_nan_states(where):
     trimming = Trimming(P)
     shown = wait(trimming, 2.0, **where)
     assert shown.position == pytest.approx(TARGET.position)
     assert shown.quaternion == pytest.approx(TARGET.quaternion)
 
 
-def test_an_error_that_never_ends_moves_the_target_by_no_more_than_is_allowed():
+def test_the_trim_is_limited():
     trimming = Trimming(P)
     shown = wait(trimming, 20.0, way=(0.05, -0.05, 0.02), turn=(0.1, 0.1, 0.0))
     assert np.linalg.norm(shown.position - TARGET.position) == pytest.approx(P.distance)
@@ -73,7 +73,7 @@ def test_an_error_that_never_ends_moves_the_target_by_no_more_than_is_allowed():
         == pytest.approx(P.angle, abs=1e-3)
 
 
-def test_what_was_found_holds_for_the_same_target_again_and_nearby_but_not_elsewhere():
+def test_the_trim_is_kept_for_equal_and_nearby_targets_only():
     trimming = Trimming(P)
     wait(trimming, 3.0, way=(0.02, 0, 0))
     found = list(trimming.position)
@@ -86,14 +86,14 @@ def test_what_was_found_holds_for_the_same_target_again_and_nearby_but_not_elsew
     assert trimming.target(state(9.0, target=far), far).position == pytest.approx(far.position)
 
 
-def test_nothing_is_learnt_over_a_pause_in_which_nobody_looked():
+def test_the_trim_does_not_change_over_a_pause():
     trimming = Trimming(P)
     for stamp in (0.0, 5.0, 10.0, 9.0, 9.0):
         shown = trimming.target(state(stamp, way=(0.05, 0, 0)), TARGET)
     assert shown.position == pytest.approx(TARGET.position)
 
 
-def test_a_rate_of_zero_leaves_targets_as_they_are():
+def test_a_rate_of_zero_leaves_targets_unchanged():
     shown = wait(Trimming(replace(P, rate=0.0)), 3.0, way=(0.02, 0, 0), turn=(0, 0.02, 0))
     assert shown.position == pytest.approx(TARGET.position)
     assert shown.quaternion == pytest.approx(TARGET.quaternion)
@@ -116,12 +116,12 @@ def hovering(mass_scale, **changed):
     return np.linalg.norm(plant.position - goal.position)
 
 
-def test_a_policy_carries_more_than_it_knows_without_sagging(tmp_path):
+def test_a_policy_carries_unknown_payload_without_a_steady_height_error(tmp_path):
     assert hovering(1.015, folder=tmp_path, rate=0.0) > 0.03
     assert hovering(1.015, folder=tmp_path) < 0.003
 
 
-def test_a_policy_in_waiting_learns_nothing_of_the_error_of_another(tmp_path):
+def test_a_policy_on_standby_does_not_trim_the_error_of_another_controller(tmp_path):
     """Where its own command is not the one in force, the error is none of its own."""
     controller, targets = PolicyController(ROBOT), []
     others = Command(0.0, np.zeros(4), np.full(4, ROBOT.hover_thrust))

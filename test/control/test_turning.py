@@ -29,7 +29,7 @@ def pose(height=1.5, quaternion=LEVEL, place=(0.3, -0.4)):
 
 
 @given(st.floats(0.2, 2.5), st.floats(0.0, 3.1), st.floats(-3, 3))
-def test_only_a_low_target_far_to_turn_to_is_shown_higher(height, angle, yaw):
+def test_only_low_targets_with_a_large_rotation_are_raised(height, angle, yaw):
     target = pose(height, rotations.from_rpy(0.0, 0.0, yaw))
     away = rotations.multiply(target.quaternion, rotations.exp(np.array([angle, 0.0, 0.0])))
     shown = Turning(P).target(state(away), target)
@@ -41,7 +41,7 @@ def test_only_a_low_target_far_to_turn_to_is_shown_higher(height, angle, yaw):
 
 
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(1.0, 4.0), st.floats(0.0, 3.1))
-def test_upside_down_a_target_far_to_turn_to_is_shown_no_farther_than_stated(x, y, z, angle):
+def test_the_distance_of_an_inverted_target_is_limited_during_a_large_rotation(x, y, z, angle):
     target, now = pose(z, place=(x, y)), state(rotations.from_rpy(angle, 0.0, 0.0), 1.0)
     shown, way = Turning(P).target(now, target), target.position - now.position
     if angle < np.pi / 2 - 1e-6 or np.linalg.norm(way) <= P.distance:
@@ -52,7 +52,7 @@ def test_upside_down_a_target_far_to_turn_to_is_shown_no_farther_than_stated(x, 
         assert np.cross(step, way) == pytest.approx(np.zeros(3), abs=1e-9) and step @ way > 0
 
 
-def test_upside_down_with_little_left_to_turn_a_far_target_is_shown_where_it_is():
+def test_an_inverted_far_target_passes_unchanged_once_the_rotation_is_small():
     turned = rotations.from_rpy(3.0, 0.0, 0.0)
     target = pose(1.5, rotations.from_rpy(2.5, 0.0, 0.0), place=(4.0, 0.0))
     assert Turning(P).target(state(turned), target) is target
@@ -68,8 +68,8 @@ def test_upside_down_with_little_left_to_turn_a_far_target_is_shown_where_it_is(
     (FAR, 1.35, 0.5, 2.0, True),
     (NEAR, 1.15, 0.5, 1.3, False),       # hardly anything to turn
 ], ids=str)
-def test_who_is_about_to_sink_below_start_and_target_is_shown_one_above(attitude, height, sinking,
-                                                                        begin, caught):
+def test_a_predicted_descent_below_start_and_target_raises_the_target(attitude, height, sinking,
+                                                                      begin, caught):
     turning, target = Turning(P), pose(1.5)
     turning.target(state(attitude, begin), target)
     shown = turning.target(state(attitude, height, sinking), target)
@@ -80,7 +80,7 @@ def test_who_is_about_to_sink_below_start_and_target_is_shown_one_above(attitude
     assert off.target(state(attitude, height, sinking), target) is target
 
 
-def test_a_new_target_begins_where_the_robot_is_and_the_same_one_again_does_not():
+def test_a_new_target_restarts_at_the_robot_and_a_repeated_one_does_not():
     turning = Turning(P)
     turning.target(state(FAR, 1.3), pose(1.5))
     assert turning.target(state(FAR, 1.1), pose(1.5)).position[2] > 1.5
@@ -89,7 +89,7 @@ def test_a_new_target_begins_where_the_robot_is_and_the_same_one_again_does_not(
     assert turning.target(state(FAR, 0.7), pose(1.5)).position[2] == 1.5
 
 
-def test_an_attitude_on_the_way_is_shown_at_the_same_places():
+def test_intermediate_attitudes_are_raised_in_the_same_way():
     turning, target = Turning(P), pose(0.4, LEVEL)
     between = replace(target, quaternion=NEAR)
     shown = turning.target(state(NEAR), target, between)
@@ -98,7 +98,7 @@ def test_an_attitude_on_the_way_is_shown_at_the_same_places():
 
 
 @pytest.mark.parametrize('broken', ['quaternion', 'height'])
-def test_a_state_that_is_not_finite_sees_the_target(broken):
+def test_for_a_state_that_is_not_finite_the_target_passes_unchanged(broken):
     target, turning = pose(0.4), Turning(P)
     bad = state(np.full(4, np.nan)) if broken == 'quaternion' else state(LEVEL, np.nan)
     assert turning.target(bad, target) is target

@@ -45,7 +45,7 @@ quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(
 
 @settings(max_examples=100, deadline=None)
 @given(quaternions)
-def test_the_level_attitude_is_level_and_the_nearest_one(quaternion):
+def test_the_level_attitude_is_the_nearest_one(quaternion):
     level = levelled(quaternion)
     assert rotations.matrix(level)[2] == pytest.approx([0, 0, 1], abs=1e-7)
     way = rotations.geodesic_angle(level, quaternion)
@@ -64,7 +64,7 @@ def uses(start, end):
 
 @settings(max_examples=30, deadline=None)
 @given(quaternions, quaternions)
-def test_the_cost_of_a_turn_is_its_angle_weighted_with_what_its_arms_can_hold(start, end):
+def test_the_cost_of_a_rotation_is_its_angle_weighted_by_arm_capacity(start, end):
     angle = rotations.geodesic_angle(start, end)
     weighted = angle * np.mean(np.maximum(uses(start, end), 0.2) ** -2)
     cost = turning_cost(Rotation.from_quat(start), Rotation.from_quat(end), AXES)
@@ -74,7 +74,7 @@ def test_the_cost_of_a_turn_is_its_angle_weighted_with_what_its_arms_can_hold(st
 
 @settings(max_examples=50, deadline=None)
 @given(st.floats(0.05, 0.5), st.floats(-np.pi, np.pi), st.floats(-np.pi, np.pi))
-def test_the_way_to_an_upside_down_attitude_stands_no_arm_upright(off, direction, yaw):
+def test_the_route_to_an_inverted_attitude_has_no_vertical_arm(off, direction, yaw):
     target = rotations.multiply(rotations.from_rpy(0, 0, yaw), rotations.from_rpy(2.98, 0.02, 0))
     start = rotations.multiply(
         target, rotations.exp(off * np.array([np.cos(direction), np.sin(direction), 0.0])))
@@ -91,7 +91,7 @@ def upward(attitude, tilts):
 
 @settings(max_examples=50, deadline=None)
 @given(quaternions, st.floats(-np.pi, np.pi))
-def test_at_the_end_of_a_turn_each_thrust_points_upward_as_far_as_its_arm_lets_it(end, yaw):
+def test_after_a_rotation_each_thrust_points_upward_as_far_as_its_arm_permits(end, yaw):
     tilts = tilts_at_end(Rotation.from_euler('z', yaw), Rotation.from_quat(end), AXES)[0]
     across = [np.linalg.norm(np.cross(rotations.matrix(end) @ axis, [0, 0, 1])) for axis in AXES]
     assert upward(end, tilts) == pytest.approx(across, abs=1e-6)
@@ -99,7 +99,7 @@ def test_at_the_end_of_a_turn_each_thrust_points_upward_as_far_as_its_arm_lets_i
 
 @settings(max_examples=20, deadline=None)
 @given(quaternions, st.floats(-np.pi, np.pi))
-def test_the_tilts_at_the_end_of_a_turn_are_those_that_a_slow_turn_ends_with(end, yaw):
+def test_predicted_final_tilts_equal_those_of_a_slow_rotation(end, yaw):
     start = rotations.from_rpy(0.0, 0.0, yaw)
     turn = rotations.log(rotations.multiply(rotations.conjugate(start), end))
     assume(np.linalg.norm(turn) < 3.1 and min(uses(start, end)) > 0.4)  # else there are two ways
@@ -113,7 +113,7 @@ def test_the_tilts_at_the_end_of_a_turn_are_those_that_a_slow_turn_ends_with(end
 
 @settings(max_examples=50, deadline=None)
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-np.pi, np.pi))
-def test_joints_wound_in_a_way_that_failed_are_wound_in_another(roll, pitch, yaw):
+def test_after_a_failed_attempt_another_winding_is_chosen(roll, pitch, yaw):
     target = rotations.multiply(rotations.from_rpy(np.pi, 0, yaw),
                                 rotations.from_rpy(roll, pitch, 0))
     failed = []
@@ -124,7 +124,7 @@ def test_joints_wound_in_a_way_that_failed_are_wound_in_another(roll, pitch, yaw
         failed.append(tilts)
 
 
-def test_where_every_way_winds_the_joints_alike_the_best_is_taken_again():
+def test_if_all_routes_wind_alike_the_best_is_repeated():
     target, other = rotations.from_rpy(0.4, 0.2, 1.0), rotations.from_rpy(0.2, 0.4, 1.0)
     best = level_between(other, target, AXES)
     assert level_between(other, target, AXES, [np.zeros(4)]) == pytest.approx(best)
@@ -137,7 +137,7 @@ def test_a_level_hover_needs_all_joints_at_zero_however_they_were_wound(tilt):
     assert 2 * np.pi - 0.05 > ROBOT.joints.position_limit
 
 
-def test_a_robot_stuck_at_a_stop_is_shown_level_above_the_same_place_after_its_patience():
+def test_a_robot_stuck_at_a_joint_stop_gets_a_level_target_above_its_place_after_the_timeout():
     unwinding = Unwinding(PARAMETERS, AXES)
     shown = fly(unwinding, 1.0)
     first = next(k for k, t in enumerate(shown) if t is not TARGET)
@@ -151,12 +151,12 @@ def test_a_robot_stuck_at_a_stop_is_shown_level_above_the_same_place_after_its_p
 @pytest.mark.parametrize('changed', [
     {'tilt': np.array([1.5, 2.3, -1.5, -2.3])}, {'quaternion': TARGET.quaternion},
     {'tilt': np.full(4, np.nan)}, {'quaternion': np.full(4, np.nan)}])
-def test_who_is_not_stuck_sees_the_target(changed):
+def test_without_a_stuck_joint_the_target_passes_unchanged(changed):
     assert all(t is TARGET for t in fly(Unwinding(PARAMETERS, AXES), 3.0, **changed))
 
 
 @pytest.mark.parametrize('rate, goes_through_level', [(1.0, False), (0.05, True)])
-def test_who_gets_nearer_sees_the_target(rate, goes_through_level):
+def test_while_the_error_falls_the_target_passes_unchanged(rate, goes_through_level):
     unwinding = Unwinding(PARAMETERS, AXES)
     shown = []
     for k in range(200):
@@ -167,7 +167,7 @@ def test_who_gets_nearer_sees_the_target(rate, goes_through_level):
 
 
 @pytest.mark.parametrize('seconds_to_half, goes_through_level', [(1.3, True), (0.5, False)])
-def test_who_creeps_nearer_has_missed(seconds_to_half, goes_through_level):
+def test_an_error_that_falls_too_slowly_counts_as_missed(seconds_to_half, goes_through_level):
     unwinding = Unwinding(PARAMETERS, AXES)
     shown = []
     for k in range(150):
@@ -179,8 +179,8 @@ def test_who_creeps_nearer_has_missed(seconds_to_half, goes_through_level):
 
 @pytest.mark.parametrize('low, high, goes_through_level', [
     (0.8, 1.4, True), (0.3, 0.95, False), (0.4, 1.4, False)])
-def test_who_swings_about_the_limit_has_missed_and_who_comes_near_has_not(low, high,
-                                                                         goes_through_level):
+def test_oscillation_about_the_limit_counts_as_missed_and_arrival_does_not(low, high,
+                                                                          goes_through_level):
     unwinding = Unwinding(PARAMETERS, AXES)
     shown = []
     for k in range(300):
@@ -191,13 +191,13 @@ def test_who_swings_about_the_limit_has_missed_and_who_comes_near_has_not(low, h
     assert any(t is not TARGET for t in shown) == goes_through_level
 
 
-def test_a_position_out_of_reach_counts_as_an_attitude_does():
+def test_a_position_error_counts_as_an_attitude_error_does():
     shown = fly(Unwinding(PARAMETERS, AXES), 1.0, quaternion=TARGET.quaternion,
                 position=TARGET.position + [0.0, 0.1, 0.0])
     assert shown[-1] is not TARGET
 
 
-def test_a_place_that_is_high_enough_stays():
+def test_a_position_that_is_high_enough_is_kept():
     target = PoseTarget(np.array([0.5, 0.0, 1.7]), TARGET.quaternion)
     shown = fly(Unwinding(PARAMETERS, AXES), 1.0, target=target, position=target.position)
     assert shown[-1] is not target and np.array_equal(shown[-1].position, target.position)
@@ -222,7 +222,7 @@ def missed(target, seconds=1.0):
                           quaternion=off)[-1]
 
 
-def test_a_long_turn_back_is_flown_by_its_half_so_that_the_side_is_the_one_that_was_chosen():
+def test_a_long_return_rotation_passes_an_attitude_halfway():
     unwinding, level = missed(UPSIDE_DOWN)
     there = {'target': UPSIDE_DOWN, 'position': UPSIDE_DOWN.position, 'tilt': np.full(4, 0.5)}
     half = fly(unwinding, 0.1, 1.0, quaternion=level.quaternion, **there)[-1]
@@ -234,7 +234,7 @@ def test_a_long_turn_back_is_flown_by_its_half_so_that_the_side_is_the_one_that_
     assert fly(unwinding, 0.1, 1.2, quaternion=near, **there)[-1] is UPSIDE_DOWN
 
 
-def test_who_never_gets_half_way_gets_the_target_back():
+def test_the_target_returns_if_the_halfway_attitude_is_not_reached():
     unwinding, level = missed(UPSIDE_DOWN)
     shown = fly(unwinding, 3.0, 1.0, UPSIDE_DOWN, position=UPSIDE_DOWN.position,
                 quaternion=level.quaternion, tilt=np.full(4, 0.5))
@@ -243,7 +243,7 @@ def test_who_never_gets_half_way_gets_the_target_back():
     assert shown[-1] is UPSIDE_DOWN
 
 
-def test_who_stays_stuck_gets_the_target_back_and_no_more_attempts_than_allowed():
+def test_the_number_of_attempts_is_limited_and_the_target_returns():
     unwinding = Unwinding(PARAMETERS, AXES)
     shown = fly(unwinding, 30.0)
     away = sum(t is not TARGET for t in shown) * 0.01
@@ -252,7 +252,7 @@ def test_who_stays_stuck_gets_the_target_back_and_no_more_attempts_than_allowed(
     assert shown[-1] is TARGET
 
 
-def test_a_new_target_is_followed_at_once_and_may_be_tried_again():
+def test_a_new_target_is_followed_at_once_and_resets_the_attempts():
     unwinding = Unwinding(PARAMETERS, AXES)
     fly(unwinding, 30.0)
     other = PoseTarget(TARGET.position + [0, 0, 0.2], TARGET.quaternion, 30.0)
@@ -263,12 +263,12 @@ def test_a_new_target_is_followed_at_once_and_may_be_tried_again():
     assert fly(unwinding, 0.1, 1.0, other)[0] is other
 
 
-def test_the_same_pose_issued_again_does_not_begin_anew():
+def test_a_repeated_pose_does_not_reset_the_attempts():
     unwinding = Unwinding(PARAMETERS, AXES)
     shown = [unwinding.target(stuck(0.01 * k), PoseTarget(
         TARGET.position.copy(), TARGET.quaternion.copy(), 0.01 * k)) for k in range(100)]
     assert rotations.matrix(shown[-1].quaternion)[2, 2] == pytest.approx(1.0)
 
 
-def test_without_attempts_nothing_is_shown_but_the_target():
+def test_without_attempts_targets_pass_unchanged():
     assert all(t is TARGET for t in fly(Unwinding(UnwindingParameters(attempts=0), AXES), 5.0))

@@ -64,19 +64,19 @@ def totals():
     return mass, first / mass, inertia
 
 
-def test_totals_are_those_of_the_robot_file():
+def test_totals_equal_those_of_the_robot_file():
     mass, centre, inertia = totals()
     assert mass == pytest.approx(ROBOT.mass, rel=1e-8)
     np.testing.assert_allclose(centre, 0, atol=1e-9)
     np.testing.assert_allclose(inertia, np.diag(ROBOT.inertia), atol=1e-9)
 
 
-def test_links_are_all_there():
+def test_all_links_exist():
     assert set(LINKS) == {'base_link', 'main_body', 'end_effector', 'imu',
                           *(f'module{k}' for k in range(1, 5)), *ROTOR_NAMES}
 
 
-def test_rotors_sit_and_point_where_the_robot_file_says():
+def test_rotor_positions_and_axes_agree_with_the_robot_file():
     placed = poses()
     for k, name in enumerate(ROTOR_NAMES):
         rotation, position = placed[name]
@@ -99,7 +99,7 @@ def test_gimbals_turn_about_their_arms_within_their_limits():
         assert float(limit.get('effort')) == ROBOT.joints.effort_limit
 
 
-def test_file_is_what_the_generator_writes():
+def test_the_file_equals_the_output_of_the_generator():
     script = Path(__file__).parents[2] / 'description' / 'generate_urdf.py'
     if not script.is_file():
         pytest.skip('no source checkout')
@@ -113,7 +113,7 @@ def test_file_is_what_the_generator_writes():
                                [float(x) for x in number.findall(written)], rtol=1e-6, atol=1e-9)
 
 
-def test_mujoco_reads_it():
+def test_mujoco_reads_the_description():
     mujoco = pytest.importorskip('mujoco')
     assert mujoco.MjModel.from_xml_path(str(URDF)).njnt == 4
 
@@ -131,7 +131,7 @@ def test_every_mesh_is_shipped_closed_and_faces_outwards():
         assert np.abs(mesh.bounds).max() < 0.5, name
 
 
-def test_meshes_are_what_the_generator_makes():
+def test_meshes_equal_the_output_of_the_generator():
     trimesh = pytest.importorskip('trimesh')
     script = Path(__file__).parents[2] / 'description' / 'generate_meshes.py'
     if not script.is_file():
@@ -145,7 +145,7 @@ def test_meshes_are_what_the_generator_makes():
         assert kept.volume == pytest.approx(made.volume, rel=1e-4), name
 
 
-def test_feet_and_propellers_touch_where_those_of_the_simulated_plant_do():
+def test_feet_and_propellers_have_the_contact_geometry_of_the_plant():
     trimesh = pytest.importorskip('trimesh')
     plant = SimulatorParameters.load().plant
     placed = poses()

@@ -48,7 +48,7 @@ def walk(kind, fields):
     assert kind in ('float32', 'float64', 'string', 'uint8'), kind
 
 
-def test_each_path_of_the_foxglove_layout_leads_to_a_value():
+def test_each_path_of_the_foxglove_layout_has_a_value():
     layout = json.loads((VIEWERS / 'foxglove.json').read_text())
     panels = layout['configById']
     paths = [path['value'] for panel in panels.values() for path in panel.get('paths', ())]
@@ -78,7 +78,7 @@ def test_every_panel_of_the_foxglove_layout_is_placed_once():
     assert sorted(placed) == sorted(layout['configById'])
 
 
-def test_each_curve_of_the_plotjuggler_layout_leads_to_a_value():
+def test_each_curve_of_the_plotjuggler_layout_has_a_value():
     curves = [curve.get('name') for curve in
               ElementTree.parse(VIEWERS / 'plotjuggler.xml').getroot().iter('curve')]
     assert len(curves) > 30
@@ -181,7 +181,7 @@ FOXGLOVE_GRID = {'color', 'divisions', 'frameId', 'frameLocked', 'instanceId', '
 FOLLOW = {'follow-pose', 'follow-position', 'follow-none'}
 
 
-def test_rviz_knows_every_class_and_property():
+def test_rviz_supports_every_class_and_property():
     content = yaml.safe_load((VIEWERS / 'beetle_omni.rviz').read_text())
     assert {panel['Class'] for panel in content['Panels']} <= {
         f'rviz_common/{name}' for name in ('Displays', 'Selection', 'Time', 'Tool Properties',
@@ -197,7 +197,7 @@ def test_rviz_knows_every_class_and_property():
     assert view['Class'] == 'rviz_default_plugins/Orbit' and view.keys() <= RVIZ_ORBIT
 
 
-def test_foxglove_knows_every_panel_and_how_it_follows():
+def test_foxglove_supports_every_panel_and_follow_mode():
     layout = json.loads((VIEWERS / 'foxglove.json').read_text())
     assert layout.keys() == {'configById', 'globalVariables', 'userNodes', 'playbackConfig',
                              'layout'}
@@ -240,7 +240,7 @@ def test_plotjuggler_finds_the_elements_of_its_layouts():
                    for curve in plot.findall('curve'))
 
 
-def test_a_bag_holds_the_frames_and_topics_of_all_layouts(tmp_path):
+def test_a_bag_contains_the_frames_and_topics_of_all_layouts(tmp_path):
     urdf = description(share_path(SHIPPED))
     with BagWriter(tmp_path / 'bag', description=urdf) as writer:
         fly(writer, make_task('waypoints'), duration=2.0)

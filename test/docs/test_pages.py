@@ -32,7 +32,7 @@ def read(page):
 
 
 @pytest.mark.parametrize('page', PAGES)
-def test_every_relative_link_leads_to_a_file_and_a_heading(page):
+def test_every_relative_link_has_an_existing_file_and_heading(page):
     assert not pages.broken_links(ROOT / page)
 
 
@@ -82,7 +82,7 @@ def test_the_start_page_links_every_tutorial_how_to_page_and_explanation():
     assert not missing
 
 
-def test_every_page_that_the_code_names_is_there():
+def test_every_page_named_in_the_code_exists():
     for path in [*(ROOT / 'beetle_omni_ros').rglob('*.py'), *(ROOT / 'params').glob('*.yaml'),
                  *(ROOT / 'benchmarks').rglob('*.py'), ROOT / 'Makefile', ROOT / 'package.xml',
                  ROOT / '.ci' / 'setup', *(ROOT / 'launch').glob('*.py')]:

@@ -17,7 +17,7 @@ def p():
     return DriveParameters.load()
 
 
-def test_each_axis_has_two_keys_that_cancel_out(p):
+def test_each_axis_has_two_opposite_keys(p):
     total = [np.zeros(3), np.zeros(3)]
     for key in keys.MOVES:
         for sum_, part in zip(total, keys.shift_of_key(key, p)):
@@ -29,7 +29,7 @@ def test_each_axis_has_two_keys_that_cancel_out(p):
     assert not set(keys.MOVES) & set(keys.WORDS)
 
 
-def test_a_full_stick_is_the_speed_and_the_dead_zone_nothing(p):
+def test_full_deflection_gives_the_speed_and_the_dead_zone_gives_zero(p):
     axes = np.zeros(8)
     for number, sign in zip(p.axes.astype(int), p.signs):
         axes[number] = sign
@@ -51,7 +51,7 @@ def test_axes_that_are_missing_or_not_finite_count_as_released(p):
     assert np.abs(way).max() == pytest.approx(0.1 * p.speed)
 
 
-def test_a_button_counts_once_when_it_goes_down(p):
+def test_a_button_counts_once_when_pressed(p):
     down = [0] * 11
     down[p.buttons['arm']] = 1
     assert keys.pressed((), down, p) == ['arm'] and keys.pressed(down, down, p) == []
@@ -62,13 +62,13 @@ def test_a_button_counts_once_when_it_goes_down(p):
     ('up 0.3', [0, 0, 0.3], [0, 0, 0]), ('  DOWN 1 # slowly', [0, 0, -1], [0, 0, 0]),
     ('right 0.5', [0, -0.5, 0], [0, 0, 0]), ('roll 180', [0, 0, 0], [np.pi, 0, 0]),
     ('yaw -90', [0, 0, 0], [0, 0, -np.pi / 2])])
-def test_words_that_shift(p, line, way, turn):
+def test_commands_that_shift_the_target(p, line, way, turn):
     shift = parse(line, p.poses)
     assert isinstance(shift, Shift)
     assert shift.way == pytest.approx(way) and shift.turn == pytest.approx(turn)
 
 
-def test_words_that_go_and_order(p):
+def test_commands_that_go_to_poses_and_that_request_actions(p):
     over = parse('over', p.poses)
     assert isinstance(over, Go) and rotations.matrix(over.quaternion)[2, 2] == pytest.approx(-1)
     goto = parse('goto 1 0 1.5', p.poses)
@@ -86,7 +86,7 @@ def test_words_that_go_and_order(p):
     ('up 1 2', 'METRES'), ('roll 200', 'at most 180'), ('goto 1 2', 'X Y Z'), ('goto', 'X Y Z'),
     ('jump 3', "'jump': expected"), ('jump', 'or a pose of home'), ('home 3', 'nothing after'),
     ('controller', 'NAME'), ('wait -1', 'SECONDS'), ('land now', 'nothing after')])
-def test_what_is_no_word_is_refused_with_what_was_expected(p, line, said):
+def test_an_unknown_command_is_refused_with_the_expected_ones(p, line, said):
     with pytest.raises(WordError) as raised:
         parse(line, p.poses)
     assert said in str(raised.value) and 'expected' in str(raised.value)
@@ -96,7 +96,7 @@ def test_what_is_no_word_is_refused_with_what_was_expected(p, line, said):
 @pytest.mark.parametrize(('text', 'said'), [
     ('shelf: [1, 2, 3]', "'shelf': expected six numbers"), ('a b: [0, 0, 1, 0, 0, 0]', "'a b'"),
     ('shelf: [0, 0, 1, 0, 0, .nan]', "'shelf'"), ('- 3', 'expected a mapping')])
-def test_a_file_of_poses_names_what_is_wrong(tmp_path, text, said):
+def test_an_unusable_pose_file_is_refused_with_the_cause(tmp_path, text, said):
     file = tmp_path / 'poses.yaml'
     file.write_text(text)
     with pytest.raises(ParameterError, match='poses.yaml') as raised:

@@ -23,7 +23,7 @@ def steering(p, why_not=lambda position, quaternion: ''):
     return Steering(p, why_not, START, LEVEL)
 
 
-def test_it_arrives_at_its_goal_never_faster_than_the_limits(p):
+def test_the_goal_is_reached_within_the_speed_limits(p):
     driven, steps = steering(p), 0
     assert driven.go([1.0, -2.0, 1.5], rotations.from_rpy(3.0, 0.2, -1.0)) == ''
     while not driven.arrived:
@@ -54,7 +54,7 @@ def test_a_goal_beyond_the_fence_or_in_the_floor_is_refused_and_the_old_one_stay
     assert driven.arrived
 
 
-def test_a_way_through_the_floor_ends_before_it(p):
+def test_a_path_through_the_floor_ends_above_it(p):
     driven = steering(p, TargetChecks(RobotParameters.load()).why_not_pose)
     driven.position = np.array([0.0, 0.0, 0.2])     # the feet are just above the floor
     driven.goal = driven.position, driven.quaternion
@@ -64,7 +64,7 @@ def test_a_way_through_the_floor_ends_before_it(p):
     assert rotations.geodesic_angle(driven.quaternion, LEVEL) < 1.5
 
 
-def test_it_waits_for_a_robot_that_stays_behind(p):
+def test_the_target_waits_for_a_robot_that_lags(p):
     driven = steering(p)
     driven.go([5.0, 0.0, 1.0], LEVEL)
     for _ in range(400):

@@ -12,7 +12,7 @@ DELAYS = strategies.floats(1e-5, 0.2)
 
 @given(strategies.floats(-1e4, 1e4), strategies.floats(-1e-4, 1e-4),
        strategies.lists(strategies.tuples(DELAYS, DELAYS), min_size=1, max_size=50))
-def test_the_truth_lies_within_the_bound(start, drift, delays):
+def test_the_true_offset_is_within_the_bound(start, drift, delays):
     """With unequal delays of 10 us to 0.2 s, and drift within its bound."""
     clock, now = ClockOffset(1e-4), 100.0
 
@@ -28,7 +28,7 @@ def test_the_truth_lies_within_the_bound(start, drift, delays):
         assert abs(clock.offset() - truth(now)) <= clock.uncertainty(now) + 1e-9
 
 
-def test_one_quick_answer_is_worth_more_than_many_slow_ones():
+def test_one_fast_answer_outweighs_many_slow_ones():
     clock = ClockOffset(1e-5)
     clock.add(0.0, 50.0005, 0.001)
     for k in range(1, 100):
@@ -37,7 +37,7 @@ def test_one_quick_answer_is_worth_more_than_many_slow_ones():
     assert clock.uncertainty(100) < 2e-3
 
 
-def test_a_restarted_clock_is_noticed_and_replaces_the_old_one():
+def test_a_restarted_clock_is_detected_and_the_offset_replaced():
     clock = ClockOffset(1e-4)
     assert not clock.add(10.0, 500.001, 10.002)
     assert clock.add(11.0, 0.001, 11.002)
@@ -45,7 +45,7 @@ def test_a_restarted_clock_is_noticed_and_replaces_the_old_one():
     assert clock.offset() == pytest.approx(-11, abs=1e-6)
 
 
-def test_nothing_is_known_before_the_first_answer():
+def test_the_offset_is_undefined_before_the_first_answer():
     clock = ClockOffset(1e-4)
     assert not clock.known
     assert math.isnan(clock.offset())

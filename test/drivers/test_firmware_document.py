@@ -12,13 +12,13 @@ from beetle_omni_ros.sim.emulated.board_parameters import EmulatedBoardParameter
 DOCUMENT = (Path(__file__).resolve().parents[2] / 'docs' / 'reference' / 'firmware.md').read_text()
 
 
-def test_the_packets_shown_are_the_packets_tested():
+def test_documented_packets_equal_the_tested_packets():
     blocks = re.findall(r'```\n((?:[0-9a-f]{2}\s+)+)```', DOCUMENT)
     shown = [bytes.fromhex(''.join(block.split())) for block in blocks]
     assert shown == [*reference.BY_HOST, *reference.BY_BOARD]
 
 
-def test_the_numbers_shown_are_the_numbers_emulated():
+def test_documented_numbers_equal_the_emulated_numbers():
     rows = re.findall(r'^\| `(\w+)` \| ([\d.]+) (?:s|V|Hz) \|', DOCUMENT, re.MULTILINE)
     assert len(rows) == 14
     parameters = EmulatedBoardParameters.load()
@@ -27,12 +27,12 @@ def test_the_numbers_shown_are_the_numbers_emulated():
 
 
 @pytest.mark.parametrize('number', mavlink.MESSAGES)
-def test_the_message_tables_are_right(number):
+def test_documented_message_tables_agree_with_the_dialect(number):
     seed, layout = mavlink.MESSAGES[number]
     name = reference.DEFINITIONS[number][0]
     assert re.search(rf'^\| {name} \| {number} \| {seed} \| {layout.size} \|', DOCUMENT,
                      re.MULTILINE), f'{name}: {number}, {seed}, {layout.size}'
 
 
-def test_the_version_shown_is_the_one_told():
+def test_the_documented_version_equals_the_transmitted_version():
     assert f'**Contract version {board_firmware.CONTRACT_VERSION}.**' in DOCUMENT

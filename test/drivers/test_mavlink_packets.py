@@ -23,7 +23,7 @@ FROM_HOST = {
 
 
 @pytest.mark.parametrize('name', FROM_HOST)
-def test_what_the_driver_packs_is_the_packet_written_by_hand(name):
+def test_driver_packets_equal_hand_written_bytes(name):
     expected, message = FROM_HOST[name]
     packer = common.MAVLink(None, 1, 191)
     packer.seq = expected[4]
@@ -40,7 +40,7 @@ def test_the_emulators_codec_reads_and_writes_the_same_bytes(frame):
 
 
 @pytest.mark.parametrize('frame', reference.BY_HOST + reference.BY_BOARD, ids=lambda f: f.hex())
-def test_pymavlinks_own_parser_takes_the_packets_written_by_hand(frame):
+def test_the_parser_of_pymavlink_accepts_the_hand_written_packets(frame):
     (message,) = common.MAVLink(None).parse_buffer(frame)
     assert message.get_type() == reference.DEFINITIONS[message.get_msgId()][0]
 
@@ -58,7 +58,7 @@ def test_esc_messages_have_the_published_seeds_and_sizes():
     assert (dialect.EscStatus.crc_extra, dialect.EscStatus.unpacker.size) == (10, 57)
 
 
-def test_esc_messages_packed_by_the_driver_come_back():
+def test_esc_messages_round_trip():
     status = dialect.EscStatus(0, 1000000, [6000, 6001, 6002, 0], [24, 24, 24, 0], [3, 3, 3, 3])
     packer = common.MAVLink(None, 1, 1)
     packer.seq = 10
@@ -72,7 +72,7 @@ def decoded(frame):
     return common.MAVLink(None).decode(bytearray(frame))
 
 
-def test_board_messages_mean_what_the_contract_says():
+def test_board_messages_agree_with_the_documented_protocol():
     status = messages.status_of(decoded(reference.BOARD_HEARTBEAT), 5.0)
     assert (status.state, status.armed, status.contract) == ('running', True, 1)
     assert (status.stop_reason, status.conditions) == ('none', ())

@@ -33,7 +33,7 @@ def pieces(data, cuts):
 
 @settings(max_examples=300, deadline=None)
 @given(NOISE, strategies.lists(strategies.integers(0, 10**6), max_size=5))
-def test_any_bytes_in_any_pieces_neither_crash_nor_pile_up(noise, cuts):
+def test_arbitrary_bytes_neither_raise_nor_accumulate(noise, cuts):
     for receiver in receivers():
         for piece in pieces(noise, cuts):
             receiver.feed(piece)
@@ -43,7 +43,7 @@ def test_any_bytes_in_any_pieces_neither_crash_nor_pile_up(noise, cuts):
 @settings(max_examples=300, deadline=None)
 @given(strategies.lists(FRAMES, min_size=1, max_size=6),
        strategies.lists(strategies.integers(0, 10**6), max_size=8))
-def test_cuts_between_reads_do_not_matter(frames, cuts):
+def test_frames_split_between_reads_are_found(frames, cuts):
     data = b''.join(frames)
     for receiver in receivers():
         found = [message for piece in pieces(data, cuts) for message in receiver.feed(piece)]
@@ -52,7 +52,7 @@ def test_cuts_between_reads_do_not_matter(frames, cuts):
 
 @settings(max_examples=300, deadline=None)
 @given(NOISE, strategies.lists(FRAMES, min_size=1, max_size=4))
-def test_good_frames_behind_noise_are_all_found(noise, frames):
+def test_good_frames_after_noise_are_found(noise, frames):
     """Once no corrupt header can still wait for the end of its frame."""
     for receiver in receivers():
         receiver.feed(noise)
@@ -61,7 +61,7 @@ def test_good_frames_behind_noise_are_all_found(noise, frames):
 
 
 @given(strategies.integers(0, len(reference.BATTERY) - 1), strategies.integers(0, 7))
-def test_a_spoilt_frame_costs_only_itself(position, bit):
+def test_a_corrupted_frame_costs_no_other_frame(position, bit):
     spoilt = bytearray(reference.BATTERY)
     spoilt[position] ^= 1 << bit
     stream = bytes(spoilt) + reference.ESC_STATUS + reference.ACCEPTED + bytes(300)
@@ -76,7 +76,7 @@ def sequence_of(*numbers, number=emulated.TIMESYNC, values=(1, 2)):
     return b''.join(emulated.pack(number, values, sequence, 1, 1) for sequence in numbers)
 
 
-def test_lost_packets_are_counted_by_the_sequence_also_where_it_wraps():
+def test_lost_packets_are_counted_across_a_sequence_wrap():
     receiver = MavlinkReceiver(1, 1)
     receiver.feed(sequence_of(250, 251, 254, 255, 0, 3))
     assert (receiver.counts.messages, receiver.counts.lost) == (6, 4)
@@ -92,14 +92,14 @@ def test_bad_checksums_and_skipped_bytes_are_counted():
     assert receiver.counts.messages == 1
 
 
-def test_other_senders_are_left_out_and_do_not_upset_the_sequence():
+def test_other_senders_are_ignored_and_do_not_affect_the_sequence():
     receiver = MavlinkReceiver(1, 1)
     assert receiver.feed(reference.HOST_HEARTBEAT) == []
     receiver.feed(sequence_of(9) + reference.ARM + sequence_of(10))
     assert (receiver.counts.foreign, receiver.counts.lost) == (2, 0)
 
 
-def test_a_restart_of_the_sender_is_no_loss():
+def test_a_restart_of_the_sender_is_not_counted_as_loss():
     beat = emulated.pack(emulated.HEARTBEAT, (1 << 24, 2, 0, 1, 1, 3), 0, 1, 1)
     receiver = MavlinkReceiver(1, 1, restarted)
     receiver.feed(sequence_of(100) + beat + sequence_of(1))
@@ -114,7 +114,7 @@ def test_signed_frames_are_refused():
         assert receiver.feed(bytes(frame) + bytes(13)) == []
 
 
-def test_pymavlinks_framing_would_lose_good_packets():
+def test_the_framing_of_pymavlink_loses_good_packets():
     """Reason for the framing in the driver; if this fails, pymavlink has improved."""
     spoilt = bytearray(reference.BATTERY)
     spoilt[1] = 200

@@ -27,7 +27,7 @@ from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
 pytestmark = pytest.mark.real_time
 
 
-def test_thrusts_arrive_as_asked_at_the_measured_voltage():
+def test_commanded_thrusts_are_produced_at_the_measured_voltage():
     with connected() as (emulated, board):
         emulated.set_battery(22.9, 20.0)
         time.sleep(0.6)         # twelve time constants of the voltage filter
@@ -37,7 +37,7 @@ def test_thrusts_arrive_as_asked_at_the_measured_voltage():
         np.testing.assert_allclose(emulated.thrust_targets, HOVER, rtol=1e-3)
 
 
-def test_saturation_is_reported_and_the_most_is_given():
+def test_saturation_is_reported_and_the_maximum_is_sent():
     with flying() as (emulated, board, pilot):
         emulated.set_battery(21.4, 40.0)
         pilot.thrust = np.array([5.0, 19.5, 5.0, 30.0])
@@ -59,7 +59,7 @@ def test_bad_thrusts_are_not_sent(thrust, age, reason):
         assert not emulated.commands.any()
 
 
-def test_refused_arming_says_why():
+def test_refused_arming_is_reported_with_the_reason():
     with connected() as (emulated, board):
         emulated.set_battery(20.0, 0.0)
         assert until(lambda: 'battery low' in board.poll().status.conditions)
@@ -82,7 +82,7 @@ def test_disarming_is_acknowledged_and_stops_the_rotors():
         assert until(lambda: not board.armed)
 
 
-def test_an_answer_to_another_question_is_not_taken_for_this_one():
+def test_an_acknowledgement_of_another_command_is_ignored():
     """The late acknowledgement of an arm command must not confirm a disarm command."""
     with connected() as (_, board):
         command = board.start_disarm()
@@ -93,7 +93,7 @@ def test_an_answer_to_another_question_is_not_taken_for_this_one():
         assert command.wait(1.0) and command.result.accepted
 
 
-def test_battery_and_rotor_states_arrive_in_our_units_with_stamps_of_our_clock():
+def test_battery_and_rotor_states_have_si_units_and_stamps_of_the_computer():
     with connected() as (emulated, board):
         emulated.set_battery(23.456, 12.34)
         emulated.set_rotors(np.array([1.0, 4.0, 9.0, 0.0]), np.array([30.0, 40.0, 50.0, 60.0]))
@@ -110,7 +110,7 @@ def test_battery_and_rotor_states_arrive_in_our_units_with_stamps_of_our_clock()
         assert before - 0.02 < rotors.stamp <= time.time()
 
 
-def test_only_news_is_polled():
+def test_a_poll_returns_new_messages_only():
     with connected() as (emulated, board):
         emulated.faults.mute = True
         time.sleep(0.05)
@@ -120,7 +120,7 @@ def test_only_news_is_polled():
         assert update.status is not None
 
 
-def test_the_offset_of_the_boards_clock_is_within_its_bound():
+def test_the_clock_offset_of_the_board_is_within_its_bound():
     with connected() as (emulated, board):
         time.sleep(0.5)
         update = board.poll()
@@ -130,7 +130,7 @@ def test_the_offset_of_the_boards_clock_is_within_its_bound():
         assert update.clock_uncertainty < 0.02
 
 
-def test_everything_the_driver_writes_passes_an_independent_parser():
+def test_an_independent_parser_accepts_all_output_of_the_driver():
     """Sequence numbers without gaps, from the right sender, all of the contract's messages."""
     device, other = pty.openpty()
     received = bytearray()
@@ -162,7 +162,7 @@ def test_everything_the_driver_writes_passes_an_independent_parser():
     os.close(other)
 
 
-def test_everything_the_emulated_board_writes_passes_pymavlinks_own_parser():
+def test_pymavlink_accepts_all_output_of_the_emulated_board():
     """Its strict parser raises at the first wrong byte."""
     with EmulatedMotorBoard(parameters=QUICK) as emulated:
         port = SerialPort(emulated.port, 921600)
@@ -183,7 +183,7 @@ def test_everything_the_emulated_board_writes_passes_pymavlinks_own_parser():
     assert parser.total_receive_errors == 0
 
 
-def test_without_a_board_nothing_waits_long_and_all_says_so():
+def test_without_a_board_every_call_times_out_soon_with_a_message():
     device, other = pty.openpty()
     with driver(os.ttyname(other), acknowledge_timeout=0.02) as board:
         assert board.wait_ready(0.1) == 'nothing heard of the board'
@@ -202,7 +202,7 @@ def test_another_firmware_is_refused():
         assert board.arm().reason == 'firmware follows contract 9, this driver 1'
 
 
-def test_a_port_that_cannot_be_opened_is_one_line(tmp_path):
+def test_a_port_that_cannot_be_opened_is_refused_in_one_line(tmp_path):
     with pytest.raises(SerialPortError, match='board: cannot be opened .no such port'):
         driver(str(tmp_path / 'board')).open()
 
@@ -248,7 +248,7 @@ def process(emulated, seconds=60, end=''):
 
 
 @pytest.mark.parametrize('end', ['', 'fail'])
-def test_a_process_that_ends_disarms_at_exit_also_after_an_exception(end):
+def test_a_process_disarms_at_exit_and_after_an_exception(end):
     with EmulatedMotorBoard(parameters=QUICK) as emulated:
         child = process(emulated, 0.2, end)
         child.wait(20)
@@ -257,7 +257,7 @@ def test_a_process_that_ends_disarms_at_exit_also_after_an_exception(end):
 
 
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP])
-def test_no_rotor_turns_100_ms_after_the_process_is_gone(number):
+def test_no_rotor_turns_100_ms_after_the_end_of_the_process(number):
     with EmulatedMotorBoard(parameters=QUICK) as emulated:
         arrivals = []
         emulated.on_target = lambda now, values: arrivals.append(now)

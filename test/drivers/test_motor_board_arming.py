@@ -77,7 +77,7 @@ def in_flight(bench):
     return board, arming
 
 
-def test_it_waits_for_the_board_and_for_the_supervisor_and_says_for_which(bench):
+def test_arming_waits_for_board_and_supervisor_and_names_which(bench):
     board, arming = bench
     board.ready, board.status = 'port is away', None
     assert arming.text == 'waiting: port is away'
@@ -94,7 +94,7 @@ def test_it_waits_for_the_board_and_for_the_supervisor_and_says_for_which(bench)
 
 
 @pytest.mark.parametrize('stop', ['disarmed', 'emergency_stop'])
-def test_it_flies_with_the_supervisor_and_disarms_with_it_until_that_is_confirmed(bench, stop):
+def test_arming_follows_the_supervisor_and_disarming_is_repeated_until_confirmed(bench, stop):
     board, arming = in_flight(bench)
     for state in ('flying:nmpc', 'fallback', 'landing'):
         arming.follow(state)
@@ -114,7 +114,7 @@ def test_it_flies_with_the_supervisor_and_disarms_with_it_until_that_is_confirme
     assert len(board.commands) == asked + 2
 
 
-def test_a_refusal_to_arm_is_told_and_not_tried_again(bench):
+def test_a_refusal_to_arm_is_reported_and_not_retried(bench):
     board, arming = bench
     arming.follow('disarmed')
     arming.follow('takeoff')
@@ -166,7 +166,7 @@ def test_a_board_that_stopped_in_flight_is_lost_until_the_supervisor_is_disarmed
 
 @pytest.mark.parametrize(('connected', 'text'), [
     (True, 'silent: nothing heard of the board'), (False, 'lost: nothing heard of the board')])
-def test_a_board_that_is_not_heard_is_told_after_patience_and_a_pause_of_our_own_is_no_silence(
+def test_a_silent_board_is_reported_after_a_timeout_that_excludes_own_pauses(
         bench, connected, text):
     board, arming = in_flight(bench)
     board.connected = connected
@@ -189,7 +189,7 @@ def test_a_board_that_is_not_heard_is_told_after_patience_and_a_pause_of_our_own
 
 
 @pytest.mark.parametrize('states', [['flying:nmpc'], ['disarmed', 'emergency_stop', 'takeoff']])
-def test_it_never_arms_in_the_middle_of_a_flight(bench, states):
+def test_arming_in_flight_never_happens(bench, states):
     board, arming = bench
     for state in states:
         arming.follow(state)
@@ -197,14 +197,14 @@ def test_it_never_arms_in_the_middle_of_a_flight(bench, states):
     assert board.asked is False
 
 
-def test_a_board_that_it_finds_armed_is_disarmed(bench):
+def test_a_board_found_armed_is_disarmed(bench):
     board, arming = bench
     board.status = ARMED
     arming.update(CYCLE)
     assert board.asked is False
 
 
-def test_an_answer_that_the_board_contradicts_at_once_is_no_flight(bench):
+def test_an_acknowledgement_contradicted_by_the_heartbeat_does_not_start_a_flight(bench):
     board, arming = bench
     arming.follow('disarmed')
     arming.follow('takeoff')
@@ -217,7 +217,7 @@ def test_an_answer_that_the_board_contradicts_at_once_is_no_flight(bench):
 
 
 @pytest.mark.real_time
-def test_the_real_driver_and_board_follow_it():
+def test_the_state_machine_drives_the_real_driver_and_board():
     with connected() as (emulated, board):
         arming = Arming(board)
 

@@ -33,7 +33,7 @@ def stays_stopped(emulated, seconds=0.5):
     return True
 
 
-def test_bad_checksums_from_the_board_are_counted_and_flown_through():
+def test_bad_checksums_from_the_board_are_counted_and_tolerated():
     with flying() as (emulated, board, _):
         emulated.faults.corrupt_out = 0.3
         assert keeps_flying(emulated)
@@ -42,7 +42,7 @@ def test_bad_checksums_from_the_board_are_counted_and_flown_through():
         assert board.armed
 
 
-def test_bad_checksums_to_the_board_are_counted_there_and_flown_through():
+def test_bad_checksums_to_the_board_are_counted_and_tolerated():
     with flying() as (emulated, board, _):
         emulated.faults.corrupt_in = 0.3
         assert keeps_flying(emulated)
@@ -50,7 +50,7 @@ def test_bad_checksums_to_the_board_are_counted_there_and_flown_through():
         assert until(lambda: board.poll().link.board.lost > 10)
 
 
-def test_lost_packets_both_ways_are_counted_and_flown_through():
+def test_lost_packets_in_both_directions_are_counted_and_tolerated():
     with flying() as (emulated, board, _):
         emulated.faults.drop_in = emulated.faults.drop_out = 0.3
         assert keeps_flying(emulated)
@@ -59,7 +59,7 @@ def test_lost_packets_both_ways_are_counted_and_flown_through():
         assert link.received.lost > 10 and link.received.bad_crc == 0
 
 
-def test_commands_get_through_where_half_of_all_packets_are_lost():
+def test_commands_succeed_with_half_of_all_packets_lost():
     with flying() as (emulated, board, _):
         emulated.faults.drop_in = emulated.faults.drop_out = 0.5
         results = [board.disarm() for _ in range(3)]
@@ -67,14 +67,14 @@ def test_commands_get_through_where_half_of_all_packets_are_lost():
         assert any(result.accepted for result in results)
 
 
-def test_short_delays_are_flown_through():
+def test_short_delays_are_tolerated():
     with flying() as (emulated, board, pilot):
         emulated.faults.delay_in = emulated.faults.delay_out = 0.03
         assert keeps_flying(emulated)
         assert not board.poll().link.board.timeouts
 
 
-def test_targets_too_long_under_way_are_refused_and_the_rotors_stop():
+def test_delayed_targets_are_refused_and_the_rotors_stop():
     with flying() as (emulated, board, pilot):
         emulated.faults.delay_in = 0.2
         assert until(lambda: not emulated.commands.any())
@@ -85,7 +85,7 @@ def test_targets_too_long_under_way_are_refused_and_the_rotors_stop():
         assert until(lambda: pilot.heard('disarmed (no target for too long)'))
 
 
-def test_a_mute_board_is_noticed_and_goes_on_following():
+def test_a_board_that_does_not_transmit_is_reported_and_still_follows_targets():
     with flying() as (emulated, board, pilot):
         emulated.faults.mute = True
         assert until(lambda: pilot.heard('nothing heard for 0.3 s'))
@@ -96,7 +96,7 @@ def test_a_mute_board_is_noticed_and_goes_on_following():
         assert board.armed
 
 
-def test_voltage_sag_is_made_up_for_and_reported_where_it_cannot_be():
+def test_voltage_sag_is_compensated_or_reported_as_saturation():
     with flying() as (emulated, board, pilot):
         emulated.set_battery(25.0, 30.0)
         time.sleep(0.3)
@@ -111,7 +111,7 @@ def test_voltage_sag_is_made_up_for_and_reported_where_it_cannot_be():
         assert keeps_flying(emulated, 0.2)
 
 
-def test_an_impossible_voltage_is_not_believed():
+def test_an_implausible_voltage_is_ignored():
     with flying() as (emulated, board, pilot):
         before = emulated.commands
         emulated.set_battery(3.0, 0.0)
@@ -119,7 +119,7 @@ def test_an_impossible_voltage_is_not_believed():
         np.testing.assert_array_equal(emulated.commands, before)
 
 
-def test_a_cable_out_for_a_moment_is_flown_through_after_a_short_stop():
+def test_a_short_disconnection_stops_the_rotors_briefly():
     with flying() as (emulated, board, pilot):
         emulated.unplug()
         assert until(lambda: pilot.heard('device is gone'))
@@ -130,7 +130,7 @@ def test_a_cable_out_for_a_moment_is_flown_through_after_a_short_stop():
         assert pilot.heard('port opened again') and board.poll().link.connections == 2
 
 
-def test_a_cable_out_for_long_disarms_and_coming_back_does_not_arm():
+def test_a_long_disconnection_disarms_and_reconnecting_does_not_arm():
     with flying() as (emulated, board, pilot):
         emulated.unplug()
         assert until(lambda: not emulated.armed)
@@ -165,7 +165,7 @@ def test_a_reboot_in_flight_stops_and_needs_arming_again():
         assert until(lambda: emulated.commands.all())
 
 
-def test_a_failed_esc_is_named_and_the_other_rotors_go_on():
+def test_a_failed_esc_is_named_and_the_other_rotors_continue():
     with flying() as (emulated, board, pilot):
         emulated.faults.failed_escs = (3,)
         assert until(lambda: pilot.heard('ESC of rotor 3 offline'))

@@ -12,7 +12,7 @@ from board_bench import connected, HOVER
 pytestmark = pytest.mark.real_time
 
 
-def test_a_step_of_our_clock_does_not_stop_the_rotors():
+def test_a_step_of_the_computers_clock_does_not_stop_the_rotors():
     """Stamps and clock step together; the age of a stamp gives the board's clock."""
     shift = [0.0]
     with connected() as (emulated, board):
@@ -26,7 +26,7 @@ def test_a_step_of_our_clock_does_not_stop_the_rotors():
         assert sum(emulated.refused.values()) <= 2
 
 
-def test_stamps_rise_and_repeat_as_ours_do_also_when_the_offset_is_corrected():
+def test_stamps_stay_monotonic_when_the_offset_is_corrected():
     with connected() as (emulated, board):
         stamps = []
         emulated.on_target = lambda now, values: stamps.append(values[0])

@@ -34,7 +34,7 @@ def received(number, values):
 
 @settings(max_examples=400, deadline=None)
 @given(strategies.lists(PAYLOADS, max_size=8))
-def test_good_frames_with_any_content_do_no_harm(payloads):
+def test_valid_frames_with_arbitrary_content_are_tolerated(payloads):
     """The voltage for the thrust map remains plausible."""
     board = watch()
     for number, payload in payloads:
@@ -47,7 +47,7 @@ def test_good_frames_with_any_content_do_no_harm(payloads):
     assert all(len(text.splitlines()) == 1 for _, text in board.take()['events'])
 
 
-def test_only_answers_to_questions_asked_count_and_once():
+def test_only_answers_to_own_requests_count_and_only_once():
     board = watch()
     question = board.timesync_request()
     now = time.monotonic()
@@ -59,7 +59,7 @@ def test_only_answers_to_questions_asked_count_and_once():
     assert board.clock.jumps == 0
 
 
-def test_the_voltage_is_low_passed_over_time_not_over_messages():
+def test_the_voltage_filter_depends_on_time_and_not_on_message_count():
     board = watch()
     cells = [65535] * 9
 
@@ -75,7 +75,7 @@ def test_the_voltage_is_low_passed_over_time_not_over_messages():
     assert board.voltage == pytest.approx(24.0)
 
 
-def test_changes_are_told_once_and_severe_ones_as_errors():
+def test_changes_are_reported_once_and_severe_ones_as_errors():
     board = watch()
 
     def beat(state, reason=0, conditions=0):
@@ -94,7 +94,7 @@ def test_changes_are_told_once_and_severe_ones_as_errors():
     assert beat(0, 4)[0] == ('warning', 'motor board: restarted (watchdog reset)')
 
 
-def test_offline_escs_are_told():
+def test_offline_escs_are_reported():
     board = watch()
     message = MavlinkReceiver(1, 1).feed(reference.ESC_INFO)[0]
     board.message(message, time.monotonic())

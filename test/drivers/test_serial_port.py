@@ -27,7 +27,7 @@ def ends():
             pass
 
 
-def test_bytes_arrive_unchanged_both_ways(ends):
+def test_bytes_arrive_unchanged_in_both_directions(ends):
     device, name = ends
     data = bytes(range(256))
     port = SerialPort(name, 921600)
@@ -79,7 +79,7 @@ def test_a_port_in_use_is_refused(ends):
     port.close()
 
 
-def test_what_cannot_be_opened_says_what_to_do(tmp_path):
+def test_a_port_that_cannot_be_opened_is_refused_with_the_remedy(tmp_path):
     with pytest.raises(SerialPortError, match='nowhere: cannot be opened .no such port'):
         SerialPort(str(tmp_path / 'nowhere'), 921600)
     (tmp_path / 'file').write_text('x')

@@ -60,7 +60,7 @@ def test_current_based_mode_caps_the_torque():
 @pytest.mark.parametrize(('signs', 'zeros'), [
     ([1, 1, 1, 1], [2048, 2048, 2048, 2048]), ([1, -1, 1, -1], [2048, 2000, 2100, 2048]),
     ([-1, -1, -1, -1], [1800, 2500, 2047, 2049])])
-def test_signs_and_zeros_make_tilts_of_counts_and_back(signs, zeros):
+def test_counts_and_tilts_convert_with_signs_and_zeros(signs, zeros):
     with running(signs=np.array(signs, float), zeros=np.array(zeros, float),
                  servos={'signs': signs, 'zeros': zeros}) as (bus, emulated):
         readings, _ = until(arrived(GOAL), bus, GOAL)
@@ -83,7 +83,7 @@ def test_velocity_current_and_effort_have_the_tilts_sign():
 
 
 @pytest.mark.real_time
-def test_torque_comes_on_without_a_jump_whatever_goal_was_left():
+def test_torque_comes_on_without_a_jump_for_any_previous_goal():
     with bench() as (bus, emulated):
         bus.configure()
         emulated.set_state([0.5, -1.0, 1.5, -2.0], np.zeros(4), np.zeros(4))
@@ -114,7 +114,7 @@ def test_the_watchdog_runs_while_torque_is_on():
 
 
 @pytest.mark.real_time
-def test_goals_beyond_the_travel_are_cut_off_and_no_numbers_are_refused():
+def test_goals_beyond_the_travel_are_clipped_and_nan_is_refused():
     with running() as (bus, emulated):
         assert bus.write_goals([9.0, -9.0, 0.0, 0.0])
         bus.read()  # answered after the goals
@@ -129,7 +129,7 @@ def test_goals_beyond_the_travel_are_cut_off_and_no_numbers_are_refused():
 
 
 @pytest.mark.real_time
-def test_old_firmware_is_read_the_plain_way():
+def test_old_firmware_is_read_with_plain_sync_read():
     with running(servos={'firmware': 45}) as (bus, emulated):
         until(arrived(GOAL), bus, GOAL)
         assert not emulated.network.refused
@@ -137,7 +137,7 @@ def test_old_firmware_is_read_the_plain_way():
 
 
 @pytest.mark.real_time
-def test_health_tells_voltage_temperature_and_torque():
+def test_health_contains_voltage_temperature_and_torque():
     with running() as (bus, emulated):
         emulated.faults.supply_voltage = 11.1
         _, reports = until(lambda _, reports: all(
@@ -148,7 +148,7 @@ def test_health_tells_voltage_temperature_and_torque():
 
 
 @pytest.mark.real_time
-def test_checking_changes_nothing_and_names_what_is_wrong():
+def test_checking_changes_nothing_and_names_the_defects():
     with bench(servos={'identifiers': (1, 2, 3, 4)}) as (bus, emulated):
         emulated.servos[0]['Model Number'] = 1200
         emulated.faults.silent = {2}
@@ -209,12 +209,12 @@ def test_impossible_parameters_are_refused(change, text):
         bind(ServoBusParameters, {**shipped, **change}, 'file')
 
 
-def test_registers_agree_with_the_emulated_servos_own_table():
+def test_registers_agree_with_the_table_of_the_emulated_servo():
     assert {one.name: (one.address, one.size, one.signed) for one in registers.ALL} \
         == {one.name: (one.address, one.size, one.signed) for one in table.REGISTERS}
 
 
 @pytest.mark.parametrize('value', [0, 1, -1, 4630, -534, -2**31, 2**31 - 1])
-def test_signed_registers_survive_their_bytes(value):
+def test_signed_registers_round_trip(value):
     register = registers.GOAL_POSITION
     assert register.decoded(register.encoded(value)) == value

@@ -51,7 +51,7 @@ def test_a_bad_line_costs_readings_but_never_gives_a_wrong_one(fault, firmware):
 
 @pytest.mark.parametrize('silent', [{1}, {3}, {4}, {1, 2}])
 @pytest.mark.parametrize('firmware', [52, 45])
-def test_silent_servos_are_left_out_and_the_others_fly_on(silent, firmware):
+def test_silent_servos_are_omitted_and_the_others_continue(silent, firmware):
     with running(servos={'firmware': firmware}) as (bus, emulated):
         others = np.array([name not in silent for name in (1, 2, 3, 4)])
         emulated.faults.silent = set(silent)
@@ -76,7 +76,7 @@ def test_silent_servos_are_left_out_and_the_others_fly_on(silent, firmware):
         assert sum('answers again' in line for line in lines) == len(silent)
 
 
-def test_all_servos_silent_is_said_and_survived():
+def test_silence_of_all_servos_is_reported_and_tolerated():
     with running() as (bus, emulated):
         emulated.faults.silent = {1, 2, 3, 4}
         until(lambda _, reports: not any(one.responding for one in reports), bus, GOAL)
@@ -98,7 +98,7 @@ def test_a_brief_overload_ends_in_a_restart_with_torque():
         assert any('restarting it' in line for line in bus.take_events())
 
 
-def test_a_lasting_overload_leaves_the_servo_off_with_a_reason_and_the_service_brings_it_back():
+def test_a_lasting_overload_disables_the_servo_with_a_reason_until_the_service_restarts_it():
     with running(recoveries=2) as (bus, emulated):
         emulated.faults.overload = {2}
         _, reports = until(lambda _, reports: not reports[1].recovering
@@ -128,7 +128,7 @@ def test_an_overheated_servo_is_left_off():
         assert any('shut down (overheated)' in line for line in bus.take_events())
 
 
-def test_low_voltage_is_reported_and_flown_with():
+def test_low_voltage_is_reported_and_tolerated():
     with running() as (bus, emulated):
         emulated.faults.supply_voltage = 5.0
         _, reports = until(lambda _, reports: all('voltage' in one.message for one in reports),
@@ -147,7 +147,7 @@ def test_an_expired_watchdog_is_cleared_and_goals_are_followed_again():
         assert any('stopped by its watchdog' in line for line in bus.take_events())
 
 
-def test_after_a_pause_of_the_driver_the_very_next_goals_count():
+def test_after_a_pause_of_the_driver_the_next_goals_are_followed():
     with running() as (bus, emulated):
         until(arrived(GOAL), bus, GOAL)
         time.sleep(0.15)
@@ -158,7 +158,7 @@ def test_after_a_pause_of_the_driver_the_very_next_goals_count():
         assert not emulated.stopped.any()
 
 
-def test_an_unplugged_cable_is_survived_and_flight_goes_on_when_it_is_back():
+def test_after_an_unplugged_cable_is_back_goals_are_followed_again():
     with running() as (bus, emulated):
         until(arrived(GOAL), bus, GOAL)
         for _ in range(3):
@@ -176,7 +176,7 @@ def test_an_unplugged_cable_is_survived_and_flight_goes_on_when_it_is_back():
         assert bus.statistics.connections == 4
 
 
-def test_servos_that_lost_power_with_the_cable_come_back_with_settings_and_turns():
+def test_servos_without_power_are_restored_with_settings_and_turns():
     with running() as (bus, emulated):
         until(arrived(GOAL), bus, GOAL)
         emulated.unplug()
@@ -189,7 +189,7 @@ def test_servos_that_lost_power_with_the_cable_come_back_with_settings_and_turns
         assert [servo['Bus Watchdog'] for servo in emulated.servos] == [5] * 4
 
 
-def test_torque_that_could_not_be_taken_off_is_taken_off_when_the_cable_is_back():
+def test_pending_torque_off_is_executed_when_the_cable_is_back():
     with running() as (bus, emulated):
         emulated.unplug()
         assert not bus.disable()
@@ -197,7 +197,7 @@ def test_torque_that_could_not_be_taken_off_is_taken_off_when_the_cable_is_back(
         until(lambda *_: not emulated.torque_enabled.any(), bus, GOAL)
 
 
-def test_torque_of_a_servo_that_was_silent_meanwhile_is_taken_off_when_it_answers():
+def test_pending_torque_off_is_executed_when_a_silent_servo_answers():
     with running() as (bus, emulated):
         emulated.faults.silent = {3}
         assert not bus.disable()
@@ -207,7 +207,7 @@ def test_torque_of_a_servo_that_was_silent_meanwhile_is_taken_off_when_it_answer
         assert any('had torque left' in line for line in bus.take_events())
 
 
-def test_disabling_confirms_on_a_bad_line_or_says_that_it_did_not():
+def test_disabling_on_a_bad_line_reports_whether_it_is_confirmed():
     with running(**BRISK) as (bus, emulated):
         emulated.faults.dropped = 0.3
         bus.disable()
@@ -222,7 +222,7 @@ def test_disabling_confirms_on_a_bad_line_or_says_that_it_did_not():
         emulated.faults.silent = set()
 
 
-def test_enabling_with_a_servo_that_refuses_leaves_none_with_torque():
+def test_enabling_fails_for_all_servos_if_one_refuses():
     with bench() as (bus, emulated):
         bus.configure()
         emulated.servos[2].trip(registers.OVERLOAD)
@@ -245,7 +245,7 @@ def test_a_reboot_without_torque_leaves_it_configured_and_off():
             bus.reboot(9)
 
 
-def test_the_guard_is_dismissed_with_the_torque():
+def test_the_guard_ends_when_torque_is_off():
     with bench(guard=True) as (bus, emulated):
         bus.configure()
         assert bus._guard is None

@@ -50,7 +50,7 @@ def driver(port, guard):
 
 
 @pytest.mark.parametrize('how', [signal.SIGKILL, signal.SIGTERM, signal.SIGSEGV])
-def test_torque_is_off_after_the_process_was_killed(how):
+def test_torque_is_off_after_the_process_is_killed(how):
     with EmulatedServoBus() as emulated:
         process = driver(emulated.port, 'guard')
         try:
@@ -63,7 +63,7 @@ def test_torque_is_off_after_the_process_was_killed(how):
             process.communicate()
 
 
-def test_the_servos_own_watchdog_stops_them_when_nobody_is_left():
+def test_the_watchdog_of_the_servos_stops_them_without_any_process():
     with EmulatedServoBus() as emulated:
         process = driver(emulated.port, 'alone')
         try:
@@ -78,7 +78,7 @@ def test_the_servos_own_watchdog_stops_them_when_nobody_is_left():
             process.communicate()
 
 
-def test_a_frozen_process_leaves_stopped_servos():
+def test_the_servos_stop_while_the_process_is_frozen():
     with EmulatedServoBus() as emulated:
         process = driver(emulated.port, 'guard')
         try:

@@ -48,7 +48,7 @@ def joint(data, error=0):
                                 length * len(data)))
 
 
-def test_what_is_sent_has_the_documents_bytes():
+def test_sent_packets_equal_the_documented_bytes():
     link = linked(status(1, 0), status(1, 0, b'\x05'), fast=False)
     link.write(1, GOAL_POSITION, 512)
     link.read(1, HARDWARE_ERROR)
@@ -66,19 +66,19 @@ def test_what_is_sent_has_the_documents_bytes():
 
 
 @pytest.mark.parametrize('data', [DATA, dict.fromkeys(IDS, b'\xff\xff\xfd\x00' * 2 + b'\xff\xfd')])
-def test_the_joint_answer_is_taken_apart_also_where_it_looks_like_headers(data):
+def test_a_fast_sync_read_answer_is_split_even_if_it_contains_headers(data):
     assert linked(joint(data)).sync_read(126, 10, IDS) == {
         name: (0, part) for name, part in data.items()}
 
 
 @pytest.mark.parametrize('kept', range(8, 50))
-def test_of_a_joint_answer_that_breaks_off_the_sound_part_is_used(kept):
+def test_the_valid_part_of_a_truncated_answer_is_used(kept):
     answers = linked(joint(DATA)[:kept]).sync_read(126, 10, IDS)
     assert answers == {name: (0, DATA[name]) for name in IDS[:(kept - 8) // 14]}
 
 
 @pytest.mark.parametrize('place', range(50))
-def test_damage_never_passes_for_data(place):
+def test_corrupted_bytes_are_never_returned_as_data(place):
     raw = bytearray(joint(DATA))
     raw[place] ^= 0x10
     answers = linked(bytes(raw)).sync_read(126, 10, IDS)
@@ -89,7 +89,7 @@ def test_damage_never_passes_for_data(place):
 @pytest.mark.parametrize('late', [
     joint({1: b'\x78\0\x23', 2: b'\x78\0\x23', 3: b'\x78\0\x23'}),  # 2 (3 + 4) = 10 + 4
     joint({1: b'\x01', 2: b'\x01', 3: b'\x01'}), status(2, 0), status(1, 0, b'\x01\x02\x03\x04')])
-def test_a_late_answer_to_another_question_is_skipped(late):
+def test_a_late_answer_to_another_request_is_skipped(late):
     link = linked(late + joint(DATA))
     assert link.sync_read(126, 10, IDS) == {name: (0, DATA[name]) for name in IDS}
     link = linked(late)
@@ -97,7 +97,7 @@ def test_a_late_answer_to_another_question_is_skipped(late):
     assert link.late
 
 
-def test_plain_answers_before_and_behind_a_broken_one_are_used():
+def test_answers_before_and_after_a_corrupted_one_are_used():
     broken = bytearray(status(2, 0, DATA[2]))
     broken[12] ^= 1
     link = linked(status(1, 0, DATA[1]) + bytes(broken) + status(3, 0, DATA[3]), fast=False)
@@ -105,7 +105,7 @@ def test_plain_answers_before_and_behind_a_broken_one_are_used():
 
 
 @pytest.mark.parametrize('fast', [True, False])
-def test_alerts_are_noticed_with_the_feedback(fast):
+def test_alerts_are_read_with_the_feedback(fast):
     blocks = [(1, 0, b'a'), (2, 0x80, b'b'), (3, 0x87, b'c')]
     raw = b''.join(fast_status(blocks, 15) if fast else [status(*block) for block in blocks])
     link = linked(raw, status(2, 0), fast=fast)
@@ -141,7 +141,7 @@ def test_a_write_whose_answer_is_lost_is_repeated():
         linked(b'', b'', b'').write(1, TORQUE_ENABLE, 1)
 
 
-def test_a_closed_link_says_so():
+def test_a_closed_link_raises_an_error():
     with pytest.raises(PortLost):
         ServoLink('wire', 1_000_000, 0.001).ping(1)
 
@@ -159,7 +159,7 @@ noise = st.binary(max_size=60) | st.builds(
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(noise, max_size=4).map(b''.join), st.booleans())
-def test_no_bytes_from_the_wire_break_or_hang_the_link(data, fast):
+def test_arbitrary_bytes_neither_raise_nor_block_the_link(data, fast):
     for error, part in linked(data, fast=fast).sync_read(126, 10, IDS).values():
         assert len(part) == 10 or error
     for ask in (lambda link: link.ping(1), lambda link: link.read(1, GOAL_POSITION),

@@ -89,7 +89,7 @@ def test_goals_between_cycles_are_written_at_once():
     assert bus.goals == [1, 2] == published
 
 
-def test_goals_that_come_during_a_transaction_follow_it_and_only_the_newest():
+def test_only_the_newest_goals_given_during_a_transaction_are_written():
     loop, bus, _, _ = make()
     bus.during_read = lambda: (loop.offer(goal(1)), loop.offer(goal(2)), bus.goals.append('read'))
     loop._lock.acquire()
@@ -98,7 +98,7 @@ def test_goals_that_come_during_a_transaction_follow_it_and_only_the_newest():
     assert bus.goals == ['read', 2]
 
 
-def test_goals_are_repeated_in_a_cycle_that_brought_none_until_they_are_too_old():
+def test_goals_are_repeated_until_they_are_too_old():
     loop, bus, clock, _ = make()
     loop.offer(goal(1, expires=clock.now + 0.1))
     loop._cycle()
@@ -112,7 +112,7 @@ def test_goals_are_repeated_in_a_cycle_that_brought_none_until_they_are_too_old(
     assert bus.goals == [1, 1] and loop.stale == 1
 
 
-def test_readings_are_handed_out_with_who_is_valid_and_obeys():
+def test_readings_include_validity_and_obedience_of_each_servo():
     loop, bus, _, seen = make()
     bus.valid = np.array([True, True, False, True])
     bus.obeying = np.array([False, True, True, True])
@@ -124,7 +124,7 @@ def test_readings_are_handed_out_with_who_is_valid_and_obeys():
     assert loop.incomplete == 2 and loop.cycles == 2
 
 
-def test_a_servo_is_lost_when_it_has_not_obeyed_for_long_enough():
+def test_a_servo_is_lost_after_a_timeout_without_obeying():
     loop, bus, clock, _ = make()
     bus.obeying = np.array([True, False, True, True])
     clock.now += 0.2
@@ -141,7 +141,7 @@ def test_a_servo_is_lost_when_it_has_not_obeyed_for_long_enough():
 
 
 @pytest.mark.real_time
-def test_many_threads_offer_goals_and_none_is_left_over():
+def test_goals_of_many_threads_are_all_handled():
     bus = FakeBus()
     loop = ServoLoop(bus, lambda *_: None)
     loop.start()
@@ -169,7 +169,7 @@ def test_many_threads_offer_goals_and_none_is_left_over():
 
 
 @pytest.mark.real_time
-def test_a_mistake_in_the_thread_closes_the_bus_and_is_told():
+def test_an_exception_in_the_thread_closes_the_bus_and_is_reported():
     bus, seen = FakeBus(), Event()
 
     def fail(readings, good):
@@ -199,7 +199,7 @@ def run(pace, now, cycles, goals=None, late=lambda k: 0.0):
     return np.array(began)
 
 
-def test_cycles_are_even_and_late_ones_are_made_up_for():
+def test_cycles_are_periodic_and_late_ones_are_caught_up():
     pace = ServoPace(PERIOD)
     pace.start(10.0)
     began = run(pace, 10.0, 101, late=lambda k: 0.004 if k % 10 == 5 else 0.0)
@@ -207,7 +207,7 @@ def test_cycles_are_even_and_late_ones_are_made_up_for():
     assert began[-1] - began[0] == pytest.approx(100 * PERIOD)
 
 
-def test_a_period_without_a_cycle_is_missed_and_not_made_up_for():
+def test_a_missed_period_is_counted_and_not_repeated():
     pace = ServoPace(PERIOD)
     pace.start(10.0)
     run(pace, 10.0, 20, late=lambda k: 2.5 * PERIOD if k == 10 else 0.0)
@@ -219,7 +219,7 @@ def test_a_period_without_a_cycle_is_missed_and_not_made_up_for():
 
 @pytest.mark.parametrize('every', [PERIOD, 2 * PERIOD])
 @pytest.mark.parametrize('phase', [0.0, 0.0011, 0.0024, 0.0049])
-def test_the_phase_glides_to_where_goals_find_the_bus_free(every, phase):
+def test_the_phase_converges_to_times_when_goals_find_the_bus_free(every, phase):
     pace = ServoPace(PERIOD)
     pace.start(10.0)
     goals = list(10.0 + phase + np.arange(0, 5, every))

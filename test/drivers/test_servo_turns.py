@@ -38,7 +38,7 @@ def test_the_nearest_turn_is_found(angle, turns, apart):
 
 @pytest.mark.real_time
 @pytest.mark.parametrize('angles', [[0, 0, 0, 0], [2.3, -2.3, 1.0, -1.0]])
-def test_torque_comes_on_where_the_angle_is_certain(angles):
+def test_torque_comes_on_if_the_angle_is_unique(angles):
     with bench() as (bus, emulated):
         place(emulated, angles)
         bus.configure()
@@ -47,7 +47,7 @@ def test_torque_comes_on_where_the_angle_is_certain(angles):
 
 
 @pytest.mark.real_time
-def test_torque_is_refused_where_the_turn_is_open_and_the_message_says_how_to_settle_it():
+def test_torque_is_refused_for_an_ambiguous_turn_with_the_remedy():
     with bench() as (bus, emulated):
         place(emulated, [0.0, 2.8, 0.0, 3.5])
         bus.configure()
@@ -61,7 +61,7 @@ def test_torque_is_refused_where_the_turn_is_open_and_the_message_says_how_to_se
 
 
 @pytest.mark.real_time
-def test_the_operator_settles_it():
+def test_confirmation_by_the_operator_resolves_the_turn():
     true = np.array([0.0, 2.8, 0.0, 3.5])
     with bench() as (bus, emulated):
         place(emulated, true)
@@ -77,7 +77,7 @@ def test_the_operator_settles_it():
 
 
 @pytest.mark.real_time
-def test_turning_it_by_hand_settles_it():
+def test_turning_the_joint_by_hand_resolves_the_turn():
     with bench() as (bus, emulated):
         place(emulated, [0.0, 0.0, 0.0, 3.5])
         bus.configure()
@@ -105,7 +105,7 @@ def test_turns_are_kept_over_disable_while_the_servo_has_power():
 
 
 @pytest.mark.real_time
-def test_turns_are_not_believed_after_a_restart_without_torque():
+def test_turns_are_ambiguous_after_a_restart_without_torque():
     with running() as (bus, emulated):
         goal = np.array([3.5, 0.0, 0.0, 0.0])
         until(arrived(goal), bus, goal)

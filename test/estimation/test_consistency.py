@@ -75,7 +75,7 @@ def test_same_input_gives_the_same_numbers():
     assert np.array_equal(first.quaternion, second.quaternion)
 
 
-def test_reset_is_as_good_as_new():
+def test_after_reset_the_filter_equals_a_new_one():
     flight = fly(7, 1.5)
     ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), fly(8, 2.0))
     ekf.reset()
@@ -84,7 +84,7 @@ def test_reset_is_as_good_as_new():
     assert np.array_equal(run(ekf, flight).estimate.covariance, fresh.covariance)
 
 
-def test_absolute_ros_time_changes_nothing_that_matters():
+def test_absolute_ros_time_does_not_change_the_estimate():
     """At 1.8e9 s a double resolves 0.2 us; the estimate must not feel it."""
     flight, late = fly(9, 2.0), fly(9, 2.0)
     shift = 1.8e9

@@ -34,7 +34,7 @@ def test_replay_equals_processing_in_order(delay, capture):
     np.testing.assert_allclose(late.covariance, prompt.covariance, rtol=1e-6, atol=1e-12)
 
 
-def test_a_pose_ahead_of_the_imu_waits_for_it():
+def test_a_pose_newer_than_the_imu_waits_for_it():
     flight = fly(2, 1.0)
     flight.poses = flight.poses[1:]
     flight.delay = -0.004  # the IMU's samples are delivered later than the MoCap's
@@ -60,7 +60,7 @@ def test_capture_time_beats_time_of_arrival():
 
 
 @pytest.mark.parametrize('age', [0.015, 0.025])
-def test_latency_hidden_in_the_stamps_of_the_imu_is_found_and_bridged(age):
+def test_latency_in_imu_stamps_is_estimated_and_compensated(age):
     flight = fly(4, 6.0, agility=0.5)
     flight.imu = [replace(s, stamp=s.stamp + age) for s in flight.imu]
     parameters = EkfParameters.load()
@@ -79,7 +79,7 @@ def test_latency_hidden_in_the_stamps_of_the_imu_is_found_and_bridged(age):
 
 
 @pytest.mark.parametrize('age', [0.015, 0.025])
-def test_a_late_rate_goes_on_changing_as_it_did(age):
+def test_a_late_angular_rate_is_extrapolated_linearly(age):
     """Its error in motion is less than half of what holding the last reading leaves."""
     shipped = EkfParameters.load()
     held = replace(shipped, time_offset=replace(shipped.time_offset, trend_samples=1))
@@ -98,7 +98,7 @@ def test_a_late_rate_goes_on_changing_as_it_did(age):
     assert errors['carried on'] < 0.5 * errors['held']
 
 
-def test_an_impact_is_no_trend():
+def test_an_impact_is_not_extrapolated():
     mounting = Mounting(EkfParameters.load().imu, GRAVITY, 3)
     readings = [(0.005 * i, np.zeros(3), np.array([float(i), 0, 0]), False) for i in range(3)]
     np.testing.assert_allclose(mounting.trend(readings), [200, 0, 0])
@@ -117,7 +117,7 @@ def test_late_stamps_of_the_mocap_do_not_shift_the_estimate_in_time():
     assert np.linalg.norm(error[:3]) < 0.004 and np.linalg.norm(error[6:9]) < np.deg2rad(0.3)
 
 
-def test_a_hovering_robot_does_not_invent_an_offset():
+def test_in_hover_no_time_offset_is_estimated():
     """At rest nothing is known of the offset, and noise must not pass for it."""
     flight = fly(6, 10.0, Sensors(), agility=0.0)
     ekf = run(ErrorStateEkf(EkfParameters.load(), GRAVITY), flight)

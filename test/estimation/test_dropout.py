@@ -40,7 +40,7 @@ def test_half_a_second_without_mocap_costs_less_than_5_cm_and_1_deg(seed):
     assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[6:9]) < np.deg2rad(1)
 
 
-def test_status_and_covariance_tell_a_dropout():
+def test_a_dropout_changes_status_and_covariance():
     limits = EkfParameters.load().status
     ekf = new_ekf(lost_after=2.0)
     rows = history(ekf, fly(1, 6.0), drop=lambda time: 2.0 < time < 4.8)
@@ -55,7 +55,7 @@ def test_status_and_covariance_tell_a_dropout():
     assert by_time[5.9][1] < 4 * by_time[1.9][1]
 
 
-def test_a_lost_filter_comes_back_where_the_robot_is():
+def test_a_lost_filter_reinitialises_at_the_robot():
     ekf, flight = new_ekf(lost_after=2.0), fly(2, 9.0)
     run(ekf, flight, drop=lambda time: 2.0 < time < 7.0)
     error = error_state(ekf.estimate, flight)
@@ -63,7 +63,7 @@ def test_a_lost_filter_comes_back_where_the_robot_is():
     assert np.linalg.norm(error[:3]) < 0.005 and np.linalg.norm(error[6:9]) < np.deg2rad(0.5)
 
 
-def test_short_dropouts_need_no_new_start():
+def test_short_dropouts_need_no_reinitialisation():
     ekf, flight = new_ekf(), fly(3, 3.0)
     rows = history(ekf, flight, drop=lambda time: 1.5 < time < 2.0)
     assert {status for time, status, _ in rows if time > 2.02} == {'tracking'}
@@ -92,7 +92,7 @@ def test_single_outliers_are_refused_and_leave_no_trace(shift, turn):
     assert ekf.status == 'tracking'
 
 
-def test_a_persistent_jump_is_believed_after_a_while_and_not_at_once():
+def test_a_persistent_jump_is_accepted_only_after_a_delay():
     flight, shift = fly(5, 5.0), np.array([0.5, -0.3, 0.2])
     flight.poses = [replace(pose, position=pose.position + shift) if pose.stamp > 2.0 else pose
                     for pose in flight.poses]
@@ -135,7 +135,7 @@ def test_an_imu_that_contradicts_gravity_never_starts_the_filter(fault):
     assert ekf.rejected['inconsistent_start'] + ekf.rejected['outlier'] > 0
 
 
-def test_noisier_mocap_than_claimed_is_noticed_and_weighed_down():
+def test_mocap_noisier_than_its_parameter_is_detected_and_weighted_less():
     """Six times the claimed noise, as in the published randomisation."""
     sensors = Sensors(position_noise=0.006, orientation_noise=0.006)
     flight = fly(9, 5.0, sensors)
@@ -168,7 +168,7 @@ def struck(flight, time, impulse, samples):
 
 
 @pytest.mark.parametrize('seen', [0.3, 1.0, 3.0])
-def test_a_blow_that_the_imu_measures_badly_does_not_lose_the_track(seen):
+def test_an_impact_with_a_poor_imu_measurement_keeps_the_track(seen):
     """A hard landing: readings aliased, or beyond the range and refused."""
     flight = struck(fly(10, 3.0, agility=0.3), 2.0, (0.0, 0.5, 1.2), [seen] * 2)
     ekf = new_ekf()
@@ -193,7 +193,7 @@ def test_a_frozen_pose_is_refused_and_the_filter_dead_reckons():
     assert np.linalg.norm(error_state(ekf.estimate, flight)[:3]) < 0.3
 
 
-def test_an_attitude_that_the_gyroscope_rules_out_is_never_believed():
+def test_an_attitude_that_contradicts_the_gyroscope_is_refused():
     """Markers confused from 4 s on: turned by 90 deg about the body's z axis, for good."""
     ekf, flight = new_ekf(), fly(3, 9.0)
     turn = rotations.exp(np.array([0.0, 0.0, np.pi / 2]))

@@ -40,7 +40,7 @@ def final_error(mounting, parameters, imu_period):
 
 
 @pytest.mark.parametrize('name', MOUNTINGS)
-def test_noise_free_flight_is_recovered_up_to_the_integration_step(name):
+def test_a_noise_free_flight_is_recovered_up_to_the_integration_error(name):
     """The error left is that of the trapezoidal rule: small, and gone with a finer step."""
     mounting = MOUNTINGS[name]
     error = final_error(mounting, parameters_for(mounting), 0.005)

@@ -77,7 +77,7 @@ def continued(ekf, flight, after):
 
 
 @pytest.mark.parametrize('reason, change', cases(BAD_IMU))
-def test_bad_imu_sample_is_refused_and_forgotten(flying, reason, change):
+def test_a_bad_imu_sample_is_refused_without_effect(flying, reason, change):
     ekf, flight = flying
     change = dict(change)
     last = max(s.stamp for s in flight.imu if s.stamp <= 1.5)
@@ -88,7 +88,7 @@ def test_bad_imu_sample_is_refused_and_forgotten(flying, reason, change):
 
 
 @pytest.mark.parametrize('reason, change', cases(BAD_POSE))
-def test_bad_pose_is_refused_and_forgotten(flying, reason, change):
+def test_a_bad_pose_is_refused_without_effect(flying, reason, change):
     ekf, flight = flying
     change = dict(change)
     last = max((s for s in flight.poses if s.stamp + flight.delay <= 1.5 + 1e-9),
@@ -112,7 +112,7 @@ def test_a_pose_without_any_imu_is_refused():
     assert ekf.rejected == {'no_imu': 1}
 
 
-def test_sign_of_the_quaternion_is_free():
+def test_the_sign_of_the_quaternion_has_no_influence():
     flight, flipped = fly(3, 2.0), fly(3, 2.0)
     flipped.poses = [replace(s, quaternion=s.quaternion * (-1) ** k)
                      for k, s in enumerate(flipped.poses)]
@@ -152,7 +152,7 @@ def test_missing_imu_samples_within_the_gap_limit_are_bridged():
 
 
 @pytest.mark.parametrize('jump', [-1000.0, 7.0])
-def test_a_clock_that_jumps_for_good_costs_the_state_and_is_followed(jump):
+def test_a_permanent_clock_jump_reinitialises_the_filter(jump):
     """Simulated time starts anew, or the IMU was silent for long."""
     flight = fly(7, 4.0)
     flight.imu = [replace(s, stamp=s.stamp + jump) if s.stamp > 2.0 else s for s in flight.imu]

@@ -19,7 +19,7 @@ LIES = {
 
 @pytest.mark.parametrize('lie', LIES)
 @pytest.mark.parametrize('seed', range(3))
-def test_the_rate_follows_the_poses_where_the_gyroscope_hides_a_turn(seed, lie):
+def test_the_rate_follows_the_poses_if_the_gyroscope_misses_a_rotation(seed, lie):
     flight = fly(seed, 6.0, agility=2.0)
     flight.imu = [sample if sample.stamp < STRUCK else replace(
         sample, angular_velocity=LIES[lie](sample.angular_velocity)) for sample in flight.imu]

@@ -79,7 +79,7 @@ def test_half_a_second_without_mocap_in_simulated_flight():
     assert ekf.status == 'tracking'
 
 
-def test_its_covariance_is_honest_on_the_multibody_plant():
+def test_the_covariance_is_consistent_on_the_multibody_plant():
     """NEES of position, velocity and attitude; jolts of the modules spoil an exact chi-square."""
     nees = []
     for seed in range(4):
@@ -114,7 +114,7 @@ def flown(true, nominal, duration):
 
 
 @pytest.mark.parametrize('name', HIDDEN)
-def test_what_the_robot_file_says_of_a_sensor_makes_the_estimate_better(name):
+def test_sensor_effects_of_the_robot_file_improve_the_estimate(name):
     values, (first, last), columns, better = HIDDEN[name]
     true = replace(RobotParameters.load(), effects={name: values})
 
@@ -130,7 +130,7 @@ def test_what_the_robot_file_says_of_a_sensor_makes_the_estimate_better(name):
 @pytest.mark.parametrize('name, bias, found', [
     ('imu_accelerometer_bias', (0.4, -0.3, 0.3), 'accelerometer_bias'),
     ('imu_gyroscope_bias', (0.08, -0.06, 0.05), 'gyroscope_bias')])
-def test_a_bias_that_the_robot_file_knows_is_not_left_to_find(name, bias, found):
+def test_a_bias_of_the_robot_file_is_the_initial_estimate(name, bias, found):
     true = replace(RobotParameters.load(), effects={name: {'bias': bias}})
     left = [np.linalg.norm(getattr(flown(true, nominal, 2.0)[1], found)) / np.linalg.norm(bias)
             for nominal in (None, true)]

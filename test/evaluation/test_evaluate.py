@@ -54,7 +54,7 @@ def test_a_seed_gives_the_same_numbers_and_another_seed_others(poses, flown):
     assert first['nmpc']['mean'] != other['nmpc']['mean']
 
 
-def test_the_json_holds_what_interfaces_promises(flown):
+def test_the_json_has_the_keys_of_the_interface(flown):
     result = json.loads((flown[1] / 'result.json').read_text())
     assert {'task', 'conditions', 'seed', 'robot', 'version'} <= set(result['meta'])
     flown = result['nmpc']
@@ -76,7 +76,7 @@ def test_the_bag_gives_the_same_numbers_as_the_flight(poses, flown):
     assert again['success_rate'] == results['nmpc']['success_rate'] == 1.0
 
 
-def test_an_unknown_weakness_of_the_plant_leaves_no_steady_error(poses, tmp_path):
+def test_an_unknown_loss_of_thrust_leaves_no_steady_error(poses, tmp_path):
     content = yaml.safe_load(share_path('params/robot.yaml').read_text())
     content['mass'] *= 1.05
     content['effects'] = {'thrust_coefficient': {'scale': 0.93}}
@@ -98,7 +98,7 @@ def test_an_unknown_controller_is_refused_before_anything_flies(poses):
         evaluate(poses, ('nmpc', 'npmc'))
 
 
-def test_a_robot_that_cannot_lift_off_says_so(poses, tmp_path):
+def test_a_failed_lift_off_is_reported(poses, tmp_path):
     content = yaml.safe_load(share_path('params/robot.yaml').read_text())
     content['effects'] = {'thrust_coefficient': {'scale': 0.2}}
     plant = tmp_path / 'plant.yaml'
@@ -107,7 +107,7 @@ def test_a_robot_that_cannot_lift_off_says_so(poses, tmp_path):
         evaluate(poses, plant=plant)
 
 
-def test_a_flight_that_the_supervisor_ends_says_when_and_why(poses, monkeypatch):
+def test_a_flight_ended_by_the_supervisor_is_reported_with_time_and_reason(poses, monkeypatch):
     small = SimulatorParameters.load()
     small = replace(small, battery=replace(small.battery, capacity=0.04))
     monkeypatch.setattr(SimulatorParameters, 'load', lambda: small)
@@ -120,7 +120,7 @@ def test_a_flight_that_the_supervisor_ends_says_when_and_why(poses, monkeypatch)
     assert f"nmpc: the flight ended early, {results['nmpc']['ended']}" in text.getvalue()
 
 
-def test_a_force_task_ends_with_the_level_that_was_too_much():
+def test_a_force_task_ends_with_the_level_of_lost_control():
     task = make_task('force')
     log = command.fly('nmpc', task, robot=ROBOT, plant=ROBOT)
     lost = metrics(log, task)
@@ -157,7 +157,7 @@ def test_faults_of_a_file_act_and_are_listed_in_the_results(poses, tmp_path):
 
 
 @pytest.mark.parametrize('reach', ['3.0', None])
-def test_a_task_beyond_the_reach_of_any_controller_is_refused_where_it_says_one(
+def test_a_task_beyond_the_declared_reach_of_a_controller_is_refused(
         tmp_path, monkeypatch, reach):
     far, own = tmp_path / 'far.csv', tmp_path / 'own.py'
     far.write_text('x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg\n0,0,1,0,0,0\n4,0,1,0,0,0\n')

@@ -46,7 +46,7 @@ def command(stamp):
     return Command(stamp, np.full(4, 0.1), np.full(4, 8.0))
 
 
-def test_without_a_fault_everything_passes_as_it_is(struck):
+def test_without_a_fault_all_messages_pass_unchanged(struck):
     processes, ear = struck()
     one, state = frame(1.0), command(1.0)
     assert processes.frame(one) is one
@@ -57,7 +57,7 @@ def test_without_a_fault_everything_passes_as_it_is(struck):
     assert ear.heard == [('on_battery', 24.0)]
 
 
-def test_a_supervisor_that_waits_finds_the_newest_messages_in_its_queues(struck):
+def test_a_paused_supervisor_receives_the_newest_messages_of_its_queues(struck):
     processes, ear = struck(Fault('supervisor_waits', duration=0.1))
     assert processes.supervisor_waits
     for k in range(20):
@@ -71,7 +71,7 @@ def test_a_supervisor_that_waits_finds_the_newest_messages_in_its_queues(struck)
     assert ('on_imu', 0) in ear.heard
 
 
-def test_a_clock_that_is_set_moves_every_stamp_and_back_again(struck):
+def test_a_clock_step_shifts_every_stamp_and_is_reversible(struck):
     processes, _ = struck(Fault('clock_jumps', at=0.1, duration=0.2, step=-3.0))
     for time, step in ((0.05, 0), (0.15, -3), (0.35, 0)):
         shifted = processes.frame(frame(time))
@@ -82,7 +82,7 @@ def test_a_clock_that_is_set_moves_every_stamp_and_back_again(struck):
 @pytest.mark.parametrize(('kind', 'numbers'), [
     ('controller_nan', {}), ('controller_rubbish', {}), ('controller_noisy', {'tilt': 0.1}),
     ('controller_constant', {})])
-def test_a_controller_that_talks_rubbish_keeps_its_stamps(struck, kind, numbers):
+def test_a_controller_with_invalid_numbers_keeps_its_stamps(struck, kind, numbers):
     processes, _ = struck(Fault(kind, **numbers))
     first, = processes.requests(command(1.0), 1.0)
     second, = processes.requests(Command(1.01, np.zeros(4), np.ones(4)), 1.01)
@@ -91,7 +91,7 @@ def test_a_controller_that_talks_rubbish_keeps_its_stamps(struck, kind, numbers)
     assert same == (kind == 'controller_constant')
 
 
-def test_a_silent_controller_says_nothing_and_a_slow_one_says_it_late(struck):
+def test_a_silent_controller_sends_nothing_and_a_slow_one_sends_late(struck):
     silent, _ = struck(Fault('controller_silent'))
     assert silent.requests(command(1.0), 1.0) == []
     slow, _ = struck(Fault('controller_slow', delay=0.08))
@@ -101,7 +101,7 @@ def test_a_silent_controller_says_nothing_and_a_slow_one_says_it_late(struck):
     assert late.stamp == 1.0
 
 
-def test_estimates(struck):
+def test_faults_of_estimates(struck):
     assert struck(Fault('estimator_dead'))[0].estimate(STATE) is None
     assert np.isnan(struck(Fault('estimator_nan'))[0].estimate(STATE).position).all()
     frozen, _ = struck(Fault('estimator_frozen'))
@@ -117,7 +117,7 @@ def test_estimates(struck):
     assert np.isclose(np.linalg.norm(random.estimate(STATE).quaternion), 1.0)
 
 
-def test_somebody_elses_target_and_what_bridges_say(struck):
+def test_foreign_targets_and_faults_of_bridge_states(struck):
     processes, _ = struck(Fault('target', z=-5.0, roll=np.pi), Fault('motor_board_lost', at=0.0))
     target = processes.target(PoseTarget(np.zeros(3), STATE.quaternion, 4.0))
     assert target.position[2] == -5.0 and target.stamp == 4.0

@@ -81,7 +81,7 @@ def fly_switching(policy, seed):
     return flight.fly(task), recorder, task
 
 
-def test_twenty_switches_at_random_moments_of_random_poses(flight):
+def test_twenty_switches_at_random_times_of_random_poses(flight):
     stayed, recorder, task = flight
     log = recorder.log()
     assert stayed and len(recorder.switched) == SWITCHES
@@ -137,7 +137,7 @@ def fly_poses(tmp_path, policy, *heights):
                        options={'rl': ControllerOptions(policy=policy)})
 
 
-def test_answers_that_are_no_numbers_end_in_hover_and_good_ones_fly_again(tmp_path):
+def test_nan_commands_lead_to_hover_and_good_ones_regain_control(tmp_path):
     pytest.importorskip('onnx')
     from hover_policy import write_hover_policy
     broken = write_hover_policy(tmp_path / 'broken.onnx', memory=True, blind_above=0.3)
@@ -155,7 +155,7 @@ def test_answers_that_are_no_numbers_end_in_hover_and_good_ones_fly_again(tmp_pa
     assert np.isnan(log.requests['rl'].thrust).any()
 
 
-def test_absurd_answers_never_get_control(tmp_path, monkeypatch):
+def test_implausible_commands_never_get_control(tmp_path, monkeypatch):
     pytest.importorskip('onnx')
     monkeypatch.setattr(loop, 'TAKEOFF_TIMEOUT', 10.0)      # s; others fly after 4
     from policy_files import write
@@ -164,7 +164,7 @@ def test_absurd_answers_never_get_control(tmp_path, monkeypatch):
         fly_poses(tmp_path, absurd, 1.0)
 
 
-def test_another_robot_flies_where_that_is_allowed(tmp_path):
+def test_a_policy_of_another_robot_flies_with_permission(tmp_path):
     pytest.importorskip('onnx')
     from hover_policy import write_hover_policy
     options = ControllerOptions(policy=write_hover_policy(tmp_path / 'p.onnx'))

@@ -83,7 +83,7 @@ def result(case, **values):
             'flyaway': False, 'takeoffs': 0, **values}
 
 
-def test_sums_add_up(listed):
+def test_summary_counts_add_up(listed):
     flown = [result('gust'), result('gust', outcome='flyaway', good=False, flyaway=True,
                                     impact_m_s=None),
              result('impact', named='push', named_s=0.2, impact_m_s=0.5, takeoffs=1),
@@ -128,7 +128,7 @@ def test_the_command_writes_page_markdown_and_json(listed, tmp_path, monkeypatch
     assert 'old' not in docs.read_text() and '| impact |' in docs.read_text()
 
 
-def test_the_table_in_the_docs_is_that_of_the_list(listed):
+def test_the_table_in_the_docs_agrees_with_the_list(listed):
     table = (ROOT / 'docs' / 'safety.md').read_text().split(page.BEGIN)[1].split(page.END)[0]
     rows = [[cell.strip() for cell in line.strip('| ').split(' | ')[:3]]
             for line in table.strip().splitlines()[2:]]
@@ -147,7 +147,7 @@ def test_unusable_input_is_refused_in_one_line(capsys, arguments, named):
     assert len(lines) == 1 and named in lines[0]
 
 
-def test_at_a_random_moment_faults_strike_all_over_the_time_of_a_pose(listed):
+def test_random_fault_times_cover_the_time_of_a_pose(listed):
     class Recorded:
         """Record the requested targets."""
 

@@ -28,7 +28,7 @@ def judged(watch, asked=True, stopped=True, refused=False):
     return watch.outcome(asked=asked, stopped=stopped, refused=refused)
 
 
-def test_a_soft_landing_flies_on_or_lands_or_was_refused(watch):
+def test_a_soft_landing_counts_as_flies_on_lands_or_refused(watch):
     watch.step(truth(1.0, 0.15, contact=True, impact=soft()), 0.0, TICK)
     assert judged(watch) == 'flies_on'
     assert judged(watch, asked=False) == 'lands'
@@ -36,7 +36,7 @@ def test_a_soft_landing_flies_on_or_lands_or_was_refused(watch):
     assert judged(watch, stopped=False) == 'does not land'
 
 
-def test_a_hard_or_tilted_landing_is_none(watch, listed):
+def test_a_hard_or_tilted_touchdown_is_not_a_landing(watch, listed):
     watch.step(truth(1.0, impact=soft(inclination=1.1 * listed.limits.inclination)), 0.0, TICK)
     assert judged(watch) == 'tilted'
     watch.step(truth(2.0, impact=soft(2.0, speed=1.1 * listed.limits.impact_speed)), 0.0, TICK)
@@ -56,12 +56,12 @@ def test_motors_must_stop_soon_after_a_crash(watch, late, outcome):
 
 
 @pytest.mark.parametrize(('x', 'away'), [(10, False), (24.9, False), (25.1, True), (40, True)])
-def test_a_flyaway_is_far_outside(watch, x, away):
+def test_a_flyaway_is_a_position_far_outside(watch, x, away):
     watch.step(truth(1.0, x=x), 20.0, TICK)
     assert (judged(watch) == 'flyaway') == away
 
 
-def test_rising_again_after_lying_down_is_a_takeoff_and_bouncing_is_none(watch):
+def test_rising_after_rest_is_a_takeoff_and_bouncing_is_not(watch):
     for k in range(200):
         watch.step(truth(k * TICK, 0.15, contact=k % 40 > 0), 0.0, TICK)
     watch.step(truth(1.1, 1.0), 20.0, TICK)
@@ -74,7 +74,7 @@ def test_rising_again_after_lying_down_is_a_takeoff_and_bouncing_is_none(watch):
     assert judged(watch) == 'takes off'
 
 
-def test_a_better_outcome_is_as_good():
+def test_a_better_outcome_than_expected_is_accepted():
     for expected in OUTCOMES:
         assert as_expected(expected, expected)
         for bad in ('flyaway', 'takes off', 'crash, motors on', 'tilted', 'hard', 'error',

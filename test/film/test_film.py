@@ -43,7 +43,7 @@ def bag(tmp_path_factory):
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_a_still_camera_sees_all_of_a_flight(seed):
+def test_the_camera_view_contains_the_whole_flight(seed):
     random = np.random.default_rng(seed)
     points = random.uniform(-1, 1, (40, 3)) * random.uniform(0.01, 3, 3) + random.uniform(-2, 2, 3)
     camera = framing(points)
@@ -61,7 +61,7 @@ def test_a_still_camera_sees_all_of_a_flight(seed):
     assert np.abs(seen @ side / depth / tangent).max() < 1.2
 
 
-def test_the_true_model_repeats_the_flight_and_a_wrong_one_drifts_until_it_is_put_right(
+def test_the_true_model_follows_the_flight_and_a_wrong_one_drifts_until_restarted(
         bag, tmp_path):
     log, flown = read_bag(bag), motion(read_bag(bag))
     heavy = tmp_path / 'heavy.yaml'
@@ -79,7 +79,7 @@ def test_the_true_model_repeats_the_flight_and_a_wrong_one_drifts_until_it_is_pu
         assert away[early].max() < 0.002 and turned[early].max() < 0.02
 
 
-def test_a_scene_holds_the_error_to_the_target_in_force(bag):
+def test_a_scene_contains_the_error_to_the_target_in_force(bag):
     log = read_bag(bag)
     times = log.targets[0].stamp + np.arange(0.0, 3.0, 0.1)
     scene = target_scene(log, 'flight', '#102030', times, RobotParameters.load())
@@ -91,7 +91,7 @@ def test_a_scene_holds_the_error_to_the_target_in_force(bag):
     assert scene.ghosts[-1].position == pytest.approx(POSES[1, :3])
 
 
-def test_a_gif_plays_what_was_drawn(tmp_path):
+def test_a_gif_contains_the_drawn_frames(tmp_path):
     pictures = []
     for k in range(6):
         picture = np.full((40, 60, 3), (230, 236, 244), np.uint8)
@@ -133,7 +133,7 @@ def test_a_film_shows_the_robot_move(bag, tmp_path):
             assert reddish.sum() > 80
 
 
-def test_without_graphics_one_line_says_what_to_install(bag, tmp_path):
+def test_without_graphics_one_line_names_the_packages(bag, tmp_path):
     done = film(bag, '-o', tmp_path / 'a.gif', MUJOCO_GL='none')
     lines = done.stderr.splitlines()
     assert done.returncode == 2 and len(lines) == 1 and 'libopengl0' in lines[0], done.stderr

@@ -31,7 +31,7 @@ def test_white_noise_of_a_sensor_raises_its_own_ceiling():
     assert 'rate_x' not in [noise.channel for noise in excess]
 
 
-def test_a_slow_error_does_not_pass_for_noise():
+def test_a_slow_error_is_not_taken_for_noise():
     excess = channels_above_ceiling([readings(drift=0.2)], {}, P)
     assert 'rate_x' in [noise.channel for noise in excess]
 
@@ -57,8 +57,8 @@ def refuted(monkeypatch, before, after, gain=(0.0, 1.0)):
     (1.12, 1.15, (500.0, 20.0), 'worse'), (1.0, 1.0, (500.0, 20.0), ''),
     (1.0, 1.0, (5.0, 20.0), 'does not improve'),
     (20.0, 15.0, (500.0, 20.0), 'does not explain most')])
-def test_a_name_needs_free_runs_that_end_and_flights_held_out_that_gain(monkeypatch, before,
-                                                                        after, gain, words):
+def test_a_name_needs_finite_free_runs_and_a_gain_on_held_out_flights(monkeypatch, before,
+                                                                      after, gain, words):
     why = refuted(monkeypatch, before, after, gain)
     assert words in why and bool(words) == bool(why)
 

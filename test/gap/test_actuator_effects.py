@@ -108,15 +108,15 @@ def test_stiction_is_found_from_below_and_from_above(fading, start):
     (0.004, [0.003, 0.0052], (0.006, [0.005, 0.007])),
     (0.0058, [0.0036, 0.008], (0.006, [0.005, 0.008])),
     (0.009, [0.008, 0.010], (0.009, [0.008, 0.010]))])
-def test_what_is_said_of_stiction_is_at_least_what_is_said_of_coulomb(stiction, interval,
-                                                                      expected):
+def test_the_stated_stiction_is_at_least_the_coulomb_friction(stiction, interval,
+                                                              expected):
     said = {'value': stiction, 'interval': interval}
     at_least(said, {'value': 0.006, 'interval': [0.005, 0.007]})
     assert (said['value'], said['interval']) == expected
 
 
 @pytest.mark.parametrize('stiction', [0.0, 0.002])
-def test_a_file_whose_stiction_is_below_coulomb_friction_holds_a_joint_by_the_latter(stiction):
+def test_stiction_below_coulomb_friction_acts_as_coulomb_friction(stiction):
     robot = replace(ROBOT, effects={'joint_friction': {'coulomb': 0.007, 'stiction': stiction}})
     keys = {**all_keys(robot), **extra_keys()}
     assert keys['joint_friction.stiction'].base == 0.007
@@ -126,7 +126,7 @@ def test_a_file_whose_stiction_is_below_coulomb_friction_holds_a_joint_by_the_la
     assert rest.std() < 0.1 * without.std()
 
 
-def test_a_servo_as_in_the_file_leaves_no_residual():
+def test_a_servo_as_in_the_robot_file_leaves_no_residual():
     rest = model(flight(servo())).residual({}, 'J')['J']
     assert np.abs(rest).max() < 2e-3
 
@@ -169,7 +169,7 @@ def test_play_behind_the_encoder_turns_the_true_tilt_only():
     assert 0.008 < apart.max() < 0.011
 
 
-def test_a_spinning_rotor_loads_its_joint_as_euler_says():
+def test_the_gyroscopic_load_on_a_joint_agrees_with_euler():
     """Turning the momentum takes a torque, which the servo gives about its axis."""
     made = model(MOTION.flight())
     load, t = spin_load(made.signals, {}), made.signals.t
@@ -180,7 +180,7 @@ def test_a_spinning_rotor_loads_its_joint_as_euler_says():
         assert np.allclose(load[:, i], np.interp(t, MOTION.t, expected), atol=5e-3)
 
 
-def test_a_torque_limit_is_sought_where_it_acts_and_found_there():
+def test_a_torque_limit_is_recovered_from_samples_at_the_limit():
     made, key = model(flight(servo(effort=0.05))), 'joint_torque_limit.effort_limit'
     begin = next(c for c in candidates(KEYS, [made]) if c.name == 'joint_torque_limit').starts
     tried = [start[0] for start in begin]
@@ -193,7 +193,7 @@ def test_a_torque_limit_is_sought_where_it_acts_and_found_there():
     assert KEYS[key].value(found[key]) == pytest.approx(0.05, abs=0.003)
 
 
-def test_turning_servos_ask_for_less_than_their_lag_suggests():
+def test_moving_servos_need_less_torque_than_their_lag_suggests():
     asked = np.abs(_torques(model(MOTION.flight())))
     lag = JOINT.kp * np.abs(MOTION.tilt_command - MOTION.tilt)
     assert np.quantile(asked, 0.999) < 0.5 * np.quantile(lag, 0.999)

@@ -30,7 +30,7 @@ def added(monkeypatch):
     monkeypatch.setitem(CATALOGUE, NAME, made['ACTUATOR'][NAME])
 
 
-def test_the_pages_own_test_passes_with_its_entry_and_fails_without(monkeypatch):
+def test_the_test_of_the_page_passes_only_with_the_new_entry(monkeypatch):
     made = {}
     exec(compile(TEST, str(PAGE), 'exec'), made)
     page_test = made['test_motors_of_50_degrees_take_thrust']
@@ -41,18 +41,18 @@ def test_the_pages_own_test_passes_with_its_entry_and_fails_without(monkeypatch)
 
 
 @pytest.mark.parametrize('consumer', ['nmpc', 'training', 'plant'])
-def test_what_flies_acts_on_it(consumer):
+def test_the_plant_applies_the_added_effect(consumer):
     assert effects.treatment(consumer, NAME).acts
     found = np.concatenate([np.ravel(part) for part in OUTPUTS[consumer](with_effect(NAME))])
     assert not np.array_equal(found, plain(consumer))
 
 
-def test_the_experiment_that_separates_it_is_its_own():
+def test_the_added_effect_has_its_own_experiment():
     assert separating_experiment(['thrust_coefficient', NAME]) == CATALOGUE[NAME].separated_by
     assert separating_experiment(['mass', 'thrust_coefficient']) == CATALOGUE['mass'].separated_by
 
 
-def test_the_gap_finder_looks_for_it_and_finds_its_size(monkeypatch):
+def test_the_gap_finder_identifies_the_added_effect(monkeypatch):
     robot = replace(FLOWN, effects={NAME: {'loss_per_kelvin': 0.0, 'temperature': 50.0}})
     keys, key = {**all_keys(robot), **extra_keys()}, f'{NAME}.loss_per_kelvin'
     monkeypatch.setitem(KEYS, key, keys[key])

@@ -19,7 +19,7 @@ RESULTS = {'verdict': 'named', 'closure': 0.9, 'effects': [NAMED], 'tolerances':
            'meta': {'runs': ['a'], 'holdout': ['b']}}
 
 
-def test_numbers_within_tolerance_take_the_place_of_the_files(tmp_path):
+def test_values_fitted_within_tolerance_replace_those_of_the_file(tmp_path):
     write_corrected(tmp_path / 'mine.yaml', RESULTS, ROBOT, None, tolerances=True)
     mine = RobotParameters.load(tmp_path / 'mine.yaml')
     assert mine.mass == pytest.approx(ROBOT.mass * np.exp(0.004), rel=1e-4)
@@ -31,14 +31,14 @@ def test_numbers_within_tolerance_take_the_place_of_the_files(tmp_path):
     assert set(mine.effects) == {'imu_misalignment'}
 
 
-def test_without_being_asked_only_what_is_named_is_written(tmp_path):
+def test_by_default_only_named_effects_are_written(tmp_path):
     write_corrected(tmp_path / 'mine.yaml', RESULTS, ROBOT, None)
     mine = RobotParameters.load(tmp_path / 'mine.yaml')
     assert replace(mine, effects={}).hash() == ROBOT.hash()
     assert mine.sensors.imu_rotation == (0.01, 0.0, -0.02)
 
 
-def test_a_named_number_goes_before_its_tolerance():
+def test_a_named_value_has_precedence_over_its_tolerance():
     assert 'joints' not in own_numbers(ROBOT, TOLERANCES, ['joint_bandwidth'])
     heavy = replace(ROBOT, effects={'mass': {'mass': 3.2}})
     assert 'mass' not in own_numbers(heavy, TOLERANCES)

@@ -58,14 +58,14 @@ def flown(seed, gusts, wanted):
     return planned + jitter - gust, gust + 0.2 * np.gradient(rng.standard_normal(LENGTH))
 
 
-def test_a_number_that_is_the_same_everywhere_gains_less_in_a_part():
+def test_a_parameter_valid_in_all_bands_gains_less_in_one_band():
     p = problem()
     x = noise(3 * len(p.where), 1).reshape(-1, 3)
     everywhere, part = gain_by_part(p, x, x @ [0.3, -0.1, 0.05] + noise(len(p.where), 2))
     assert part < everywhere
 
 
-def test_a_number_that_is_there_in_slow_motion_only_gains_more():
+def test_a_parameter_valid_in_slow_motion_only_gains_more_there():
     p = problem()
     x = noise(len(p.where), 1)[:, None]
     slowly = lfilter([0.05], [1, -0.95], x[:, 0])
@@ -75,7 +75,7 @@ def test_a_number_that_is_there_in_slow_motion_only_gains_more():
 
 @pytest.mark.parametrize('groups, channels', [('B', range(6)), ('J', range(12, 16)),
                                               ('BAWJ', range(16))])
-def test_bands_together_hold_all_that_is_in_time(groups, channels):
+def test_the_bands_add_up_to_the_signal(groups, channels):
     p = problem()
     x, r = noise(2 * len(p.where), 1).reshape(-1, 2), noise(len(p.where), 2)
     inside = np.isin(p.where, channels)
@@ -102,7 +102,7 @@ def test_closed_loop_bias_is_separated_from_an_inertia(gusts, wanted, true, pass
     assert differs_between_bands(p, x, r) != passes
 
 
-def test_what_others_could_take_over_is_no_evidence():
+def test_a_gain_that_other_parameters_could_reach_is_no_evidence():
     p = problem()
     known = noise(len(p.where), 1)
     own = noise(len(p.where), 2)
@@ -114,7 +114,7 @@ def test_what_others_could_take_over_is_no_evidence():
     np.testing.assert_allclose(rest, slopes[:, 0], atol=1e-6)
 
 
-def test_a_gain_in_the_priors_is_no_closed_loop_bias():
+def test_a_gain_in_the_priors_is_not_a_closed_loop_bias():
     p = problem()
     x = noise(len(p.where), 1)[:, None]
     slowly = lfilter([0.05], [1, -0.95], x[:, 0])

@@ -166,14 +166,14 @@ def test_a_wind_is_recovered_in_world_axes(made):
     assert np.allclose([found[name] for name in names], true, rtol=0.01, atol=0.01)
 
 
-def test_every_body_effect_was_asked_for():
+def test_every_body_effect_is_tested():
     asked = {name.partition('.')[0] for name in CASES} | {
         'wind', 'inertia', 'centre_of_mass'}     # the last two: test_dynamics
     assert asked >= {name for name, effect in CATALOGUE.items() if effect.apply}
 
 
 @pytest.mark.parametrize('name', [n for n, e in CATALOGUE.items() if e.apply])
-def test_a_mirrored_robot_answers_as_in_a_mirror(name):
+def test_a_mirrored_robot_gives_mirrored_results(name):
     """Mirrored at the x-z plane: vectors change y, rates and torques change x and z."""
     places = np.array([[1, 1, -0.02], [-1, 1, -0.02], [-1, -1, -0.02], [1, -1, -0.02]]) * 0.2
     robot = replace(ROBOT, rotors=replace(ROBOT.rotors, positions=places))

@@ -42,7 +42,7 @@ ROBOT = RobotParameters.load()
 
 
 @pytest.mark.parametrize('layer', list(NAMES))
-def test_every_fixed_name_is_there_in_its_layer(layer):
+def test_every_fixed_name_exists_in_its_layer(layer):
     for name in NAMES[layer].split():
         assert CATALOGUE[name].layer == layer
 
@@ -53,7 +53,7 @@ def test_parameters_have_the_fixed_names(name):
 
 
 @pytest.mark.parametrize('name', list(CATALOGUE))
-def test_an_entry_says_what_excites_it_and_what_it_is_confused_with(name):
+def test_an_entry_states_its_excitation_and_its_confusions(name):
     effect = CATALOGUE[name]
     assert effect.layer in LAYERS
     assert effect.source and effect.excited_by and effect.separated_by
@@ -64,13 +64,13 @@ def test_an_entry_says_what_excites_it_and_what_it_is_confused_with(name):
             assert 0 < spec.smallest < spec.typical
 
 
-def test_an_entry_acts_somewhere_or_is_a_sensors():
+def test_an_entry_acts_on_a_model_or_on_a_sensor():
     for name, effect in CATALOGUE.items():
         acts = effect.apply or effect.servo or effect.settings or 'delay' in effect.parameters
         assert acts or effect.layer == 'sensor' or name == 'joint_backlash'
 
 
-def test_a_number_that_the_file_has_is_varied_by_a_ratio():
+def test_a_value_of_the_robot_file_is_varied_by_a_ratio():
     keys = all_keys(ROBOT)
     assert keys['mass.mass'].relative
     assert keys['mass.mass'].value(math.log(1.1)) == pytest.approx(1.1 * ROBOT.mass)

@@ -58,7 +58,7 @@ def test_the_hidden_wind_is_named_with_its_size(made):
 
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='forks on Linux only')
-def test_on_two_cores_it_says_the_same_as_on_one(made, monkeypatch):
+def test_two_cores_give_the_same_result_as_one(made, monkeypatch):
     folder, results, _ = made
     monkeypatch.setattr(workers, 'width', lambda: 2)
     again = gap_results([folder / 'flight0'], [folder / 'flight1'], console=quiet())
@@ -66,14 +66,14 @@ def test_on_two_cores_it_says_the_same_as_on_one(made, monkeypatch):
         assert again[name] == results[name], name
 
 
-def test_the_gap_on_the_flight_held_out_shrinks_and_a_placebo_does_not_help(made):
+def test_the_held_out_gap_shrinks_and_a_placebo_does_not_shrink_it(made):
     results = made[1]
     assert results['held_out'] and results['gap_after'] < results['gap_before']
     assert results['closure'] > 0.8
     assert results['horizons']['0.5 s']['placebo'] > results['gap_before']
 
 
-def test_what_makes_flights_held_out_worse_is_not_named(made):
+def test_an_effect_that_worsens_held_out_flights_is_not_named(made):
     folder, robot = made[0], RobotParameters.load()
     fly('hover', make_task(str(folder / 'poses.csv'), 0), robot=robot, plant=robot, seed=2,
         bag=folder / 'calm')        # another day: no wind
@@ -83,7 +83,7 @@ def test_what_makes_flights_held_out_worse_is_not_named(made):
     assert results['gap_after'] == results['gap_before']
 
 
-def test_what_leaves_most_of_a_large_gap_is_not_named(made):
+def test_an_effect_that_leaves_most_of_a_large_gap_is_not_named(made):
     folder, robot = made[0], RobotParameters.load()
     strong = replace(robot, effects={'wind': {'force': 6 * np.array(TRUE)}})
     fly('hover', make_task(str(folder / 'poses.csv'), 0), robot=robot, plant=strong, seed=3,
@@ -94,7 +94,7 @@ def test_what_leaves_most_of_a_large_gap_is_not_named(made):
     assert 'wind' in results['reason'] and 'does not explain most' in results['reason']
 
 
-def test_the_json_holds_what_the_interfaces_fix(made):
+def test_the_json_has_the_fixed_keys(made):
     results = json.loads((made[0] / 'gap.json').read_text())
     for key in ('verdict', 'effects', 'where', 'gap_before', 'gap_after', 'noise_floor',
                 'closure', 'candidates', 'next_experiment'):
@@ -112,7 +112,7 @@ def test_the_new_robot_file_is_the_old_one_with_the_wind(made):
     assert robot.provenance['runs'] and robot.provenance['date']
 
 
-def test_page_and_terminal_say_what_was_found(made):
+def test_page_and_terminal_state_the_finding(made):
     folder, _, printed = made
     page = (folder / 'gap.html').read_text()
     assert 'wind' in printed and 'wind' in page
@@ -130,7 +130,7 @@ def _bag_of_something_else(folder):
     (lambda folder: folder, 'no .mcap file'),
     (lambda folder: folder / 'photo.jpg', 'expected a rosbag2 folder'),
     (_bag_of_something_else, 'no recording of this robot')])
-def test_what_is_no_recording_of_this_robot_is_one_line_and_status_2(made, words, tmp_path,
+def test_a_run_of_another_kind_is_refused_with_one_line_and_status_2(made, words, tmp_path,
                                                                      capsys):
     (tmp_path / 'photo.jpg').write_bytes(b'no bag')
     run = made(tmp_path)
@@ -143,7 +143,7 @@ def test_what_is_no_recording_of_this_robot_is_one_line_and_status_2(made, words
     assert words in capsys.readouterr().err
 
 
-def test_another_robot_with_the_same_sensors_is_no_recording_of_this_one(made, tmp_path, capsys):
+def test_a_recording_of_another_robot_with_the_same_sensors_is_refused(made, tmp_path, capsys):
     other = tmp_path / 'other'
     with BagWriter(other) as bag:
         for message in read_messages(made[0] / 'flight0'):
@@ -166,7 +166,7 @@ def test_the_same_recording_twice_is_refused_under_any_name(made, tmp_path, caps
         assert 'the same recording twice' in error and str(other) in error
 
 
-def test_a_part_of_a_fitted_flight_is_no_flight_held_out(made, tmp_path, capsys):
+def test_a_part_of_a_fitted_flight_is_refused_as_held_out_flight(made, tmp_path, capsys):
     part = tmp_path / 'part'
     with BagWriter(part) as bag:
         for message in read_messages(made[0] / 'flight0'):
@@ -176,7 +176,7 @@ def test_a_part_of_a_fitted_flight_is_no_flight_held_out(made, tmp_path, capsys)
     assert 'the same flight in two recordings' in capsys.readouterr().err
 
 
-def test_a_damaged_hold_out_is_bad_data_and_not_left_out(made, tmp_path):
+def test_a_damaged_held_out_flight_gives_bad_data(made, tmp_path):
     damaged = tmp_path / 'damaged'
     with BagWriter(damaged) as bag:
         for message in read_messages(made[0] / 'flight1'):
@@ -218,7 +218,7 @@ def test_the_page_begins_with_verdict_sentence_and_picture(made):
     assert made[1]['summary'][:40] in page
 
 
-def test_the_sentence_says_size_and_closure(made):
+def test_the_sentence_states_size_and_closure(made):
     assert made[1]['summary'].startswith('Wind of 1.2') and '+-' in made[1]['summary']
     assert f'{made[1]["closure"]:.0%}' in made[1]['summary']
 

@@ -164,7 +164,7 @@ def plain(consumer):
 
 @pytest.mark.parametrize('name', CATALOGUE)
 @pytest.mark.parametrize('consumer', OUTPUTS)
-def test_a_consumer_acts_on_an_effect_or_says_why_not(consumer, name):
+def test_a_consumer_applies_an_effect_or_states_why_not(consumer, name):
     treatment, robot = effects.treatment(consumer, name), with_effect(name)
     if treatment.error:
         with pytest.raises(ParameterError, match=f'effects.{name}: the .* refuses') as error:
@@ -178,7 +178,7 @@ def test_a_consumer_acts_on_an_effect_or_says_why_not(consumer, name):
 
 
 @pytest.mark.parametrize('name', CATALOGUE)
-def test_the_gap_finder_acts_on_every_effect(name):
+def test_the_gap_finder_applies_every_effect(name):
     assert gap(name) and effects.treatment('gap', name).acts
 
 

@@ -55,7 +55,7 @@ class Curved(Straight):
         self.at = theta
 
 
-def test_a_slow_fit_leaves_nothing_for_others_to_gain():
+def test_a_slowly_converging_fit_leaves_no_gain_for_other_candidates():
     problem = Curved(0.25, 0.0)
     search = Search.__new__(Search)
     search.p = P
@@ -88,7 +88,7 @@ class Rough(Straight):
 
 
 @pytest.mark.parametrize('split', [False, True])
-def test_a_rough_slope_need_not_hold_up_the_others(split):
+def test_an_inaccurate_derivative_does_not_slow_the_other_parameters(split):
     problem = Rough(0.02, 0.0)
     start, free = problem.start(), frozenset({Rough.FRICTION})
     state, cost = problem.refine(start, [LAG, OTHER, Rough.FRICTION], free, 5, split)
@@ -109,18 +109,18 @@ def before(truth, overlap=0.0):
     return cost, search._plausible_cost(state, cost)
 
 
-def test_a_lag_far_beyond_tolerance_is_not_taken_over_by_it():
+def test_a_lag_far_beyond_tolerance_is_not_absorbed_by_the_tolerance():
     fitted, believable = before(0.25)
     # The tolerance's own price is eight deviations: 70 of chi2. The data say thousands.
     assert fitted < 2300 and believable > fitted + 1000 * 30**2 * (0.25 - 0.09)**2
 
 
-def test_nor_by_the_tolerance_of_something_else():
+def test_a_lag_is_not_absorbed_by_the_tolerance_of_another_parameter():
     fitted, believable = before(0.25, overlap=0.99)
     assert believable > fitted + 1000
 
 
-def test_a_lag_within_tolerance_is():
+def test_a_lag_within_tolerance_is_absorbed():
     fitted, believable = before(0.05)
     assert believable == fitted
 
@@ -130,7 +130,7 @@ def test_a_prior_has_a_plausible_range(x, expected):
     assert Prior(0.03).within(x, P.beyond) == pytest.approx(expected)
 
 
-def test_a_free_range_ends_beyond_itself():
+def test_a_search_range_extends_beyond_its_plausible_range():
     prior = Prior(5e-4, 0.010, 0.005, 0.003)
     assert prior.within(0.004, P.beyond) == 0.004
     assert prior.within(0.02, P.beyond) == pytest.approx(0.0065)
@@ -145,9 +145,9 @@ def test_a_free_range_ends_beyond_itself():
     (30.0, 31.0, 10.0, 28.0, True), (30.0, 130.0, 1.5, 28.0, True),
     (20.0, 21.0, 10.0, 40.0, False), (60.0, 600.0, 10.0, 20.0, False),
     (60.0, 600.0, 10.0, 60.0, True)])
-def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch, gain, left,
-                                                                     agreement, prior_gain,
-                                                                     named):
+def test_a_small_gap_above_noise_must_be_explained_mostly_by_the_effect(monkeypatch, gain, left,
+                                                                        agreement, prior_gain,
+                                                                        named):
     drag = Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag')
     trial = Trial(drag, gain, {'rotor_drag.coefficient': 0.4}, refined=True,
                   prior_gain=prior_gain)
@@ -168,7 +168,7 @@ def test_of_the_little_that_noise_leaves_an_effect_must_explain_most(monkeypatch
     (100.0, 40.0, 0.6, 0.0, True), (100.0, 80.0, 1.0, 0.0, False), (1000.0, 800.0, 1.0, 0.0, True),
     (1000.0, 800.0, 0.75, 0.0, False), (100.0, 80.0, 1.0, 90.0, True),
     (100.0, 80.0, 0.75, 90.0, False), (100.0, 80.0, 1.0, 10.0, False)])
-def test_what_gains_little_must_gain_it_evenly(gain, error, positive, prior_gain, held):
+def test_a_small_gain_must_be_even_over_the_blocks(gain, error, positive, prior_gain, held):
     drag = Candidate('rotor_drag', ('rotor_drag.coefficient',), label='rotor_drag')
     blocks = SimpleNamespace(total=gain, error=error, positive=positive, without_best=0.5 * gain)
     assert confirmed(Trial(drag, gain, {}, held=blocks, prior_gain=prior_gain), P) == held
@@ -177,7 +177,7 @@ def test_what_gains_little_must_gain_it_evenly(gain, error, positive, prior_gain
 @pytest.mark.parametrize('name, delay, physical', [
     ('imu_filter_lag', -0.003, False), ('joint_feedback_delay', -0.003, False),
     ('joint_feedback_delay', 0.003, True), ('mocap_time_offset', -0.003, True)])
-def test_a_reading_is_not_younger_than_its_stamp(name, delay, physical):
+def test_a_reading_is_not_newer_than_its_stamp(name, delay, physical):
     key = f'{name}.delay'
     trial = Trial(Candidate(name, (key,), label=name), 100.0, {key: delay})
     assert at_bound(KEYS, trial) != physical
@@ -197,7 +197,7 @@ def test_an_effect_of_one_sign_stays_on_its_side(name):
     assert KEYS[name].low == 0.0 < KEYS[name].high
 
 
-def test_an_effect_that_only_the_file_has_may_fall_to_nothing():
+def test_an_effect_of_the_robot_file_may_be_fitted_to_zero():
     own = all_keys(replace(ROBOT, effects={'rotor_drag': {'coefficient': 0.8}}))
     key = 'rotor_drag.coefficient'
     gone = Trial(Candidate('rotor_drag', (key,), label='gone'), 100.0, {key: own[key].low})
@@ -208,7 +208,7 @@ def test_an_effect_that_only_the_file_has_may_fall_to_nothing():
     assert at_bound(KEYS, dead)
 
 
-def test_a_reading_may_be_younger_than_the_robot_file_says():
+def test_a_reading_may_be_newer_than_in_the_robot_file():
     late = all_keys(replace(ROBOT, effects={'joint_feedback_delay': {'delay': 0.01}}))
     key = 'joint_feedback_delay.delay'
     trial = Trial(Candidate('joint_feedback_delay', (key,), label='late'), 100.0, {key: -0.004})
@@ -218,7 +218,7 @@ def test_a_reading_may_be_younger_than_the_robot_file_says():
 @pytest.mark.parametrize('tilt, thrust, usual', [
     (0.0, 0.0, True), (0.004, -0.009, True), (-0.009, 0.004, True), (0.011, 0.0, False),
     (0.0, 0.011, False), (-0.014, 0.0, False)])
-def test_each_bus_is_late_within_its_own_range(tilt, thrust, usual):
+def test_each_bus_has_its_own_range_of_delay(tilt, thrust, usual):
     priors = tolerances(P)
     beyond = [abs(priors[name].residual(x)) for name, x in
               ((TILT_BUS, tilt), (THRUST_BUS, thrust))]
@@ -248,7 +248,7 @@ class Capped(Problem):
         return State({self.KEY: x}, self.residual({self.KEY: x}), slope[:, None], [self.KEY])
 
 
-def test_a_limit_that_one_block_alone_knows_is_without_it_no_limit_at_worst():
+def test_without_the_only_block_at_a_limit_the_limit_is_open():
     problem = Capped()
     point, without = problem.at(0.019), problem.at(3.0)     # where bad readings pull it
     trial = Trial(Candidate('joint_velocity_limit', (problem.KEY,), label='limit'), 1.0,

@@ -47,7 +47,7 @@ def test_every_flight_has_its_own_gusts():
     assert noise_floor(windy, storm)[HALF, 1] > 2 * noise_floor(windy, calm)[HALF, 1]
 
 
-def test_a_force_that_the_catalogue_knows_is_no_noise():
+def test_a_force_of_the_catalogue_is_not_counted_as_noise():
     problem = fitted(gusts(MOTION, 1, 0.1), others=[
         made(gusts(MOTION, 3, 0.1) + push) for push in ([0, 0, 0], [0.8, -0.5, 0.0])])
     _, plain, blown = problem.noise_of_each({}, WIDE)
@@ -65,7 +65,7 @@ def test_a_perfect_model_is_at_the_floor_on_a_windy_day_too():
     assert gap([runs(0.5, 0.5)], HALF, trim=trim) == pytest.approx(1)
 
 
-def test_no_floor_is_higher_than_what_the_model_reaches():
+def test_the_noise_floor_is_at_most_the_gap_of_the_model():
     trim = floor_factors([runs(0.05, 0.1), runs(0.1, 0.2)])
     assert trim == pytest.approx(0.5)
     assert gap([runs(0.5, 0.5)], HALF, trim=trim) == pytest.approx(2)
@@ -75,7 +75,7 @@ def test_a_bad_fit_does_not_raise_the_floor():
     assert floor_factors([runs(3.0, 0.1)]) == pytest.approx(1)
 
 
-def test_joints_are_at_the_floor_where_they_spread_as_the_noise_does():
+def test_joints_with_the_spread_of_the_noise_are_at_the_floor():
     keep, drive = 0.9, 0.004
     spread = drive / np.sqrt(1 - keep**2)     # of x' = keep x + e
     flight = made(np.zeros(3))
@@ -84,7 +84,7 @@ def test_joints_are_at_the_floor_where_they_spread_as_the_noise_does():
     assert noise_floor(flight, noise)[HALF, 4] == pytest.approx(2 * spread, rel=0.02)
 
 
-def test_torques_that_nobody_knows_lean_the_thrust():
+def test_unknown_torques_tilt_the_thrust():
     size, step = 0.5, THIN * P.grid * P.body_every
     noise = Noise({'B': np.ones((6, 1)), 'J': np.ones((4, 1))},
                   {'B': np.array([0, 0, 0, *[size] * 3]), 'J': np.zeros(4)})

@@ -16,7 +16,7 @@ def made():
     return model(Motion().flight())
 
 
-def test_rotors_follow_their_servos_through_the_play_between(made):
+def test_rotors_follow_their_servos_through_backlash(made):
     starts, steps = np.arange(0, 1200, 50), 100
     _, shaft, tight = _servo_runs(made, {}, starts, steps)
     _, same, loose = _servo_runs(made, {'joint_backlash.gap': GAP}, starts, steps)
@@ -32,7 +32,7 @@ def test_rotors_follow_their_servos_through_the_play_between(made):
     np.testing.assert_allclose(np.abs(loose - tight)[:, -1][turning], GAP / 2, atol=2e-3)
 
 
-def test_joints_with_play_are_foretold_as_well_as_without(made):
+def test_joints_with_backlash_are_predicted_as_well_as_without(made):
     noise = Noise.white(P)
     error = {gap: free_runs(made, {'joint_backlash.gap': gap}, noise).error[..., STATES['joint']]
              for gap in (0.0, GAP)}

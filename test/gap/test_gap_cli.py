@@ -12,7 +12,7 @@ from beetle_omni_ros.cli.models import spread
     ('--robot r a b --holdout c d', '--robot r a b --holdout c --holdout d'),
     ('--holdout c a b', '--holdout c a b'),
     ('a --holdout c --holdout d', 'a --holdout c --holdout d')])
-def test_every_run_after_holdout_judges(given, meant):
+def test_every_run_after_holdout_is_held_out(given, meant):
     assert spread(given.split()) == meant.split()
 
 

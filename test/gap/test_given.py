@@ -11,5 +11,5 @@ from beetle_omni_ros.identify.gap.ingest import names_of
     (['/a/one', '/a/two'], ['one', 'two']),
     (['/a/one/bag', '/a/two/bag'], ['one/bag', 'two/bag']),
     (['/a/1/x/bag', '/b/1/x/bag'], ['a/1/x/bag', 'b/1/x/bag']), (['/a/one'], ['one'])])
-def test_names_tell_recordings_apart(paths, names):
+def test_recordings_have_distinct_names(paths, names):
     assert names_of([Path(path) for path in paths]) == names

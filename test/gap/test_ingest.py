@@ -39,7 +39,7 @@ def cut(made, topic, keep):
     return made
 
 
-def test_a_good_recording_is_taken_whole():
+def test_a_good_recording_is_used_completely():
     flight = prepare(recording(), ROBOT, P)
     assert flight.duration > 15 and not flight.findings
 
@@ -62,7 +62,7 @@ def test_many_stamps_that_occur_twice_are_refused():
     refused(made, 'imu/data_raw', 'twice')
 
 
-def test_long_silence_of_a_sensor_is_refused_and_short_silence_is_cut_around():
+def test_long_sensor_gaps_are_refused_and_short_ones_cut_out():
     made = recording()
     t = made.times['imu/data_raw']
     refused(cut(made, 'imu/data_raw', (t < 5) | (t > 9)), 'imu/data_raw', 'silent')
@@ -76,14 +76,14 @@ def test_long_silence_of_a_sensor_is_refused_and_short_silence_is_cut_around():
     assert flight.start > 6 and flight.findings
 
 
-def test_a_recording_too_short_to_judge_is_refused():
+def test_a_recording_that_is_too_short_is_refused():
     made = recording()
     for topic, t in made.times.items():
         cut(made, topic, t < 4)
     refused(made, 's of usable flight')
 
 
-def test_what_is_too_short_for_the_filters_is_refused_whatever_is_allowed():
+def test_a_recording_shorter_than_the_filters_is_refused_for_any_setting():
     p = GapParameters.load(least_duration=3.0)
     made = recording()
     for topic, t in made.times.items():
@@ -98,24 +98,24 @@ def test_what_is_too_short_for_the_filters_is_refused_whatever_is_allowed():
     Noise.of([residual], p).whiten(residual)
 
 
-def test_a_robot_that_stays_on_the_ground_is_no_flight():
+def test_a_recording_on_the_ground_is_refused():
     made = recording()
     made.values['command'][:, 4:] = 0.0
     refused(made, 'does not fly')
 
 
-def test_another_robots_file_is_noticed():
+def test_the_file_of_another_robot_is_detected():
     with pytest.raises(UnusableFlight, match='robot file does not fit'):
         prepare(recording(), replace(ROBOT, mass=0.25 * ROBOT.mass), P)
 
 
-def test_an_accelerometer_of_another_range_is_noticed():
+def test_a_clipped_accelerometer_is_detected():
     made = recording()
     made.values['imu/data_raw'][:, :3] *= 3
     refused(made, 'imu/data_raw', 'linear acceleration is 3 times')
 
 
-def test_readings_that_are_no_numbers_are_left_out_and_counted():
+def test_nan_readings_are_omitted_and_counted():
     made = recording()
     made.values['imu/data_raw'][100:104] = np.nan
     flight = prepare(made, ROBOT, P)
@@ -123,6 +123,6 @@ def test_readings_that_are_no_numbers_are_left_out_and_counted():
     assert np.isfinite(flight.imu).all()
 
 
-def test_no_bag_at_all_is_one_line(tmp_path):
+def test_a_missing_bag_is_refused_in_one_line(tmp_path):
     with pytest.raises(BagError, match='no such bag'):
         load_flight(tmp_path / 'nothing', ROBOT, P)

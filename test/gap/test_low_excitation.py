@@ -67,7 +67,7 @@ def test_a_planned_motion_has_excitation():
     assert excitation(problem(MOTION.flight())) > 3 * P.least_liveliness
 
 
-def test_a_robot_that_gusts_push_has_low_excitation():
+def test_motion_by_gusts_is_low_excitation():
     hover = problem(hovering(push=0.1))
     hover.noise = replace(hover.noise, sigma={
         **hover.noise.sigma, 'B': np.array([0.1] * 3 + [0.2] * 3)})
@@ -87,7 +87,7 @@ def test_spread_is_that_of_the_coloured_noise():
         2.0 / np.sqrt(1 - 0.9**2), rel=0.02)
 
 
-def test_low_excitation_names_no_force_but_says_what_would_decide():
+def test_low_excitation_names_no_force_and_proposes_an_experiment():
     rival = trial('mass', 'mass.mass')
     a = decided([thrust()], True, [rival])
     assert (a.verdict, a.accepted) == ('not_decidable', [])
@@ -96,7 +96,7 @@ def test_low_excitation_names_no_force_but_says_what_would_decide():
     assert 'large turns' in a.experiment and 'weigh the robot' in a.experiment
 
 
-def test_low_excitation_is_not_unknown_for_what_gusts_leave():
+def test_residuals_of_gusts_in_low_excitation_are_not_unknown():
     assert decided([thrust()], True, everything=100.0).verdict == 'not_decidable'
     assert decided([thrust()], False, everything=100.0).verdict == 'unknown'
 
@@ -120,7 +120,7 @@ def test_low_excitation_without_a_finding_is_not_decidable():
 
 
 @pytest.mark.parametrize('lively, expected', [(5.0, 2), (0.5, 1)])
-def test_one_explanation_of_low_excitation_is_enough(monkeypatch, lively, expected):
+def test_low_excitation_is_explained_once(monkeypatch, lively, expected):
     first, second = thrust(), trial('wind', 'wind.force[2]')
     search = Search(problem(MOTION.flight()), [first.candidate, second.candidate])
     search._proposals = SimpleNamespace(fit_more=list)

@@ -15,7 +15,7 @@ DESCRIBED, MOTION = RobotParameters.load(), Motion()
 KEYS = ('module_reaction.module_inertia', 'module_reaction.mass_moment')
 
 
-def test_undescribed_modules_load_joints_as_described_ones_of_that_moment_and_inertia():
+def test_undescribed_modules_load_joints_as_described_ones_of_equal_moment_and_inertia():
     flight, module = MOTION.flight(), DESCRIBED.multibody.module
     moment = -module.mass * module.centre_of_mass[2]
     inertia = module.inertia[0] - moment * module.centre_of_mass[2]
@@ -26,7 +26,7 @@ def test_undescribed_modules_load_joints_as_described_ones_of_that_moment_and_in
     assert np.std(moment * hanging - expected) > np.std(found - expected)
 
 
-def test_what_the_file_describes_is_not_counted_again():
+def test_described_module_loads_are_not_counted_twice():
     flight = MOTION.flight()
     assert undescribed_load(Signals(flight, DESCRIBED, P), {}) == ()
     assert not module_load(Signals(flight, ROBOT, P), {}).any()
@@ -34,7 +34,7 @@ def test_what_the_file_describes_is_not_counted_again():
 
 @pytest.mark.parametrize('robot, groups', [(ROBOT, 'BJ'), (DESCRIBED, 'B')],
                          ids=['undescribed', 'described'])
-def test_the_reaction_shows_in_joints_where_nothing_else_loads_them(robot, groups):
+def test_the_module_reaction_is_identified_from_joints_without_other_loads(robot, groups):
     keys = all_keys(robot)
     assert [keys[name].groups for name in KEYS] == [groups, groups]
 

@@ -34,13 +34,13 @@ def rms(x):
 
 
 @pytest.mark.parametrize('name', [DELAY, 'imu_filter_lag.delay'])
-def test_slopes_by_a_delay_hold_no_noise_of_the_encoders(name):
+def test_derivatives_by_a_delay_contain_no_encoder_noise(name):
     slopes = [model(noisy(tilt)).slopes({}, [name])['J'] for tilt in (0.0, 0.02)]
     clean = model(noisy()).slopes({}, [DELAY])['J']
     assert rms(slopes[1] - slopes[0]) < 0.02 * rms(clean)
 
 
-def test_a_stale_slope_does_not_explain_noise():
+def test_an_outdated_derivative_does_not_explain_noise():
     made = model(noisy(0.02))
     slope = made.slopes({}, [DELAY])['J'].ravel()
     for moved in (-0.004, 0.004):
@@ -49,18 +49,18 @@ def test_a_stale_slope_does_not_explain_noise():
         assert gain < 0.01 * rest @ rest
 
 
-def test_late_and_noisy_encoders_are_found_to_be_late():
+def test_the_delay_of_noisy_encoders_is_recovered():
     found = solved(model(noisy(0.02, joint_delay=0.012)), [DELAY], 'J')
     assert found[DELAY] == pytest.approx(0.012, abs=1e-3)
 
 
-def test_noise_of_readings_is_known_from_the_readings():
+def test_the_noise_of_readings_is_estimated_from_the_readings():
     signals = model(noisy(0.02, 0.006)).signals
     assert signals.reading_noise == pytest.approx(0.02, rel=0.15)
     assert signals.position_noise == pytest.approx(0.006, rel=0.1)
 
 
-def test_tilts_follow_the_servo_where_encoders_are_noisy():
+def test_tilts_follow_the_servo_model_if_encoders_are_noisy():
     made = model(noisy(0.02))
     inside = slice(100, -150)
     truth = at(made, MOTION.tilt), at(made, MOTION.tilt_acceleration)
@@ -79,13 +79,13 @@ def test_slow_errors_of_the_servo_model_are_corrected_by_the_encoders():
     assert rms(error[100:-150]) < 0.01
 
 
-def test_good_encoders_stand_for_themselves():
+def test_tilts_follow_good_encoders():
     made = model(noisy(4e-4))
     made.smooth_tilts({})
     assert made.signals.model_tilts is None
 
 
-def test_the_imu_carries_the_velocity_where_positions_are_noisy():
+def test_velocity_follows_the_imu_if_positions_are_noisy():
     errors = [rms((made.signals.pose({})[2] - at(made, MOTION.velocity))[100:-100])
               for made in (model(noisy(position=0.006)), model(noisy(position=0.0035)))]
     assert errors[0] < 0.012 < errors[1]    # the less noisy one is what positions alone give
@@ -103,7 +103,7 @@ def test_inertia_of_a_servo_is_the_inverse_of_its_gains():
     assert np.abs(heavy - same).max() > 0.005
 
 
-def test_a_module_may_be_heavier_about_its_joint_than_the_servo_says():
+def test_module_inertia_may_exceed_that_of_the_servo():
     prior = tolerances(P, swing=0.28)['swing.ratio']
     assert abs(prior.residual(0.25)) < 1 < abs(prior.residual(0.4))
     assert abs(tolerances(P)['swing.ratio'].residual(0.25)) > 2
@@ -128,12 +128,12 @@ def pruned(monkeypatch, name, value, loss):
 
 
 @pytest.mark.parametrize('loss, kept', [(3.0, 0), (300.0, 1)])
-def test_an_only_step_goes_too_if_the_fit_does_not_miss_it(monkeypatch, loss, kept):
+def test_a_single_step_is_dropped_if_the_fit_does_not_worsen(monkeypatch, loss, kept):
     assert pruned(monkeypatch, 'rotor_drag.coefficient', 0.4, loss) == kept
 
 
 @pytest.mark.parametrize('value, kept', [(0.004, 1), (-0.012, 0)])
-def test_what_the_fit_of_all_together_makes_impossible_is_dropped(monkeypatch, value, kept):
+def test_an_effect_that_the_joint_fit_excludes_is_dropped(monkeypatch, value, kept):
     assert pruned(monkeypatch, 'joint_feedback_delay.delay', value, 300.0) == kept
 
 
@@ -160,7 +160,7 @@ def test_a_servo_stiffer_than_the_others_sags_less_under_its_load():
 
 
 @pytest.mark.parametrize('gain', ['kp', 'kd'])
-def test_slopes_by_a_servos_own_gain_are_what_its_joint_does(gain):
+def test_derivatives_by_the_gain_of_a_servo_agree_with_its_joint(gain):
     made, own = model(MOTION.flight()), [f'servo.{gain}[{k}]' for k in range(4)]
     slopes, h = made.slopes({}, [f'joint_bandwidth.{gain}', *own])['J'], 0.01
     for k, name in enumerate(own):
@@ -170,7 +170,7 @@ def test_slopes_by_a_servos_own_gain_are_what_its_joint_does(gain):
     assert slopes[:, :, 1:].sum(axis=2) == pytest.approx(slopes[:, :, 0], abs=1e-12)
 
 
-def test_delays_that_data_cannot_tell_apart_have_the_same_slopes():
+def test_indistinguishable_delays_have_equal_derivatives():
     names = ['command_latency.delay', 'base.tilt_delay', 'joint_command_latency.delay',
              'base.thrust_delay', 'rotor_dead_time.delay']
     slopes = model(MOTION.flight()).slopes({}, names)

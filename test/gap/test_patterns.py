@@ -52,7 +52,7 @@ def field():
     return np.outer(np.exp(-0.5 * (y / 0.4)**2), [0.6, 0.2, 0.0])
 
 
-def test_a_jet_somewhere_in_the_room_goes_with_the_place():
+def test_a_local_jet_is_a_pattern_over_position():
     found = best(gust(1) + field())
     calm = best(gust(1))
     assert found['the place'].gain > P.least_pattern > calm['the place'].gain
@@ -60,7 +60,7 @@ def test_a_jet_somewhere_in_the_room_goes_with_the_place():
     assert found['the place'].size[0] > P.least_force
 
 
-def test_a_constant_wind_is_no_pattern():
+def test_a_constant_wind_is_not_a_pattern():
     assert best(gust(1) + [0.5, -0.3, 0.0])['the place'].gain < P.least_pattern
 
 
@@ -105,7 +105,7 @@ def wind():
 
 
 @pytest.mark.parametrize('reason, verdict', [(TOO_SMALL, 'named'), ('', 'unknown')])
-def test_what_is_too_small_to_matter_is_no_unknown(reason, verdict):
+def test_a_pattern_below_the_threshold_is_not_unknown(reason, verdict):
     key = 'joint_command_latency.delay'
     other = Trial(Candidate('joint_command_latency', (key,), label='latency'), 90.0,
                   {key: 8e-4}, True, reason=reason)
@@ -120,12 +120,12 @@ SURE = Pattern('the place', 90.0, 15.0, 1.0, (0.2, 0.0))
     (replace(SURE, error=38.0), 'unknown'), (replace(SURE, error=38.0, positive=0.75), 'no_gap'),
     (replace(SURE, positive=0.5), 'no_gap'), (replace(SURE, gain=20.0, error=1.0), 'no_gap'),
     (replace(SURE, size=(0.9 * P.least_force, 0.9 * P.least_torque)), 'no_gap')])
-def test_a_sure_and_large_pattern_is_unknown(pattern, verdict):
+def test_a_significant_large_pattern_is_unknown(pattern, verdict):
     assert decided(found=[pattern]).verdict == verdict
 
 
 @pytest.mark.parametrize('gain, verdict', [(90.0, 'unknown'), (35.0, 'named')])
-def test_a_name_does_not_stand_where_a_pattern_explains_as_much_again(gain, verdict):
+def test_a_name_is_withdrawn_if_a_pattern_explains_as_much(gain, verdict):
     a = decided([wind()], [replace(SURE, gain=gain, error=5.0)])
     assert a.verdict == verdict
     assert [t.candidate.name for t in a.partial] == (['wind'] if verdict == 'unknown' else [])
@@ -133,7 +133,7 @@ def test_a_name_does_not_stand_where_a_pattern_explains_as_much_again(gain, verd
 
 @pytest.mark.parametrize('text, size, verdict', [
     (SWINGING, 1.1, 'unknown'), (SWINGING, 0.9, 'named'), ('the place', 2.0, 'named')])
-def test_a_mass_that_swings_is_unknown_however_much_its_weight_explains(text, size, verdict):
+def test_a_swinging_mass_is_unknown_even_if_its_weight_explains_much(text, size, verdict):
     swing = Pattern(text, 2 * P.least_pattern, 5.0, 1.0, (size * P.swinging_force, 0.0))
     winds = [wind() for _ in range(4)]      # they explain nine times what is left
     assert decided(winds, [swing]).verdict == verdict

@@ -253,7 +253,7 @@ def _twice(made, topic=IMU):
 
 @pytest.mark.parametrize('conditions', ['nominal', 'published'])
 @pytest.mark.parametrize('kind', KINDS)
-def test_damage_is_refused_with_topic_cause_and_moment(kind, conditions):
+def test_damage_is_refused_with_topic_cause_and_time(kind, conditions):
     change, topic, words, at = KINDS[kind]
     with warnings.catch_warnings(), pytest.raises(UnusableFlight) as error:
         warnings.simplefilter('error')
@@ -275,7 +275,7 @@ def test_a_sound_recording_has_no_damage(conditions):
 
 @pytest.mark.parametrize('seed', range(4))
 @pytest.mark.parametrize('swapped', [False, True])
-def test_rotors_of_unlike_strength_in_hover_are_not_in_another_order(swapped, seed):
+def test_rotors_of_different_strength_in_hover_are_not_taken_for_swapped(swapped, seed):
     # Two weak neighbours: they are commanded more, which looks like a torque that is not there.
     # In another order it would look like less.
     rng, count = np.random.default_rng(seed), 600
@@ -302,7 +302,7 @@ def test_rotors_of_unlike_strength_in_hover_are_not_in_another_order(swapped, se
                                   'MoCap clock of another computer', 'MoCap clock back',
                                   'quaternion scaled', 'IMU spike', 'recorded twice', 'IMU stale',
                                   'IMU upside down', 'out of order', 'marker flips'])
-def test_a_repair_gives_the_sound_recording_back(kind):
+def test_a_repair_restores_the_sound_recording(kind):
     sound = recording()
     fixed, done, left = repaired(KINDS[kind][0](recording()), ROBOT)
     assert done and left == []
@@ -317,7 +317,7 @@ def test_a_repair_gives_the_sound_recording_back(kind):
             assert np.median(error) < 1e-3 + 0.03 * np.std(column), (topic, k)
 
 
-def test_without_repair_the_recording_is_left_as_it_was():
+def test_without_repair_the_recording_is_unchanged():
     made = KINDS['degrees per second'][0](recording())
     before = {topic: v.copy() for topic, v in made.values.items()}
     repaired(made, ROBOT)
@@ -325,7 +325,7 @@ def test_without_repair_the_recording_is_left_as_it_was():
         assert np.array_equal(made.values[topic], values)
 
 
-def test_reading_all_messages_at_once_gives_what_reading_each_gives(tmp_path, monkeypatch):
+def test_reading_all_messages_at_once_equals_reading_each(tmp_path, monkeypatch):
     with BagWriter(tmp_path / 'bag') as bag:
         for k in range(60):
             bag.write_raw(f'/{IMU}', 'sensor_msgs/msg/Imu', _imu_bytes(k), 0.1 * k + 1.0)

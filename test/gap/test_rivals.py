@@ -52,6 +52,6 @@ def test_a_lag_of_second_order_is_dead_time_or_lag(monkeypatch, accepted, other,
     assert rivals(monkeypatch, accepted, other, beside, 120.0) == [other[0]] * meant
 
 
-def test_what_is_no_form_of_the_same_must_explain_as_much(monkeypatch):
+def test_rivals_of_another_kind_must_explain_as_much(monkeypatch):
     assert rivals(monkeypatch, DEAD, SAG, 33.0, 120.0) == []
     assert rivals(monkeypatch, DEAD, SAG, 0.0, 215.0) == ['voltage_sag']

@@ -27,18 +27,18 @@ def recovered(flight, names, groups):
 @pytest.mark.parametrize('name, groups, reading', [
     ('imu_filter_lag', 'AW', 'imu_delay'), ('mocap_time_offset', 'AW', 'pose_delay'),
     ('joint_feedback_delay', 'J', 'joint_delay')])
-def test_a_late_reading_is_found_to_be_late(name, groups, reading):
+def test_the_delay_of_a_reading_is_recovered(name, groups, reading):
     flight = MOTION.flight(**{reading: 0.012})
     assert recovered(flight, [f'{name}.delay'], groups) == pytest.approx([0.012], abs=3e-4)
 
 
-def test_imu_and_mocap_delays_have_opposite_signs_where_only_they_meet():
+def test_imu_and_mocap_delays_have_opposite_signs_in_their_common_residual():
     found = recovered(MOTION.flight(imu_delay=0.01), ['mocap_time_offset.delay'], 'W')
     assert found == pytest.approx([-0.01], abs=5e-4)
 
 
 @pytest.mark.parametrize('name, part', [('imu_accelerometer_bias', 0), ('imu_gyroscope_bias', 3)])
-def test_a_bias_is_what_is_added(name, part):
+def test_a_bias_equals_the_added_constant(name, part):
     true = np.array([0.1, -0.05, 0.2])
     imu = readings()
     imu[:, part:part + 3] += true
@@ -62,7 +62,7 @@ def test_turned_markers_are_recovered_as_their_axes_seen_from_base_link():
     assert recovered(flight, names, 'AW') == pytest.approx(true, abs=2e-3)
 
 
-def test_a_lever_arm_is_where_the_imu_sits():
+def test_a_lever_arm_is_the_position_of_the_imu():
     true = np.array([0.03, -0.02, 0.05])
     turning = np.gradient(MOTION.rate, STEP, axis=0)
     imu = readings()
@@ -71,14 +71,14 @@ def test_a_lever_arm_is_where_the_imu_sits():
     assert recovered(MOTION.flight(imu=imu), names, 'A') == pytest.approx(true, abs=1e-3)
 
 
-def test_units_of_all_sensor_keys_are_their_own():
+def test_every_sensor_key_has_its_unit():
     for name in ('imu_accelerometer_bias.bias[0]', 'mocap_misalignment.rotation[2]'):
         assert KEYS[name].base == 0.0 and not KEYS[name].body
 
 
 @pytest.mark.parametrize('name', [name for name, effect in CATALOGUE.items()
                                   if any(map(effect.in_readings, effect.parameters))])
-def test_what_the_robot_file_says_of_readings_is_where_a_fit_begins(name):
+def test_a_fit_begins_at_the_sensor_effects_of_the_robot_file(name):
     (parameter, spec), = CATALOGUE[name].parameters.items()
     known = replace(ROBOT, effects={name: {parameter: (np.array(spec.neutral)
                                                        + spec.typical).tolist()}})

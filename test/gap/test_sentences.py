@@ -22,43 +22,43 @@ def made(*effects, closure=0.9, **more):
 
 
 @pytest.mark.parametrize('file, words', [(0.0, 'robot file: none'), (0.8, 'file: 0.8 N s/m')])
-def test_the_sentence_says_what_the_robot_file_has(file, words):
+def test_the_sentence_states_the_value_of_the_robot_file(file, words):
     text = summary(made(effect(['rotor_drag'], 0.4, [0.3, 0.5], file)))
     assert text.startswith('Rotor drag of 0.4 +- 0.1 N s/m') and words in text
     assert 'explains the disagreement. Adding it closes 90%' in text
 
 
-def test_an_interval_that_is_cut_off_is_said_by_both_ends():
+def test_a_truncated_interval_is_stated_by_both_ends():
     assert '0 (0 to 0.08) N s/m' in summary(made(effect(['rotor_drag'], 0.0, [0.0, 0.08], 0.8)))
 
 
-def test_names_of_sensors_are_spelled_as_people_do():
+def test_sensor_names_have_their_usual_spelling():
     text = summary(made(effect(['imu_accelerometer_bias', 'mocap_misalignment'], 0.2, [0.1, 0.3],
                                0.0)))
     assert text.startswith('IMU accelerometer bias or MoCap misalignment of')
 
 
-def test_bad_data_says_the_first_cause_and_counts_the_others():
+def test_bad_data_states_the_first_cause_and_counts_the_others():
     told = {'verdict': 'bad_data', 'reason': 'a: imu/data_raw: degrees per second?',
             'bad_data': [{}, {}]}
     assert summary(told) == 'a: imu/data_raw: degrees per second? 1 more fault is listed below.'
     assert summary({**told, 'reason': 'a: cut', 'bad_data': [{}]}) == 'a: cut.'
 
 
-def test_what_explains_a_part_is_said_once():
+def test_a_partial_explanation_is_stated_once():
     told = {'verdict': 'unknown', 'reason': 'joint_4 is off, also with centre_of_mass',
             'partial': [{'names': ['centre_of_mass']}]}
     assert summary(told).endswith('also with centre_of_mass.')
     assert 'Wind would explain a part' in summary({**told, 'partial': [{'names': ['wind']}]})
 
 
-def test_the_headline_tells_joints_apart():
+def test_the_headline_distinguishes_joints():
     two = [effect(['joint_offset'], 0.01, [0.0, 0.02], 0.0, 'rad', joint=k) for k in (3, 1)]
     assert headline(made(*two)) == 'named: joint_offset 3, joint_offset 1'
     assert 'explain the disagreement' in summary(made(*two))
 
 
-def test_columns_about_what_is_named_stand_where_something_is():
+def test_columns_of_named_effects_appear_only_with_named_effects():
     named, = (g for g in grids(made(effect(['wind'], 1.0, [0.9, 1.1], 0.0)))
               if g.title.startswith('Free runs'))
     assert 'sign reversed' in named.header and 'sign reversed' in named.note
@@ -68,7 +68,7 @@ def test_columns_about_what_is_named_stand_where_something_is():
 
 @pytest.mark.parametrize('name, deviation, expected', [
     ('rotor_drag.coefficient', 0.03, [0.0, 0.13]), ('axial_inflow.per_rotor', 0.4, [0.3, 0.5])])
-def test_no_interval_holds_what_cannot_be(name, deviation, expected):
+def test_intervals_exclude_impossible_values(name, deviation, expected):
     a = SimpleNamespace(keys=KEYS, widths={name: 0.1})
     entry, parameter = name.split('.')
     found = parameters(a, entry, (name,), {name: deviation}, ROBOT)[parameter]

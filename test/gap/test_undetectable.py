@@ -15,7 +15,7 @@ from beetle_omni_ros.identify.gap.verdict import hidden, not_met
 
 
 @pytest.mark.parametrize('higher, seen', [(0.0, True), (30.0, False)])
-def test_the_ground_shows_near_the_ground_alone(higher, seen):
+def test_ground_effect_is_detectable_near_the_ground_only(higher, seen):
     motion = Motion(3, 24.0)
     motion.position[:, 2] += higher
     made = model(motion.flight())
@@ -28,7 +28,7 @@ def test_the_ground_shows_near_the_ground_alone(higher, seen):
     assert 'ground_effect' not in hidden(a, P)
 
 
-def test_an_entry_in_one_of_its_forms_is_out_of_sight_in_none():
+def test_an_entry_detectable_in_one_form_is_not_undetectable():
     a = Analysis(detectability={name: SimpleNamespace(sigma=sigma) for name, sigma in (
         ('rotor_drag', 1.0), ('joint_offset[1]', 1.0), ('joint_offset[2]', 90.0),
         ('ground_effect', 1.0), ('mass', np.inf))})

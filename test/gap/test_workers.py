@@ -99,7 +99,7 @@ def test_workers_do_the_work_and_end(cores):
     assert shared.map(process, range(2)) == [PARENT] * 2        # afterwards as on one core
 
 
-def test_what_a_worker_has_learnt_stays_with_it(cores):
+def test_state_of_a_worker_stays_in_its_process(cores):
     with Workers([]) as shared:
         done = [row for _ in range(3) for row in shared.map(counted, range(cores))]
     for who in {who for who, _ in done}:
@@ -131,7 +131,7 @@ def test_an_error_beside_the_work_ends_the_workers(cores):
 
 
 @pytest.mark.parametrize('end', [dies, leaves])
-def test_what_a_dead_worker_leaves_is_done_here(cores, end):
+def test_work_of_a_dead_worker_is_done_by_the_parent(cores, end):
     before = children()
     with Workers() as shared:
         assert shared.map(end, range(5)) == [0, 1, 4, 9, 16]
@@ -161,7 +161,7 @@ def test_workers_end_at_once_with_the_first_process(tmp_path, end):
 
 
 @pytest.mark.parametrize('threads, expected', [('1', 1), ('2', 2), ('99', 3), ('', 3), ('x', 3)])
-def test_who_limits_threads_limits_processes(monkeypatch, threads, expected):
+def test_a_thread_limit_limits_the_processes(monkeypatch, threads, expected):
     monkeypatch.setattr(joblib, 'cpu_count', lambda: 3)
     monkeypatch.setenv('OMP_NUM_THREADS', threads)
     assert width() == expected

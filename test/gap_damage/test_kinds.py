@@ -74,7 +74,7 @@ def test_damage_is_the_same_for_the_same_seed_and_leaves_the_original(flights):
     assert raw(first[0], MOCAP) != raw(another[0], MOCAP)
 
 
-def test_each_damage_can_be_told_and_controls_have_no_cause():
+def test_each_damage_has_a_cause_and_controls_have_none():
     for kind in KINDS.values():
         assert bool(kind.causes) == (kind.harm != HARMLESS), kind.name
 
@@ -98,7 +98,7 @@ def test_scales_and_signs(flights, name, topic, factor):
     np.testing.assert_allclose(after, before * factor, atol=1e-12)
 
 
-def test_swaps(flights):
+def test_swapped_entries(flights):
     before, after = values(flights, 'mocap_wxyz', MOCAP)
     np.testing.assert_array_equal(after[:, 3], before[:, 6])
     np.testing.assert_array_equal(after[:, 6], before[:, 5])
@@ -118,7 +118,7 @@ def test_a_mirrored_frame_turns_the_other_way_about_two_axes(flights):
         found, mirror @ Rotation.from_quat(before[:, 3:]).as_matrix() @ mirror, atol=1e-9)
 
 
-def test_y_up_moves_the_vertical(flights):
+def test_y_up_axes_change_the_vertical(flights):
     for name in ('mocap_y_up', 'mocap_y_up_body'):
         before, after = values(flights, name, MOCAP)
         np.testing.assert_allclose(after[:, 1], before[:, 2], atol=1e-12)
@@ -131,7 +131,7 @@ def test_a_control_turns_the_world_but_not_gravity_in_the_body(flights):
     np.testing.assert_allclose(*down, atol=1e-9)
 
 
-def test_without_gravity_little_is_left(flights):
+def test_without_gravity_the_accelerations_are_small(flights):
     after = values(flights, 'accelerometer_without_gravity', IMU)[1]
     assert np.abs(after[:-2, :3]).max() < 0.2
 
@@ -158,7 +158,7 @@ def test_a_clock_steps_and_times_of_recording_stay(flights, name, topic, step):
     assert [m.received for m in after.on(topic)] == [m.received for m in flights[0].on(topic)]
 
 
-def test_stamps_of_another_kind(flights):
+def test_stamps_in_other_units_and_epochs(flights):
     assert not damaged(flights, 'imu_stamps_zero').stamps(IMU).any()
     late = damaged(flights, 'received_hour_late')
     np.testing.assert_array_equal(late.stamps(MOCAP), flights[0].stamps(MOCAP))
@@ -169,7 +169,7 @@ def test_stamps_of_another_kind(flights):
     np.testing.assert_allclose(drift, 0.0101, atol=1e-6)
 
 
-def test_whole_bags(flights, tmp_path):
+def test_damage_of_whole_bags(flights, tmp_path):
     before = flights[0].counts()
     assert all(n == 2 * before[t] for t, n in damaged(flights, 'duplicates').counts().items())
     merged = damaged(flights, 'two_flights')

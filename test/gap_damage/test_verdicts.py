@@ -26,7 +26,7 @@ def refused(topic, cause, at_s=None, status=3):
 MILLIMETRES = KINDS['mocap_millimetres']
 
 
-def test_the_cause_in_words_and_the_topic_are_right():
+def test_cause_in_words_and_topic_are_accepted():
     found = judge(MILLIMETRES, refused('mocap/pose', 'position in millimetres'))
     assert found.right and found.cause and found.topic and found.onset is None
 
@@ -36,11 +36,11 @@ def test_the_cause_in_words_and_the_topic_are_right():
     refused('mocap/pose', 'the pose jumps'), asked('no_gap'), asked('unknown'),
     asked('named', names=['mass'], findings=['mocap/pose in millimetres']),
     UNANSWERED])
-def test_other_answers_are_wrong(answer):
+def test_other_answers_are_not_accepted(answer):
     assert not judge(MILLIMETRES, answer).right
 
 
-def test_a_topic_may_stand_in_the_text_and_folders_do_not_count():
+def test_a_topic_in_the_text_counts_and_folder_names_do_not():
     text = statements(asked('bad_data', reason='/x/millimetres/a: /imu/data_raw is bad')['answer'],
                       '/x/millimetres')
     assert 'milli' not in text[0]['text'] and 'imu/data_raw' in text[0]['text']
@@ -49,14 +49,14 @@ def test_a_topic_may_stand_in_the_text_and_folders_do_not_count():
 
 
 @pytest.mark.parametrize(('at_s', 'near'), [(28.0, True), (18.5, True), (35.0, False)])
-def test_a_moment_counts_by_the_stamps_or_from_the_start(at_s, near):
+def test_a_time_counts_as_stamp_or_from_the_start(at_s, near):
     kind = KINDS['mocap_clock_back']
     found = judge(kind, refused('mocap/pose', 'the clock jumps back', at_s)
                   | {'onset': 28.5, 'begin': 10.0})
     assert found.onset is near
 
 
-def test_repairable_damage_may_be_used_if_it_is_told():
+def test_repairable_damage_may_be_used_if_it_is_reported():
     kind = KINDS['imu_spike']
     told = judge(kind, asked('no_gap', findings=['imu/data_raw: a spike at 3.0 s'])
                  | {'onset': 3.0})
@@ -64,7 +64,7 @@ def test_repairable_damage_may_be_used_if_it_is_told():
     assert not judge(kind, asked('no_gap')).right
 
 
-def test_controls_are_to_be_used():
+def test_controls_must_be_used():
     kind = KINDS['nothing']
     assert judge(kind, asked('no_gap')).right
     assert judge(kind, asked('named', names=['mass']), ('mass',)).right
@@ -81,7 +81,7 @@ def test_totals_and_files(tmp_path):
     assert 'mocap_millimetres' in (tmp_path / 'damage.md').read_text()
 
 
-def test_folders_of_damaged_bags_tell_nothing():
+def test_folder_names_of_damaged_bags_reveal_no_cause():
     place = gap_damage.place_of(Path('x'), 'mocap_millimetres', 0)
     assert not MILLIMETRES.told_by(str(place))
 

@@ -68,7 +68,7 @@ def test_cases_follow_from_the_seed():
         c.key() for c in one)
 
 
-def test_the_full_set_holds_every_name_and_kind():
+def test_the_full_set_contains_every_name_and_kind():
     cases = make_cases(SETTINGS, 'full', 0, 0.01)
     for difficulty in ('clean', 'hard'):
         names = {c.effects[0][0] for c in cases
@@ -90,7 +90,7 @@ def test_ordinary_sizes_are_three_detection_limits_or_more():
                 assert abs(size) >= 2.99 * SETTINGS['effects'][name]['limit'], name
 
 
-def test_a_case_is_made_once_and_the_same_again(folder, tmp_path):
+def test_a_case_is_generated_once_and_reproducibly(folder, tmp_path):
     first = make_case(SMALL, folder / 'flights', folder / 'sealed')
     assert sorted(p.name for p in first.iterdir()) == ['fit_1', 'fit_2', 'holdout_1', 'robot.yaml']
     changed = {p: p.stat().st_mtime_ns for p in first.rglob('*.mcap')}
@@ -105,7 +105,7 @@ def test_a_case_is_made_once_and_the_same_again(folder, tmp_path):
 
 
 @pytest.mark.parametrize('name', ['mass', 'module_reaction'])
-def test_the_told_file_describes_no_effect_that_is_hidden(tmp_path, name):
+def test_the_given_robot_file_describes_no_hidden_effect(tmp_path, name):
     case = replace(SMALL, effects=((name, 0.3 if name == 'mass' else 1.0, 'plain'),), fit=1,
                    duration=2.0)
     made = make_case(case, tmp_path / 'flights', tmp_path / 'sealed')
@@ -114,7 +114,7 @@ def test_the_told_file_describes_no_effect_that_is_hidden(tmp_path, name):
     assert not told.effects
 
 
-def test_a_campaign_judges_workflows_side_by_side(folder, stub):
+def test_a_campaign_scores_workflows_side_by_side(folder, stub):
     none = replace(SMALL, kind='none', effects=())
     right, silent = stub(['mass']), stub([])
     workflows = [Workflow('right', f'{right}:run_gap'), Workflow('silent', f'{silent}:run_gap')]
@@ -184,7 +184,7 @@ def test_a_baseline_finds_a_large_effect(tmp_path):
     ('clean', lambda c: c.difficulty == 'clean'),
     ('mass,wake', lambda c: {'mass', 'wake'} & {e[0] for e in c.effects}),
     ('singles,mass', lambda c: c.kind == 'singles' and c.effects[0][0] == 'mass')])
-def test_of_each_sort_that_is_named_a_case_must_fit_one(only, fits):
+def test_a_case_must_match_one_value_of_each_given_filter(only, fits):
     import gap_campaign
     cases = make_cases(load_settings(), 'full', 0, 0.0)
     chosen = gap_campaign.select(cases, only)

@@ -58,7 +58,7 @@ def test_every_shape_flies(name, shape):
 
 
 @pytest.mark.parametrize('name', OUTSIDE)
-def test_every_outside_effect_disturbs(name):
+def test_every_effect_outside_the_catalogue_disturbs_the_flight(name):
     size = SETTINGS['outside'][name]['range'][1]
     ends = []
     for effect in (True, False):
@@ -92,7 +92,7 @@ def test_tilt_loss_has_its_size_at_sixty_degrees(shape, sign):
 
 
 @shapes('axial_inflow')
-def test_inflow_takes_thrust_in_a_climb(shape):
+def test_axial_inflow_reduces_thrust_in_a_climb(shape):
     robot, hidden, _ = put('axial_inflow', 0.4, shape)
     f, h = robot.hover_thrust, 1e-3
     slope = f * (gain(hidden, snapshot(), speed=(0, 0, h))
@@ -101,7 +101,7 @@ def test_inflow_takes_thrust_in_a_climb(shape):
 
 
 @shapes('translational_lift')
-def test_lift_grows_with_speed_across(shape):
+def test_translational_lift_grows_with_lateral_speed(shape):
     robot, hidden, _ = put('translational_lift', 0.08, shape)
     f = robot.hover_thrust
     assert f * (gain(hidden, snapshot(), speed=(1, 0, 0)) - 1) == pytest.approx(0.08, rel=0.03)
@@ -145,7 +145,7 @@ def test_gyroscopic_torque_is_the_change_of_angular_momentum(shape):
 
 
 @shapes('rotor_acceleration_torque')
-def test_spinning_up_pushes_back(shape):
+def test_rotor_acceleration_gives_a_reaction_torque(shape):
     robot, hidden, _ = put('rotor_acceleration_torque', 0.05, shape)
     f = robot.hover_thrust
     torque = hidden.wrenches[0](0, snapshot(thrust_rate=[10.0] * 4), f, UP, (0, 0, 0))[3:]
@@ -155,14 +155,14 @@ def test_spinning_up_pushes_back(shape):
 
 
 @shapes('voltage_sag')
-def test_sag_takes_its_power_of_the_voltage(shape):
+def test_voltage_sag_follows_its_exponent(shape):
     _, hidden, label = put('voltage_sag', 1.2, shape)
     assert gain(hidden, snapshot(voltage=22.8)) == pytest.approx((22.8 / 25.2) ** 1.2, rel=1e-6)
     assert label['exponent'] == 1.2
 
 
 @shapes('rotor_lag')
-def test_rotor_lag_is_later_by_its_size(shape):
+def test_rotor_lag_delays_thrust_by_its_time_constant(shape):
     robot, hidden, label = put('rotor_lag', 0.03, shape)
     from gap_data.rotors import Rotors
     delays = []
@@ -175,7 +175,7 @@ def test_rotor_lag_is_later_by_its_size(shape):
 
 
 @shapes('joint_friction')
-def test_friction_holds_the_joint_where_the_spring_is_weaker(shape):
+def test_friction_holds_the_joint_against_a_smaller_spring_torque(shape):
     robot, hidden, label = put('joint_friction', 0.01, shape)
     stuck = label['stiction'] / 0.3449
     ends = []
@@ -191,7 +191,7 @@ def test_friction_holds_the_joint_where_the_spring_is_weaker(shape):
 
 
 @shapes('joint_backlash')
-def test_play_is_as_wide_as_its_gap(shape):
+def test_backlash_has_the_width_of_its_gap(shape):
     _, hidden, label = put('joint_backlash', 0.04, shape)
     wave = 0.3 * np.sin(2 * np.pi * 2.0 * 0.001 * np.arange(1000))
     errors = np.array([hidden.tilt_errors[0](0, angle, 0.0, snapshot(t=0.001 * k))
@@ -203,7 +203,7 @@ def test_play_is_as_wide_as_its_gap(shape):
 
 
 @shapes('joint_deflection')
-def test_deflection_grows_with_thrust_and_is_seen(shape):
+def test_deflection_grows_with_thrust_and_is_measured(shape):
     robot, hidden, _ = put('joint_deflection', 0.003, shape)
     body = Plant(robot, hidden, multibody=False, position=(0, 0, 5), tilt=[0.0] * 4,
                  quaternion=(1, 0, 0, 0), thrust=[robot.hover_thrust] * 4)
@@ -223,7 +223,7 @@ def test_offset_is_true_tilt_minus_encoder():
     assert body.snapshot.axes[joint] == pytest.approx(axis, abs=1e-9)
 
 
-def test_mass_and_centre_move_what_the_imu_feels():
+def test_mass_and_centre_of_mass_change_the_specific_force():
     robot, hidden, label = put('mass', 0.3)
     body = Plant(robot, hidden, multibody=False, position=(0, 0, 5), tilt=[0.0] * 4,
                  quaternion=(1, 0, 0, 0), thrust=[7.0] * 4)
@@ -241,7 +241,7 @@ def test_mass_and_centre_move_what_the_imu_feels():
     assert spin_up == pytest.approx(torque / robot.inertia, rel=0.02, abs=0.01)
 
 
-def test_every_label_holds_what_the_interface_asks_for():
+def test_every_label_contains_the_parameters_of_the_interface():
     from gap_data.judge import PUBLIC
     for name, entry in SETTINGS['effects'].items():
         _, _, label = put(name, entry['range'][0])
@@ -255,7 +255,7 @@ def test_a_case_always_has_the_same_truth():
     assert one == two
 
 
-def test_an_inertia_that_is_far_off_is_still_that_of_bodies():
+def test_a_large_inertia_change_is_physically_possible():
     for seed in range(60):
         rng = np.random.default_rng(seed)
         robot, nominal = Robot.nominal().within_tolerance(rng), Robot.nominal().inertia

@@ -19,7 +19,7 @@ def flown(kind, seconds, difficulty, robot=None, hidden=None):
 
 @pytest.mark.parametrize('difficulty', [CLEAN, HARD], ids=['clean', 'hard'])
 @pytest.mark.parametrize('kind', ['poses', 'lemniscate', 'hover'])
-def test_the_controller_follows_its_course(kind, difficulty):
+def test_the_controller_tracks_its_reference(kind, difficulty):
     truth = flown(kind, 8.0, difficulty)
     every = int(round(1 / RATE / 0.001))
     rows = len(truth.t) // every
@@ -37,7 +37,7 @@ def test_pose_flights_excite_and_hover_does_not():
     assert np.linalg.norm(still.columns['velocity'], axis=1).max() < 0.1
 
 
-def test_courses_are_smooth_and_pass_low():
+def test_references_are_smooth_and_pass_near_the_ground():
     courses = [make_course('poses', 60.0, np.random.default_rng(k)) for k in range(4)]
     for course in courses:
         assert np.abs(np.diff(course.velocity, axis=0)).max() * RATE < 15.0
@@ -48,7 +48,7 @@ def test_courses_are_smooth_and_pass_low():
         assert turned[:-200] == pytest.approx(middle[:-200], abs=0.1)
 
 
-def test_allocation_gives_the_wrench_asked_for():
+def test_allocation_gives_the_requested_wrench():
     controller = PoseController(Robot.nominal(), np.random.default_rng(0), lively=False)
     tilt, thrust = controller.trim(np.array([3.0, -2.0, 28.0]))
     robot, force, torque = Robot.nominal(), np.zeros(3), np.zeros(3)
@@ -61,7 +61,7 @@ def test_allocation_gives_the_wrench_asked_for():
     assert torque == pytest.approx(np.zeros(3), abs=1e-9)
 
 
-def test_a_robot_that_cannot_fly_is_a_lost_flight():
+def test_a_robot_that_cannot_fly_gives_a_lost_flight():
     robot = Robot.nominal()
     robot.thrust_scale = np.full(4, 0.3)
     with pytest.raises(LostFlight, match='poses flight, seed 2'):

@@ -48,7 +48,7 @@ def test_a_set_with_the_truth_is_right_but_not_exact():
     assert judged['right'] and judged['exact'] == [False] and not judged['wrong']
 
 
-def test_a_set_of_everything_is_wrong():
+def test_a_set_of_all_names_is_wrong():
     many = effect('rotor_drag', 'a', 'b', 'c', 'd')
     assert not judge(label(DRAG), run(many))['right']
 
@@ -100,7 +100,7 @@ def test_missing_and_malformed_parameters_are_noted():
     assert row['missing']
 
 
-def test_hover_is_answered_by_the_verdict_or_a_set():
+def test_hover_may_be_answered_by_verdict_or_set():
     hover = label({**ROTOR, 'name': 'mass', 'parameters': {'mass': 3.3}}, kind='undecidable',
                   accept=('not_decidable',), sets=('mass', 'thrust_coefficient'))
     assert judge(hover, run(verdict='not_decidable', next_experiment={'fly': 'x'}))[
@@ -111,7 +111,7 @@ def test_hover_is_answered_by_the_verdict_or_a_set():
     assert not judge(hover, run(verdict='no_gap'))['right']
 
 
-def test_bad_bags_want_a_verdict_or_one_line():
+def test_bad_bags_need_the_verdict_or_one_line():
     bad = label(kind='damaged', accept=('bad_data', 'refused'))
     refused = {'answer': None, 'problems': ['no JSON'], 'status': 2, 'wall_s': 1.0, 'cpu_s': 1.0,
                'traceback': False, 'message': 'bag/: topic imu/data_raw is missing'}
@@ -122,7 +122,7 @@ def test_bad_bags_want_a_verdict_or_one_line():
     assert not judge(bad, run(effect('mass')))['right']
 
 
-def test_scores_of_a_perfect_and_of_a_silent_workflow():
+def test_scores_of_a_perfect_workflow_and_of_one_without_answers():
     none = label(kind='none', accept=('no_gap',))
     pair = label(DRAG, LAG, kind='pairs')
     right = [judge(label(DRAG), run(effect('rotor_drag'))), judge(none, run(verdict='no_gap')),
@@ -141,7 +141,7 @@ def test_scores_of_a_perfect_and_of_a_silent_workflow():
         assert value(silent, name) == (bad if bad is None else pytest.approx(bad))
 
 
-def test_confusion_and_power_count_what_was_answered():
+def test_confusion_and_power_count_the_answers():
     right = judge(label(DRAG), run(effect('rotor_drag')))
     wrong = judge(label(DRAG), run(effect('wind')))
     lost = judge(label(DRAG), run(verdict='unknown'))
@@ -155,7 +155,7 @@ def test_confusion_and_power_count_what_was_answered():
         (0.5, 0.0), (3.0, 1.0)]
 
 
-def test_intervals():
+def test_coverage_of_intervals():
     assert share([])['value'] is None
     half = share([True] * 50 + [False] * 50)
     assert half['value'] == 0.5 and half['interval'] == pytest.approx([0.404, 0.596], abs=1e-3)
@@ -176,7 +176,7 @@ def test_an_answer_is_checked_against_the_interface(tmp_path):
     assert any('maybe' in p for p in problems) and any('interval' in p for p in problems)
 
 
-def test_workflows_are_understood_from_the_command_line():
+def test_workflows_are_parsed_from_the_command_line():
     assert Workflow.parse('bic').text.endswith('white_bic:run_gap')
     assert Workflow.parse('mine=a.b:c').name == 'mine'
     assert Workflow.parse('tool {runs} --json {json}').name == 'gap'
@@ -185,7 +185,7 @@ def test_workflows_are_understood_from_the_command_line():
             Workflow.parse(wrong)
 
 
-def test_hover_may_be_named_where_force_and_torque_decide():
+def test_hover_may_be_named_if_force_and_torque_decide():
     hover = label(ROTOR, kind='undecidable', accept=('not_decidable',)) | {'name_is_right': True}
     entry = {'value': 0.9, 'interval': (0.89, 0.91), 'parameter': 'scale', 'rotor': 2}
     assert judge(hover, run(effect(ROTOR['name'], **entry)))['right']

@@ -43,7 +43,7 @@ def test_hovers_at_hover_thrust(multibody):
     assert body.specific_force == pytest.approx([0, 0, 9.80665], abs=0.02)
 
 
-def test_multibody_totals_are_those_of_the_interface():
+def test_multibody_totals_equal_those_of_the_interface():
     body = plant(multibody=True)
     model, data = body.model, body.data
     mujoco.mj_forward(model, data)
@@ -72,7 +72,7 @@ def test_multibody_keeps_energy_and_momentum_without_forces():
     assert body.data.subtree_angmom[1] == pytest.approx(momentum, abs=2e-5)
 
 
-def test_servo_answers_a_step_as_its_equation():
+def test_the_step_response_of_a_servo_agrees_with_its_equation():
     body = plant()
     step = 0.05
     body.command(0.0, [step, 0, 0, 0], [body.robot.hover_thrust] * 4)
@@ -127,7 +127,7 @@ def test_rotor_is_a_first_order_lag():
     assert rotors.thrust[0] == pytest.approx(9 - 4 * np.exp(-0.094 / 0.0942), rel=1e-9)
 
 
-def test_two_lags_in_series_are_as_late_as_one():
+def test_two_lags_in_series_have_the_delay_of_one():
     hidden = Hidden(rotor_poles=0.12)
     rotors = Rotors(Robot.nominal(), hidden, 0.001, [0.0] * 4)
     lost = 0.0
@@ -136,7 +136,7 @@ def test_two_lags_in_series_are_as_late_as_one():
     assert lost == pytest.approx(0.0942, abs=1e-3)  # the area above the answer is the delay
 
 
-def test_pack_gives_what_the_load_leaves():
+def test_pack_voltage_falls_with_the_load():
     pack = Pack(Robot.nominal(), 1.0)
     voltage = pack.load([7.45] * 4, 0.001, True)
     assert pack.rest == pytest.approx(25.2)
@@ -154,7 +154,7 @@ def test_a_command_acts_after_its_age_and_delay():
     assert body.data.qpos[body._q[0]] > 0.005  # the tilt was under way 20 ms before
 
 
-def test_gusts_have_their_strength_and_colour():
+def test_gusts_have_their_strength_and_spectrum():
     settings = {'force': [0.3, 0.3], 'torque': [0.01, 0.01], 'time': [0.5, 0.5]}
     waves = [draw_gust(settings, 60.0, 0.005, np.random.default_rng(k)) for k in range(8)]
     force = np.concatenate([f for f, _ in waves])
@@ -166,7 +166,7 @@ def test_gusts_have_their_strength_and_colour():
     assert near == pytest.approx(2 * np.exp(-1), abs=0.08)
 
 
-def test_tolerances_stay_within_what_the_issue_says():
+def test_tolerances_stay_within_the_stated_limits():
     nominal = Robot.nominal()
     robots = [Robot.nominal().within_tolerance(np.random.default_rng(k)) for k in range(40)]
     assert 0.003 < max(abs(r.mass / 3.0386 - 1) for r in robots) <= 0.005

@@ -49,7 +49,7 @@ def test_stamps_are_capture_times_at_the_interface_rates():
         np.pi / 4096 + 1e-12)
 
 
-def test_noise_has_the_size_asked_for():
+def test_noise_has_the_requested_size():
     noise = {'accelerometer': 0.05, 'gyroscope': 0.005, 'position': 0.001, 'orientation': 0.002,
              'tilt': 0.0}
     quiet, loud = sample(), sample(noise=noise)
@@ -74,7 +74,7 @@ def test_filter_has_its_group_delay(shape):
     assert late[1000:] == pytest.approx(np.sin(2 * np.pi * (t[1000:] - 0.015)), abs=0.01)
 
 
-def test_biases_and_mounting():
+def test_biases_and_mounting_appear_in_readings():
     rotation = np.array([0.05, -0.02, 0.03])
     hidden = Hidden(accelerometer_bias=np.array([0.1, 0.2, 0.3]), imu_rotation=rotation,
                     gyroscope_bias=np.array([0.01, 0, 0]), mocap_rotation=rotation)
@@ -100,7 +100,7 @@ def stamp(message):
     return message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
 
 
-def test_bag_holds_the_topics_of_the_interface(tmp_path):
+def test_a_bag_contains_the_topics_of_the_interface(tmp_path):
     recording = sample()
     write_bag(tmp_path / 'bag', recording, epoch=1.78e9)
     rows = read(tmp_path / 'bag')
@@ -121,7 +121,7 @@ def test_bag_holds_the_topics_of_the_interface(tmp_path):
 
 
 @pytest.mark.parametrize('damage', DAMAGES)
-def test_damage_is_there(tmp_path, damage):
+def test_damage_is_in_the_bag(tmp_path, damage):
     recording, path = sample(truth=made_up(10.0)), tmp_path / 'bag'
     write_bag(path, recording, epoch=1.78e9, damage=damage, rng=np.random.default_rng(3))
     if damage == 'cut':
@@ -142,7 +142,7 @@ def test_damage_is_there(tmp_path, damage):
         assert np.diff(stamps['/mocap/pose']).max() > 2.0
 
 
-def test_nothing_in_a_bag_tells_its_label(tmp_path):
+def test_a_bag_does_not_reveal_its_label(tmp_path):
     write_bag(tmp_path / 'bag', sample(), epoch=1.78e9)
     text = b''.join(p.read_bytes() for p in Path(tmp_path).rglob('*') if p.is_file())
     for word in (b'rotor_drag', b'ground_truth', b'effect', b'label', b'sealed'):

@@ -78,7 +78,7 @@ def test_unusable_input_ends_with_status_2_and_one_line(tmp_path, capsys, what):
     assert refused(capsys, 'identify', what, bad, '--robot', tmp_path / 'absent.yaml')
 
 
-def test_a_bad_log_to_validate_is_refused_before_the_work(logs, tmp_path, capsys):
+def test_a_bad_validation_log_is_refused_before_the_fit(logs, tmp_path, capsys):
     bad = tmp_path / 'bad.csv'
     bad.write_text('t_s,x\n1,2\n')
     assert 'bad.csv' in refused(capsys, 'identify', 'joint', logs[0], '--validate', bad)
@@ -86,7 +86,7 @@ def test_a_bad_log_to_validate_is_refused_before_the_work(logs, tmp_path, capsys
     assert str(logs[1]) in message and 'after --validate' in message
 
 
-def test_help_tells_what_there_is(capsys):
+def test_help_lists_the_options(capsys):
     for command in (['identify'], ['identify', 'joint'], ['identify', 'rotor']):
         assert cli.main([*command, '--help']) == 0
         assert 'Usage' in capsys.readouterr().out

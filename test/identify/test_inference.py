@@ -38,7 +38,7 @@ LOW, HIGH = np.array([-5.0, 0.0]), np.array([5.0, 3.0])
 
 
 @pytest.mark.parametrize('path', sorted(FOLDER.glob('*.py')), ids=lambda path: path.stem)
-def test_the_engine_imports_nothing_of_this_package_but_itself(path):
+def test_the_inference_package_imports_no_other_part_of_this_package(path):
     for item in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
         names = [item.module or ''] if isinstance(item, ast.ImportFrom) else \
             [alias.name for alias in item.names] if isinstance(item, ast.Import) else []
@@ -67,7 +67,7 @@ def problems(count, seed=0):
     return measured, residual, jacobian
 
 
-def test_problems_side_by_side_end_where_single_ones_do():
+def test_batched_problems_converge_to_the_single_solutions():
     measured, residual, jacobian = problems(12)
     start = np.tile([2.0, 1.0], (12, 1))
     fits = minimise(start, np.full((12, 2), True), LOW, HIGH, residual, jacobian, UNKNOWN, 60,
@@ -79,7 +79,7 @@ def test_problems_side_by_side_end_where_single_ones_do():
         assert fits.chi2[k] == pytest.approx(2 * alone.cost, rel=1e-8)
 
 
-def test_what_is_held_stays_and_bounds_are_kept():
+def test_fixed_parameters_stay_and_bounds_are_kept():
     _, residual, jacobian = problems(3)
     free = np.array([[True, False], [False, True], [True, True]])
     high = np.array([5.0, 0.2])
@@ -88,7 +88,7 @@ def test_what_is_held_stays_and_bounds_are_kept():
     assert fits.points[1, 1] == fits.points[2, 1] == 0.2
 
 
-def test_a_prior_weighs_like_data():
+def test_a_prior_has_the_weight_of_equal_data():
     """A straight line through data of deviation 1 and a prior: the precision-weighted mean."""
     value = np.array([3.0, -1.0])
 
@@ -105,7 +105,7 @@ def test_a_prior_weighs_like_data():
 
 
 @pytest.mark.parametrize('prior', [Prior(0.5), Prior(0.5, centre=2.0), Prior(0.1, 0.3, 0.7, 5.0)])
-def test_the_slope_of_a_prior_is_its_residuals_derivative(prior):
+def test_the_derivative_of_a_prior_is_that_of_its_residual(prior):
     x = np.linspace(-3.03, 3.02, 80)
     numeric = (prior.residual(x + 1e-6) - prior.residual(x - 1e-6)) / 2e-6
     assert prior.slope(x) == pytest.approx(numeric, rel=1e-5)
@@ -124,7 +124,7 @@ def coloured(seed, count=20000):
     return lfilter([0.3], [1.0, -1.2, 0.5], np.random.default_rng(seed).standard_normal(count))
 
 
-def test_an_autoregression_is_found_and_whitens():
+def test_an_autoregression_is_fitted_and_whitens():
     series = [coloured(1), coloured(2)]
     taps, level = autoregression(series, 2)
     assert taps == pytest.approx([1.0, -1.2, 0.5], abs=0.02)
@@ -135,7 +135,7 @@ def test_an_autoregression_is_found_and_whitens():
     assert level**2 * gain(taps) == pytest.approx(series[0].var(), rel=0.1)
 
 
-def test_each_channel_is_whitened_by_its_own_noise_whatever_outliers_are_in_it():
+def test_each_channel_is_whitened_by_its_own_noise_despite_outliers():
     rows = np.stack([coloured(3), np.random.default_rng(4).standard_normal(20000)])
     spoilt = rows.copy()
     spoilt[:, ::4000] += 50.0
@@ -149,7 +149,7 @@ def test_each_channel_is_whitened_by_its_own_noise_whatever_outliers_are_in_it()
     assert (Noise.of(np.zeros((2, 100)), 4, 0.01).sigma == 0.01).all()
 
 
-def test_coordinates_go_there_and_back_within_bounds():
+def test_coordinates_round_trip_within_bounds():
     all_of_them = Coordinates(tuple(TERMS.values()))
     rng = np.random.default_rng(0)
     low, high = (np.array([getattr(t, side) for t in TERMS.values()]) for side in ('low', 'high'))
@@ -193,7 +193,7 @@ def test_gains_on_blocks_left_out():
     assert held.sigmas == pytest.approx(8.0 / held.error) and one.sigmas == 0.0
 
 
-def test_a_regression_is_judged_on_blocks_that_it_was_not_fitted_to():
+def test_a_regression_is_cross_validated_by_blocks():
     rng = np.random.default_rng(0)
     x, block = rng.standard_normal((400, 3)), np.arange(400) // 80
     r = x @ [1.0, -0.5, 0.0] + rng.standard_normal(400)
@@ -216,7 +216,7 @@ def test_normal_equations_of_any_scale_are_solved():
     assert solved(h, h @ truth[:, 0]) * scale == pytest.approx(truth[:, 0] * scale, rel=1e-6)
 
 
-def test_differences_are_the_jacobian():
+def test_finite_differences_equal_the_jacobian():
     _, residual, jacobian = problems(3)
     points, rows = np.array([[2.0, 1.0], [1.0, 0.4], [2.5, 2.0]]), np.arange(3)
     base = residual(points, rows)
@@ -224,7 +224,7 @@ def test_differences_are_the_jacobian():
         jacobian(points, rows, base), abs=1e-3)
 
 
-def test_priors_by_name_count_where_they_are_known_and_wanted():
+def test_named_priors_apply_to_known_and_requested_parameters():
     priors = {'a': Prior(0.5), 'b': Prior(2.0), 'c': Prior(1.0)}
     slopes, off = together(priors, {'a': 1.0, 'c': 9.0}, ['a', 'b', 'c', 'd'], frozenset('c'))
     assert slopes == pytest.approx([2.0, 0.5, 0.0, 0.0])

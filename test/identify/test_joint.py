@@ -55,13 +55,13 @@ def test_the_true_terms_are_kept_and_no_others(models, name):
 @pytest.mark.parametrize(('name', 'tolerance'), [
     ('slow', {'natural_frequency': 8.0, 'delay': 0.005}),
     ('fast', {'natural_frequency': 3.0, 'delay': 0.002})])
-def test_the_true_numbers_are_recovered(models, name, tolerance):
+def test_the_true_values_are_recovered(models, name, tolerance):
     for model, true, term in judged(models[name]):
         assert model.values[INDEX[term]] == pytest.approx(true, abs=tolerance.get(term, 0.002))
 
 
 @pytest.mark.parametrize('name', ['slow', 'fast'])
-def test_intervals_cover_the_truth_but_say_something(models, name):
+def test_intervals_cover_the_truth_and_are_narrow(models, name):
     inside = [low <= true <= high for model, true, term in judged(models[name])
               for low, high in [model.uncertainty.intervals[INDEX[term]]]]
     assert np.mean(inside) > 0.8
@@ -70,7 +70,7 @@ def test_intervals_cover_the_truth_but_say_something(models, name):
             assert np.ptp(model.uncertainty.intervals[INDEX[term]]) < max(0.3 * true, 0.004)
 
 
-def test_a_slow_log_trades_delay_against_bandwidth_and_a_fast_one_does_not(models):
+def test_only_a_slow_log_confounds_delay_and_bandwidth(models):
     pair = ['delay', 'natural_frequency']
     assert any(pair in model.inseparable for model in models['slow'])
     assert not any(pair in model.inseparable for model in models['fast'])
@@ -85,7 +85,7 @@ def test_fits_of_the_slow_log_predict_the_fast_one(logs, models):
         assert error_rms(logs['fast'], k, published_set(PUBLISHED), held=False) > 0.03
 
 
-def test_a_speed_limit_is_found_where_the_command_exceeds_it():
+def test_a_speed_limit_is_found_if_the_command_exceeds_it():
     t, command = sweep(4.0, periods=(0.8, 1.2), amplitudes=(1.2, 1.6))
     log = log_of(t, command, [{'velocity_limit': 5.5, 'coulomb': 0.012}], seed=3)
     model, = identify_joints(log, PUBLISHED)
@@ -93,7 +93,7 @@ def test_a_speed_limit_is_found_where_the_command_exceeds_it():
     assert model.values[INDEX['velocity_limit']] == pytest.approx(5.5, rel=0.02)
 
 
-def test_a_limit_never_met_stays_as_published_with_an_open_interval(logs, models):
+def test_a_limit_that_is_never_reached_stays_with_an_open_interval(logs, models):
     results = joint_results(logs['slow'], [logs['fast']], models['slow'], PUBLISHED)
     for joint in results['joints']:
         limit = joint['terms']['velocity_limit']
@@ -102,7 +102,7 @@ def test_a_limit_never_met_stays_as_published_with_an_open_interval(logs, models
         assert limit['interval'][0] > 2 and limit['interval'][1] is None
 
 
-def test_samples_of_the_judging_part_are_never_looked_at():
+def test_samples_of_the_validation_part_are_not_used_by_the_fit():
     log = log_of(*sweep(3.0, periods=(0.8, 1.0)), SERVOS[:1], seed=4)
     one, other = (identify_joints(each, PUBLISHED)[0] for each in (log, replace_end(log)))
     assert one.kept == other.kept and len(one.kept) > 1

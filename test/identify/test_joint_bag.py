@@ -26,7 +26,7 @@ def recorded(folder, t, command, sent=None, joints=True):
     return folder
 
 
-def test_each_feedback_stands_beside_the_command_that_came_last_before_it(tmp_path):
+def test_each_reading_is_paired_with_the_last_command_before_it(tmp_path):
     t, command = sweep(duration=3.0)
     log = read_joint_log(recorded(tmp_path / 'bag', t + 5.0, command))
     assert log.joints == (1, 2, 3, 4)
@@ -35,7 +35,7 @@ def test_each_feedback_stands_beside_the_command_that_came_last_before_it(tmp_pa
     assert np.allclose(log.measured, 0.9 * log.command, atol=1e-9)
 
 
-def test_the_longest_stretch_with_commands_counts_and_of_it_the_liveliest_part(
+def test_the_part_of_highest_excitation_of_the_longest_stretch_is_used(
         tmp_path, monkeypatch):
     monkeypatch.setattr(joint_log, 'LIMITS', replace(joint_log.LIMITS, longest_bag=2.5))
     t, command = sweep(duration=9.0)

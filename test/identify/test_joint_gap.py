@@ -77,7 +77,7 @@ def against_shipped():
     return log, judged(log, SHIPPED)
 
 
-def test_the_files_servos_move_as_a_plain_simulation_with_its_effects():
+def test_servos_of_the_robot_file_agree_with_a_plain_simulation():
     file_robot = robot(joint_offset={'offset': (0.02, -0.01, 0.0, 0.0)},
                        joint_backlash={'gap': 0.024}, joint_feedback_delay={'delay': 0.006})
     shown = np.array([servo(T, COMMAND, frequency=FREQUENCY, damping=DAMPING,
@@ -88,7 +88,7 @@ def test_the_files_servos_move_as_a_plain_simulation_with_its_effects():
     assert np.sqrt(np.mean(error[:, 25:]**2)) < 5e-4 and np.abs(error[:, 25:]).max() < 2e-3
 
 
-def test_a_servo_with_an_offset_turns_its_thrust_where_it_is_told_to():
+def test_an_offset_servo_turns_its_thrust_to_the_commanded_tilt():
     zero, target = np.array([0.02, -0.03, 0.0, 0.05]), np.array([0.3, -0.2, 0.8, 0.0])
     file_robot = replace(SHIPPED, effects={'joint_offset': {'offset': tuple(zero)}})
     encoder = target + file_sets(file_robot, (1, 2, 3, 4))[:, INDEX['offset']]
@@ -99,7 +99,7 @@ def test_a_servo_with_an_offset_turns_its_thrust_where_it_is_told_to():
     assert np.allclose(seen[0], plain[0], atol=1e-9) and np.allclose(seen[1], plain[1], atol=1e-9)
 
 
-def test_points_and_their_shared_slopes_agree_with_single_simulations():
+def test_batched_points_and_derivatives_agree_with_single_simulations():
     servos, log = Servos(robot(), (1, 2)), made(2)
     fitter = ServoFitter(log, Noise.white(2), servos)
     free = servos.mask('joint_bandwidth') | servos.mask('joint_offset', 1)
@@ -114,13 +114,13 @@ def test_points_and_their_shared_slopes_agree_with_single_simulations():
         assert np.allclose(slopes[k], expected, atol=1e-9)
 
 
-def test_a_log_of_the_files_own_servos_has_no_gap():
+def test_a_log_of_the_servos_of_the_robot_file_has_no_gap():
     result = judged(made(3))
     assert result['verdict'] == 'no_gap' and result['effects'] == []
     assert result['gap_before'] == pytest.approx(1.0, abs=0.3)
 
 
-def test_limits_that_a_log_does_not_meet_are_listed_and_the_rest_would_have_shown():
+def test_limits_that_a_log_does_not_reach_are_listed_as_undetectable():
     hidden = judged(made(3))['hidden']
     assert 'joint_torque_limit' in hidden
     assert not {'joint_offset', 'joint_friction', 'joint_bandwidth'} & set(hidden)
@@ -148,7 +148,7 @@ def test_a_change_of_timing_is_named_alone(change, name):
 
 @pytest.mark.parametrize('change', [{'delay': DELAY + 0.015},
                                     {'frequency': 0.7 * FREQUENCY}])
-def test_one_servo_that_differs_is_not_explained_by_what_all_share(change, tmp_path):
+def test_one_different_servo_is_not_explained_by_a_shared_effect(change, tmp_path):
     result, page = analyse_joint_log([write(tmp_path / 'log.csv', made(31, {}, change))], [],
                                      robot(), None)
     assert result['verdict'] == 'unknown' and result['effects'] == []
@@ -157,7 +157,7 @@ def test_one_servo_that_differs_is_not_explained_by_what_all_share(change, tmp_p
     assert page.index('class="verdict"') < page.index('<img') < page.index('<table')
 
 
-def test_friction_of_one_joint_is_named_and_its_joint_told():
+def test_friction_of_one_joint_is_named_with_its_joint():
     effect, = judged(made(6, {'coulomb': 0.030}, {}))['effects']
     assert effect['names'] == ['joint_friction'] and 1 in effect['joints']
     each = effect['parameters']['coulomb']['each']
@@ -165,7 +165,7 @@ def test_friction_of_one_joint_is_named_and_its_joint_told():
     assert each['2'] == pytest.approx(BANDS[1] * stiffness(), rel=0.1)
 
 
-def test_what_is_fitted_is_what_is_written(against_shipped):
+def test_the_fitted_values_are_written(against_shipped):
     log, result = against_shipped
     found = Search(log, SHIPPED).run()
     written = file_sets(corrected(SHIPPED, result), log.joints)
@@ -174,14 +174,14 @@ def test_what_is_fitted_is_what_is_written(against_shipped):
     assert np.abs(a - b).max() < 2e-4
 
 
-def test_after_its_own_correction_a_log_has_no_gap(against_shipped):
+def test_a_corrected_log_has_no_gap(against_shipped):
     log, result = against_shipped
     assert result['verdict'] in ('named', 'named_set') and result['gap_before'] > 10
     again = judged(log, corrected(SHIPPED, result))
     assert again['verdict'] == 'no_gap' and again['gap_before'] < 1.3
 
 
-def test_everything_accepted_and_every_member_of_a_set_has_evidence_of_its_own(against_shipped):
+def test_each_accepted_effect_and_set_member_has_its_own_evidence(against_shipped):
     _, result = against_shipped
     members = [*result['effects'], *(r for e in result['effects']
                                      for r in e.get('rivals', []))]
@@ -193,7 +193,7 @@ def test_everything_accepted_and_every_member_of_a_set_has_evidence_of_its_own(a
         assert member['evidence']['delta_bic'] > 0 and member['evidence']['cv_gain'] > 0
 
 
-def test_changes_between_two_logs_are_told_with_intervals_that_hold_them():
+def test_changes_between_two_logs_are_reported_with_valid_intervals():
     before, after = made(7), made(8, {'offset': 0.018}, {}, coulomb=0.024)
     rows = changes(before, replace(after, name='after.csv'), SHIPPED)
     true = {(1, 'offset'): -0.018, (1, 'dead_band'): 0.024 - BANDS[0],
@@ -214,7 +214,7 @@ def test_two_logs_of_the_same_servos_show_no_change():
     assert not any(row['significant'] for row in changes(made(9), made(10), SHIPPED))
 
 
-def test_friction_may_stand_for_each_joint():
+def test_friction_may_be_given_for_each_joint():
     file_robot = replace(SHIPPED, effects={'joint_friction': {
         'coulomb': (0.001, 0.002, 0.003, 0.004), 'stiction': 0.002}})
     for joint in range(4):

@@ -93,7 +93,7 @@ def test_other_files_are_refused(tmp_path, content):
         read_joint_log(tmp_path / 'absent.csv')
 
 
-def test_columns_may_stand_anywhere_beside_others(good, tmp_path):
+def test_columns_may_have_any_order_and_others_are_ignored(good, tmp_path):
     rows = np.concatenate([good[:, ::-1], good[:, :1]], axis=1)
     log = read_joint_log(saved(tmp_path / 'log.csv', rows, [*HEADER[::-1], 'temperature_C']))
     assert log.joints == (1, 2)

@@ -63,7 +63,7 @@ def test_intervals_cover_the_truth():
     assert np.mean(inside) > 0.85
 
 
-def test_noise_that_grows_with_thrust_and_outliers_do_no_harm(tmp_path):
+def test_the_fit_is_robust_to_growing_noise_and_outliers(tmp_path):
     rng = np.random.default_rng(5)
     rows = bench(rng, force_noise=0.0)
     rows[:, 1] *= 1 + 0.01 * rng.normal(size=len(rows))
@@ -78,7 +78,7 @@ def test_a_sagging_supply_still_gives_five_plateaus(tmp_path):
     assert len(rows) == 5
 
 
-def test_other_columns_and_signs_mean_the_same(tmp_path):
+def test_other_columns_and_signs_give_the_same_result(tmp_path):
     rows = bench(np.random.default_rng(1))
     _, first, _ = identified(tmp_path, rows)
     other = rows * [1 / 20, 1, -1, 1]
@@ -89,7 +89,7 @@ def test_other_columns_and_signs_mean_the_same(tmp_path):
         assert np.allclose(a.coefficients, b.coefficients, rtol=1e-3, atol=1e-2)
 
 
-def test_rows_before_the_rotor_has_settled_are_left_out(tmp_path):
+def test_rows_before_the_rotor_settles_are_omitted(tmp_path):
     rng = np.random.default_rng(3)
     levels = np.repeat(np.linspace(55, 90, 15), 60)
     t = 0.05 * np.arange(len(levels))
@@ -106,7 +106,7 @@ def test_rows_before_the_rotor_has_settled_are_left_out(tmp_path):
     assert relative_error(fitted[0], true, lowest=3.0) < 0.01
 
 
-def test_the_robot_file_has_the_map(tmp_path):
+def test_the_written_robot_file_contains_the_map(tmp_path):
     log, rows, ratio = identified(tmp_path, bench(np.random.default_rng(0)))
     path = tmp_path / 'robot.yaml'
     write_rotor_file(path, rotor_results(log, rows, ratio), None)

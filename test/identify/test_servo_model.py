@@ -29,7 +29,7 @@ def step_command(size=0.3, at=0.2, duration=1.0):
     return t, np.where(t >= at - 1e-9, size, 0.0)
 
 
-def test_a_step_answers_as_the_second_order_system_does():
+def test_the_step_response_is_that_of_a_second_order_system():
     t, command = step_command()
     wn, zeta = 50.0, 0.7
     fine = np.arange(0, t[-1] + 1e-4, 1e-4)
@@ -72,7 +72,7 @@ def test_friction_holds_the_joint_exactly_still():
     assert 0 < moved[0, -1] < 0.01
 
 
-def test_sets_in_a_batch_do_not_see_each_other():
+def test_parameter_sets_in_a_batch_are_independent():
     t, command = sweep(duration=3.0)
     log = log_for(t, command)
     sets = np.concatenate([parameter_set(), parameter_set(delay=0.02, coulomb_friction=0.02),
@@ -111,6 +111,6 @@ def test_without_a_compiler_the_numbers_are_the_same(values, monkeypatch):
                        rtol=0, atol=1e-9)
 
 
-def test_where_nothing_compiles_numpy_takes_its_place(monkeypatch):
+def test_without_any_compiler_numpy_is_used(monkeypatch):
     monkeypatch.setenv('CC', '/nowhere/cc')
     assert servo_model._compiled.__wrapped__() is None

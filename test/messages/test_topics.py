@@ -129,7 +129,7 @@ def test_messages_of_several_layouts_keep_their_order():
                                   if mine is None else mine, equal_nan=True)
 
 
-def test_a_length_that_the_message_does_not_hold_is_refused():
+def test_a_length_beyond_the_message_is_refused():
     data = bytearray(cdr('command', value('command')))
     at = 4 + 8 + 4 + 4      # behind stamp and the empty frame_id: the number of names
     data[at:at + 4] = (0xFFFFFFF0).to_bytes(4, 'little')

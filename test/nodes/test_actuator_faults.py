@@ -132,7 +132,7 @@ BEARABLE = [
 ]
 
 
-def test_faults_that_drivers_recover_from_do_not_end_a_flight(robot):
+def test_faults_with_recovery_in_the_drivers_do_not_end_a_flight(robot):
     graph, mechanic = robot
     for switched, mended, bridge, status, counter in BEARABLE:
         where = f'{bridge}_bridge_node', status, counter
@@ -200,7 +200,7 @@ def test_a_board_that_stopped_is_not_armed_again_in_the_fall_or_after_it(robot, 
     assert not graph.dead()
 
 
-def test_nothing_is_left_on_when_the_bridges_are_killed(robot):
+def test_rotors_and_torque_are_off_after_the_bridges_are_killed(robot):
     graph, mechanic = robot
     graph.kill(BRIDGES_COMPOSED)
     assert mechanic.wait(lambda: mechanic.device('armed') == 'False', 10)

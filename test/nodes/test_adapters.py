@@ -128,7 +128,7 @@ def test_a_controller_on_standby_steps_between_the_steps_of_the_one_that_flies(m
     assert np.allclose(np.diff(steps_from(102.0)), 0.01, atol=1e-6)
 
 
-def test_without_a_target_it_holds_the_pose_of_the_hand_over(make):
+def test_without_a_target_the_pose_of_the_handover_is_held(make):
     node = make(FollowerNode)
     node._on_joints(JointReading(100.0, np.zeros(4), np.zeros(4)))
     node._on_mode('takeoff')
@@ -143,7 +143,7 @@ def test_without_a_target_it_holds_the_pose_of_the_hand_over(make):
     assert node.follower.received[-1][1].position[2] == 0.4
 
 
-def test_the_newest_target_counts_and_an_unset_stamp_means_now(make):
+def test_the_newest_target_is_used_and_an_unset_stamp_means_now(make):
     node = make(FollowerNode)
     node._on_joints(JointReading(100.0, np.zeros(4), np.zeros(4)))
     for stamp, x in ((50.0, 1.0), (60.0, 2.0), (50.0, 3.0)):
@@ -163,7 +163,7 @@ def test_the_payload_changes_in_flight_within_its_range(make):
     assert not node.set_parameters([Parameter('seed', value=3)])[0].successful
 
 
-def test_the_supervisor_takes_another_controller_but_no_unknown_one(make):
+def test_the_supervisor_accepts_known_controllers_only(make):
     node = make(SupervisorNode)
 
     def select(name):
@@ -176,14 +176,14 @@ def test_the_supervisor_takes_another_controller_but_no_unknown_one(make):
     assert not node.set_parameters([Parameter('takeoff.height', value=2.0)])[0].successful
 
 
-def test_the_supervisor_refuses_to_arm_without_an_estimate_and_says_why(make):
+def test_the_supervisor_refuses_to_arm_without_an_estimate_with_the_reason(make):
     node = make(SupervisorNode)
     answer = node._request('arm')(None, SimpleNamespace())
     assert not answer.success and 'ekf_node' in answer.message
     assert node._state == 'disarmed'
 
 
-def test_the_reference_waits_for_flight_then_plays_the_task(make, monkeypatch):
+def test_the_reference_node_starts_the_task_in_flight(make, monkeypatch):
     node = make(ReferenceNode, 'task:=waypoints')
     clock = SimpleNamespace(now=2000.0)
     monkeypatch.setattr(node, 'now', lambda: clock.now)

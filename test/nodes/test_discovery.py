@@ -42,7 +42,7 @@ def test_an_unknown_range_is_refused():
 
 @pytest.mark.parametrize('start', [
     'runner.main(ProbeNode, ["probe"])', 'sys.exit(runner.run([ProbeNode], ["x"], "composed"))'])
-def test_every_node_that_is_started_alone_or_composed_is_confined(ros_domain, unset, start):
+def test_every_separate_or_composed_node_is_limited_to_this_computer(ros_domain, unset, start):
     done = subprocess.run([sys.executable, '-c', PROBE + start], capture_output=True, text=True,
                           check=False, timeout=60)
     assert done.stderr.strip() == 'probe_node: error: LOCALHOST'
@@ -72,7 +72,7 @@ def test_the_range_argument_of_a_composition_is_not_a_node(ros_domain, unset):
 
 
 @pytest.mark.parametrize('command', ['fly', 'check'])
-def test_commands_that_join_the_graph_have_the_argument(command):
+def test_commands_that_join_the_graph_have_the_discovery_argument(command):
     done = subprocess.run([sys.executable, '-m', 'beetle_omni_ros.cli', command, '--help'],
                           capture_output=True, text=True, check=False, timeout=60)
     assert '--discovery' in done.stdout
@@ -88,7 +88,7 @@ def test_an_argument_of_fly_holds_for_the_processes_that_it_starts(tmp_path, uns
     assert given['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SUBNET'
 
 
-def test_a_graph_is_confined(tmp_path, unset, monkeypatch):
+def test_a_graph_is_limited_to_this_computer(tmp_path, unset, monkeypatch):
     given = {}
     monkeypatch.setattr(subprocess, 'Popen', lambda *_, env, **__: given.update(env))
     Graph({'ekf_node': {}}, tmp_path, 7).start_process('composed')

@@ -167,7 +167,7 @@ def test_a_silent_servo_leaves_joint_states_incomplete_and_is_named(active):
     witness.until(lambda: torque_is_back(emulated, witness, HOME), 'not back')
 
 
-def test_an_unplugged_cable_is_lost_and_flown_on_when_it_is_back(active):
+def test_an_unplugged_cable_is_reported_lost_until_it_is_back(active):
     emulated, witness = active
     emulated.unplug()
     witness.until(lambda: witness.now == f'lost: {emulated.port}: no connection')
@@ -180,7 +180,7 @@ def test_an_unplugged_cable_is_lost_and_flown_on_when_it_is_back(active):
 
 
 @pytest.mark.parametrize('fault', ['bad_crc', 'dropped'])
-def test_a_bad_line_keeps_going(active, fault):
+def test_a_bad_line_does_not_stop_the_bridge(active, fault):
     emulated, witness = active
     before = witness.numbers('bus')
     setattr(emulated.faults, fault, 0.1)
@@ -256,7 +256,7 @@ def test_the_torque_is_off_after_the_process_has_ended(tmp_path, how):
         assert 'Traceback' not in graph.log(NODE).read_text()
 
 
-def test_composed_with_another_node_it_waits_for_its_port_and_says_why(tmp_path):
+def test_a_composed_bridge_waits_for_its_port_and_reports_why(tmp_path):
     port = tmp_path / 'servo_bus'
     with joint_bridge(tmp_path, ['ekf_node'], port=str(port), autostart='activate') \
             as (graph, witness):

@@ -131,7 +131,7 @@ def test_the_plant_may_differ_from_the_robot_file(bringup):
                      'rl_node': 'a.yaml', 'supervisor_node': 'a.yaml'}
 
 
-def test_either_controller_is_active_and_the_other_stands_by(bringup, capsys, monkeypatch):
+def test_each_controller_can_be_active_with_the_other_on_standby(bringup, capsys, monkeypatch):
     def controllers(**arguments):
         nodes = bringup.start(composed='false', **arguments)
         active = next(n.kwargs['parameters'][0]['controller'] for n in nodes
@@ -168,7 +168,7 @@ def test_ros2_bag_records_where_it_is_installed_else_the_recorder(bringup, monke
         assert recorder.kwargs['parameters'] == [{'bag': '/data/run'}]
 
 
-def test_a_launch_is_found_on_this_computer_alone(bringup, monkeypatch):
+def test_a_launch_is_visible_on_this_computer_only(bringup, monkeypatch):
     for name in (*discovery.ROS_SETTINGS, discovery.VARIABLE):
         monkeypatch.delenv(name, raising=False)
     bringup.generate_launch_description()
@@ -180,7 +180,7 @@ def test_a_launch_is_found_on_this_computer_alone(bringup, monkeypatch):
     assert os.environ[discovery.RANGE] == 'OFF'
 
 
-def test_the_ports_of_a_launch_lie_in_the_users_own_folder(bringup):
+def test_the_ports_of_a_launch_are_in_a_private_folder(bringup):
     nodes = {n.kwargs['name']: n.kwargs['parameters'][0] for n in bringup.start(composed='false')}
     assert Path(nodes['sim_node']['servo_port']).parent.parent == private.folder()
 

@@ -39,13 +39,13 @@ def run(pacing, clock, seconds, jitter=None):
     return np.array(ages)
 
 
-def test_one_tick_a_call_and_stamps_of_now(pacing, clock):
+def test_each_call_gives_one_tick_with_the_present_stamp(pacing, clock):
     ages = run(pacing, clock, 2.0)
     assert pacing.ticks == 400
     assert np.abs(ages).max() < 1e-6
 
 
-def test_a_late_first_call_does_not_make_all_stamps_old(pacing, clock):
+def test_a_late_first_call_does_not_delay_later_stamps(pacing, clock):
     clock.now += 0.0043
     pacing.due()
     clock.now += TICK - 0.0043
@@ -54,13 +54,13 @@ def test_a_late_first_call_does_not_make_all_stamps_old(pacing, clock):
     assert pacing.ticks == pytest.approx(801, abs=1)
 
 
-def test_jitter_costs_no_ticks(pacing, clock):
+def test_jitter_loses_no_ticks(pacing, clock):
     ages = run(pacing, clock, 10.0, np.random.default_rng(2).uniform(0, 0.003, 2000))
     assert pacing.ticks == pytest.approx(2000, abs=1) and pacing.lost_ticks == 0
     assert ages.max() < 0.0035 and ages.min() > -0.002
 
 
-def test_a_stall_costs_ticks_but_no_lasting_delay(pacing, clock):
+def test_a_stall_loses_ticks_without_lasting_delay(pacing, clock):
     run(pacing, clock, 0.5)
     clock.now += 3.0                        # everything stood still
     assert pacing.due() == CATCH_UP_TICKS
@@ -131,7 +131,7 @@ def test_simulated_time_is_as_slow_as_the_slowest_node(waiting, clock, slowness)
     assert max(leads) <= LAG + 2 * TICK and waiting.lost_ticks == 0
 
 
-def test_a_silent_node_is_waited_for_once_and_again_after_its_return(waiting, clock):
+def test_simulated_time_waits_once_for_each_silence_of_a_node(waiting, clock):
     fly(waiting, clock, 0.5, lambda k: waiting.now)
     fly(waiting, clock, 2.0, lambda k: None)
     silent = PATIENCE / TICK

@@ -24,12 +24,12 @@ def name():
     return f'beetle_omni_{os.getuid()}'
 
 
-def test_the_folder_is_for_this_user_alone(temporary, name):
+def test_the_folder_is_private_to_this_user(temporary, name):
     assert private.folder() == temporary / name
     assert stat.S_IMODE(os.lstat(temporary / name).st_mode) == 0o700
 
 
-def test_the_runtime_folder_comes_first_where_it_is_safe(temporary, monkeypatch):
+def test_the_runtime_folder_is_preferred_if_it_is_safe(temporary, monkeypatch):
     runtime = temporary / 'runtime'
     runtime.mkdir(mode=0o700)
     monkeypatch.setenv('XDG_RUNTIME_DIR', str(runtime))
@@ -63,7 +63,7 @@ def test_a_folder_of_another_user_is_refused(temporary, name):
 
 
 @pytest.mark.parametrize('link', [os.symlink, os.link])
-def test_a_file_of_the_victim_is_not_emptied(temporary, link):
+def test_a_linked_file_of_the_user_is_not_truncated(temporary, link):
     victim = temporary / 'victim'
     victim.write_text('precious')
     for number in discovery.DOMAINS:
@@ -79,13 +79,13 @@ def test_a_pipe_in_place_of_a_lock_is_refused_at_once(temporary):
         private.open_lock('x.lock')
 
 
-def test_a_lock_is_not_emptied_before_it_is_held(temporary):
+def test_a_lock_file_is_not_truncated_before_it_is_held(temporary):
     (private.folder() / 'x.lock').write_text('4711')
     with private.open_lock('x.lock') as file:
         assert file.read() == '4711'
 
 
-def test_a_lock_names_its_holder_and_leaves_nothing_behind(temporary, name):
+def test_a_lock_names_its_holder_and_removes_its_file(temporary, name):
     lock = private.Lock('x.lock')
     with pytest.raises(private.HeldError, match=str(os.getpid())):
         private.Lock('x.lock')
@@ -95,7 +95,7 @@ def test_a_lock_names_its_holder_and_leaves_nothing_behind(temporary, name):
     private.Lock('x.lock').close()
 
 
-def test_a_lock_that_its_holder_removes_meanwhile_is_taken_anew(temporary, monkeypatch):
+def test_a_lock_file_removed_during_locking_is_created_again(temporary, monkeypatch):
     first, opened = private.Lock('x.lock'), private.open_lock
 
     def late(name):
@@ -121,7 +121,7 @@ def test_a_domain_leaves_only_the_locks_of_running_processes(temporary):
     assert not list(temporary.iterdir())
 
 
-def test_a_node_leaves_the_file_behind_a_link_alone(temporary):
+def test_a_node_does_not_write_through_a_link(temporary):
     from beetle_omni_ros.nodes.node import lock_name
     victim = temporary / 'victim'
     victim.write_text('precious')

@@ -42,7 +42,7 @@ def test_the_outcome_is_determined_from_truth_and_commands(observer, flying, ref
     assert result['outcome'] == outcome and result['named'] == 'rotor1_lost'
 
 
-def test_a_take_off_from_the_floor_is_counted_and_a_bounce_is_none(monkeypatch):
+def test_a_take_off_from_the_floor_is_counted_and_a_bounce_is_not(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(process_faults.time, 'monotonic', lambda: now[0])
     observer = Observer.__new__(Observer)
@@ -61,7 +61,7 @@ def test_a_take_off_from_the_floor_is_counted_and_a_bounce_is_none(monkeypatch):
     assert observer.takeoffs == 1
 
 
-def test_the_names_are_those_of_the_page_in_the_docs():
+def test_the_fault_names_equal_those_of_the_docs():
     text = share_path('docs/faults.md').read_text() if share_path('.').joinpath(
         'docs', 'faults.md').exists() else None
     if text is None:

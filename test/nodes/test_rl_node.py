@@ -56,7 +56,7 @@ def process(ros_domain, tmp_path):
             witness.close()
 
 
-def test_the_node_answers_as_the_controller_does(process):
+def test_the_node_publishes_the_commands_of_the_controller(process):
     graph, witness, policy = process
     node = witness._node
     odom = node.create_publisher(Odometry, 'odom', wire.profile(ESTIMATE))
@@ -123,7 +123,7 @@ def test_a_policy_that_cannot_fly_is_refused_at_the_start(ros_domain, tmp_path):
     assert 'robot_hash' in refusal(f"policy:={tmp_path / 'whole.onnx'}", f'robot_file:={other}')
 
 
-def test_a_policy_that_cannot_fly_does_not_stand_by(tmp_path):
+def test_an_unusable_policy_is_not_on_standby(tmp_path):
     policy = str(write(tmp_path / 'policy.onnx'))
     other = str(share_path('params/robot_weak_and_heavy.yaml'))
     assert list(controller_nodes('nmpc', policy=policy)[0]) == ['nmpc_node', 'rl_node']

@@ -45,7 +45,7 @@ def flying(bridge):
     return bridge
 
 
-def test_it_arms_at_takeoff_follows_the_thrusts_and_disarms_with_the_supervisor(bridge):
+def test_the_bridge_arms_at_takeoff_follows_thrusts_and_disarms_with_the_supervisor(bridge):
     board, commander = bridge.board, bridge.commander
     commander.thrust = np.zeros(4)
     commander.spin(0.2)
@@ -62,7 +62,7 @@ def test_it_arms_at_takeoff_follows_the_thrusts_and_disarms_with_the_supervisor(
     assert not any(text.startswith('lost') for text in commander.bridge_states)
 
 
-def test_thrusts_arrive_at_a_sagging_battery(flying):
+def test_thrusts_are_produced_with_a_sagging_battery(flying):
     board, commander = flying.board, flying.commander
     board.set_battery(22.7, 40.0)
     assert commander.wait(lambda: flying.follows(), SOON)
@@ -90,7 +90,7 @@ def test_a_low_battery_refuses_arming_with_the_reason(bridge):
     assert not board.armed and not board.commands.any()
 
 
-def test_each_command_is_repeated_but_a_stream_that_stops_stops_the_rotors(flying):
+def test_commands_are_repeated_and_the_rotors_stop_with_the_stream(flying):
     board, commander = flying.board, flying.commander
     commander.period = 0.06
     arrivals = []
@@ -123,7 +123,7 @@ def test_old_commands_are_not_sent(flying):
                                          lambda n: n and int(n) > 5)
 
 
-def test_a_stream_that_stays_away_disarms_and_is_not_armed_again_in_this_flight(flying):
+def test_a_missing_stream_disarms_for_the_rest_of_the_flight(flying):
     board, commander = flying.board, flying.commander
     commander.thrust = None
     assert commander.reaches('lost: disarmed (no target for too long)')
@@ -136,7 +136,7 @@ def test_a_stream_that_stays_away_disarms_and_is_not_armed_again_in_this_flight(
     (lambda board: board.reboot(), 'lost: restarted'),
     (lambda board: board.hang(), 'lost: restarted (watchdog reset)'),
     (lambda board: board.unplug(), 'lost: {port}: port is away')])
-def test_a_lost_board_stays_disarmed_until_the_supervisor_was(flying, fault, why):
+def test_a_lost_board_stays_disarmed_until_the_supervisor_is_disarmed(flying, fault, why):
     board, commander = flying.board, flying.commander
     fault(board)
     assert commander.reaches(why.format(port=board.port)), commander.bridge_states
@@ -153,7 +153,7 @@ def test_a_lost_board_stays_disarmed_until_the_supervisor_was(flying, fault, why
     flying.take_off()
 
 
-def test_a_silent_board_keeps_getting_targets_until_the_supervisor_has_landed(flying):
+def test_targets_are_sent_to_a_silent_board_until_the_supervisor_has_landed(flying):
     board, commander = flying.board, flying.commander
     board.faults.mute = True
     assert commander.reaches('silent: nothing heard of the board'), commander.bridge_states
@@ -169,7 +169,7 @@ def test_a_silent_board_keeps_getting_targets_until_the_supervisor_has_landed(fl
 @pytest.mark.parametrize('faults', [
     {'corrupt_in': 0.05, 'corrupt_out': 0.05}, {'drop_in': 0.05, 'drop_out': 0.05},
     {'delay_in': 0.01, 'delay_out': 0.01}])
-def test_a_poor_link_is_flown_through(flying, faults):
+def test_a_poor_link_is_tolerated(flying, faults):
     board, commander = flying.board, flying.commander
     for name, value in faults.items():
         setattr(board.faults, name, value)
@@ -185,7 +185,7 @@ def test_a_poor_link_is_flown_through(flying, faults):
     assert commander.bridge_states == ['ready']
 
 
-def test_battery_and_rotor_speeds_are_published_in_our_units_and_signs(bridge):
+def test_battery_and_rotor_speeds_are_published_in_ros_units_and_signs(bridge):
     board, commander = bridge.board, bridge.commander
     board.set_battery(23.456, 12.34)
     board.set_rotors(np.array([1.0, 4.0, 9.0, 0.0]), np.array([30.0, 40.0, 50.0, 60.0]))
@@ -224,7 +224,7 @@ def test_diagnostics_contain_link_clock_latency_and_a_failed_esc(flying):
     assert commander.bridge == 'ready' and board.armed
 
 
-def test_a_bridge_that_is_killed_leaves_no_rotor_turning_and_its_successor_does_not_arm(tmp_path):
+def test_after_a_killed_bridge_no_rotor_turns_and_a_new_one_does_not_arm(tmp_path):
     with bench(tmp_path) as made:
         board, commander = made.board, made.commander
         assert commander.reaches('ready', START), made.log
@@ -246,7 +246,7 @@ def test_a_bridge_that_is_killed_leaves_no_rotor_turning_and_its_successor_does_
         assert not board.armed and not board.commands.any()
 
 
-def test_a_bridge_that_ends_disarms_and_reports_it(tmp_path):
+def test_a_bridge_disarms_at_its_end_and_reports_it(tmp_path):
     with bench(tmp_path) as made:
         board, commander = made.board, made.commander
         assert commander.reaches('ready', START), made.log
@@ -260,7 +260,7 @@ def test_a_bridge_that_ends_disarms_and_reports_it(tmp_path):
         assert '[ERROR]' not in made.log[0], made.log
 
 
-def test_a_port_that_is_absent_is_waited_for_and_named(tmp_path):
+def test_the_bridge_waits_for_a_missing_port_and_names_it(tmp_path):
     port = tmp_path / 'motor_board'
     with bench(tmp_path, port=str(port)) as made:
         commander = made.commander

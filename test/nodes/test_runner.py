@@ -62,7 +62,7 @@ def test_a_broken_parameter_file_is_refused_with_its_line(ros_domain, tmp_path):
     assert status == 2 and 'line 3' in error and len(error.strip().splitlines()) == 1
 
 
-def test_an_unknown_argument_is_refused_and_help_is_given(ros_domain):
+def test_an_unknown_argument_is_refused_and_help_is_printed(ros_domain):
     status, error = finish(start('ekf_node', 'imu.rate=100'))
     assert status == 2 and "unknown argument 'imu.rate=100'" in error
     status, error = finish(start('ekf_node', '--help'))

@@ -52,7 +52,7 @@ def test_commands_and_joint_states_pass_through_the_ports_instead_of_topics(make
     assert not {'/joint_states', '/battery_state'} & published and '/command' not in subscribed
 
 
-def test_the_direct_path_is_as_it_was(make):
+def test_the_direct_path_is_unchanged(make):
     node = make(actuators='direct')
     published, subscribed = topics(node)
     assert {'/joint_states', '/battery_state'} <= published and '/command' in subscribed
@@ -61,7 +61,7 @@ def test_the_direct_path_is_as_it_was(make):
     assert not put(node, board_faults__hang=True).successful
 
 
-def test_faults_are_switched_live_and_told(make):
+def test_faults_are_switched_in_flight_and_reported(make):
     node = make('faults:="mocap_lost"', actuators='direct')
     assert node._robot_status()[0] == health.OK
     node._simulator.step()
@@ -79,7 +79,7 @@ def test_faults_are_switched_live_and_told(make):
     assert node._simulator.faults == []
 
 
-def test_faults_of_what_devices_measure_are_refused_beside_them(make):
+def test_faults_of_device_measurements_are_refused_with_emulated_devices(make):
     node = make()
     assert put(node, faults='gyroscope_bias x=0.1; rotor_stops rotor=1').successful
     for text in ('joints_lost', 'battery_unread', 'commands_lost'):
@@ -87,7 +87,7 @@ def test_faults_of_what_devices_measure_are_refused_beside_them(make):
         assert not answer.successful and 'servo_faults' in answer.reason
 
 
-def test_simulated_time_is_made_here_and_not_with_serial_devices(make):
+def test_the_simulator_publishes_simulated_time_only_without_serial_devices(make):
     node = make('clock:=simulated', actuators='direct')
     assert '/clock' in topics(node)[0] and '/odom' in topics(node)[1]
     before = node.now()
@@ -95,7 +95,7 @@ def test_simulated_time_is_made_here_and_not_with_serial_devices(make):
     assert np.allclose(np.diff([before, *ticks]), 0.005, rtol=0, atol=1e-6)
 
 
-def test_simulated_time_and_serial_devices_do_not_go_together(make):
+def test_simulated_time_is_refused_with_serial_devices(make):
     with pytest.raises(ParameterError, match=r"key 'clock': simulated: serial devices keep real"):
         make('clock:=simulated')
 
@@ -110,7 +110,7 @@ def test_ports_have_the_requested_names_and_end_with_the_node(make, tmp_path):
     assert not os.path.lexists(servos) and not os.path.lexists(board)
 
 
-def test_a_path_that_is_taken_is_refused_and_left_alone(make, tmp_path):
+def test_an_existing_path_is_refused_and_unchanged(make, tmp_path):
     servos, taken = tmp_path / 'servos', tmp_path / 'notes.txt'
     taken.write_text('keep')
     with pytest.raises(OSError, match=r'notes.txt: cannot be made a port, it exists and is no li'):
@@ -158,7 +158,7 @@ def test_an_event_happens_each_time_it_is_set_and_resets_itself(make):
     assert node.get_parameter('board_faults.reboot').value is False
 
 
-def test_faults_can_be_on_from_the_start(make):
+def test_faults_can_be_active_from_the_start(make):
     node = make('servo_faults.overheated:=[3, 4]', 'board_faults.unplugged:=true')
     assert node._devices.bus.faults.overheated == {3, 4}
     assert not Path(node._devices.board.port).exists()
@@ -166,7 +166,7 @@ def test_faults_can_be_on_from_the_start(make):
     assert Path(node._devices.board.port).exists()
 
 
-def test_faults_of_nothing_at_the_start_end_the_node_with_one_line(make):
+def test_unknown_faults_at_the_start_end_the_node_with_one_line(make):
     with pytest.raises(ParameterError, match='servo_faults.silent: no servo has the id 8'):
         make('servo_faults.silent:=[8]')
 

@@ -87,7 +87,7 @@ def test_a_flight_that_fails_after_a_pause_reports_the_pause(may_be_slow):
 
 
 @pytest.mark.real_time
-def test_a_fault_that_keeps_it_on_the_ground_ends_the_attempt_at_once():
+def test_a_fault_that_prevents_take_off_ends_the_attempt_at_once():
     class Jammed(Nodes):
         states, waited = [], 0
 

@@ -30,7 +30,7 @@ def test_a_period_without_a_target_is_missed(gaps, cycles, missed):
     assert (stream.cycles, stream.missed) == (cycles, missed)
 
 
-def test_rest_is_not_missed_but_a_full_buffer_is():
+def test_a_full_buffer_counts_as_missed_and_rest_does_not():
     stream = TargetStream(PERIOD)
     stream.add(sent(), 1.0)
     stream.rest()

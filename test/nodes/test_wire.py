@@ -34,7 +34,7 @@ def time_message(stamp):
     return message
 
 
-def test_stamps_survive_to_the_nanosecond():
+def test_stamps_round_trip_to_the_nanosecond():
     for stamp in (0.0, 1e-9, 1.999999999, 1_790_000_000.123456789):
         assert conversions.seconds(time_message(stamp)) == pytest.approx(stamp, abs=3e-7)
     assert time_message(2 - 1e-12).nanosec == 0      # rounds up into the next second
@@ -62,7 +62,7 @@ def test_command_round_trip_and_layout(rng):
     assert back.stamp == pytest.approx(12.5)
 
 
-def test_joints_are_found_by_name_not_by_place(rng):
+def test_joints_are_found_by_name_not_by_position(rng):
     position = rng.normal(size=4)
     message = wire.message('joint_states', JointReading(1.0, position, -position))
     shuffled = JointState(name=[message.name[k] for k in (2, 0, 3, 1)],
@@ -72,7 +72,7 @@ def test_joints_are_found_by_name_not_by_place(rng):
     assert np.array_equal(conversions.take_joints(shuffled).velocity, -position)
 
 
-def test_rotor_speeds_stand_under_the_rotors_names():
+def test_rotor_speeds_have_the_names_of_the_rotors():
     message = over_the_wire(wire.message(
         'rotor_states', RotorReading(2.5, np.array([1.0, np.nan, 3, 400]))))
     assert list(message.name) == ['rotor1', 'rotor2', 'rotor3', 'rotor4']

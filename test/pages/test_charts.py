@@ -27,7 +27,7 @@ def unpack(numbers, where):
 
 @BUSY
 @given(st.lists(st.lists(FLOATS, max_size=20), min_size=1, max_size=4))
-def test_values_come_back_within_half_a_step(series):
+def test_values_round_trip_within_half_a_quantum(series):
     numbers = Numbers()
     places = [numbers.add(np.array(values)) for values in series]
     for values, where in zip(series, places, strict=True):
@@ -47,13 +47,13 @@ def test_logarithmic_values_keep_their_relative_precision(values):
     assert back[:-2] == pytest.approx(values, rel=2e-4) and np.isnan(back[-2:]).all()
 
 
-def test_noise_takes_no_more_than_its_bits_and_constants_nothing():
+def test_noise_is_stored_in_few_bits_and_constants_in_none():
     noise, still = Numbers(), Numbers()
     noise.add(np.random.default_rng(0).uniform(size=12_000))
     still.add(np.full(12_000, 3.0))
     assert len(noise.blob()) < 2.1 * 4 / 3 * 12_000 and len(still.blob()) < 300
 
 
-def test_no_text_ends_the_block_of_data():
+def test_no_text_can_end_the_data_block():
     block = data_block({'label': '</script><script>alert(1)</script>'}, Numbers())
     assert block.count('</script>') == 2 and 'alert(1)</' not in block

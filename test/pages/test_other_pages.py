@@ -58,7 +58,7 @@ def committed_comparison(folder):
 
 @pytest.mark.parametrize('made', [rotor, comparison, committed_comparison, faults, verdict],
                          ids=lambda made: made.__name__)
-def test_nothing_is_cut_off(made, tmp_path):
+def test_no_content_is_clipped(made, tmp_path):
     file = tmp_path / 'page.html'
     file.write_text(made(tmp_path))
     with browser() as chromium:

@@ -70,7 +70,7 @@ def test_the_page_draws_everything_and_fits(chromium, page_file, width):
         assert '2 of' not in page.locator('.card').nth(1).inner_text()
 
 
-def test_a_run_that_is_switched_off_is_gone(chromium, page_file):
+def test_a_run_that_is_switched_off_is_hidden(chromium, page_file):
     with opened(chromium, page_file, 1280) as page:
         seek(page, 12)
         both, scene = picture(page, '[data-chart="chart0"]'), page.locator('#errors')
@@ -111,7 +111,7 @@ def test_the_scene_shows_the_error_of_the_metrics(chromium, page_file):
         assert near == 'near: 10 mm, 3.0°' and far == 'far: 300 mm, 3.0°'
 
 
-def test_all_time_axes_zoom_together_and_a_tap_goes_there(chromium, page_file):
+def test_time_axes_zoom_together_and_a_tap_sets_the_time(chromium, page_file):
     with opened(chromium, page_file, 1280) as page:
         seek(page, 12.0)
         holder = page.locator('[data-chart="chart5"]')

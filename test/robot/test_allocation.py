@@ -61,7 +61,7 @@ def test_allocation_leaves_no_residual_and_respects_the_limits():
     assert met > 100
 
 
-def test_each_tilt_is_the_legal_turn_nearest_the_present_angle():
+def test_each_tilt_is_the_permitted_turn_nearest_the_present_angle():
     rng = np.random.default_rng(3)
     for _ in range(300):
         force, torque = random_wrench(rng)
@@ -73,7 +73,7 @@ def test_each_tilt_is_the_legal_turn_nearest_the_present_angle():
             assert abs(angle - now) == pytest.approx(min(abs(turn - now) for turn in legal))
 
 
-def test_solution_has_the_least_norm_of_all_that_make_the_wrench():
+def test_the_solution_has_minimum_norm():
     rng = np.random.default_rng(4)
     for _ in range(5):
         force, torque = random_wrench(rng)
@@ -105,7 +105,7 @@ def test_small_change_of_wrench_makes_a_small_change_of_the_targets():
         np.testing.assert_allclose(second.thrust, first.thrust, atol=1e-3)
 
 
-def test_following_a_full_roll_never_jumps_while_the_travel_allows():
+def test_a_full_roll_gives_no_jump_within_the_travel():
     present, path = np.zeros(4), []
     for roll in np.linspace(0, np.pi, 400):
         got = ALLOCATOR.hover(rotations.from_rpy(roll, 0.2, 0.3), present)
@@ -137,13 +137,13 @@ def test_rotor_without_thrust_keeps_its_present_angle():
     assert not got.saturated.any()
 
 
-def test_too_much_thrust_is_cut_off_and_reported():
+def test_excess_thrust_is_clipped_and_reported():
     got = ALLOCATOR.allocate(np.array([0.0, 0.0, 200.0]), np.zeros(3), np.zeros(4))
     np.testing.assert_array_equal(got.thrust, np.full(4, ROBOT.rotors.thrust_max))
     assert got.saturated.all()
 
 
-def test_tilt_without_a_legal_turn_is_cut_off_and_reported():
+def test_a_tilt_without_a_permitted_turn_is_clipped_and_reported():
     short = replace(ROBOT, joints=replace(ROBOT.joints, position_limit=1.0))
     got = allocate(short, np.array([0.0, 0.0, -20.0]), np.zeros(3), np.zeros(4))
     assert np.all(np.abs(got.tilt) <= 1.0)

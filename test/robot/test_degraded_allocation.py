@@ -43,7 +43,7 @@ def keeps_to(health, tilt, thrust):
 
 
 @pytest.mark.parametrize('health', KINDS)
-def test_makes_the_wrench_with_what_is_left_within_the_limits(health):
+def test_the_remaining_actuators_give_the_wrench_within_limits(health):
     ours, met = allocator(ROBOT, health), 0
     for force, torque, present in draws(100, 1):
         got = ours.allocate(force, torque, present)
@@ -65,7 +65,7 @@ def test_with_all_actuators_it_is_the_healthy_allocation():
             np.testing.assert_allclose(got.thrust, right.thrust, atol=1e-9)
 
 
-def test_a_stuck_rotor_that_would_have_to_pull_is_off():
+def test_a_stuck_rotor_that_would_need_negative_thrust_is_off():
     health = stuck(0, np.pi)
     got = allocator(ROBOT, health).hover(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(4))
     assert got.thrust[0] == 0.0
@@ -73,7 +73,7 @@ def test_a_stuck_rotor_that_would_have_to_pull_is_off():
 
 
 @pytest.mark.parametrize('health', [lost(0), stuck(1, 0.8)])
-def test_beyond_the_limits_it_comes_nearer_than_clipping(health):
+def test_beyond_the_limits_the_error_is_smaller_than_by_clipping(health):
     ours = allocator(ROBOT, health)
     scale = 1 / np.r_[np.full(3, ROBOT.mass), ROBOT.inertia]
     nearer, clipped = [], []
@@ -97,7 +97,7 @@ def test_beyond_the_limits_it_comes_nearer_than_clipping(health):
 
 
 @pytest.mark.parametrize('health', KINDS)
-def test_near_the_present_tilts_it_keeps_to_reach_and_health(health):
+def test_solutions_near_the_present_tilts_respect_range_and_health(health):
     ours = allocator(ROBOT, health)
     for force, torque, present in draws(40, 4):
         present, _ = health.possible(present, np.zeros(4))
@@ -107,7 +107,7 @@ def test_near_the_present_tilts_it_keeps_to_reach_and_health(health):
         assert np.all(np.abs(got.tilt - present) <= WEIGHTS.tilt_reach + 1e-9)
 
 
-def test_near_a_solution_it_stays_there():
+def test_near_a_solution_the_tilts_do_not_change():
     health = lost(3)
     ours = allocator(ROBOT, health)
     attitude = rotations.from_rpy(0.25, 0.25, 0.0)
@@ -119,7 +119,7 @@ def test_near_a_solution_it_stays_there():
     np.testing.assert_allclose(got.thrust, aim.thrust, atol=1e-5)
 
 
-def test_a_rotor_that_holds_a_thrust_gives_it_and_the_others_meet_the_wrench():
+def test_a_rotor_stuck_at_a_thrust_is_compensated_by_the_others():
     ours = DegradedAllocator(ROBOT, ActuatorHealth(held=(None, 9.0, None, None)))
     for force, torque, present in draws(50, 5):
         got = ours.allocate(force, torque, present)
@@ -129,7 +129,7 @@ def test_a_rotor_that_holds_a_thrust_gives_it_and_the_others_meet_the_wrench():
                                        np.concatenate([force, torque]), atol=1e-6)
 
 
-def test_health_refuses_what_is_not_four():
+def test_health_refuses_lengths_other_than_four():
     with pytest.raises(ValueError, match='rotors: expected four, found 3'):
         ActuatorHealth(rotors=(True,) * 3)
     assert ALL_HEALTHY.healthy and not lost(1).healthy and not stuck(0, 0.0).healthy

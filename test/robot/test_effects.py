@@ -38,19 +38,19 @@ def tables(package):
     return found
 
 
-def test_few_tables_outside_robot_are_keyed_by_names_of_effects():
+def test_few_tables_outside_robot_have_effect_names_as_keys():
     found = tables(PACKAGE)
     assert len(found) <= MOST_TABLES, '\n'.join(found)
 
 
-def test_a_table_of_effects_is_counted(tmp_path):
+def test_the_check_counts_a_table_of_effects(tmp_path):
     (tmp_path / 'a.py').write_text("LATE = {'mocap_time_offset.delay': 1, 'imu_filter_lag': 2}\n"
                                    "ONE = ('mass',)\nWORDS = ('force_x', 'torque')\n")
     assert tables(tmp_path) == ['a.py: LATE']
 
 
 @pytest.mark.parametrize('name', CATALOGUE)
-def test_a_declaration_is_complete_and_agrees_with_itself(name):
+def test_a_declaration_is_complete_and_consistent(name):
     effect = CATALOGUE[name]
     assert effect.source and effect.excited_by and effect.separated_by
     assert all(other in CATALOGUE for other in effect.confused_with)
@@ -69,7 +69,7 @@ def test_a_declaration_is_complete_and_agrees_with_itself(name):
         assert spec.step > 0 and (spec.form or spec.typical > spec.smallest > 0)
 
 
-def test_what_delays_commands_and_readings_is_declared():
+def test_delays_of_commands_and_readings_are_declared():
     assert delaying('tilt') == ('command_latency', 'joint_command_latency')
     assert delaying('thrust') == ('rotor_dead_time', 'command_latency')
     assert delaying('imu', 'encoders') == ('joint_feedback_delay', 'imu_filter_lag')

@@ -38,7 +38,7 @@ def test_with_a_rotor_lost_every_attitude_near_level_is_held_but_level_is_singul
 
 
 @pytest.mark.parametrize('health', [LOST, STUCK])
-def test_what_has_a_margin_is_held_by_the_allocation(holdings, health):
+def test_an_attitude_with_margin_is_held_by_the_allocation(holdings, health):
     ours = allocator(ROBOT, health)
     for quaternion in attitudes(60):
         if holdings[health].margin(quaternion) > 0:
@@ -49,14 +49,14 @@ def test_what_has_a_margin_is_held_by_the_allocation(holdings, health):
             np.testing.assert_allclose(torque, 0.0, atol=0.01)
 
 
-def test_heading_does_not_matter(holdings):
+def test_heading_does_not_change_the_margin(holdings):
     for quaternion in attitudes(20):
         turned = rotations.multiply(rotations.from_rpy(0, 0, 1.1), quaternion)
         assert holdings[STUCK].margin(turned) == pytest.approx(holdings[STUCK].margin(quaternion))
 
 
 @pytest.mark.parametrize('health', [LOST, STUCK])
-def test_the_nearest_attitude_is_firm_and_none_of_the_table_is_nearer(holdings, health):
+def test_the_nearest_attitude_has_the_margin_and_no_sample_is_nearer(holdings, health):
     holding = holdings[health]
     for desired in attitudes(30):
         got = holding.nearest(desired, 1.0)
@@ -66,12 +66,12 @@ def test_the_nearest_attitude_is_firm_and_none_of_the_table_is_nearer(holdings, 
         assert rotations.geodesic_angle(got, desired) <= least + 1e-6
 
 
-def test_an_attitude_that_is_firm_stays(holdings):
+def test_an_attitude_with_margin_is_kept(holdings):
     firm = leaned(LEVEL, holdings[LOST].directions[np.argmax(holdings[LOST].margins)])
     np.testing.assert_allclose(holdings[LOST].nearest(firm, 2.0), firm)
 
 
-def test_without_any_firm_one_the_nearest_of_the_firmest_is_taken(holdings):
+def test_without_any_margin_the_nearest_of_the_best_is_taken(holdings):
     holding = holdings[LOST]
     nearly = 0.8 * holding.margins.max()
     for desired in (LEVEL, *attitudes(10)):
@@ -82,7 +82,7 @@ def test_without_any_firm_one_the_nearest_of_the_firmest_is_taken(holdings):
         assert rotations.geodesic_angle(got, desired) <= least + 1e-6
 
 
-def test_the_quickest_attitude_needs_no_turn_where_all_is_firm(holdings):
+def test_the_quickest_attitude_is_the_present_one_if_all_have_margin(holdings):
     got = holdings[ALL_HEALTHY].quickest(LEVEL, np.zeros(3), np.zeros(4), 1.0, 0.8)
     assert rotations.geodesic_angle(got, LEVEL) < 0.2
     turning = holdings[ALL_HEALTHY].quickest(LEVEL, np.array([5.0, 0, 0]), np.zeros(4), 1.0,
@@ -90,14 +90,14 @@ def test_the_quickest_attitude_needs_no_turn_where_all_is_firm(holdings):
     assert rotations.log(turning)[0] > rotations.log(got)[0] + 0.05
 
 
-def test_the_nearest_attitude_has_the_margin_to_fly_near_the_wished_one():
+def test_the_nearest_attitude_has_the_flight_margin_near_the_requested_one():
     holding = Holding(ROBOT, LOST)
     got = holding.nearest(LEVEL, holding.parameters.flying_margin)
     assert holding.margin(got) >= 2.0
     assert rotations.geodesic_angle(got, LEVEL) < np.radians(20)
 
 
-def test_leaned_is_the_shortest_turn():
+def test_leaning_is_the_shortest_rotation():
     for quaternion, direction in zip(attitudes(20), sphere(20)):
         got = leaned(quaternion, direction)
         np.testing.assert_allclose(up(got), direction, atol=1e-9)
@@ -112,7 +112,7 @@ def test_leaned_is_the_shortest_turn():
     # attitude upside down, from which level cannot be reached but by falling; they fell by 2 m.
     (3, (0.99, 0.14, -0.04), -1.9, (1.6, 1.6, -1.6, -1.5)),
     (2, (-0.97, 0.24, -0.07), 1.8, (-1.6, -1.6, 1.6, 1.7))])
-def test_on_its_side_the_escape_leads_towards_level(lost, up_now, rate, tilt):
+def test_from_the_side_the_escape_leads_towards_level(lost, up_now, rate, tilt):
     holding = Holding(ROBOT, ActuatorHealth(rotors=tuple(i != lost for i in range(4))))
     start = leaned(LEVEL, np.array(up_now) / np.linalg.norm(up_now))
     got = holding.quickest(start, np.array([0.0, 0.0, rate]), np.array(tilt), 2.0, 0.8)
@@ -120,7 +120,7 @@ def test_on_its_side_the_escape_leads_towards_level(lost, up_now, rate, tilt):
     assert up(got)[2] > 0.8
 
 
-def test_less_thrust_leaves_no_attitude_firmer_and_level_the_firmest(holdings):
+def test_less_thrust_reduces_all_margins_and_level_keeps_the_largest(holdings):
     weak = Holding(ROBOT, ActuatorHealth(thrust_limit=8.8))
     assert np.all(weak.margins <= holdings[ALL_HEALTHY].margins + 1e-9)
     on_its_side = np.abs(weak.directions[:, 2]) < 0.5

@@ -52,7 +52,7 @@ def refusal(cls, text, tmp_path):
     ('extends: "a\\0b"\n', "key 'extends': expected the name of a file"),
     ('extends: ' + 'x' * 5000 + '\n', "key 'extends': expected the name of a file"),
 ])
-def test_a_file_that_is_an_attack_is_refused_in_one_line(tmp_path, text, expected):
+def test_a_malicious_file_is_refused_in_one_line(tmp_path, text, expected):
     assert expected in refusal(RobotParameters, text, tmp_path)
 
 
@@ -70,19 +70,19 @@ def test_effects_of_another_kind_are_refused(tmp_path, value, expected):
 @pytest.mark.parametrize('cells, expected', [
     ('.nan', 'nan is not finite'), ('.inf', 'inf is not finite'), ('6.5', 'expected an integer'),
     ('0x' + 'f' * 9000, 'expected an integer, found an integer of 36000 bits')])
-def test_an_integer_is_an_integer(tmp_path, cells, expected):
+def test_an_integer_parameter_refuses_other_types(tmp_path, cells, expected):
     text = 'extends: robot.yaml\nbattery: {cells: ' + cells + '}\n'
     message = refusal(RobotParameters, text, tmp_path)
     assert "key 'battery.cells'" in message and expected in message
 
 
 @pytest.mark.parametrize('rows', ['3', 'x', '{a: 1}'])
-def test_a_thrust_map_is_a_list(tmp_path, rows):
+def test_a_thrust_map_refuses_other_types_than_lists(tmp_path, rows):
     message = refusal(RobotParameters, f'extends: robot.yaml\nrotors: {{map: {rows}}}\n', tmp_path)
     assert "key 'rotors.map': expected a list" in message
 
 
-def test_a_charge_table_is_a_list(tmp_path):
+def test_a_charge_table_refuses_other_types_than_lists(tmp_path):
     text = share_path('params/simulator.yaml').read_text()
     text = re.sub(r'charge_levels: +\[[^]]*\]', 'charge_levels: 1.0', text)
     message = refusal(SimulatorParameters, text, tmp_path)
@@ -99,35 +99,35 @@ def test_a_charge_table_is_a_list(tmp_path):
     ('floors: 3\n', "key 'floors': expected shape (5,), found ()"),
     ('floors: [1, 2, 3, 4, x]\n', "key 'floors': expected numbers, found [1, 2, 3, 4, 'x']"),
     ('floors: [0.1, 0.1, 0.1, 0.1, -1]\n', "key 'floors': -1 is outside 1e-09 to 1000")])
-def test_numbers_of_the_gap_finder_keep_type_range_and_shape(tmp_path, text, expected):
+def test_gap_parameters_have_type_range_and_shape(tmp_path, text, expected):
     assert expected in refusal(GapParameters, text, tmp_path)
 
 
-def test_a_long_value_is_quoted_in_part():
+def test_a_long_value_is_truncated_in_messages():
     for value in ('x' * 10**6, list(range(10**6)), dict.fromkeys(range(99), 'y' * 500),
                   'a\nb' * 999, 1 << 100_000, b'\xff' * 9999):
         assert len(quoted(value)) <= 200 and '\n' not in quoted(value)
     assert quoted('heavy') == "'heavy'" and quoted([1, 2.5]) == '[1, 2.5]'
 
 
-def test_a_long_value_on_the_command_line_is_quoted_in_part():
+def test_a_long_value_on_the_command_line_is_truncated_in_messages():
     with pytest.raises(ParameterError, match='not valid YAML') as error:
         parse_changes(['iterations=[' + '1, ' * 10000])
     assert len(str(error.value)) < LONGEST
 
 
-def test_aliases_in_moderation_stay_legal(tmp_path):
+def test_few_yaml_aliases_are_accepted(tmp_path):
     path = tmp_path / 'file.yaml'
     path.write_text('base: &base {gain: 1}\nmore: {<<: *base, mass: 2}\nlist: [*base, *base]\n')
     assert load_yaml(path)['more'] == {'gain': 1, 'mass': 2}
 
 
-def test_a_path_that_is_none_is_refused():
+def test_an_invalid_path_is_refused():
     with pytest.raises(ParameterError, match='cannot be read'):
         load_yaml('a\0b')
 
 
-def test_values_that_a_node_is_given_are_bounded_too():
+def test_parameter_values_of_a_node_are_bounded():
     with pytest.raises(ParameterError) as error:
         bind(RobotParameters, {'mass': 'x' * 10**6})
     assert len(str(error.value)) < LONGEST

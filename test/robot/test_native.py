@@ -25,7 +25,7 @@ def cache(tmp_path, monkeypatch):
 
 
 @needs_compiler
-def test_machine_code_gives_the_numbers_of_the_interpreter_to_the_last_digit():
+def test_compiled_and_interpreted_results_are_bitwise_equal():
     interpreted = body_acceleration(RobotParameters.load())
     compiled, generator = native.compiled(interpreted), np.random.default_rng(0)
     assert compiled.is_a('External') and not interpreted.is_a('External')
@@ -37,7 +37,7 @@ def test_machine_code_gives_the_numbers_of_the_interpreter_to_the_last_digit():
 
 
 @needs_compiler
-def test_code_is_built_once_and_anew_when_it_changes(cache):
+def test_code_is_built_once_and_again_after_a_change(cache):
     native.compiled(FUNCTION)
     first = {path: path.stat().st_mtime_ns for path in cache.iterdir()}
     assert len(first) == 1
@@ -49,7 +49,7 @@ def test_code_is_built_once_and_anew_when_it_changes(cache):
 
 @pytest.mark.parametrize('obstacle', ['no compiler', 'a compiler that fails', 'a blocked cache',
                                       'a library that is none'])
-def test_without_machine_code_the_interpreter_goes_on(tmp_path, monkeypatch, obstacle):
+def test_without_compiled_code_the_interpreter_is_used(tmp_path, monkeypatch, obstacle):
     if obstacle == 'no compiler':
         monkeypatch.setenv('CC', 'no-such-cc')
     elif obstacle == 'a compiler that fails':

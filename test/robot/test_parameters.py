@@ -21,7 +21,7 @@ def load(tmp_path, content):
     return RobotParameters.load(path)
 
 
-def test_parts_put_the_rotors_where_the_totals_say():
+def test_rotor_positions_of_parts_and_totals_agree():
     robot = RobotParameters.load()
     parts = robot.multibody
     for i in range(4):
@@ -40,7 +40,7 @@ def test_the_rotor_map_grows_with_thrust_at_every_voltage():
         assert 50 < duty[0] < duty[-1] <= 100
 
 
-def test_the_hash_follows_physics_and_not_the_name(tmp_path, content):
+def test_the_hash_depends_on_physics_and_not_on_the_name(tmp_path, content):
     original = RobotParameters.load().hash()
     content['name'] = 'sister'
     assert load(tmp_path, content).hash() == original
@@ -62,7 +62,7 @@ def test_the_hash_follows_physics_and_not_the_name(tmp_path, content):
     (lambda c: c.update(effects={'thrust_coefficient': {'scale': 93}}), 'is outside 0.2 to 2'),
     (lambda c: c.update(effects={'wind': {'force': [1, 2]}}), 'expected shape (3,)'),
 ])
-def test_a_bad_robot_file_is_refused_by_name(tmp_path, content, change, message):
+def test_a_bad_robot_file_is_refused_with_the_key(tmp_path, content, change, message):
     change(content)
     with pytest.raises(ParameterError) as error:
         load(tmp_path, content)
@@ -71,7 +71,7 @@ def test_a_bad_robot_file_is_refused_by_name(tmp_path, content, change, message)
     assert '\n' not in str(error.value)
 
 
-def test_a_file_that_extends_another_names_only_what_differs(tmp_path):
+def test_a_file_that_extends_another_contains_differences_only(tmp_path):
     (tmp_path / 'mine.yaml').write_text(
         'extends: robot.yaml\nmass: 3.2\nrotors: {thrust_max: 18.0}\n')
     (tmp_path / 'other.yaml').write_text(
@@ -88,7 +88,7 @@ def test_a_file_that_extends_another_names_only_what_differs(tmp_path):
     ('extends: mine.yaml\n', 'extends itself'),
     ('extends: robot.yaml\nmas: 3\n', "key 'mas': unknown key; did you mean 'mass'?"),
 ])
-def test_a_bad_extension_is_refused_by_name(tmp_path, text, message):
+def test_a_bad_extension_is_refused_with_the_key(tmp_path, text, message):
     (tmp_path / 'mine.yaml').write_text(text)
     with pytest.raises(ParameterError) as error:
         RobotParameters.load(tmp_path / 'mine.yaml')
@@ -96,7 +96,7 @@ def test_a_bad_extension_is_refused_by_name(tmp_path, text, message):
     assert 'mine.yaml' in str(error.value)
 
 
-def test_the_weak_and_heavy_plant_is_what_its_name_says():
+def test_the_weak_and_heavy_plant_is_weaker_and_heavier():
     shipped = RobotParameters.load()
     plant = RobotParameters.load(share_path('params/robot_weak_and_heavy.yaml'))
     assert plant.mass == pytest.approx(1.05 * shipped.mass)

@@ -33,7 +33,7 @@ def test_exponential_of_tiny_vectors_is_first_order_exact(size):
     assert np.allclose(rotations.log(rotations.exp(vector)), vector, rtol=1e-9, atol=1e-20)
 
 
-def test_geodesic_angle_is_a_metric_blind_to_the_quaternion_sign(pair):
+def test_geodesic_angle_is_a_metric_independent_of_quaternion_sign(pair):
     a, b = pair
     angle = rotations.geodesic_angle(a, b)
     relative = Rotation.from_quat(b).inv() * Rotation.from_quat(a)

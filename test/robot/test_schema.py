@@ -49,7 +49,7 @@ def test_a_class_of_a_file_reads_the_shipped_one_or_another(tmp_path):
     assert isinstance(other, Longer) and (other.turn_rate, other.rate) == (3.0, 4.0)
 
 
-def test_plain_and_ros_form_give_the_same(tmp_path):
+def test_plain_and_ros_form_give_equal_parameters(tmp_path):
     plain = schema.load(Outer, write(tmp_path, 'mass: 2\ninner: {gain: 3}\n'))
     ros = schema.load(Outer, write(
         tmp_path, '/**:\n  ros__parameters:\n    mass: 2\n    inner: {gain: 3}\n'))

@@ -52,7 +52,7 @@ def test_numpy_and_casadi_have_the_same_acceleration(kind):
                                rtol=1e-12)
 
 
-def test_small_steps_go_where_the_acceleration_points():
+def test_small_steps_agree_with_the_acceleration():
     target, tilt, rate, load = states(seed=2)
     inside = np.abs(rate) < 9
     h = 1e-7
@@ -89,7 +89,7 @@ def test_stiction_holds_a_joint_exactly_still_and_releases_it_beyond():
     assert step(0.0, 0.0, 0.0, 0.029) == (0.0, 0.0)
 
 
-def test_a_load_beyond_the_motors_torque_moves_the_joint():
+def test_a_load_beyond_the_motor_torque_moves_the_joint():
     servo = replace(PLAIN, effort_limit=0.05)
     assert servo.acceleration(NUMPY, 1.0, 0.0, 0.0, -0.08) == pytest.approx(
         -0.03 / servo.inertia)
@@ -97,7 +97,7 @@ def test_a_load_beyond_the_motors_torque_moves_the_joint():
     assert rate == pytest.approx(-0.03 / servo.inertia * 1e-5)
 
 
-def test_play_follows_only_where_it_is_pushed():
+def test_backlash_follows_only_when_pushed():
     driving = np.array([0.0, 0.05, 0.2, 0.15, -0.05])
     np.testing.assert_allclose(play(driving, 0.1), [0.0, 0.0, 0.1, 0.1, 0.05])
 
@@ -106,7 +106,7 @@ def test_play_follows_only_where_it_is_pushed():
     {'joint_friction': {'coulomb': 0.01, 'stiction': 0.02}},
     {'joint_deflection': {'deflection_per_newton': 0.002}},
     {'propeller_gyroscopic_torque': {'angular_momentum_at_hover': 0.066, 'joint_share': 1.0}}])
-def test_a_joint_effect_changes_the_controllers_model_and_a_training_step(effects):
+def test_a_joint_effect_changes_controller_model_and_training_step(effects):
     from beetle_omni_ros.train import model
     rng = np.random.default_rng(3)
     x = np.concatenate([rng.normal(size=6), [0, 0, 0, 1.0], rng.normal(size=3),

@@ -41,7 +41,7 @@ def test_every_shipped_cubic_rises_over_its_whole_range(row):
 
 
 @pytest.mark.parametrize('row', ROTORS.map, ids=lambda row: f'{row.voltage} V')
-def test_at_a_measured_voltage_it_is_the_cubic(row):
+def test_at_a_measured_voltage_the_map_equals_the_cubic(row):
     for thrust in np.linspace(0.01, row.thrust_max, 57):
         oracle = cubic_thrust(row, float(MAP.duty(thrust, row.voltage)))
         assert len(oracle) == 1
@@ -71,13 +71,13 @@ def test_less_voltage_needs_more_duty(thrust, voltage, sag):
 
 
 @given(strategies.floats(0.5, 18), strategies.integers(0, 4))
-def test_no_step_where_the_battery_crosses_a_measured_voltage(thrust, k):
+def test_the_map_is_continuous_at_a_measured_voltage(thrust, k):
     voltage = MAP.voltages[k]
     around = MAP.duty(thrust, np.array([voltage - 1e-7, voltage, voltage + 1e-7]))
     assert np.ptp(around) < 1e-4
 
 
-def test_between_voltages_it_predicts_a_row_that_was_left_out():
+def test_interpolation_between_voltages_predicts_an_omitted_row():
     """Within 0.15 N, 0.7 % of the range; interpolation at equal thrust misses by 0.22 N."""
     for k in (1, 2, 3):
         rows = sorted(ROTORS.map, key=lambda row: row.voltage)
@@ -109,7 +109,7 @@ def test_zero_thrust_stops_and_the_least_thrust_turns():
     assert MAP.thrust(STOP_DUTY, 23.0) == 0
 
 
-def test_arrays_give_what_single_numbers_give():
+def test_arrays_and_scalars_give_equal_results():
     rng = np.random.default_rng(0)
     voltage = rng.uniform(20, 26, (50, 1))
     thrust = rng.uniform(0, 26, (50, 4))
@@ -136,7 +136,7 @@ def bent(peak=False):
 
 
 @pytest.mark.parametrize('peak', [False, True])
-def test_a_cubic_that_falls_is_made_to_rise(peak):
+def test_a_falling_cubic_is_made_monotonic(peak):
     row = bent(peak)
     thrust_map = ThrustMap(replace(ROTORS, map=(row,)))
     assert thrust_map.repaired == (23.0,)
@@ -148,7 +148,7 @@ def test_a_cubic_that_falls_is_made_to_rise(peak):
     assert np.all(np.abs(duty - np.maximum.accumulate(cubic)) < 2e-3)
 
 
-def test_a_map_that_cannot_be_used_says_so():
+def test_an_unusable_map_is_refused():
     with pytest.raises(ParameterError, match='at least one row'):
         ThrustMap(replace(ROTORS, map=()))
     with pytest.raises(ParameterError, match='two rows at one voltage'):

@@ -81,7 +81,7 @@ def assert_equal_logs(a: FlightLog, b: FlightLog):
     assert a.meta == b.meta
 
 
-def test_a_flight_comes_back_from_its_bag_as_it_was_recorded(recorded):
+def test_a_flight_round_trips_through_its_bag(recorded):
     folder, memory, _ = recorded
     log = read_bag(folder)
     assert_equal_logs(memory, log)
@@ -103,7 +103,7 @@ def test_a_replay_is_incremental_without_the_omitted_topics(recorded):
     assert np.concatenate(times).max() >= memory.end
 
 
-def test_a_trajectory_comes_back_from_its_bag(tmp_path):
+def test_a_trajectory_round_trips_through_its_bag(tmp_path):
     target = make_task('lemniscate').targets(1.7e9)[1]
     with BagWriter(tmp_path / 'bag') as writer:
         writer.write_target(target)
@@ -146,7 +146,7 @@ def test_two_independent_readers_agree_on_every_message(recorded):
                 np.testing.assert_array_equal(mine.effort, other.effort)
 
 
-def test_messages_by_topic_are_those_in_order(recorded):
+def test_messages_by_topic_equal_those_in_order(recorded):
     folder, _, counts = recorded
     one_by_one, together = {}, {}
     for message in read_messages(folder):
@@ -162,7 +162,7 @@ def test_messages_by_topic_are_those_in_order(recorded):
 
 @pytest.mark.parametrize(('chunks', 'compression'), [
     (False, CompressionType.NONE), (True, CompressionType.ZSTD)])
-def test_files_of_other_writers_read_the_same(recorded, tmp_path, chunks, compression):
+def test_files_of_other_writers_give_the_same_messages(recorded, tmp_path, chunks, compression):
     folder, memory, _ = recorded
     with (tmp_path / 'other.mcap').open('wb') as stream, \
             (folder / f'{folder.name}.mcap').open('rb') as source:
@@ -288,7 +288,7 @@ def test_a_folder_without_permission_is_refused(tmp_path):
         BagWriter(tmp_path / 'bag')
 
 
-def test_a_path_that_is_no_bag_is_refused_by_name(tmp_path):
+def test_a_path_that_is_not_a_bag_is_refused(tmp_path):
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'text.mcap').write_text('hello, this is no bag at all')
     (tmp_path / 'notes.txt').write_text('x')
@@ -362,7 +362,7 @@ def test_raw_messages_and_late_topics_stay_readable_by_both_readers(tmp_path):
     assert len(read_bag(tmp_path / 'bag').imu_t) == 2
 
 
-def test_namespaces_are_taken_off_and_several_robots_need_a_choice(tmp_path):
+def test_namespaces_are_removed_and_several_robots_need_a_choice(tmp_path):
     with BagWriter(tmp_path / 'one', namespace='robot1') as writer:
         write_command(writer, 1.0, np.ones(4), np.ones(4))
         write_request(writer, 'nmpc', 1.0, np.zeros(4), np.ones(4))
@@ -377,7 +377,7 @@ def test_namespaces_are_taken_off_and_several_robots_need_a_choice(tmp_path):
 
 
 @pytest.mark.parametrize('t', [0.0, 0.1, 1.005, 1.7e9 + 0.123456789, 1.9e9 - 1e-6])
-def test_times_keep_every_bit(t):
+def test_times_are_stored_exactly(t):
     again = conversions.from_nanoseconds(conversions.nanoseconds(t))
     assert again == pytest.approx(t, rel=1e-16, abs=1e-9)
 

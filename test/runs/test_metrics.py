@@ -190,7 +190,7 @@ def test_a_pose_replaced_before_its_time_does_not_count():
 
 
 @pytest.mark.parametrize('how', ['fall', 'stop', 'nan'])
-def test_a_crash_is_seen_in_the_flight(how):
+def test_a_crash_is_detected_in_the_flight(how):
     recorder = LogRecorder()
     fly(recorder, make_task('waypoints'), duration=20.0)
     if how == 'fall':
@@ -203,7 +203,7 @@ def test_a_crash_is_seen_in_the_flight(how):
     assert metrics(flown(make_task('waypoints'), duration=20.0))['crashed'] is False
 
 
-def test_landing_after_the_task_is_no_crash():
+def test_landing_after_the_task_is_not_a_crash():
     recorder = LogRecorder()
     fly(recorder, make_task('random2'))
     for k in range(200):
@@ -238,7 +238,7 @@ def test_metrics_use_the_estimate_without_truth():
     assert 'estimation' not in result
 
 
-def test_the_error_of_the_estimate_is_reported_where_truth_is_known():
+def test_the_estimation_error_is_reported_if_truth_is_recorded():
     result = metrics(flown(make_task('random1')))
     assert result['estimation']['position_rms_m'] == pytest.approx(1e-3 * np.sqrt(3), rel=0.1)
 

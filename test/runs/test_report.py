@@ -74,7 +74,7 @@ def test_numbers_too_close_for_a_histogram_do_not_prevent_the_page(tmp_path):
     assert '>Pose<' in make_page(runs, results_of(runs))
 
 
-def test_flights_with_and_without_targets_stand_on_one_page(tmp_path):
+def test_flights_with_and_without_targets_share_one_page(tmp_path):
     bags = [record(tmp_path / 'none', task='hover', body='odom'),
             record(tmp_path / 'one', task='hover', targets=2)]
     run_report(bags, tmp_path / 'page.html', console=Console(file=io.StringIO()))

@@ -77,7 +77,7 @@ def test_metadata_has_the_fields_of_version_9_and_names_jazzy(plain):
     assert topics['/imu/data_raw']['offered_qos_profiles'][0]['reliability'] == 'best_effort'
 
 
-def test_the_file_alone_carries_the_same_metadata_and_hashes(plain):
+def test_the_file_contains_the_same_metadata_and_hashes(plain):
     with next(plain.glob('*.mcap')).open('rb') as stream:
         reader = make_reader(stream)
         assert reader.get_header().profile == 'ros2'
@@ -119,7 +119,7 @@ def test_rosbags_and_mcap_read_every_message(kind, request):
     assert len(found) == sum(counts.values())
 
 
-def test_compressed_bags_hold_the_same_in_half_the_space(plain, packed):
+def test_compressed_bags_have_equal_content_and_half_the_size(plain, packed):
     size = {bag: next(bag.glob('*.mcap')).stat().st_size for bag in (plain, packed)}
     assert size[packed] < 0.5 * size[plain]
     with next(packed.glob('*.mcap')).open('rb') as stream:

@@ -37,7 +37,7 @@ def test_valid_targets_are_accepted(position, quaternion):
     assert why(position, quaternion) == ''
 
 
-def test_every_pose_of_the_random_task_is_taken():
+def test_every_pose_of_the_random_task_is_accepted():
     random = np.random.default_rng(0)
     for _ in range(300):
         assert why((*random.uniform(-2, 2, 2), 0.6),

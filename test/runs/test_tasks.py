@@ -203,6 +203,6 @@ def test_a_binary_file_a_folder_and_a_missing_file_are_refused(tmp_path):
             make_task(path)
 
 
-def test_an_unknown_task_is_refused_with_the_names_that_exist():
+def test_an_unknown_task_is_refused_with_the_known_names():
     with pytest.raises(TaskError, match='waypoints, random100'):
         make_task('random')

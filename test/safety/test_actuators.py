@@ -12,7 +12,7 @@ def report(puppet, name, text):
     puppet.run(TICK)
 
 
-def test_bridges_that_were_never_heard_have_no_influence():
+def test_bridges_without_any_message_have_no_influence():
     puppet = flown()
     assert puppet.supervisor.actuators.why_not_arm == ''
     assert puppet.supervisor.actuators.diagnostics() == {}
@@ -20,7 +20,7 @@ def test_bridges_that_were_never_heard_have_no_influence():
 
 @pytest.mark.parametrize('name', ['joint', 'rotor'])
 @pytest.mark.parametrize('text', ['waiting: port is away', 'lost: restarted', 'something', ''])
-def test_a_bridge_that_is_not_ready_refuses_arming_with_its_own_words(name, text):
+def test_a_bridge_that_is_not_ready_prevents_arming_with_its_reason(name, text):
     puppet = Puppet()
     puppet.run(0.6)
     report(puppet, name, text)
@@ -68,7 +68,7 @@ def test_a_lost_motor_board_in_flight_stops_everything_until_disarmed(landing):
     assert puppet.supervisor.disarm(puppet.now)
 
 
-def test_a_motor_board_that_is_not_heard_carries_the_robot_to_the_ground():
+def test_a_silent_motor_board_leads_to_a_powered_landing():
     puppet = flown()
     report(puppet, 'rotor', 'silent: nothing heard of the board')
     assert puppet.supervisor.state == 'landing' and puppet.command.thrust.any()
@@ -79,7 +79,7 @@ def test_a_motor_board_that_is_not_heard_carries_the_robot_to_the_ground():
 
 
 @pytest.mark.parametrize('name', ['joint', 'rotor'])
-def test_a_bridge_lost_before_lift_off_just_stops_the_motors(name):
+def test_a_bridge_lost_before_lift_off_stops_the_motors(name):
     puppet = Puppet()
     puppet.lifts = False
     puppet.run(0.6)
@@ -91,7 +91,7 @@ def test_a_bridge_lost_before_lift_off_just_stops_the_motors(name):
                for said in puppet.texts('error'))
 
 
-def test_the_rest_of_a_flight_is_not_bothered_by_a_bridge_that_is_lost_while_disarmed():
+def test_a_bridge_lost_while_disarmed_does_not_affect_the_next_flight():
     puppet = Puppet()
     puppet.run(0.6)
     report(puppet, 'rotor', 'lost: restarted')
@@ -99,7 +99,7 @@ def test_the_rest_of_a_flight_is_not_bothered_by_a_bridge_that_is_lost_while_dis
     assert puppet.supervisor.diagnostics()['rotor_bridge_node'] == 'lost: restarted'
 
 
-def test_an_unknown_bridge_is_refused_and_told():
+def test_an_unknown_bridge_is_refused_and_reported():
     puppet = flown()
     assert not puppet.supervisor.on_actuators('wheel', 'lost: it', puppet.now)
     puppet.run(0.1)

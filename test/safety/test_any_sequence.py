@@ -80,7 +80,7 @@ def watch(puppet, command):
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(airborne=st.booleans(), sequence=actions)
-def test_nothing_unsafe_ever_goes_out(airborne, sequence):
+def test_no_unsafe_command_is_sent(airborne, sequence):
     puppet = flown() if airborne else Puppet()
     inner = puppet.supervisor.update
 

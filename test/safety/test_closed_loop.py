@@ -101,7 +101,7 @@ def test_lands_on_request():
 @pytest.mark.parametrize('dead, conditions', [
     ({'ekf'}, 'nominal'), ({'ekf'}, 'published'), ({'ekf', 'mocap'}, 'nominal'),
     ({'ekf', 'imu'}, 'nominal'), ({'joints'}, 'nominal')])
-def test_descends_on_what_is_left_with_the_motors_off_at_the_ground(dead, conditions):
+def test_descends_on_remaining_sensors_and_stops_the_motors_at_the_ground(dead, conditions):
     flight = Flight(conditions=conditions).run(5.0)
     assert flight.supervisor.state == 'flying'
     flight.alive -= dead
@@ -112,7 +112,7 @@ def test_descends_on_what_is_left_with_the_motors_off_at_the_ground(dead, condit
     assert np.linalg.norm(flight.sim.truth.position[:2]) < 0.5
 
 
-def test_descends_from_upside_down_level_out_first():
+def test_descent_from_inverted_attitude_levels_first():
     flight = Flight(attitude=rotations.from_rpy(np.pi - 0.2, 0.1, 0.5)).run(8.0)
     assert rotations.geodesic_angle(flight.sim.truth.quaternion, LEVEL) > 2.5
     flight.alive.discard('ekf')

@@ -67,7 +67,7 @@ def test_follows_a_motion_with_late_noisy_mocap_and_a_biased_imu():
     assert position < 0.01 and velocity < 0.06 and attitude < 0.01
 
 
-def test_catches_up_the_samples_between_the_last_estimate_and_the_failure():
+def test_samples_between_the_last_estimate_and_the_failure_are_replayed():
     estimator = BackupEstimator(BackupParameters(), GRAVITY)
     follow(estimator, 0.0, 2.0, mocap=False)
     estimator.start(state(1.7))
@@ -75,7 +75,7 @@ def test_catches_up_the_samples_between_the_last_estimate_and_the_failure():
     assert position < 0.01 and velocity < 0.02 and attitude < 0.01
 
 
-def test_learnt_biases_carry_dead_reckoning():
+def test_estimated_biases_are_used_in_dead_reckoning():
     results = []
     for learn in (True, False):
         estimator = BackupEstimator(BackupParameters(), GRAVITY)
@@ -88,7 +88,7 @@ def test_learnt_biases_carry_dead_reckoning():
     assert ignorant[0] > 3 * learnt[0] and ignorant[2] > 3 * learnt[2]
 
 
-def test_follows_mocap_alone_when_the_imu_is_gone():
+def test_follows_mocap_alone_without_imu():
     estimator = BackupEstimator(BackupParameters(), GRAVITY)
     estimator.start(state(0.0))
     estimator.imu_alive = False
@@ -97,7 +97,7 @@ def test_follows_mocap_alone_when_the_imu_is_gone():
     assert position < 0.03 and velocity < 0.15 and attitude < 0.02
 
 
-def test_one_wild_mocap_frame_moves_it_little():
+def test_one_mocap_outlier_has_little_influence():
     estimator = BackupEstimator(BackupParameters(), GRAVITY)
     estimator.start(state(0.0))
     follow(estimator, 0.0, 1.0)

@@ -27,7 +27,7 @@ def changes(handover, asked, start):
     return np.array(changed), in_force
 
 
-def test_it_lets_everything_through_until_somebody_takes_over():
+def test_commands_pass_unchanged_until_a_handover():
     asked = command(1.01, 3.0, 20.0)
     assert Handover(LIMITS).limit(asked, command(1.0, 0.0, 0.0)) is asked
     handover = Handover(LIMITS)
@@ -38,7 +38,7 @@ def test_it_lets_everything_through_until_somebody_takes_over():
 
 
 @pytest.mark.parametrize('period', [0.005, 0.01])
-def test_the_change_is_limited_and_the_wish_is_reached(period):
+def test_the_change_is_limited_and_the_requested_command_is_reached(period):
     handover = Handover(LIMITS)
     handover.start()
     stamps = 1.0 + period * np.arange(1, 61)
@@ -48,14 +48,14 @@ def test_the_change_is_limited_and_the_wish_is_reached(period):
     assert np.allclose(last.tilt, 0.5) and np.allclose(last.thrust, 2.0)
 
 
-def test_one_that_has_caught_up_may_jump_again():
+def test_after_convergence_commands_may_jump_again():
     handover = Handover(LIMITS)
     handover.start()
     changed, _ = changes(handover, [(1.01, 0.05, 8.0), (1.02, 2.0, 18.0)], command(1.0, 0.0, 7.0))
     assert np.allclose(changed, [[0.05, 1.0], [1.95, 10.0]])
 
 
-def test_it_ends_in_time_even_if_it_never_catches_up():
+def test_the_handover_ends_at_its_time_limit_without_convergence():
     handover = Handover(LIMITS)
     handover.start()
     stamps = 1.0 + 0.01 * np.arange(1, 60)
@@ -64,7 +64,7 @@ def test_it_ends_in_time_even_if_it_never_catches_up():
     assert np.sum(changed[:, 0] > 0) == pytest.approx(LIMITS.time / 0.01 + 1, abs=1)
 
 
-def test_a_state_that_was_answered_already_is_not_answered_again():
+def test_a_state_gets_one_command_only():
     handover, before = Handover(LIMITS), command(1.0, 0.0, 7.0)
     handover.start()
     for stamp in (0.99, 1.0):

@@ -45,7 +45,7 @@ def test_ends_level_and_no_loaded_joint_turns_over(attitude):
 
 
 @pytest.mark.parametrize('signs', [(1, 1, -1, -1), (1, -1, -1, 1), (-1, -1, 1, 1), (-1, 1, 1, -1)])
-def test_from_upside_down_the_side_is_chosen_by_the_windings(signs):
+def test_from_an_inverted_attitude_the_joint_windings_choose_the_side(signs):
     tilt = np.pi * np.array(signs)
     way = plan(UPSIDE_DOWN[0], tilt, ALLOCATOR, P)
     tilts, jumps = followed(way, tilt)
@@ -55,7 +55,7 @@ def test_from_upside_down_the_side_is_chosen_by_the_windings(signs):
 
 @pytest.mark.parametrize('attitude', UPSIDE_DOWN)
 @pytest.mark.parametrize('joint', range(4))
-def test_a_joint_wound_the_wrong_way_turns_over_where_its_arm_stands_upright(attitude, joint):
+def test_an_adversely_wound_joint_unwinds_while_its_arm_is_vertical(attitude, joint):
     tilt = held(attitude)
     tilt[joint] -= 2 * np.pi * np.sign(tilt[joint])
     way = plan(attitude, tilt, ALLOCATOR, P)
@@ -64,7 +64,7 @@ def test_a_joint_wound_the_wrong_way_turns_over_where_its_arm_stands_upright(att
     assert jumps.max() < 1.5        # of 7.5 N
 
 
-def test_is_no_faster_than_body_and_joints_may_turn():
+def test_levelling_respects_the_rate_limits_of_body_and_joints():
     for attitude in ATTITUDES:
         way = plan(attitude, held(attitude), ALLOCATOR, P)
         times = np.linspace(0, way.duration, 100)[:-1]
@@ -79,14 +79,14 @@ def test_the_rate_is_the_derivative_of_the_attitude():
         np.testing.assert_allclose(turn / (2 * h), way.at(t)[1], atol=2e-2)
 
 
-def test_a_straight_way_is_the_shortest_turn():
+def test_a_direct_route_is_the_shortest_rotation():
     goal = rotations.from_rpy(0, 0, 0.3)
     way = Way.straight(ATTITUDES[1], goal, 0.5)
     assert way.duration == pytest.approx(rotations.geodesic_angle(goal, ATTITUDES[1]) / 0.5)
     assert Way.straight(goal, goal, 0.5).duration == 0.0
 
 
-def test_a_joint_that_waits_at_the_start_holds_the_attitude_meanwhile():
+def test_the_attitude_is_held_while_a_joint_waits_at_the_start():
     tilt = held(ATTITUDES[0])
     tilt[0] -= 0.8
     way = plan(ATTITUDES[0], tilt, ALLOCATOR, P)

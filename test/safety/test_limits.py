@@ -60,7 +60,7 @@ def test_repeated_and_older_stamps_are_refused():
     assert checked.offer(command(stamp=NOW + 0.01), NOW + 0.01) == ''
 
 
-def test_rounding_beyond_a_limit_is_cut_off_not_refused():
+def test_rounding_beyond_a_limit_is_clipped_and_not_refused():
     checked, over = stream(), LIMITS.limit_tolerance / 2
     top, travel = ROBOT.rotors.thrust_max, ROBOT.joints.position_limit
     assert checked.offer(command(tilt=[travel + over, 0, 0, 0], thrust=[-over, 7, 7, top + over]),
@@ -91,7 +91,7 @@ def test_a_small_overstep_is_executed_at_the_limits_for_half_a_second_and_no_lon
 
 @pytest.mark.parametrize('numbers', [{'thrust': [7, 7, 7, 760.0]}, {'thrust': [-8.0, 7, 7, 7]},
                                      {'tilt': [57.3, 0, 0, 0]}])
-def test_another_unit_is_never_executed(numbers):
+def test_a_command_in_another_unit_is_never_executed(numbers):
     checked = stream()
     checked.offer(command(), NOW)
     good = checked.accepted
@@ -102,7 +102,7 @@ def test_another_unit_is_never_executed(numbers):
     assert checked.in_force is None
 
 
-def test_lone_spike_is_refused_but_a_real_step_costs_one_command():
+def test_a_single_spike_is_refused_and_a_real_step_loses_one_command():
     checked, far = stream(), (0.1 + LIMITS.tilt_step + 0.1, 0.2, 0.3, 0.4)
     checked.offer(command(), NOW)
     assert checked.offer(command(NOW + 0.01, far), NOW + 0.01) == limits.JUMP
@@ -111,7 +111,7 @@ def test_lone_spike_is_refused_but_a_real_step_costs_one_command():
     assert checked.offer(command(NOW + 0.04, far, (16, 16, 16, 16)), NOW + 0.04) == limits.JUMP
 
 
-def test_a_step_to_a_new_target_does_not_cost_the_right_to_be_selected():
+def test_a_step_to_a_new_target_keeps_the_controller_selectable():
     checked, near, far = stream(), command(), (3.0, 0.2, 0.3, 0.4)
     for k in range(200):
         checked.tick(0.01)
@@ -121,7 +121,7 @@ def test_a_step_to_a_new_target_does_not_cost_the_right_to_be_selected():
     assert checked.refused == {limits.JUMP: 1}
 
 
-def test_one_that_jumps_all_the_time_is_silent_and_not_good():
+def test_a_stream_that_always_jumps_is_silent_and_not_good():
     checked, now = stream(), NOW
     for k in range(100):
         checked.tick(0.01)
@@ -130,7 +130,7 @@ def test_one_that_jumps_all_the_time_is_silent_and_not_good():
     assert checked.silence.silent and not checked.good
 
 
-def test_one_that_repeats_its_numbers_is_refused_until_they_change():
+def test_a_stream_of_repeated_numbers_is_refused_until_they_change():
     checked = stream()
     reasons = [checked.offer(command(NOW + 0.01 * k), NOW + 0.01 * k) for k in range(20)]
     assert reasons[:limits.SAME] == [''] * limits.SAME
@@ -177,14 +177,14 @@ def test_clock_set_back_does_not_block_a_stream():
     assert checked.offer(command(NOW - 5), NOW - 5) == ''
 
 
-def test_last_look_cuts_to_limits_and_refuses_what_is_not_finite():
+def test_the_final_check_clips_to_limits_and_refuses_non_finite_values():
     out = within_limits(command(tilt=[9, -9, 0, 0], thrust=[-1, 99, 1, 1]), ROBOT)
     assert np.abs(out.tilt).max() == ROBOT.joints.position_limit
     assert out.thrust.min() == 0 and out.thrust.max() == ROBOT.rotors.thrust_max
     assert within_limits(command(tilt=[np.nan, 0, 0, 0]), ROBOT) is None
 
 
-def test_shipped_file_holds_every_parameter_at_its_default():
+def test_the_shipped_file_contains_every_parameter_at_its_default():
     from beetle_omni_ros.robot import schema
     from beetle_omni_ros.robot.resources import share_path
     leaves = {name for name, *_ in schema.flatten(SupervisorParameters())}

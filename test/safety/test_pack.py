@@ -70,7 +70,7 @@ def all_together(extra):
 
 @pytest.mark.parametrize('command', [hover, manoeuvres])
 @pytest.mark.parametrize('extra', [0.15, 0.2, 0.3])
-def test_a_worn_contact_is_told_within_half_a_second_with_the_thrust_that_is_left(command, extra):
+def test_a_worn_contact_is_reported_within_half_a_second_with_the_remaining_thrust(command, extra):
     flight = Flight()
     assert flight.fly(0.5, np.zeros(4)) is None
     assert flight.fly(6.0, command) is None
@@ -86,7 +86,7 @@ def test_a_worn_contact_is_told_within_half_a_second_with_the_thrust_that_is_lef
 
 @pytest.mark.parametrize('command', [hover, manoeuvres])
 @pytest.mark.parametrize('seed', [0, 1])
-def test_a_good_pack_that_empties_is_never_weak(command, seed):
+def test_a_good_pack_is_not_weak_while_discharging(command, seed):
     flight = Flight(seed)
     assert flight.fly(0.5, np.zeros(4)) is None
     # Four times the simulated current: a real pack of this size is empty after 12 minutes.
@@ -102,7 +102,7 @@ def test_an_empty_pack_is_weak():
     assert flight.watch.limit is not None and flight.watch.limit < 15.0
 
 
-def test_a_new_flight_knows_nothing_of_the_last():
+def test_a_new_flight_starts_without_state_of_the_last():
     flight = Flight()
     flight.battery.extra_resistance = 0.3
     flight.fly(0.5, np.zeros(4))

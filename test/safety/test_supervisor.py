@@ -81,7 +81,7 @@ def test_fallback_holds_the_pose_at_which_it_began():
     np.testing.assert_array_equal(goal.quaternion, puppet.quaternion)
 
 
-def test_controller_that_sends_only_rubbish_counts_as_silent_and_the_reason_is_named():
+def test_a_controller_with_invalid_commands_only_counts_as_silent_with_the_reason():
     puppet = flown()
     puppet.alive.discard('nmpc')
     for _ in range(20):
@@ -93,7 +93,7 @@ def test_controller_that_sends_only_rubbish_counts_as_silent_and_the_reason_is_n
     assert puppet.supervisor.diagnostics()['nmpc.refused.not finite'] == 20
 
 
-def test_controller_that_shakes_at_the_limits_of_a_manoeuvre_goes_on_flying():
+def test_a_controller_that_oscillates_at_the_limits_keeps_control():
     puppet = flown()
     puppet.alive.discard('nmpc')
     top = ROBOT.rotors.thrust_max
@@ -107,7 +107,7 @@ def test_controller_that_shakes_at_the_limits_of_a_manoeuvre_goes_on_flying():
     assert puppet.supervisor.diagnostics()['nmpc.refused.thrust out of range'] >= 29
 
 
-def test_controller_that_is_not_there_at_hand_over_is_waited_for_in_hover():
+def test_hover_lasts_until_the_controller_is_present_for_the_handover():
     puppet = Puppet()
     puppet.alive.discard('nmpc')
     puppet.run(0.6)
@@ -137,7 +137,7 @@ def test_selecting_in_flight_needs_a_good_controller():
     assert not unknown and "unknown controller 'pid'" in unknown.text
 
 
-def test_selecting_on_the_ground_is_free():
+def test_on_the_ground_any_controller_can_be_selected():
     puppet = Puppet()
     puppet.alive -= {'rl', 'nmpc'}
     puppet.run(0.1)
@@ -171,7 +171,7 @@ def test_disarming_is_refused_in_the_air_and_granted_on_the_ground():
     assert flying.supervisor.state == 'flying'
 
 
-def test_takeoff_that_never_leaves_the_ground_is_given_up():
+def test_a_takeoff_without_lift_off_is_aborted():
     puppet = Puppet()
     puppet.lifts = False
     puppet.run(0.6)
@@ -221,7 +221,7 @@ def test_estimator_that_reports_lost_counts_as_silent():
     assert any("last refused: status 'lost'" in text for text in puppet.texts('error'))
 
 
-def test_nothing_left_to_measure_with_stops_the_motors():
+def test_loss_of_all_sensors_stops_the_motors():
     puppet = flown()
     puppet.alive -= {'estimate', 'imu', 'mocap'}
     puppet.run(1.0)
@@ -229,7 +229,7 @@ def test_nothing_left_to_measure_with_stops_the_motors():
     assert any('no estimator, no MoCap, no IMU' in text for text in puppet.texts('error'))
 
 
-def test_fault_before_lift_off_just_stops_the_motors():
+def test_a_fault_before_lift_off_stops_the_motors():
     puppet = Puppet()
     puppet.lifts = False
     puppet.run(0.6)
@@ -301,7 +301,7 @@ def test_lost_control_reaction_is_a_parameter(motion, reaction, state):
     assert puppet.supervisor.state == state
 
 
-def test_any_attitude_is_legal():
+def test_any_attitude_is_permitted():
     puppet = flown()
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -310,7 +310,7 @@ def test_any_attitude_is_legal():
     assert puppet.supervisor.state == 'flying'
 
 
-def test_supervisor_that_was_held_up_declares_nobody_dead_and_sends_nothing_old():
+def test_a_delayed_supervisor_reports_no_silence_and_sends_no_old_command():
     puppet = flown()
     puppet.now += 3.0
     assert puppet.supervisor.update(puppet.now) is None
@@ -318,7 +318,7 @@ def test_supervisor_that_was_held_up_declares_nobody_dead_and_sends_nothing_old(
     assert puppet.supervisor.state == 'flying' and puppet.command is not None
 
 
-def test_clock_set_back_in_flight_is_survived():
+def test_a_clock_set_back_in_flight_is_tolerated():
     puppet = flown()
     puppet.now -= 30.0
     puppet.run(1.0)
@@ -353,7 +353,7 @@ def test_bad_estimates_are_refused_and_counted(change, reason):
     ({'position': np.array([1.5, 0, 0])}, True), ({'position': np.array([0.5, 0, 0])}, False),
     ({'quaternion': rotations.from_rpy(1.5, 0, 0)}, True),
     ({'quaternion': rotations.from_rpy(0, -0.5, 0)}, False)])
-def test_a_lone_jump_of_the_estimate_is_refused_and_a_lasting_one_is_accepted(change, refused):
+def test_a_single_jump_of_the_estimate_is_refused_and_a_lasting_one_accepted(change, refused):
     puppet = Puppet()
     puppet.run(0.1)
     vehicle = puppet.supervisor.vehicle
@@ -391,7 +391,7 @@ def test_command_of_an_unknown_controller_is_counted_and_not_executed():
     assert puppet.supervisor.diagnostics()['refused.unknown controller'] == 1
 
 
-def test_requests_out_of_place_say_why():
+def test_untimely_requests_are_refused_with_the_reason():
     puppet = Puppet()
     puppet.run(0.1)
     assert 'not in flight' in puppet.supervisor.land(puppet.now).text

@@ -21,13 +21,13 @@ WINDINGS = [np.pi * np.array(signs) for signs in itertools.product((1.0, -1.0), 
 WRONG = [tilt for tilt in WINDINGS if plan(UPSIDE_DOWN, tilt, ALLOCATOR, LEVEL).lost > P.lost_lift]
 
 
-def test_only_windings_alike_on_both_pairs_of_arms_have_no_way_to_level():
+def test_only_equal_windings_on_both_arm_pairs_prevent_levelling():
     alike = [tilt for tilt in WINDINGS if tilt[0] == tilt[2] and tilt[1] == tilt[3]]
     np.testing.assert_array_equal(WRONG, alike)
 
 
 @pytest.mark.parametrize('tilt', WRONG)
-def test_one_turn_of_the_joint_opens_a_way_and_three_rotors_hold_the_place(tilt):
+def test_one_joint_turn_permits_levelling_while_three_rotors_hold_the_position(tilt):
     found = find_turnover(UPSIDE_DOWN, tilt, ROBOT, ALLOCATOR, LEVEL, P)
     holding = Holding(ROBOT, found.health())
     assert holding.margin(found.quaternion) > holding.parameters.flying_margin
@@ -38,13 +38,13 @@ def test_one_turn_of_the_joint_opens_a_way_and_three_rotors_hold_the_place(tilt)
     assert plan(UPSIDE_DOWN, turned, ALLOCATOR, LEVEL).lost <= P.lost_lift
 
 
-def test_nothing_turns_over_where_no_joint_can():
+def test_no_joint_turns_over_if_none_can():
     level = rotations.from_rpy(0.0, 0.0, 0.7)
     assert find_turnover(level, np.zeros(4), ROBOT, ALLOCATOR, LEVEL, P) is None
 
 
 @pytest.mark.parametrize('signs', [(1, 1, 1, 1), (-1, 1, -1, 1)])
-def test_lands_softly_from_upside_down_with_every_joint_wound_the_wrong_way(signs):
+def test_lands_softly_from_inverted_attitude_with_all_joints_wound_adversely(signs):
     from test_closed_loop import Flight  # the robot, its sensors and its supervisor
     flight = Flight()
     flight.run(5.0)

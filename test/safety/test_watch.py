@@ -76,7 +76,7 @@ def test_by_the_wrench_alone_a_lost_rotor_takes_longer():
 
 @pytest.mark.parametrize('angle', [-1.2, -0.6, 0.6, 1.2])
 @pytest.mark.parametrize('joint', [0, 3])
-def test_a_thrust_that_points_elsewhere_is_a_slipped_joint(joint, angle):
+def test_a_thrust_in_another_direction_is_a_slipped_joint(joint, angle):
     body, watch = Body(ATTITUDES[0]), wrench_watch()
     assert body.feed(watch, 1.0) is None
     turn = np.zeros(4)
@@ -86,7 +86,7 @@ def test_a_thrust_that_points_elsewhere_is_a_slipped_joint(joint, angle):
     assert watch.slipped[0] == joint and watch.slipped[1] == pytest.approx(angle, abs=0.25)
 
 
-def test_a_weaker_rotor_and_a_push_from_outside_are_no_lost_rotor():
+def test_a_weaker_rotor_and_an_external_push_are_not_a_lost_rotor():
     body, watch = Body(ATTITUDES[0]), wrench_watch()
     assert body.feed(watch, 0.5, works=np.array([0.8, 1, 1, 1])) is None
     body, watch = Body(ATTITUDES[0]), wrench_watch()
@@ -94,7 +94,7 @@ def test_a_weaker_rotor_and_a_push_from_outside_are_no_lost_rotor():
     assert np.linalg.norm(watch.unexplained) == pytest.approx(20.0 / ALLOCATOR.mass, rel=0.05)
 
 
-def test_contact_is_an_impact_or_a_push_near_the_ground_alone():
+def test_contact_is_detected_by_impact_or_by_a_push_near_the_ground():
     wrench, contact = wrench_watch(), ContactWatch(P.contact, ROBOT.gravity)
     wrench.impact = 80.0
     contact.update(TICK, 1.5, wrench)
@@ -140,7 +140,7 @@ def test_joints_that_follow_are_never_named():
         assert follow(JointWatch(P.servo, ROBOT), swings, lambda t, q: q, 6.0, delay) is None
 
 
-def test_a_jammed_and_a_wandering_joint_are_told_apart():
+def test_a_jammed_and_a_drifting_joint_are_distinguished():
     watch = JointWatch(P.servo, ROBOT)
     assert follow(watch, swings, lambda t, q: np.where(np.arange(4) == 2, 0.4, q)) < 0.6
     assert watch.jammed[2] and not watch.astray.any()
@@ -149,7 +149,7 @@ def test_a_jammed_and_a_wandering_joint_are_told_apart():
     assert watch.astray[1] or watch.jammed[1]
 
 
-def test_an_encoder_that_jumps_is_seen_at_once():
+def test_an_encoder_jump_is_detected_at_once():
     watch = JointWatch(P.servo, ROBOT)
     first = follow(watch, swings, lambda t, q: q + 1.5 * (t > 1.0) * np.eye(4)[3])
     assert first == pytest.approx(1.0, abs=0.02)
@@ -169,7 +169,7 @@ def test_a_rotor_that_turns_too_slowly_is_named_by_its_esc():
     assert named[1] == 1 and named[0] < 0.2
 
 
-def test_an_esc_without_telemetry_is_no_lost_rotor():
+def test_an_esc_without_telemetry_is_not_a_lost_rotor():
     watch = SpeedWatch(P.rotor, ROBOT)
     for n in range(300):
         watch.on_command(0.02 * n, np.full(4, 7.0))
@@ -180,7 +180,7 @@ def test_an_esc_without_telemetry_is_no_lost_rotor():
 @pytest.mark.parametrize(('answer', 'deaf'), [
     (lambda lagged, t: lagged, False), (lambda lagged, t: 0.7 * lagged, False),
     (lambda lagged, t: np.full(4, 7.0), True)], ids=['healthy', 'weak', 'holds its thrust'])
-def test_a_rotor_that_does_not_follow_its_commands_is_told_by_the_slope(answer, deaf):
+def test_a_rotor_that_does_not_follow_its_commands_is_detected_by_the_slope(answer, deaf):
     watch, thrust, noise = SpeedWatch(P.rotor, ROBOT), np.full(4, 7.0), np.random.default_rng(0)
     told = False
     for n in range(1200):
@@ -216,7 +216,7 @@ def poses(watch, attitude, at, estimate=lambda t: None):
     return watch
 
 
-def test_a_flip_of_the_markers_is_blamed_on_mocap_and_a_wrong_estimate_on_the_estimator():
+def test_a_marker_flip_is_attributed_to_mocap_and_a_wrong_estimate_to_the_estimator():
     def turning(t):
         return rotations.from_rpy(0, 0, 0.5 * t)
 

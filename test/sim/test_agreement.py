@@ -63,7 +63,7 @@ def test_plant_without_module_inertia_agrees_with_casadi(robot):
         assert difference(found[3:6], np.array(angular).ravel()) < 1e-6
 
 
-def test_modules_known_by_their_effect_alone_act_as_the_described_ones():
+def test_modules_given_by_effect_act_as_described_ones():
     """The plant with the effect instead of modules has the same motion."""
     described = plant(ROBOT)
     by_effect, rigid = (plant(replace(ROBOT, multibody=None, effects=e))
@@ -154,7 +154,7 @@ def test_terminal_speed_is_where_drag_carries_the_weight():
 
 @pytest.mark.parametrize('name, values', [
     ('joint_backlash', {'gap': 0.01}), ('joint_friction', {'coulomb': 0.01, 'stiction': 0.01})])
-def test_effect_that_the_plant_lacks_is_refused_by_name(name, values):
+def test_an_effect_without_support_in_the_plant_is_refused_by_name(name, values):
     with pytest.raises(ParameterError, match=f'effects.{name}: the simulated plant refuses'):
         plant(replace(ROBOT, effects={name: values}))
 
@@ -164,7 +164,7 @@ def test_effect_that_the_plant_lacks_is_refused_by_name(name, values):
     ('body_drag', {'coefficient': 0.5}), ('axial_inflow', {'per_rotor': 0.3}),
     ('tilt_thrust_loss', {'loss_at_60deg': 0.1, 'cosine_share': 0.3}),
     ('ground_effect', {'gain_at_0.25m': 0.1, 'exponential_share': 0.4})])
-def test_forces_of_the_plant_are_those_of_the_catalogue(name, values):
+def test_forces_of_the_plant_equal_those_of_the_catalogue(name, values):
     robot = replace(ROBOT, effects={name: values})
     rng = np.random.default_rng(4)
     function = dynamics.added_wrench(robot, [name])

@@ -12,7 +12,7 @@ from beetle_omni_ros.sim.battery import Battery
 HOVER = np.full(4, ROBOT.hover_thrust)
 
 
-def test_ohm_and_power_hold():
+def test_ohms_law_and_the_power_balance_hold():
     battery = Battery(ROBOT, WORLD.battery)
     rest = battery.rest_voltage
     battery.step(HOVER, 1e-6)
@@ -33,7 +33,7 @@ def test_rest_voltage_falls_with_the_charge_drawn():
     assert battery.charge == pytest.approx(1 - drawn / WORLD.battery.capacity)
 
 
-def test_thrust_limit_is_the_maps_at_its_voltages_and_falls_below():
+def test_the_thrust_limit_equals_that_of_the_map_and_falls_below_it():
     battery = Battery(ROBOT, WORLD.battery)
     for row in ROBOT.rotors.map:
         battery.voltage = row.voltage
@@ -56,7 +56,7 @@ def test_overload_and_empty_pack_stay_finite():
 @pytest.mark.parametrize('levels, voltages', [
     ([0.0, 1.0], [0.8, 0.9, 1.0]), ([0.0, 0.5, 0.4, 1.0], [0.8, 0.9, 0.95, 1.0]),
     ([0.0, 0.5, 1.0], [0.8, 0.7, 1.0]), ([0.1, 1.0], [0.8, 1.0])])
-def test_a_curve_that_is_none_is_refused(levels, voltages):
+def test_an_invalid_charge_curve_is_refused(levels, voltages):
     with pytest.raises(ParameterError, match='charge_levels'):
         replace(WORLD.battery, charge_levels=np.array(levels),
                 relative_voltages=np.array(voltages))

@@ -73,11 +73,11 @@ def test_targets_are_ignored_until_armed_and_followed_then():
     assert bench.state == firmware.RUNNING
 
 
-def test_arming_is_refused_without_heartbeat_and_says_so():
+def test_arming_is_refused_without_heartbeat_with_the_reason():
     assert Bench().blocked_by() == firmware.NO_HEARTBEAT
 
 
-def test_arming_is_refused_while_thrust_is_asked_for():
+def test_arming_is_refused_while_targets_are_above_zero():
     bench = Bench()
     bench.beat()
     bench.target(0.0, 0.01)
@@ -151,7 +151,7 @@ def test_repeating_an_old_target_does_not_keep_the_rotors_alive():
 
 
 @pytest.mark.parametrize('armed', [True, False])
-def test_heartbeat_loss_disarms_whatever_targets_still_come(armed):
+def test_heartbeat_loss_disarms_despite_targets(armed):
     bench = Bench()
     if armed:
         bench.arm()
@@ -164,7 +164,7 @@ def test_heartbeat_loss_disarms_whatever_targets_still_come(armed):
     assert bench.outputs == firmware.STOP
 
 
-def test_armed_and_left_alone_it_disarms():
+def test_an_armed_board_without_targets_disarms():
     bench = Bench().arm()
     for _ in range(5):
         bench.wait(0.39)
@@ -197,7 +197,7 @@ def test_commands_beyond_the_range_saturate():
     assert bench.board.conditions(bench.now) & firmware.SATURATED
 
 
-def test_other_senders_are_not_obeyed():
+def test_commands_of_other_senders_are_ignored():
     bench = Bench()
     bench.send(mavlink.HEARTBEAT, 0, 6, 8, 0, 4, 3, sender=(255, 190))
     assert bench.blocked_by() == firmware.NO_HEARTBEAT
@@ -207,7 +207,7 @@ def test_other_senders_are_not_obeyed():
     assert bench.outputs == firmware.STOP
 
 
-def test_a_hang_leaves_the_outputs_until_the_watchdog_resets():
+def test_during_a_hang_the_outputs_stay_until_the_watchdog_resets():
     bench = Bench().arm()
     bench.target(0.5)
     bench.board.hang(bench.now)
@@ -235,7 +235,7 @@ def test_a_reboot_in_flight_stops_at_once_and_needs_arming_again():
     assert bench.outputs == firmware.STOP
 
 
-def test_the_time_answer_mirrors_the_question_and_tells_the_boards_clock():
+def test_the_time_answer_repeats_the_request_and_adds_the_board_clock():
     bench = Bench()
     ((number, (tc1, ts1)),) = bench.send(mavlink.TIMESYNC, 0, 12345)
     assert (number, ts1) == (mavlink.TIMESYNC, 12345)
@@ -301,7 +301,7 @@ PAYLOADS = strategies.sampled_from(sorted(mavlink.MESSAGES)).flatmap(
 
 @settings(max_examples=300, deadline=None)
 @given(strategies.lists(PAYLOADS, max_size=10), strategies.booleans())
-def test_good_frames_with_any_content_do_no_harm(payloads, armed):
+def test_valid_frames_with_arbitrary_content_are_tolerated(payloads, armed):
     """Outputs stay within their range, and every answer can be packed."""
     bench = Bench()
     if armed:

@@ -65,7 +65,7 @@ def test_crc_has_the_published_generator():
 
 
 @pytest.mark.parametrize(('name', 'instruction', 'parameters', 'expected'), INSTRUCTIONS)
-def test_instructions_have_the_documents_bytes(name, instruction, parameters, expected):
+def test_instructions_have_the_documented_bytes(name, instruction, parameters, expected):
     made = packet(name, instruction, bytes.fromhex(parameters))
     assert made == bytes.fromhex(expected)
     (received,) = Receiver().feed(made)
@@ -75,21 +75,21 @@ def test_instructions_have_the_documents_bytes(name, instruction, parameters, ex
 
 
 @pytest.mark.parametrize(('name', 'data', 'expected'), ANSWERS)
-def test_answers_have_the_documents_bytes(name, data, expected):
+def test_answers_have_the_documented_bytes(name, data, expected):
     assert status(name, 0, bytes.fromhex(data)) == bytes.fromhex(expected)
 
 
 @pytest.mark.parametrize(('blocks', 'expected'), [
     ([(3, 0, 'A6 00 00 00'), (7, 0, '1F 08 00 00'), (4, 0, 'FF 03 00 00')], FAST),
     ([(3, 0, 'A6 00 00 00'), (7, 0, 'A5 01'), (4, 0, '1F')], FAST_BULK)])
-def test_the_joint_answer_has_the_documents_bytes(blocks, expected):
+def test_the_fast_sync_read_answer_has_the_documented_bytes(blocks, expected):
     blocks = [(name, error, bytes.fromhex(data)) for name, error, data in blocks]
     length = sum(4 + len(data) for _, _, data in blocks)
     assert dynamixel.fast_status(blocks, length) == [bytes.fromhex(text) for text in expected]
 
 
 @given(payloads)
-def test_stuffing_is_undone_and_hides_every_header(payload):
+def test_stuffing_round_trips_and_leaves_no_header(payload):
     name, instruction, parameters = payload
     body = bytes((instruction,)) + parameters
     assert unstuffed(stuffed(body)) == body
@@ -99,7 +99,7 @@ def test_stuffing_is_undone_and_hides_every_header(payload):
 
 
 @given(st.lists(payloads, min_size=1, max_size=6), st.data())
-def test_packets_are_found_however_the_stream_is_cut(sent, data):
+def test_packets_are_found_for_any_split_of_the_stream(sent, data):
     stream = b''.join(packet(*payload) for payload in sent)
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=12)))
     receiver, found = Receiver(), []
@@ -121,7 +121,7 @@ def test_after_any_noise_and_a_pause_the_next_packet_is_found(noise, payload):
 
 
 @given(payloads, st.integers(1, 60), payloads)
-def test_a_truncated_packet_costs_no_other(broken, kept, payload):
+def test_a_truncated_packet_loses_no_other(broken, kept, payload):
     receiver = Receiver()
     whole = packet(*broken)
     list(receiver.feed(whole[:min(kept, len(whole) - 3)]))

@@ -64,7 +64,7 @@ def wave(k):
 
 @pytest.mark.parametrize(('conditions', 'seed'), [('nominal', 0), ('published', 1),
                                                   ('published', 5)])
-def test_a_command_acts_when_it_would_on_the_direct_path(conditions, seed):
+def test_a_command_acts_at_the_time_of_the_direct_path(conditions, seed):
     direct = Simulator(ROBOT, WORLD, conditions, seed)
     direct.reset(HIGH)
     actuators, simulator = coupled(conditions, seed)
@@ -94,7 +94,7 @@ def test_a_servo_without_torque_does_not_drive_and_shows_no_current():
     assert np.all(efforts[:, 1] == 0) and np.all(np.abs(efforts).max(axis=0)[[0, 2, 3]] > 0.01)
 
 
-def test_a_stopped_servo_holds_where_it_truly_is_whatever_it_measures():
+def test_a_stopped_servo_holds_its_true_angle_despite_encoder_faults():
     actuators, simulator = coupled('published', seed=2)
     actuators.bus.goals = [1.0] * 4
     for _ in range(7):
@@ -112,7 +112,7 @@ def test_a_stopped_servo_holds_where_it_truly_is_whatever_it_measures():
     np.testing.assert_allclose(simulator.truth.tilt, -2.0, atol=0.1)
 
 
-def test_devices_are_shown_angles_as_their_encoders_have_them():
+def test_devices_receive_angles_of_their_encoders():
     actuators, simulator = coupled('published', seed=3)
     errors = []
     for _ in range(400):
@@ -129,7 +129,7 @@ def test_devices_are_shown_angles_as_their_encoders_have_them():
     np.testing.assert_array_equal(actuators.bus.shown[-1][0], simulator.truth.tilt)
 
 
-def test_the_board_is_shown_the_pack_and_the_rotors():
+def test_the_board_receives_pack_and_rotor_states():
     actuators, simulator = coupled()
     actuators.board.thrust_targets = np.full(4, HOVER)
     errors = []
@@ -156,7 +156,7 @@ def devices():
 
 
 @pytest.mark.real_time
-def test_every_level_reaches_its_device_and_can_be_taken_back(devices):
+def test_every_fault_level_reaches_its_device_and_can_be_reset(devices):
     servo = ServoFaultSwitches(
         bad_crc=0.1, dropped=0.2, delayed=0.3, delay=0.04, silent=np.array([2.0]),
         overload=np.array([1.0, 3.0]), overheated=np.array([4.0]), supply_voltage=5.0)
@@ -194,7 +194,7 @@ def test_events_happen_each_time_they_are_set(devices):
     ({'overload': np.array([1.5])}, {}, r'servo_faults.overload: no servo has the id 1.5'),
     ({'reboot': 9}, {}, 'servo_faults.reboot: no servo has the id 9'),
     ({}, {'failed_escs': np.array([1.5])}, 'board_faults.failed_escs: expected rotors 1 to 4')])
-def test_a_fault_of_nothing_is_refused_and_changes_nothing(devices, servo, board, text):
+def test_an_unknown_fault_is_refused_without_effect(devices, servo, board, text):
     with pytest.raises(ParameterError, match=text):
         devices.set_faults(replace(ServoFaultSwitches(), dropped=0.5, **servo),
                            replace(BoardFaultSwitches(), mute=True, **board))
@@ -203,7 +203,7 @@ def test_a_fault_of_nothing_is_refused_and_changes_nothing(devices, servo, board
 
 
 @pytest.mark.real_time
-def test_unplugging_takes_the_ports_away_and_brings_them_back(devices):
+def test_unplugging_removes_the_ports_and_plugging_restores_them(devices):
     ports = [Path(devices.bus.port), Path(devices.board.port)]
     there = [port.exists() for port in ports]
     devices.set_faults(ServoFaultSwitches(unplugged=True), BoardFaultSwitches(unplugged=True))

@@ -110,7 +110,7 @@ def flight():
         yield made
 
 
-def test_thrusts_and_tilts_arrive_and_what_they_do_is_measured(flight):
+def test_thrusts_and_tilts_act_and_are_measured(flight):
     flight.tilt = np.array([0.3, -0.3, 0.3, -0.3])
     flight.run(0.7)
     np.testing.assert_allclose(flight.truth.thrust, HOVER, rtol=0.01)
@@ -166,7 +166,7 @@ def test_a_failed_esc_stops_its_rotor_alone(flight):
     np.testing.assert_allclose(flight.truth.thrust[:3], HOVER[:3], rtol=0.02)
 
 
-def test_a_sagging_pack_is_told_and_the_thrust_kept(flight):
+def test_a_sagging_pack_is_reported_and_thrust_is_kept(flight):
     before = flight.told['battery'].voltage
     flight.switch(board={'voltage_sag': 2.0})
     flight.run(0.6)

@@ -204,14 +204,14 @@ def test_goals_mean_the_same_angle_as_positions(angle, sign, zero, turns):
 # --- the line ---------------------------------------------------------------------------------
 
 
-def test_only_the_one_called_answers_and_only_at_its_speed(network):
+def test_only_the_addressed_servo_answers_at_its_baud_rate(network):
     assert [name for name, _, _ in ask(network, 3, Instruction.PING)] == [3]
     assert ask(network, 9, Instruction.PING) == []
     assert ask(network, 3, Instruction.PING, baud_rate=57600) == []
     assert [name for name, _, _ in ask(network, BROADCAST, Instruction.PING)] == [1, 2, 3, 4]
 
 
-def test_registered_writes_wait_for_action(network):
+def test_registered_writes_wait_for_the_action_instruction(network):
     goal = table.BY_NAME['Goal Position'].address.to_bytes(2, 'little') + b'\x00\x04\0\0'
     assert ask(network, 1, Instruction.ACTION)[0][1] == Error.INSTRUCTION
     assert ask(network, 1, Instruction.REG_WRITE, goal)[0][1] == Error.NONE
@@ -238,7 +238,7 @@ def test_a_bad_crc_is_answered_with_its_error_and_does_nothing(network):
         == []
 
 
-def test_refused_sync_writes_are_silent_but_noted(network):
+def test_refused_sync_writes_are_not_answered_but_recorded(network):
     write(network.servos[0], 'Torque Enable', 1)
     mode = place('Operating Mode') + bytes((1, 4, 2, 4))
     assert ask(network, BROADCAST, Instruction.SYNC_WRITE, mode) == []
@@ -268,7 +268,7 @@ def test_servos_behind_a_silent_one_do_not_answer_either(network, instruction):
         assert len(data) == 8 + 5
 
 
-def test_old_firmware_does_not_know_fast_sync_read():
+def test_old_firmware_does_not_support_fast_sync_read():
     network = ServoNetwork([EmulatedServo(1, firmware=45)])
     assert ask(network, BROADCAST, Instruction.FAST_SYNC_READ, place('ID') + b'\1') == []
     assert ask(network, BROADCAST, Instruction.SYNC_READ, place('ID') + b'\1') == [(1, 0, b'\1')]
@@ -284,7 +284,7 @@ def test_the_status_return_level_decides_what_is_answered(network):
     assert network.servos[0]['LED'] == 1
 
 
-def test_a_rebooting_servo_is_away_for_its_time(network):
+def test_a_rebooting_servo_is_silent_for_its_boot_time(network):
     assert ask(network, 1, Instruction.REBOOT, now=5.0) == [(1, 0, b'')]
     assert ask(network, 1, Instruction.PING, now=5.05) == []
     assert ask(network, 1, Instruction.PING, now=5.11)
@@ -294,7 +294,7 @@ def test_a_rebooting_servo_is_away_for_its_time(network):
 @given(st.lists(st.tuples(st.sampled_from([*Instruction, 0x20, 0xC3]),
                           st.sampled_from((0, 1, 2, 4, 7, BROADCAST)),
                           st.binary(max_size=30)), max_size=12))
-def test_no_sequence_of_packets_breaks_the_servos(sequence):
+def test_arbitrary_sequences_of_packets_raise_no_error(sequence):
     network = ServoNetwork([EmulatedServo(name, reboot_time=0.01) for name in (1, 2, 3, 4)])
     for count, (instruction, name, parameters) in enumerate(sequence):
         (asked,) = Receiver().feed(packet(name, instruction, parameters))

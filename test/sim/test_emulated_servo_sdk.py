@@ -58,7 +58,7 @@ def test_the_table_agrees_with_the_makers_model_file():
         assert (table.BY_NAME[name].address, table.BY_NAME[name].size) == (address, size), name
 
 
-def test_ping_read_write_and_errors_as_the_sdk_understands_them(bus, line):
+def test_the_sdk_reads_writes_pings_and_receives_errors(bus, line):
     port, handler = line
     assert handler.ping(port, 2) == (1210, sdk.COMM_SUCCESS, 0)
     assert handler.ping(port, 9)[1] == sdk.COMM_RX_TIMEOUT
@@ -72,7 +72,7 @@ def test_ping_read_write_and_errors_as_the_sdk_understands_them(bus, line):
     assert bus.goals[0] == pytest.approx((-534 - 2048) * 2 * np.pi / 4096)
 
 
-def test_values_that_look_like_a_header_arrive_whole(line):
+def test_values_that_contain_a_header_arrive_complete(line):
     port, handler = line
     assert handler.write1ByteTxRx(port, 1, 11, 4) == (0, 0)
     for value in (0xFFFDFFFF, 0xFFFDFFFF, 0xFFFFFFFD):  # FF FF FD FF and the like, all legal
@@ -105,7 +105,7 @@ def test_broadcast_ping_finds_all(line):
 
 
 @pytest.mark.parametrize('read', ['txRxPacket', 'fastSyncRead'])
-def test_group_reads_give_what_the_plant_set(bus, line, read):
+def test_group_reads_give_the_values_of_the_plant(bus, line, read):
     angles = np.array([0.5, -1.0, 3.6, -3.9])
     bus.set_state(angles, [1.0, -2.0, 0.0, 5.0], [0.1, 0.0, -0.2, 0.0])
     group = group_read(line, 126, 10)
@@ -130,7 +130,7 @@ def test_group_writes_reach_all(bus, line):
     assert [servo['LED'] for servo in bus.servos] == [1, 0, 1, 0]
 
 
-def test_group_bulk_reads(bus, line):
+def test_group_bulk_reads_give_the_registers(bus, line):
     for fast in (False, True):
         group = sdk.GroupBulkRead(*line)
         group.addParam(1, 132, 4)
@@ -141,7 +141,7 @@ def test_group_bulk_reads(bus, line):
 
 
 @pytest.mark.parametrize('read', ['txRxPacket', 'fastSyncRead'])
-def test_faults_of_the_line_are_what_the_sdk_calls_them(bus, line, read):
+def test_line_faults_have_the_names_of_the_sdk(bus, line, read):
     group = group_read(line, 126, 10)
     bus.faults.bad_crc = 1.0
     assert getattr(group, read)() in (sdk.COMM_RX_CORRUPT, sdk.COMM_RX_TIMEOUT)
@@ -165,7 +165,7 @@ def test_another_baud_rate_is_noise_to_the_servos(bus):
     port.closePort()
 
 
-def test_answers_take_the_wires_time_when_asked_to():
+def test_answers_take_the_transmission_time_if_requested():
     with EmulatedServoBus(identifiers=(1,), baud_rate=9600, timing=True) as bus:
         port, handler = sdk.PortHandler(bus.port), sdk.PacketHandler(2.0)
         port.setBaudRate(9600)
@@ -176,7 +176,7 @@ def test_answers_take_the_wires_time_when_asked_to():
         port.closePort()
 
 
-def test_the_emulator_outlives_noise_and_an_impatient_client(bus, line):
+def test_the_emulator_tolerates_noise_and_early_requests(bus, line):
     port, handler = line
     random = Random(3)
     for _ in range(60):
@@ -188,7 +188,7 @@ def test_the_emulator_outlives_noise_and_an_impatient_client(bus, line):
     assert handler.ping(port, 1)[:2] == (1210, sdk.COMM_SUCCESS)
 
 
-def test_without_a_plant_the_servos_move_by_themselves():
+def test_without_a_plant_the_servos_simulate_their_motion():
     joints = RobotParameters.load().joints
     with EmulatedServoBus(motion=joints) as bus:
         port, handler = sdk.PortHandler(bus.port), sdk.PacketHandler(2.0)

@@ -87,7 +87,7 @@ def healthy():
 
 
 @pytest.mark.parametrize('kind', ROBOT_KINDS)
-def test_a_kind_changes_what_it_claims_and_nothing_before_its_time(kind, healthy):
+def test_a_fault_kind_changes_its_quantity_from_its_start_only(kind, healthy):
     frames, _ = flight(some(kind, at=0.2))
     assert differing(frames[:40], healthy[:40]) == set()
     changed = differing(frames, healthy, 40)
@@ -107,7 +107,7 @@ def test_a_kind_is_deterministic(kind):
 
 @pytest.mark.parametrize('kind', sorted(
     kind for kind in set(ROBOT_KINDS) - PHYSICAL if SENSING[kind]))
-def test_a_fault_of_a_sensor_ends_without_a_trace(kind, healthy):
+def test_after_a_sensor_fault_the_readings_are_unchanged(kind, healthy):
     frames, simulator = flight(some(kind, at=0.1, duration=0.2))
     assert differing(frames, healthy, 110) == set()
     assert simulator.faults == []
@@ -182,7 +182,7 @@ def test_a_turn_of_the_markers_is_in_base_link(healthy):
             np.testing.assert_allclose(frame.mocap.quaternion, turned, atol=1e-12)
 
 
-def test_late_poses_are_the_same_poses(healthy):
+def test_late_poses_have_unchanged_content(healthy):
     frames, _ = flight(Fault('mocap_delayed', delay=0.03))
     expected = [frame.mocap for frame in healthy if frame.mocap is not None]
     late = [frame.mocap for frame in frames if frame.mocap is not None]
@@ -191,7 +191,7 @@ def test_late_poses_are_the_same_poses(healthy):
     assert len(late) == len(expected) - 3
 
 
-def test_faults_that_stay_in_the_list_go_on():
+def test_faults_that_stay_in_the_list_continue():
     simulator = Simulator(ROBOT, WORLD)
     simulator.reset(HIGH)
     slip = Fault('servo_jammed', servo=1, offset=0.5)
@@ -246,7 +246,7 @@ def test_the_impact_of_a_fall_has_its_speed():
     assert simulator.broken and simulator.truth.broken
 
 
-def test_a_robot_breaks_on_its_side_but_not_when_it_was_put_there():
+def test_a_robot_on_its_side_breaks_unless_placed_there():
     side = rotations.from_rpy(np.pi / 2, 0, 0)
     assert fallen(0.9, side).broken
     assert not fallen(0.33, side).broken
@@ -282,7 +282,7 @@ def test_a_soft_touchdown_breaks_nothing():
 @pytest.mark.parametrize(('arguments', 'named'), [
     (('rotor_stop',), 'rotor_stops'), (('rotor_stops',), "'rotor' is missing"),
     (('mocap_lost', -1.0), "'at'"), (('mocap_lost', 0.0, -inf), "'duration'")])
-def test_a_fault_that_is_none_is_refused(arguments, named):
+def test_an_unknown_fault_kind_is_refused(arguments, named):
     with pytest.raises(ParameterError, match=named):
         Fault(*arguments)
 
@@ -302,14 +302,14 @@ def test_the_simulator_refuses_faults_of_processes():
         Simulator(ROBOT, WORLD).set_faults([Fault('controller_silent')])
 
 
-def test_the_shipped_list_holds_enough_and_flies_every_kind():
+def test_the_shipped_list_contains_every_kind():
     listed = FaultList.load()
     assert len(listed.cases) >= 45
     flown = {fault.kind for case in listed.cases.values() for fault in case.strike}
     assert flown == set(KINDS)
 
 
-def test_files_of_one_flight(tmp_path):
+def test_a_fault_file_of_one_flight_is_read(tmp_path):
     path = tmp_path / 'faults.yaml'
     path.write_text('faults:\n- {what: rotor_stops, at: 3, duration: 2, rotor: 2}\n'
                     '- {what: servo_bus_lost, at: 4}\n- {what: rotor_blinks, at: 1}\n')
@@ -337,7 +337,7 @@ def test_unusable_files_name_the_key_in_one_line(tmp_path, text, named):
     assert named in str(raised.value) and '\n' not in str(raised.value)
 
 
-def test_short_texts():
+def test_short_texts_describe_a_fault():
     assert parse_faults(' rotor_stops rotor=2;mocap_lost duration=3 ; ') == [
         Fault('rotor_stops', rotor=2), Fault('mocap_lost', duration=3)]
     assert parse_faults('') == []
@@ -348,7 +348,7 @@ def test_short_texts():
             parse_faults(text)
 
 
-def test_a_simulator_file_of_other_limits_breaks_elsewhere():
+def test_break_limits_of_a_simulator_file_are_used():
     tough = replace(WORLD, crash=replace(WORLD.crash, speed=50.0))
     simulator = Simulator(ROBOT, tough)
     simulator.reset([0, 0, 2.0])

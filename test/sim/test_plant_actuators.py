@@ -106,7 +106,7 @@ def test_a_joint_without_torque_ignores_its_target_and_only_its_damping_slows_it
         np.testing.assert_allclose(tilt[[0, 3]], expected, atol=1e-4)
 
 
-def test_a_joint_without_torque_is_not_stiffened_by_a_weak_motors_limits():
+def test_limits_of_a_weak_motor_do_not_stiffen_a_joint_without_torque():
     weak = replace(immovable(), joints=replace(JOINT, effort_limit=0.01, velocity_limit=1.0))
     made = plant(weak)
     made.set_powered([False] * 4)
@@ -115,7 +115,7 @@ def test_a_joint_without_torque_is_not_stiffened_by_a_weak_motors_limits():
     np.testing.assert_allclose(made.state[1][6:], damped(TICK, 5.0)[1], rtol=1e-3)
 
 
-def test_torque_that_returns_takes_the_joint_to_its_target_again():
+def test_when_torque_returns_the_joint_follows_its_target():
     made = plant(immovable())
     made.set_powered([False] * 4)
     made.set_targets(np.full(4, 0.3), np.zeros(4))
@@ -141,7 +141,7 @@ def test_a_joint_without_torque_lets_its_module_hang():
     assert np.all(np.abs(tilt[1:] - 1.0) < 0.06)
 
 
-def test_a_reset_gives_the_torque_back():
+def test_a_reset_restores_the_torque():
     made = plant(immovable())
     made.set_powered([False] * 4)
     made.reset(HIGH)

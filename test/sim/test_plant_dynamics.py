@@ -55,7 +55,7 @@ def test_tilting_modules_react_on_the_body_and_keep_momenta(target):
     assert turned > 1e-3
 
 
-def test_energy_is_what_the_wrench_put_in():
+def test_energy_equals_the_work_of_the_wrench():
     made = plant(WEIGHTLESS)
     force = np.array([2.0, -1.0, 3.0])
     made.set_wrench(force, np.zeros(3))

@@ -34,7 +34,7 @@ assert changed(ghost)[75:].sum() == 0 < changed(again).sum() < 400
 """
 
 
-def test_figure_has_its_rotors_where_the_robot_has_them():
+def test_the_drawn_rotors_have_the_positions_of_the_robot():
     mujoco = pytest.importorskip('mujoco')
     text = Figure(ROBOT, WORLD.plant).body()
     model = mujoco.MjModel.from_xml_string(

@@ -37,7 +37,7 @@ def agrees(samples, deviation, mean=0.0):
     np.testing.assert_allclose(samples.std(axis=0), deviation, rtol=5 / np.sqrt(2 * count))
 
 
-def test_nominal_noise_is_as_stated():
+def test_nominal_noise_has_its_parameters():
     _, frames = at_rest()
     force = np.array([frame.imu.specific_force for frame in frames])
     rate = np.array([frame.imu.angular_velocity for frame in frames])
@@ -62,7 +62,7 @@ def test_rates_and_ages_are_exact_in_ticks():
     assert sum(frame.battery is not None for frame in frames) == 10
 
 
-def test_readings_are_the_truth_of_their_stamps():
+def test_readings_equal_the_truth_at_their_stamps():
     """Falling and turning, noise off: old readings equal the old truth."""
     quiet = replace(WORLD, imu=replace(WORLD.imu, specific_force_noise=0.0,
                                        angular_velocity_noise=0.0),
@@ -127,7 +127,7 @@ def test_imu_measures_acceleration_less_gravity():
         np.testing.assert_allclose(now.imu.specific_force, expected, atol=0.05)
 
 
-def test_joints_at_their_rate_limit_turn_evenly():
+def test_joints_at_their_rate_limit_have_constant_velocity():
     """No burst of module inertia in the reading."""
     quiet = replace(WORLD, imu=replace(WORLD.imu, specific_force_noise=0.0))
     simulator = Simulator(ROBOT, quiet)
@@ -179,7 +179,7 @@ def test_published_draws_fill_their_ranges():
         assert {round(getattr(d, name) / tick) for d in drawn} == expected
 
 
-def test_published_imu_hides_its_age():
+def test_published_imu_stamps_omit_the_latency():
     quiet = replace(WORLD, imu=replace(WORLD.imu, angular_velocity_noise=0.0),
                     published=replace(WORLD.published, angular_velocity_noise=0.0,
                                       angular_velocity_bias=0.0))

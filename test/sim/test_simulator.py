@@ -62,7 +62,7 @@ def test_rotors_stop_100_ms_after_the_last_command():
     assert np.all(np.diff(thrusts[19:]) < 0)
 
 
-def test_nan_command_is_refused_counted_and_harmless():
+def test_a_nan_command_is_refused_and_counted_without_effect():
     simulator = Simulator(ROBOT, WORLD)
     simulator.reset(HIGH)
     simulator.command(Command(0.0, np.zeros(4), HOVER))

@@ -63,7 +63,7 @@ def held(monkeypatch):
     return run
 
 
-def test_a_constant_offset_is_what_both_windows_find(held):
+def test_both_windows_give_a_constant_offset(held):
     found = held(lambda step: (0.03, 0.05))
     assert found['U_position_m'] == pytest.approx(0.03, rel=1e-3)
     assert found['L_position_m'] == pytest.approx(0.03, rel=1e-3)
@@ -73,7 +73,7 @@ def test_a_constant_offset_is_what_both_windows_find(held):
     assert found['tilt_change_rad'] == found['thrust_change_N'] == 0
 
 
-def test_the_windows_are_seconds_seven_to_seven_and_a_half_and_one_to_seven(held):
+def test_the_windows_are_7_0_to_7_5_s_and_1_to_7_s(held):
     def offset(step):      # step k is flown from 10 k ms to 10 (k + 1) ms
         time = (step + 1) * 0.01
         if 6.995 < time < 7.495:
@@ -86,13 +86,13 @@ def test_the_windows_are_seconds_seven_to_seven_and_a_half_and_one_to_seven(held
     assert found['L_attitude_deg'] == pytest.approx(np.degrees(0.1), rel=1e-3)
 
 
-def test_who_is_within_a_decimetre_and_ten_degrees_has_reached(held):
+def test_reached_means_within_10_cm_and_10_deg(held):
     distance = torch.tensor([0.05, 0.099, 0.101, 0.3, 0.05])
     angle = torch.tensor([0.0, 0.0, 0.0, 0.0, np.radians(11)]).float()
     assert held(lambda step: (distance, angle), robots=5)['reached'] == pytest.approx(2 / 5)
 
 
-def test_lost_robots_have_not_reached_and_leave_the_means_alone(held):
+def test_lost_robots_count_as_missed_and_not_in_the_means(held):
     distance = torch.tensor([5.0] * 3 + [0.02] * 7)
     found = held(lambda step: (distance, 0.0), robots=10, lost=3)
     assert found['lost'] == pytest.approx(0.3)
@@ -100,14 +100,14 @@ def test_lost_robots_have_not_reached_and_leave_the_means_alone(held):
     assert found['U_position_m'] == pytest.approx(0.02, rel=1e-3)
 
 
-def test_where_all_are_lost_there_are_no_means(held):
+def test_if_all_robots_are_lost_the_means_are_missing(held):
     found = held(lambda step: (5.0, 0.0), robots=10, lost=10)
     assert found['lost'] == 1 and found['reached'] == 0
     assert not any(key.startswith(('U_', 'L_')) for key in found)
     assert all(np.isfinite(value) for value in found.values())
 
 
-def test_restless_commands_are_measured_at_the_target(held):
+def test_command_changes_are_measured_at_the_target(held):
     sign = itertools.cycle((1.0, -1.0))
     amplitude = torch.tensor([0.02] * 4 + [0.1] * 4)
 
@@ -118,7 +118,7 @@ def test_restless_commands_are_measured_at_the_target(held):
     assert found['thrust_change_N'] == pytest.approx(2 * 0.1 * 0.5, rel=1e-3)
 
 
-def test_nominal_conditions_disturb_nothing_and_published_ones_all_alike():
+def test_nominal_conditions_have_no_disturbance_and_published_ones_equal_severity():
     nominal = conditions('nominal', RandomParameters())
     for name in QUIET:
         group, key = name.split('.')

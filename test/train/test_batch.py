@@ -18,7 +18,7 @@ def single(values):
     return torch.tensor(np.asarray(values), dtype=torch.float32)
 
 
-def test_matrices_products_and_exponentials_are_scipys():
+def test_matrices_products_and_exponentials_agree_with_scipy():
     a, b = rotations(200, 0), rotations(200, 1)
     np.testing.assert_allclose(batch.matrix(single(a.as_quat())), a.as_matrix(), atol=1e-6)
     np.testing.assert_allclose(
@@ -30,7 +30,7 @@ def test_matrices_products_and_exponentials_are_scipys():
                                Rotation.from_rotvec(vector).as_matrix(), atol=1e-6)
 
 
-def test_turning_back_is_the_transposed_matrix():
+def test_inverse_rotation_is_the_transposed_matrix():
     a, b = rotations(50, 3), rotations(50, 4)
     vector = np.random.default_rng(5).normal(size=(50, 3))
     np.testing.assert_allclose(batch.transpose_product(single(a.as_matrix()), single(vector)),
@@ -88,7 +88,7 @@ def test_uniform_numbers_keep_their_range_and_order():
     assert abs(float(draw.chance(0.3).float().mean()) - 0.3) < 0.05
 
 
-def test_more_numbers_than_drawn_are_refused():
+def test_requests_beyond_the_drawn_numbers_are_refused():
     draw = batch.Draw(torch.rand(3, 5))
     draw.uniform(4)
     with pytest.raises(ValueError, match='6 random numbers'):

@@ -50,7 +50,7 @@ def states(count, seed=0, dtype=torch.float64):
 
 @pytest.mark.parametrize('robot', [ROBOT, EVERYTHING, replace(ROBOT, multibody=None)],
                          ids=['shipped', 'every effect', 'one rigid body'])
-def test_torch_computes_what_casadi_computes(robot):
+def test_torch_agrees_with_casadi(robot):
     assert set(EFFECTS) == {name for name, effect in CATALOGUE.items()
                             if effect.apply and name != 'voltage_sag'}   # needs a voltage
     function = model.substep(robot, 0.0025)
@@ -70,7 +70,7 @@ def test_the_precision_is_that_of_the_inputs():
     np.testing.assert_allclose(single.numpy(), step(*inputs).numpy(), atol=1e-5)
 
 
-def test_every_operation_of_the_tables_is_right_also_with_constants():
+def test_every_operation_of_the_tables_is_correct_with_constants_too():
     x, y = ca.SX.sym('x', 2), ca.SX.sym('y', 2)
     a, b = x[0], y[1]
     inside = ca.logic_and(a > -1, ca.logic_not(ca.logic_or(b <= 0.3, a != a)))
@@ -166,7 +166,7 @@ def triton(monkeypatch):
 
 
 @pytest.mark.parametrize('count', [1, physics.BLOCK, 150])
-def test_the_kernel_does_what_torch_does(triton, count):
+def test_the_kernel_agrees_with_torch(triton, count):
     made = physics.Physics(EVERYTHING, 0.01, 4, 'cpu', kernel=True)
     assert made.has_kernel
     x, _, wrench, body = states(count, 3, torch.float32)
@@ -177,7 +177,7 @@ def test_the_kernel_does_what_torch_does(triton, count):
     np.testing.assert_allclose(ours.numpy(), theirs.numpy(), atol=1e-5)
 
 
-def test_triton_itself_agrees_where_there_is_one():
+def test_triton_agrees_if_available():
     pytest.importorskip('triton', reason='triton is not installed')
     if not torch.cuda.is_available():
         pytest.skip('triton compiles for a GPU, and here is none')

@@ -61,7 +61,7 @@ def test_a_delay_of_half_a_period_splits_it():
     torch.testing.assert_close(env.state['x'], expected)
 
 
-def test_the_command_in_force_and_the_one_before_are_remembered_apart():
+def test_the_present_and_the_previous_command_are_stored_separately():
     env = quiet(only('hover'))
     start, (first, second) = env.state['previous'].clone(), actions(env, 2, 2)
     env.advance(first)
@@ -84,7 +84,7 @@ def test_no_two_entries_of_the_state_share_memory():
         assert env.done.any()
 
 
-def test_the_thrust_limit_binds_the_rotors_and_is_not_seen():
+def test_the_thrust_limit_acts_but_is_not_observed():
     env = quiet({**only('hover'), 'random.thrust_limit': [9.0, 9.0], 'random.thrust_sag': 0.0,
                  'random.command_latency': [0.0, 0.0]})
     action = torch.zeros(env.num_envs, 8)
@@ -100,7 +100,7 @@ def test_the_thrust_limit_binds_the_rotors_and_is_not_seen():
 
 
 @pytest.mark.parametrize('charge', [0.9, 0.6, 0.35])
-def test_the_pack_sags_under_load_as_the_simulated_one(charge):
+def test_the_pack_sags_under_load_as_in_the_simulator(charge):
     pack = Battery(replace(ROBOT, rotors=replace(ROBOT.rotors, thrust_max=40.0)),
                    SimulatorParameters.load().battery)
     shipped = TrainParameters.load().random
@@ -120,7 +120,7 @@ def test_the_pack_sags_under_load_as_the_simulated_one(charge):
     np.testing.assert_allclose(env._thrust_limit(), limit(ROBOT.hover_thrust), rtol=1e-6)
 
 
-def test_actions_beyond_the_actuators_act_and_are_seen_as_their_limits():
+def test_actions_beyond_the_actuators_act_and_are_observed_as_their_limits():
     env = quiet(only('hover'))
     env.advance(torch.full((env.num_envs, 8), 1e3))
     limits = [ROBOT.joints.position_limit] * 4 + [ROBOT.rotors.thrust_max] * 4
@@ -147,7 +147,7 @@ def step_both(one, other, seed=3):
 
 
 @pytest.mark.parametrize(('name', 'entry', 'places', 'value'), BROKEN, ids=lambda v: str(v))
-def test_a_robot_out_of_bounds_starts_anew_and_no_other(name, entry, places, value):
+def test_only_a_robot_out_of_bounds_is_reset(name, entry, places, value):
     one, other = pair()
     other.state[entry][:8, places] = value
     other.state['age'].fill_(50.0)
@@ -164,7 +164,7 @@ def test_a_robot_out_of_bounds_starts_anew_and_no_other(name, entry, places, val
     assert torch.isfinite(other.reward).all()
 
 
-def test_only_a_lost_robot_pays_for_its_end():
+def test_only_a_lost_robot_gets_the_termination_penalty():
     one, other = pair()
     cost = one.cfg.reward.termination * one.cfg.reward.scale
     other.state['age'][:8] = other.max_episode_length - 1
@@ -177,7 +177,7 @@ def test_only_a_lost_robot_pays_for_its_end():
     assert not other.state['age'][:16].any()
 
 
-def test_who_is_lost_at_the_time_limit_is_lost():
+def test_a_robot_lost_at_the_time_limit_counts_as_lost():
     env = quiet()
     env.state['age'].fill_(env.max_episode_length - 1)
     env.state['x'][:8, 3:6] = 50.0
@@ -297,7 +297,7 @@ def test_the_same_seed_is_the_same_flight_and_another_is_not():
 
 
 @pytest.mark.parametrize('memory', [False, True])
-def test_wild_actions_never_leave_a_number_behind_that_is_none(memory):
+def test_extreme_actions_never_give_nan(memory):
     env = environment({'memory': memory, **DISTURBED}, robots=256)
     for k, action in enumerate(actions(env, 7, 250, size=20.0)):
         env.advance(action)
@@ -309,7 +309,7 @@ def test_wild_actions_never_leave_a_number_behind_that_is_none(memory):
     assert env.read_tally()['deaths'] == 0     # it begins anew
 
 
-def test_the_tally_counts_targets_and_who_reached_them():
+def test_the_tally_counts_targets_and_reached_targets():
     env = quiet({**only('hold'), 'episode.target_time': [1.0, 1.0]}, robots=10)
     env.state['target_left'].fill_(1)
     env.state['target_position'].copy_(env.state['x'][:, :3])

@@ -39,7 +39,7 @@ def observations(memory, count=64):
 
 
 @pytest.mark.parametrize(('memory', 'carry'), VARIANTS)
-def test_the_lean_graph_is_the_networks_mean(memory, carry):
+def test_the_exported_graph_computes_the_mean_of_the_network(memory, carry):
     network, _ = actor(memory, carry)
     lean = ExportedPolicy(network)
     with torch.no_grad():
@@ -88,7 +88,7 @@ def test_the_file_is_complete_and_accepted_on_board(tmp_path, memory):
     assert action == pytest.approx(expected.tolist(), abs=1e-4)
 
 
-def test_nothing_in_the_file_tells_where_it_was_made(tmp_path):
+def test_the_file_contains_no_local_path(tmp_path):
     network, parameters = actor()
     path = tmp_path / 'policy.onnx'
     export_policy(network, path, ROBOT, parameters)
@@ -100,7 +100,7 @@ def test_nothing_in_the_file_tells_where_it_was_made(tmp_path):
 
 
 @pytest.mark.parametrize('difference', [1e-4, float('nan')])
-def test_a_file_that_computes_something_else_is_not_left_behind(tmp_path, monkeypatch, difference):
+def test_a_wrong_export_is_removed(tmp_path, monkeypatch, difference):
     network, parameters = actor()
     monkeypatch.setattr(export, 'compare', lambda *_: difference)
     (tmp_path / 'policy.onnx').write_text('the one before')
@@ -110,7 +110,7 @@ def test_a_file_that_computes_something_else_is_not_left_behind(tmp_path, monkey
     assert (tmp_path / 'policy.onnx').read_text() == 'the one before'
 
 
-def test_the_comparison_finds_a_difference(tmp_path):
+def test_the_comparison_detects_a_difference(tmp_path):
     network, parameters = actor()
     path = tmp_path / 'policy.onnx'
     export_policy(network, path, ROBOT, parameters)
@@ -118,7 +118,7 @@ def test_the_comparison_finds_a_difference(tmp_path):
     assert export.compare(lambda seen: network.mean(seen) + 0.1, path, 33) > 1e-3
 
 
-def test_the_network_stays_as_it_is(tmp_path):
+def test_export_does_not_change_the_network(tmp_path):
     network, parameters = actor()
     before = {name: value.clone() for name, value in network.state_dict().items()}
     network.train()

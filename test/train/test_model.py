@@ -78,7 +78,7 @@ def assert_close(ours, theirs, **tolerances):
         assert difference <= tolerance, f'{name}: {difference:.2g}, more than {tolerance}'
 
 
-def test_a_period_is_that_of_the_robots_dynamics_away_from_servo_limits():
+def test_one_period_agrees_with_the_dynamics_away_from_servo_limits():
     x, u = states(100, 0, tilt_step=0.05)
     fine = np.array(dynamics.integrator(RIGID, 200).map(100)(
         x.T, u.T, np.zeros((10, 100)), PERIOD)).T
@@ -88,7 +88,7 @@ def test_a_period_is_that_of_the_robots_dynamics_away_from_servo_limits():
 
 
 @pytest.mark.parametrize('tilt_step', [0.05, 0.5, 8.0])
-def test_a_period_is_that_of_tiny_clamped_steps_with_the_modules_reaction(tilt_step):
+def test_one_period_agrees_with_small_clamped_steps_with_module_reaction(tilt_step):
     x, u = states(60, 1, tilt_step=tilt_step, joint_rate=0 if tilt_step < 0.1 else 10)
     fine = finely(ROBOT, x, u)
     at_limit = np.abs(fine[:, UNITS['tilt_rate']]) > 0.99 * ROBOT.joints.velocity_limit
@@ -97,7 +97,7 @@ def test_a_period_is_that_of_tiny_clamped_steps_with_the_modules_reaction(tilt_s
                  rate=0.03, tilt=0.01, tilt_rate=1.0, thrust=2e-4)
 
 
-def test_shorter_substeps_come_closer():
+def test_shorter_substeps_reduce_the_error():
     x, u = states(40, 2, tilt_step=0.05)
     fine = finely(ROBOT, x, u)
     coarse = np.abs(trained(ROBOT, x, u) - fine).max(0)
@@ -130,7 +130,7 @@ def test_the_rotors_lag_is_exact():
         np.testing.assert_allclose(trained(ROBOT, x, u, duration)[:, 21:], expected, atol=1e-12)
 
 
-def test_a_wrench_and_another_mass_act_as_newton_says():
+def test_a_wrench_and_another_mass_agree_with_newton():
     x, u = states(20, 5, tilt_step=0.0)
     x[:, UNITS['rate']] = 0
     step = model.substep(RIGID, 0.001).map(20)
@@ -163,7 +163,7 @@ def test_reaction_parameters_are_those_of_the_modules():
     assert found['mass_moment'] == pytest.approx(0.4 * 0.03)
 
 
-def test_a_robot_files_effects_are_where_the_bodies_start():
+def test_effects_of_the_robot_file_are_the_initial_body_parameters():
     robot = replace(ROBOT, effects={'mass': {'mass': 3.5}, 'centre_of_mass': {
         'offset': (0.01, 0.0, -0.01)}})
     assert model.nominal_body(ROBOT) == [ROBOT.mass, *ROBOT.inertia, 0.0, 0.0, 0.0]

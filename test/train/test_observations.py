@@ -48,7 +48,7 @@ def on_board(env, k):
 
 
 @pytest.mark.parametrize('memory', [False, True])
-def test_without_noise_and_delay_the_batch_sees_what_the_controller_sees(memory):
+def test_without_noise_and_delay_batch_and_controller_observations_agree(memory):
     env = quiet({'memory': memory})
     scattered(env)
     seen, _ = env._observe(env.state, draw(env))
@@ -58,7 +58,7 @@ def test_without_noise_and_delay_the_batch_sees_what_the_controller_sees(memory)
 
 
 @pytest.mark.parametrize('memory', [False, True])
-def test_the_critic_sees_the_truth_with_the_rotors_torques_and_thrusts(memory):
+def test_the_critic_observes_the_truth_with_rotor_torques_and_thrusts(memory):
     env = environment({'memory': memory, 'random.noise_power': 0})
     s = scattered(env)
     _, seen = env._observe(s, draw(env))
@@ -91,7 +91,7 @@ def test_a_late_value_lies_on_the_line_between_two_entries():
 @pytest.mark.parametrize(('delay', 'weights'), [(0.0, [1, 0, 0]), (0.01, [0, 1, 0]),
                                                 (0.015, [0, 0.5, 0.5]), (0.02, [0, 0, 1])])
 @pytest.mark.parametrize('late_one', ['velocity', 'tilt'])
-def test_a_delayed_robot_sees_its_past(delay, weights, late_one):
+def test_a_delayed_observation_is_a_past_state(delay, weights, late_one):
     env = quiet({**only('moving'), f'random.{late_one}_latency': [delay, delay]}, robots=16)
     g, truth = torch.Generator().manual_seed(2), []
     for _ in range(8):
@@ -159,7 +159,7 @@ def widths(env, random):
 
 @pytest.mark.parametrize('kind', ['noise', 'bias'])
 @pytest.mark.parametrize('name', ['position', 'attitude', 'velocity', 'rate', 'tilt'])
-def test_noise_and_bias_fill_their_half_width_and_disturb_nothing_else(name, kind):
+def test_noise_and_bias_fill_their_half_width_in_their_entries_only(name, kind):
     env = quiet({f'random.{name}_{kind}': 0.04, 'random.noise_power': 0.0}, robots=2000)
     for other, error in widths(env, env.cfg.random).items():
         if other == name:
@@ -170,7 +170,7 @@ def test_noise_and_bias_fill_their_half_width_and_disturb_nothing_else(name, kin
             assert np.abs(error).max() < 1e-5
 
 
-def test_a_bias_stays_and_noise_does_not():
+def test_a_bias_is_constant_and_noise_varies():
     env = quiet({'random.tilt_bias': 0.05, 'random.noise_power': 0.0}, robots=500)
     first, second = (Signals(env.cfg.random, env.state, draw(env, seed)).tilt for seed in (1, 2))
     torch.testing.assert_close(first, second)
@@ -186,7 +186,7 @@ def test_a_robots_noise_scale_is_a_power_of_a_uniform_number():
     assert float(scale.sqrt().mean()) == pytest.approx(1 / 2, abs=0.02)
 
 
-def test_the_estimate_is_seen_with_its_noise_and_bias():
+def test_the_estimate_is_observed_with_its_noise_and_bias():
     env = quiet({'memory': True, 'random.noise_power': 0.0, 'estimate.force_noise': 0.3,
                  'estimate.torque_bias': 0.2}, robots=2000)
     scattered(env)

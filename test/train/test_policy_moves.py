@@ -26,7 +26,7 @@ def moves():
 
 
 @pytest.mark.parametrize('name', ['rl', 'rl_memory'])
-def test_many_observations_at_once_are_answered_as_one_by_one(moves, name):
+def test_batched_and_single_observations_give_equal_actions(moves, name):
     path = find(f'policies/{name}.onnx')
     network = PolicyNetwork(path, ROBOT)
     rng = np.random.default_rng(0)
@@ -35,7 +35,7 @@ def test_many_observations_at_once_are_answered_as_one_by_one(moves, name):
     np.testing.assert_allclose(moves.Batched(path)(rows), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_a_robot_that_was_lost_counts_as_lost_and_in_nothing_else(moves):
+def test_a_lost_robot_counts_as_lost_only(moves):
     flown = {name: np.array([[value, 9.0], [value, 9.0]]) for name, value in (
         ('U_position', 0.01), ('U_attitude', 0.01), ('L_position', 0.02), ('L_attitude', 0.02),
         ('depth', 0.3), ('lowest', 0.25))}
@@ -46,7 +46,7 @@ def test_a_robot_that_was_lost_counts_as_lost_and_in_nothing_else(moves):
     assert totals['below_0.3_m'] == 2 and totals['L_position_m'] == pytest.approx(0.02)
 
 
-def test_robots_in_a_hover_stay_where_they_are_asked_to(moves, monkeypatch):
+def test_hovering_robots_hold_their_target(moves, monkeypatch):
     monkeypatch.setattr(moves, 'SEGMENT', 30)
     monkeypatch.setattr(moves, 'ON_THE_WAY', (0, 15))
     monkeypatch.setattr(moves, 'AT_TARGET', (15, 30))

@@ -40,7 +40,7 @@ def rollout_of_rsl_rl(made):
     return alg.storage
 
 
-def test_the_rollout_is_that_of_rsl_rl():
+def test_the_rollout_equals_that_of_rsl_rl():
     rollouts = []
     for collect in (lambda made: made.alg.collect(), rollout_of_rsl_rl):
         made = randomised(runner(**{'ppo.steps': 12}))
@@ -117,7 +117,7 @@ def test_densities_entropy_and_divergence_are_those_of_torch():
 
 
 @pytest.mark.parametrize('schedule', ['adaptive', 'fixed'])
-def test_one_update_is_that_of_rsl_rl(schedule, monkeypatch):
+def test_one_update_equals_that_of_rsl_rl(schedule, monkeypatch):
     results = []
     for own in (False, True):
         made = randomised(runner(**{
@@ -185,7 +185,7 @@ def test_gradients_are_clipped_for_actor_and_critic_apart(monkeypatch):
     assert norms and np.max(norms) <= 1e-3 * (1 + 1e-4) and np.max(norms) > 0.9e-3
 
 
-def test_the_standard_deviations_are_bounded_from_above_alone():
+def test_the_standard_deviations_have_an_upper_bound_only():
     gaussian = BoundedGaussian(8, [0.5] * 4 + [2.0] * 4)
     np.testing.assert_allclose(torch.exp(gaussian.log_std_param.detach()), [0.5] * 4 + [2.0] * 4,
                                rtol=1e-6)
@@ -195,7 +195,7 @@ def test_the_standard_deviations_are_bounded_from_above_alone():
     assert gaussian.log_std_param.requires_grad
 
 
-def test_the_same_batch_is_learnt():
+def test_repeated_updates_fit_the_same_batch():
     made = runner(**{'ppo.robots': 64, 'ppo.steps': 16, 'ppo.epochs': 4, 'network.hidden': [32]})
     made.alg.collect()
     losses = []

@@ -41,7 +41,7 @@ def store(share=1.0):
     return replays, step(replays, s, states(1), states(2), flags(due=[2, 3], missed=[2])), first
 
 
-def test_the_state_in_which_a_missed_target_began_is_what_is_stored():
+def test_the_initial_state_of_a_missed_target_is_stored():
     replays, s, first = store()
     assert s['filled'].tolist() == [0, 0, 1, 0, 0, 0, 0, 0]
     for name, value in replays.unpacked(s['stored']).items():
@@ -79,7 +79,7 @@ def test_without_store_or_share_episodes_begin_as_drawn(case):
     assert after['source'][0] == -1
 
 
-def test_picks_are_spread_over_what_is_stored_and_nothing_else():
+def test_samples_cover_the_stored_situations_only():
     replays, s, _ = store()
     s['filled'] = torch.tensor([0.0, 1, 0, 0, 1, 1, 0, 0])
     numbers = torch.full((COUNT, 3), 0.0)
@@ -90,7 +90,7 @@ def test_picks_are_spread_over_what_is_stored_and_nothing_else():
 
 @pytest.mark.parametrize(('missed', 'chance', 'left'), [
     (False, 0.45, 0), (False, 0.55, 1), (True, 0.05, 0), (True, 0.15, 1)])
-def test_what_was_flown_is_dropped_sooner_than_what_was_missed_again(missed, chance, left):
+def test_reached_situations_are_dropped_before_missed_ones(missed, chance, left):
     replays, s, first = store()
     s = step(replays, s, states(3), states(4), flags(done=[0]))
     numbers = torch.full((COUNT, 3), chance)
@@ -101,7 +101,7 @@ def test_what_was_flown_is_dropped_sooner_than_what_was_missed_again(missed, cha
     assert after['filled'][0] == 0 and after['source'][0] == -1
 
 
-def test_a_replay_cut_short_says_nothing():
+def test_a_truncated_replay_changes_no_situation():
     replays, s, _ = store()
     s = step(replays, s, states(3), states(4), flags(done=[0]))
     s['filled'][2] = 1.0
@@ -109,7 +109,7 @@ def test_a_replay_cut_short_says_nothing():
     assert after['filled'][2] == 1
 
 
-def test_robots_of_the_environment_meet_again_what_they_missed():
+def test_the_environment_replays_missed_situations():
     env = quiet({**only('hover'), 'episode.replay_share': 0.9, 'episode.hold_targets': 0.0,
                  'episode.target_time': [1.0, 1.0], 'episode.duration': 2.0,
                  'episode.rate_limit': 200.0, 'episode.velocity_limit': 100.0}, robots=16)
@@ -152,7 +152,7 @@ def test_disturbed_robots_are_not_stored():
     assert env.state['filled'].tolist() == [0.0] * 7 + [1.0] * 9
 
 
-def test_a_deep_dive_is_a_miss_wherever_it_ends():
+def test_a_large_loss_of_height_counts_as_missed():
     env = quiet({**only('hold'), 'episode.target_time': [1.0, 1.0]}, robots=4)
     env.state['target_position'].copy_(env.state['x'][:, model.POSITION])
     env.state['deepest'][1] = 0.5

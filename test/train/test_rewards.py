@@ -102,7 +102,7 @@ def test_reaching_the_pose_counts_all_four_errors():
         assert float(rewards.reach_pose(moment(**{**inside, name: outside}))) == 0
 
 
-def test_at_rest_at_the_target_nothing_is_punished_but_thrust():
+def test_at_rest_at_the_target_only_thrust_is_penalised():
     at_target = moment()
     costs = {name: float(term(at_target)) for name, term in rewards.TERMS.items()
              if getattr(RewardWeights(), name) < 0}
@@ -141,26 +141,26 @@ FALLS = {
 }
 
 
-def test_every_term_but_the_step_is_tried_for_its_direction():
+def test_every_term_except_the_step_is_tested_for_its_direction():
     assert {*GROWS, *FALLS, 'z_axis_align'} == set(rewards.TERMS)
 
 
 @pytest.mark.parametrize(('name', 'changes', 'sign'), [
     *((name, changes, 1) for name, changes in GROWS.items()),
     *((name, changes, -1) for name, changes in FALLS.items())])
-def test_a_term_is_monotone_in_what_it_judges(name, changes, sign):
+def test_a_term_is_monotonic_in_its_quantity(name, changes, sign):
     values = rewards.TERMS[name](moment(**changes)).numpy()
     assert (sign * np.diff(values) > 0).all()
 
 
-def test_restlessness_counts_at_the_target_alone():
+def test_command_changes_count_at_the_target_only():
     for term in (rewards.hover_tilt_rate, rewards.hover_thrust_rate):
         here, there = term(moment(position_error=[0.0, 1.0], tilt_command=np.full((2, 4), 0.1),
                                   thrust_command=np.full((2, 4), 9.0)))
         assert here > 0 and there < 1e-3 * here
 
 
-def test_limits_do_not_punish_what_is_within_them():
+def test_values_within_limits_are_not_penalised():
     tilts = np.array(list(itertools.product([-TILT_LIMIT, 0, TILT_LIMIT], repeat=4)))
     assert not rewards.joint_limit(moment(tilt_command=tilts)).any()
     thrusts = np.array(list(itertools.product([0, THRUST_LIMIT], repeat=4)))
@@ -169,7 +169,7 @@ def test_limits_do_not_punish_what_is_within_them():
     assert not rewards.joint_winding(moment(tilt=[[np.pi, -np.pi, 0, 1]])).any()
 
 
-def test_no_dive_costs_as_much_as_ending_the_episode():
+def test_a_loss_of_height_costs_less_than_a_termination():
     p = TrainParameters.load()
     deepest = float(rewards.sinking(moment(depth=1e3)))
     assert -p.reward.sinking * deepest / (1 - p.ppo.discount) < -p.reward.termination
@@ -181,13 +181,13 @@ def test_saturating_penalties_stay_finite_far_beyond():
     assert torch.isfinite(values).all() and float(values.abs().max()) < 500
 
 
-def test_upside_down_begins_at_a_distance_of_one_and_a_half():
+def test_the_inverted_attitude_has_a_distance_of_1_5():
     angle = 2 * np.arcsin(0.75)
     axes = [[np.sin(a), 0, np.cos(a)] for a in (angle - 0.01, angle + 0.01)]
     assert rewards.z_axis_align(moment(z_axis=axes)).tolist() == [0, 1]
 
 
-def test_the_terms_stand_in_the_order_of_the_table():
+def test_the_terms_have_the_order_of_the_table():
     made = moments(50, 1)
     found = rewards.terms(made)
     assert found.shape == (50, len(rewards.TERMS))

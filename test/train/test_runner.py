@@ -66,7 +66,7 @@ def test_the_environment_of_the_runner_and_its_starts_share_the_severity():
     assert float(env._starts.severity) == pytest.approx(0.3)
 
 
-def test_rows_come_when_they_are_due_and_hold_finite_numbers(tmp_path):
+def test_progress_rows_appear_at_their_interval_with_finite_numbers(tmp_path):
     rows = []
     runner(tmp_path, iterations=5, log_every=2).train(rows.append)
     assert [row['iteration'] for row in rows] == [2, 4, 5]
@@ -77,7 +77,7 @@ def test_rows_come_when_they_are_due_and_hold_finite_numbers(tmp_path):
     assert rows[0]['steps'] == 2 * 16 * 6
 
 
-def test_checkpoints_come_when_they_are_due_and_at_the_end(tmp_path):
+def test_checkpoints_are_written_at_their_interval_and_at_the_end(tmp_path):
     runner(tmp_path, iterations=5, save_every=2).train()
     assert {path.name for path in tmp_path.glob('model_*')} == {'model_2.pt', 'model_4.pt',
                                                                 'model_5.pt'}
@@ -89,7 +89,7 @@ def test_without_a_folder_nothing_is_written(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_training_stops_early_when_told_to(tmp_path):
+def test_stop_after_ends_the_training_early(tmp_path):
     made, rows = runner(tmp_path, iterations=1000), []
     made.train(rows.append, stop_after=0.0)
     assert len(rows) == 1 and (tmp_path / 'model_1.pt').is_file()
@@ -249,7 +249,7 @@ def test_a_loss_that_is_not_finite_stops_the_training_before_it_is_saved(tmp_pat
     assert {path.name for path in tmp_path.glob('model_*')} == {'model_3.pt'}
 
 
-def test_tensorboard_gets_every_number(tmp_path):
+def test_every_number_is_written_to_tensorboard(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
     rows = []
     runner(tmp_path, iterations=3).train(rows.append)

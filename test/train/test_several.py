@@ -56,7 +56,7 @@ def test_the_first_process_alone_writes(ranks):
     assert output.count('2 x 32 robots on cpu') == output.count('agrees with torch') == 1
 
 
-def test_they_stop_together_when_the_first_one_does(ranks):
+def test_all_processes_stop_with_the_first_one(ranks):
     assert [output['iterations'] for output in ranks[2]] == [1, 1]
 
 

@@ -23,7 +23,7 @@ def test_strata_have_their_shares_in_every_part_of_the_batch():
 
 
 @pytest.mark.parametrize('name', STRATA)
-def test_each_stratum_is_what_its_name_says(name):
+def test_each_stratum_has_the_starts_of_its_name(name):
     env = environment({**only(name), 'start.other_branch': 0.0}, robots=300)
     x = env.state['x']
     windings = (x[:, model.TILT] / torch.pi).round().long()
@@ -63,7 +63,7 @@ def test_targets_last_three_to_eight_seconds():
     assert float(left.mean()) == pytest.approx(5.5, abs=0.1)
 
 
-def test_a_target_stands_for_exactly_its_time():
+def test_a_target_lasts_exactly_its_time():
     env = quiet(only('hold'))
     env.state['age'].zero_()
     env.state['target_left'].copy_(torch.arange(64) % 4 + 1)

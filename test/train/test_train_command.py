@@ -53,7 +53,7 @@ def values(parameters):
             for name, _, _, value in flatten(parameters)}
 
 
-def test_a_run_leaves_all_that_it_promises(run):
+def test_a_run_writes_all_documented_files(run):
     names = {path.name for path in run.iterdir()}
     assert {'train.yaml', 'policy.onnx', 'model_2.pt', 'model_3.pt'} <= names
     assert any(name.startswith('events.out.tfevents') for name in names)
@@ -68,7 +68,7 @@ def test_the_parameter_file_of_a_run_loads_back_equal(run):
     assert values(TrainParameters.load(run / 'train.yaml')) == values(expected)
 
 
-def test_every_parameter_survives_a_file(tmp_path):
+def test_every_parameter_round_trips_through_a_file(tmp_path):
     changed = read_parameters(None, {'reward.scale': 1.23456789e-7, 'network.hidden': [7, 5],
                                      'memory': True, 'random.thrust_limit': [15.5, 18.25]})
     write_parameters(changed, tmp_path / 'copy.yaml')
@@ -100,7 +100,7 @@ def test_the_policy_of_a_run_flies_in_the_loop(run, tmp_path):
                      '--task', str(task), '--json', str(result)]) in (0, 1)
 
 
-def test_a_run_goes_on_where_it_stopped(run, tmp_path, capsys, monkeypatch):
+def test_a_run_continues_from_its_last_checkpoint(run, tmp_path, capsys, monkeypatch):
     asked, figures = [], {'reached': 0.5, 'U_position_m': 0.25}
     monkeypatch.setattr(command, 'assess', lambda *given: asked.append(given[4]) or figures)
     shutil.copytree(run, tmp_path / 'run')
@@ -118,7 +118,7 @@ def test_a_run_goes_on_where_it_stopped(run, tmp_path, capsys, monkeypatch):
     assert 'nominal, training environment: reached 0.5, U_position_m 0.25' in printed
 
 
-def test_a_run_goes_on_in_another_folder_from_an_older_checkpoint(run, tmp_path, capsys):
+def test_a_run_continues_in_another_folder_from_an_older_checkpoint(run, tmp_path, capsys):
     assert cli.main(['train', '--smoke', '--resume', str(run / 'model_2.pt'), '--device', 'cpu',
                      '--output', str(tmp_path / 'branch')]) == 0
     assert 'iterations 2 to 3' in capsys.readouterr().out
@@ -150,14 +150,14 @@ def test_an_interrupted_run_keeps_its_state(tmp_path, capsys, monkeypatch, place
     assert (folder / 'policy.onnx').is_file()
 
 
-def test_a_loss_that_is_not_finite_is_one_line(tmp_path, capsys, monkeypatch):
+def test_a_non_finite_loss_is_reported_in_one_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(GraphPpo, 'learn_batch', lambda self: self.losses.fill_(torch.nan))
     line = refused(capsys, *TINY, '--output', tmp_path / 'run', status=1)
     assert 'iteration 1: the loss is not finite' in line and str(tmp_path / 'run') in line
     assert not list((tmp_path / 'run').glob('model_*'))
 
 
-def test_a_wrong_export_is_one_line(tmp_path, capsys, monkeypatch):
+def test_a_wrong_export_is_reported_in_one_line(tmp_path, capsys, monkeypatch):
     from beetle_omni_ros.train import export
     monkeypatch.setattr(export, 'compare', lambda *_: 1.0)
     line = refused(capsys, *TINY, '--output', tmp_path / 'run', status=1)
@@ -167,7 +167,7 @@ def test_a_wrong_export_is_one_line(tmp_path, capsys, monkeypatch):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason='here is a GPU')
 @pytest.mark.parametrize('device', ['cuda', 'cuda:1'])
-def test_a_gpu_where_there_is_none_is_one_line(tmp_path, capsys, device):
+def test_a_missing_gpu_is_reported_in_one_line(tmp_path, capsys, device):
     line = refused(capsys, '--smoke', '--device', device, '--output', tmp_path / 'run')
     assert f"--device '{device}': this machine has no CUDA device" in line
     assert not (tmp_path / 'run').exists()
@@ -194,8 +194,8 @@ def test_a_gpu_where_there_is_none_is_one_line(tmp_path, capsys, device):
     (['--output', 'OUT', '--json', 'no/folder.json'], 'folder.json'),
     (['--resume', 'nowhere'], '--resume nowhere: no model_N.pt there'),
     (['--output', 'file'], '--output file')])
-def test_unusable_input_is_one_line_before_anything_is_made(capsys, tmp_path, monkeypatch,
-                                                            arguments, named):
+def test_unusable_input_is_refused_before_any_file_is_written(capsys, tmp_path, monkeypatch,
+                                                              arguments, named):
     monkeypatch.chdir(tmp_path)
     Path('file').touch()
     assert named in refused(capsys, '--smoke', '--device', 'cpu', *arguments)
@@ -217,7 +217,7 @@ def test_another_run_is_not_overwritten(capsys, run):
 
 
 @pytest.mark.parametrize('how', ['broken', 'other size'])
-def test_a_checkpoint_that_does_not_fit_is_one_line(capsys, run, tmp_path, how):
+def test_an_incompatible_checkpoint_is_refused_in_one_line(capsys, run, tmp_path, how):
     shutil.copytree(run, tmp_path / 'run')
     arguments = ['--resume', tmp_path / 'run', '--device', 'cpu']
     if how == 'broken':
@@ -227,7 +227,7 @@ def test_a_checkpoint_that_does_not_fit_is_one_line(capsys, run, tmp_path, how):
     assert 'model_3.pt: no checkpoint that fits this training' in refused(capsys, *arguments)
 
 
-def test_changes_are_yaml_and_keep_what_was_given():
+def test_changes_are_parsed_as_yaml():
     found = parse_changes(['a.b=1e-3', 'c=[1, 2]', 'd = true'], seed=3, memory=None)
     assert found == {'a.b': 1e-3, 'c': [1, 2], 'd': True, 'seed': 3}
     with pytest.raises(ParameterError, match='key=value'):

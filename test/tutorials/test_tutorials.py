@@ -128,7 +128,7 @@ def stop(process):
 
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
-def test_a_tutorial_does_what_it_says(page, tmp_path, shell):
+def test_the_commands_of_a_tutorial_give_its_results(page, tmp_path, shell):
     found = blocks(page)
     if any('fly ' in block.text or block.one('background') for block in found):
         pytest.importorskip('rclpy')
@@ -155,6 +155,6 @@ def test_a_tutorial_does_what_it_says(page, tmp_path, shell):
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.stem)
-def test_a_tutorial_has_commands_that_are_run_and_a_picture(page):
+def test_a_tutorial_has_tested_commands_and_a_picture(page):
     assert any('skip' not in block.told and block.language == 'sh' for block in blocks(page))
     assert re.search(r'!\[.*\]\(\S+\.(png|gif)\)', page.read_text())

@@ -45,7 +45,7 @@ def test_unusable_input_is_one_line_and_status_2(bag, tmp_path, monkeypatch, cap
     assert not captured.out
 
 
-def test_it_prints_its_address_serves_there_and_ends_with_ctrl_c(bag):
+def test_the_viewer_prints_its_address_and_ends_with_ctrl_c(bag):
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view', str(bag),
          '--port', '8420', '--paused'], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -40,7 +40,7 @@ def rows_of(path):
     return rows
 
 
-def test_the_rows_of_a_bag_are_what_the_bag_holds(bag):
+def test_rows_agree_with_the_content_of_the_bag(bag):
     log, rows = read_bag(bag), rows_of(bag)
     np.testing.assert_allclose(np.diff(rows.times), STEP)
     assert rows.times[-1] == pytest.approx(log.end, abs=0.1)
@@ -135,7 +135,7 @@ def test_between_rows_poses_are_interpolated_and_targets_hold():
     assert rows.at(-3.0)[T] == 0.0 and rows.at(9.0)[COLUMNS['position']][0] == 2.0
 
 
-def test_rows_stay_in_order_and_forget_what_is_old():
+def test_rows_stay_in_order_and_old_ones_are_dropped():
     rows = Rows(longest=10.0)
     for t in range(3000):
         rows.append(row(0.1 * t)[None])

@@ -103,14 +103,14 @@ def test_torque_arcs_turn_as_the_reaction_torque_on_the_body():
 
 @pytest.mark.parametrize('file', sorted(share_path('description/meshes').glob('*.stl')),
                          ids=lambda file: file.stem)
-def test_meshes_are_those_that_another_reader_finds(file):
+def test_meshes_agree_with_an_independent_reader(file):
     vertices, faces = _mesh(file)
     other = trimesh.load_mesh(file)
     assert len(faces) == len(other.faces) and len(vertices) == len(other.vertices)
     np.testing.assert_array_equal(vertices[faces], other.triangles)
 
 
-def test_a_broken_mesh_is_refused_by_name(tmp_path):
+def test_a_broken_mesh_is_refused_with_its_file(tmp_path):
     (tmp_path / 'b.stl').write_bytes(b'no mesh at all')
     with pytest.raises(ParameterError, match=r'b\.stl: not a usable mesh'):
         _mesh(tmp_path / 'b.stl')
