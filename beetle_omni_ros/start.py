@@ -13,16 +13,25 @@ import sys
 
 PACKAGE = 'beetle_omni_ros'
 INTERRUPTED = 130
-PROGRAMS = {'beetle_omni': f'{PACKAGE}.cli'}     # all other executables are modules of nodes/
+# Executables with a module and its ``main``; all others are nodes.
+PROGRAMS = {'beetle_omni': f'{PACKAGE}.cli', 'composed': f'{PACKAGE}.nodes.composed'}
 
 
-def run(module: str) -> int | None:
-    """Import ``module`` and run its ``main``; returns the exit status."""
+def load(name: str):
+    """Import an executable and return its entry point."""
+    if name in PROGRAMS:
+        return import_module(PROGRAMS[name]).main
+    runner = import_module(f'{PACKAGE}.nodes.runner')
+    return partial(runner.main, runner.node_class(name))
+
+
+def run(name: str) -> int | None:
+    """Run an executable; returns the exit status."""
     # A shell starts background jobs with the signal ignored, which must stay so.
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if handled:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    main = import_module(module).main
+    main = load(name)
     try:
         if handled:
             signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -35,11 +44,11 @@ def __getattr__(name):
     """Entry point of the executable ``name``."""
     if name.startswith('_'):
         raise AttributeError(name)
-    return partial(run, PROGRAMS.get(name, f'{PACKAGE}.nodes.{name}'))
+    return partial(run, name)
 
 
 if __name__ == '__main__':
     if len(sys.argv) < 2:
         sys.exit(f'usage: python -m {PACKAGE}.start NAME ...')
     del sys.argv[0]
-    sys.exit(run(PROGRAMS.get(sys.argv[0], f'{PACKAGE}.nodes.{sys.argv[0]}')))
+    sys.exit(run(sys.argv[0]))

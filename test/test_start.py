@@ -9,7 +9,8 @@ import time
 
 import pytest
 
-from beetle_omni_ros import start
+from beetle_omni_ros import cli, start
+from beetle_omni_ros.nodes.plan import NODES
 
 ROOT = Path(__file__).resolve().parents[1]
 SLOW = 'import time\nprint("loading", flush=True)\ntime.sleep(30)\n'
@@ -21,7 +22,8 @@ def launch(tmp_path, text, before=''):
     (tmp_path / 'program.py').write_text(text)
     return subprocess.Popen(
         [sys.executable, '-c', f'import sys, signal\n{before}\nsys.path.insert(0, "{tmp_path}")\n'
-         'from beetle_omni_ros.start import run\nsys.exit(run("program"))'],
+         'from beetle_omni_ros import start\nstart.PROGRAMS["program"] = "program"\n'
+         'sys.exit(start.run("program"))'],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
 
@@ -75,7 +77,12 @@ def test_a_signal_that_the_shell_ignores_stays_ignored(tmp_path):
     assert process.returncode == 1
 
 
-@pytest.mark.parametrize(('name', 'module'), [('beetle_omni', 'beetle_omni_ros.cli'),
-                                              ('ekf_node', 'beetle_omni_ros.nodes.ekf_node')])
-def test_each_executable_is_the_main_of_its_module(name, module):
-    assert getattr(start, name).args == (module,)
+def test_a_program_is_the_main_of_its_module():
+    assert start.beetle_omni.args == ('beetle_omni',) and start.load('beetle_omni') is cli.main
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_every_other_executable_runs_the_node_of_its_name(name):
+    runner = pytest.importorskip('beetle_omni_ros.nodes.runner', exc_type=ImportError)
+    entry = start.load(name)
+    assert entry.func is runner.main and runner.executable(*entry.args) == name

@@ -1,15 +1,14 @@
 """
-Several nodes in one process: ``python -m beetle_omni_ros.nodes.composed NODE...``.
+Several nodes in one process: ``python -m beetle_omni_ros.start composed NODE...``.
 
 NODE is an executable, a registered controller name, or ``package.module:Class`` of a controller.
 """
 
-from importlib import import_module
 import sys
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.nodes import runner
-from beetle_omni_ros.nodes.plan import class_name, GENERIC, NODES
+from beetle_omni_ros.nodes.plan import GENERIC, NODES
 from beetle_omni_ros.robot.schema import ParameterError
 
 COMMAND = 'composed'
@@ -42,7 +41,7 @@ def _end(text):
 
 def _class(name):
     try:
-        return getattr(import_module(f'{__package__}.{name}'), class_name(name))
+        return runner.node_class(name)
     except ModuleNotFoundError as error:
         _end(f"{name} needs the Python package '{error.name}'; what bridges need installs the "
              "extra 'hardware' of beetle_omni_ros")
@@ -62,7 +61,3 @@ def _controller_class(reference):
             super().__init__(entry)
 
     return Named
-
-
-if __name__ == '__main__':
-    main()

@@ -17,7 +17,7 @@ from beetle_omni_ros.control.base import (
 )
 from beetle_omni_ros.control.registry import ControllerEntry
 from beetle_omni_ros.messages.values import MessageError
-from beetle_omni_ros.nodes import health, runner
+from beetle_omni_ros.nodes import health
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
@@ -181,6 +181,20 @@ class ControllerNode(FlightNode):
             **report, 'guidance': guidance_of(controller)}
 
 
+class NmpcNode(ControllerNode):
+    """Publishes nmpc/command, stamped with the state that it answers."""
+
+    def __init__(self):
+        super().__init__('nmpc')
+
+
+class RlNode(ControllerNode):
+    """Publishes rl/command, stamped with the state that it answers."""
+
+    def __init__(self):
+        super().__init__('rl')
+
+
 @dataclass(frozen=True, kw_only=True)
 class NoParameters:
     """Parameters of a controller that has none."""
@@ -211,12 +225,3 @@ def _requested_controller() -> str:
         return name.removesuffix('_node')
     raise ParameterError("key 'controller': missing; expected a registered controller "
                          f"({', '.join(registry.names())}) or package.module:Class")
-
-
-def main(args=None):
-    """Run the node."""
-    runner.main(ControllerNode, args)
-
-
-if __name__ == '__main__':
-    main()

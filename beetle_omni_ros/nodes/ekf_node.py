@@ -6,7 +6,7 @@ from beetle_omni_ros.estimation.ekf import ErrorStateEkf
 from beetle_omni_ros.estimation.parameters import EkfParameters
 from beetle_omni_ros.estimation.samples import pose_covariance, twist_covariance
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes import health, runner
+from beetle_omni_ros.nodes import health
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.parameters import RobotParameters
 from beetle_omni_ros.robot.schema import parameter
@@ -62,12 +62,3 @@ class EkfNode(FlightNode):
         level = {'tracking': health.OK, 'dead_reckoning': health.WARN, 'lost': health.ERROR}
         values = {f'rejected: {reason}': count for reason, count in self._ekf.rejected.items()}
         return level.get(self._status, health.OK), self._status, values
-
-
-def main(args=None):
-    """Run the node."""
-    runner.main(EkfNode, args)
-
-
-if __name__ == '__main__':
-    main()

@@ -74,10 +74,9 @@ class Graph:
 
     def start_process(self, name: str) -> subprocess.Popen:
         """Start one process, or start it again."""
-        module, *arguments = self._commands[name]
         with open(self.log(name), 'a') as log:
             self.processes[name] = subprocess.Popen(
-                [sys.executable, '-m', f'{__package__}.{module}', *arguments,
+                [sys.executable, '-m', 'beetle_omni_ros.start', *self._commands[name],
                  '--params-file', str(self._file)],
                 env=child_environment(self.domain), stdin=subprocess.DEVNULL, stdout=log,
                 stderr=log, start_new_session=True)     # Ctrl-C reaches this process only

@@ -10,7 +10,7 @@ from beetle_omni_ros.drivers.servo_bus import ServoBus
 from beetle_omni_ros.drivers.servo_link import ServoBusError
 from beetle_omni_ros.drivers.servo_loop import Goal, ServoLoop
 from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
-from beetle_omni_ros.nodes import health, runner
+from beetle_omni_ros.nodes import health
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.lifecycle_node import (
     ACTIVE,
@@ -243,12 +243,3 @@ def servo_status(loop, index):
         bad = not one.responding or (one.errors and not one.torque)
         return (health.ERROR if bad else health.WARN), one.message, values
     return health.OK, 'being brought back' if one.recovering else 'ok', values
-
-
-def main(args=None):
-    """Run the node."""
-    runner.main(JointBridgeNode, args)
-
-
-if __name__ == '__main__':
-    main()

@@ -17,8 +17,8 @@ BRIDGES = ('joint_bridge_node', 'rotor_bridge_node')
 STATES = {'joint_bridge_node': 'joint_bridge/state', 'rotor_bridge_node': 'rotor_bridge/state'}
 ACTUATORS = ('emulated', 'direct')
 READY = 'ready'
-# Executables: modules of this folder with a class of the same name. `controller_node` runs any
-# registered controller under the name `<controller>_node`.
+# Executables: modules of this folder with a class of the same name, and the classes of two
+# controllers in `controller_node`, which runs any registered one as `<controller>_node`.
 NODES = ('sim_node', 'ekf_node', 'nmpc_node', 'rl_node', 'controller_node', 'supervisor_node',
          'joint_bridge_node', 'rotor_bridge_node', 'reference_node', 'recorder_node',
          'viewer_node')
@@ -216,11 +216,6 @@ def unfit(policy: str, robot_file: str = '', allow_other_robot: bool = False) ->
 def executable(node: str) -> str:
     """Return the executable of a node."""
     return node if node in NODES else GENERIC
-
-
-def class_name(name: str) -> str:
-    """Return the class name of an executable: ekf_node -> EkfNode."""
-    return ''.join(part.capitalize() for part in name.split('_'))
 
 
 def arguments(nodes: Parameters, names: Iterable[str]) -> list[str]:

@@ -7,7 +7,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 
 from beetle_omni_ros.control import registry
 from beetle_omni_ros.messages.topics import ALL, LATCHED_LOG, LOG, topics_with
-from beetle_omni_ros.nodes import health, runner, wire
+from beetle_omni_ros.nodes import health, wire
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import NAMES, parameter, ParameterError
 from beetle_omni_ros.robot.urdf import description
@@ -120,12 +120,3 @@ class RecorderNode(FlightNode):
                 bag.close()
         except BagError as error:
             print(f'recorder_node: error: {error}', file=sys.stderr)
-
-
-def main(args=None):
-    """Run the node."""
-    runner.main(RecorderNode, args)
-
-
-if __name__ == '__main__':
-    main()

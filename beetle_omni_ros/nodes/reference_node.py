@@ -8,7 +8,7 @@ from rcl_interfaces.srv import SetParameters
 from beetle_omni_ros.control.base import PoseTarget, TrajectoryTarget
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Wrench
-from beetle_omni_ros.nodes import health, runner, wire
+from beetle_omni_ros.nodes import health, wire
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.schema import parameter
 from beetle_omni_ros.runs.tasks import make_task, TaskPlayer
@@ -123,12 +123,3 @@ class ReferenceNode(FlightNode):
             self._wrenches.publish(Wrench(now, moment.force_world, moment.torque_body))
         if self._task.kind == 'payload':
             self._payload.call_async(wire.parameter_request('payload', float(moment.payload)))
-
-
-def main(args=None):
-    """Run the node."""
-    runner.main(ReferenceNode, args)
-
-
-if __name__ == '__main__':
-    main()

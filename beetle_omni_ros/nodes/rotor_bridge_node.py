@@ -8,7 +8,6 @@ from beetle_omni_ros.drivers.motor_board import MotorBoard
 from beetle_omni_ros.drivers.motor_board_arming import Arming, FLIES
 from beetle_omni_ros.drivers.motor_board_parameters import MotorBoardParameters
 from beetle_omni_ros.drivers.serial_port import SerialPortError
-from beetle_omni_ros.nodes import runner
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.lifecycle_node import AUTOSTART, LifecycleFlightNode
 from beetle_omni_ros.nodes.rotor_bridge_report import RotorBridgeReport, TargetStream
@@ -189,12 +188,3 @@ class RotorBridgeNode(LifecycleFlightNode):
         self._arming.end()
         self._states.publish(self._arming.text)
         self._board.close()
-
-
-def main(args=None):
-    """Run the node."""
-    runner.main(RotorBridgeNode, args)
-
-
-if __name__ == '__main__':
-    main()

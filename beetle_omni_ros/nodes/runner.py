@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from contextlib import contextmanager
 import ctypes
 import gc
+from importlib import import_module
 import os
 import re
 import signal
@@ -19,6 +20,7 @@ from rclpy.utilities import remove_ros_args
 
 from beetle_omni_ros.nodes import discovery
 from beetle_omni_ros.nodes.node import StartError
+from beetle_omni_ros.nodes.plan import GENERIC
 from beetle_omni_ros.robot.schema import load_yaml, ParameterError
 
 OK, FAILED, UNUSABLE = 0, 1, 2
@@ -115,6 +117,13 @@ def own_arguments(argv: Sequence[str], name: str) -> list[str]:
         if not isinstance(error, ParameterError) and 'ROSArgs' not in type(error).__name__:
             raise
         sys.exit(_fail(name, error, UNUSABLE))
+
+
+def node_class(name: str) -> type:
+    """Import the class of a node's executable: ekf_node -> EkfNode."""
+    kind = ''.join(part.capitalize() for part in name.split('_'))
+    module = GENERIC if name in ('nmpc_node', 'rl_node') else name
+    return getattr(import_module(f'{__package__}.{module}'), kind)
 
 
 def executable(node_class: type) -> str:

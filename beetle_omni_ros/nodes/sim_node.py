@@ -11,7 +11,7 @@ from beetle_omni_ros.drivers.servo_parameters import ServoBusParameters
 from beetle_omni_ros.messages.conversions import set_time
 from beetle_omni_ros.messages.topics import SENSOR
 from beetle_omni_ros.messages.values import Odom
-from beetle_omni_ros.nodes import health, runner, wire
+from beetle_omni_ros.nodes import health, wire
 from beetle_omni_ros.nodes.command_source import CommandSource
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.nodes.pacing import RealTimePacing, SimulatedTimePacing
@@ -272,12 +272,3 @@ class SimNode(FlightNode):
         times = self._latency
         return health.OK, 'stamp of the answered IMU sample to the arrival of its command', {
             **times.milliseconds(), 'count': times.count}
-
-
-def main(args=None):
-    """Run the node."""
-    runner.main(SimNode, args)
-
-
-if __name__ == '__main__':
-    main()

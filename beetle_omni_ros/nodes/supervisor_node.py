@@ -10,7 +10,7 @@ from beetle_omni_ros.control.base import State
 from beetle_omni_ros.control.hover import HoverController
 from beetle_omni_ros.messages.conversions import take_known_joints
 from beetle_omni_ros.messages.values import HealthReport, TargetOverride
-from beetle_omni_ros.nodes import health, runner
+from beetle_omni_ros.nodes import health
 from beetle_omni_ros.nodes.command_source import new_identity, TOPIC
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.robot.actuator_health import ALL_HEALTHY
@@ -169,12 +169,3 @@ class SupervisorNode(FlightNode):
         level = LEVELS.get(supervisor.state, health.WARN if supervisor.faults else health.OK)
         named = ', '.join(supervisor.faults)
         return level, f'{self._state}; faults: {named}' if named else self._state, values
-
-
-def main(args=None):
-    """Run the node."""
-    runner.main(SupervisorNode, args)
-
-
-if __name__ == '__main__':
-    main()

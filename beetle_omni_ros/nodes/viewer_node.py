@@ -9,7 +9,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from beetle_omni_ros.messages.conversions import BODY, set_time, set_xyz, set_xyzw, WORLD
 from beetle_omni_ros.messages.topics import EVENT, LATCHED, SENSOR
-from beetle_omni_ros.nodes import runner, wire
+from beetle_omni_ros.nodes import wire
 from beetle_omni_ros.nodes.node import FlightNode
 from beetle_omni_ros.nodes.transform_message import transform_message
 from beetle_omni_ros.robot import rotations
@@ -140,12 +140,3 @@ def _transform(stamp, parent, child, position, quaternion):
     set_xyz(frame.transform.translation, position)
     set_xyzw(frame.transform.rotation, quaternion)
     return frame
-
-
-def main(args=None):
-    """Run the node."""
-    runner.main(ViewerNode, args)
-
-
-if __name__ == '__main__':
-    main()

@@ -103,7 +103,8 @@ def test_an_active_controller_outside_the_supervisors_list_is_refused(make):
     (('-p', f'controller:={OWN}Not'), 'its classes: PoseController')])
 def test_an_unusable_controller_ends_the_node_with_one_line(ros_domain, override, message):
     done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.nodes.controller_node', '--ros-args', *override],
+        [sys.executable, '-m', 'beetle_omni_ros.start', 'controller_node', '--ros-args',
+         *override],
         capture_output=True, text=True, timeout=60, check=False, env=dict(os.environ))
     assert done.returncode == 2, done.stderr
     line, = done.stderr.strip().splitlines()

@@ -66,7 +66,7 @@ def test_an_argument_of_a_node_sets_the_range(ros_domain, unset):
 
 def test_the_range_argument_of_a_composition_is_not_a_node(ros_domain, unset):
     done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.nodes.composed', '--discovery', 'subnet',
+        [sys.executable, '-m', 'beetle_omni_ros.start', 'composed', '--discovery', 'subnet',
          'no_node'], capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 2 and "unknown node 'no_node'" in done.stderr
 

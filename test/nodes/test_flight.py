@@ -181,7 +181,7 @@ def children(pid):
         except OSError:
             continue
         if parent == pid and '-m' in words:
-            found[words[words.index('-m') + 1].rpartition('.')[2]] = int(entry.name)
+            found[words[words.index('-m') + 2]] = int(entry.name)
     return found
 
 

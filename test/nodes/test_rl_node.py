@@ -106,7 +106,7 @@ def refusal(*overrides):
     """Error of rl_node, which does not start: status 2 and one line."""
     arguments = [a for override in overrides for a in ('-p', override)]
     done = subprocess.run(
-        [sys.executable, '-m', 'beetle_omni_ros.nodes.rl_node', '--ros-args', *arguments],
+        [sys.executable, '-m', 'beetle_omni_ros.start', 'rl_node', '--ros-args', *arguments],
         capture_output=True, text=True, timeout=60, check=False, env=dict(os.environ))
     assert done.returncode == 2, done.stderr
     lines = done.stderr.strip().splitlines()
