@@ -1,5 +1,5 @@
 """
-The flight path on aarch64, shown on a computer that has none.
+Wheels, tests and instruction counts of the flight path on aarch64, on another computer.
 
     python benchmarks/aarch64.py wheels            # what PyPI holds for aarch64
     python benchmarks/aarch64.py tests [TEST...]   # the flight path's tests under qemu-user
@@ -46,7 +46,7 @@ DEBS = ('python3.11', 'libpython3.11-stdlib', 'libstdc++6', 'libgomp1', 'libgl1'
 # onnxruntime 1.32 ends at its import in qemu 7.2.
 EMULATED = ('onnxruntime<1.24', 'pytest>=8', 'pytest-timeout>=2.2', 'hypothesis>=6.100',
             'onnx>=1.16')
-# What lies between sensors and actuators, without ROS and without limits in real time: an emulated
+# Tests between sensors and actuators, without ROS and without real-time limits: an emulated
 # processor does not answer on a servo bus within 3 ms.
 TESTS = ('test/estimation/test_noise.py', 'test/estimation/test_odometry.py',
          'test/estimation/test_propagation.py', 'test/estimation/test_guard.py',
@@ -75,10 +75,10 @@ def requirements() -> dict[str, list[str]]:
 
 def resolved(python: str, wanted: list[str]) -> tuple[list[dict], str]:
     """
-    Resolve ``wanted`` for aarch64 with wheels alone.
+    Resolve ``wanted`` for aarch64 from wheels only.
 
     Returns:
-        the distributions, each name, version and file; the complaint of pip, or ''.
+        the distributions, each name, version and file; the error message of pip, or ''.
 
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -98,7 +98,7 @@ def resolved(python: str, wanted: list[str]) -> tuple[list[dict], str]:
 
 
 def wheels(console: Console) -> dict:
-    """Each distribution of the flight path: does aarch64 have a wheel, for which Python."""
+    """Find the wheels for aarch64 of each distribution of the flight path."""
     wanted = [one for group in requirements().values() for one in group]
     files: dict[str, dict] = {}
     complaints = {}
@@ -144,7 +144,7 @@ def packages() -> dict[str, dict]:
 
 
 def closure(known: dict[str, dict], wanted) -> list[str]:
-    """Packages with all that they depend on; of alternatives the first."""
+    """Packages with all their dependencies; the first of alternatives."""
     done, todo = [], list(wanted)
     while todo:
         name = todo.pop()
@@ -207,7 +207,7 @@ def emulated(sysroot: Path, *arguments: str, plugin: str = '', **options):
 
 
 def run_tests(sysroot: Path, tests, console: Console) -> list[dict]:
-    """Run test files in one process; how each of them ended, and how long it took."""
+    """Run test files in one process; return outcome and duration of each test."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / 'report.xml'
         done = emulated(sysroot, '-m', 'pytest', '-v', '-p', 'no:cacheprovider', '--timeout',
@@ -232,14 +232,14 @@ def run_tests(sysroot: Path, tests, console: Console) -> list[dict]:
 
 
 def count(sysroot: Path, console: Console) -> list[dict]:
-    """Instructions of the controllers' steps in a recorded flight, and what they bound."""
+    """Count instructions of controller steps in a recorded flight; bound their duration."""
     here = ROOT / 'benchmarks' / 'instructions'
     with tempfile.TemporaryDirectory() as folder:
         plugin, inputs = f'{folder}/plugin.so', f'{folder}/inputs'
         subprocess.run(['gcc', '-O2', '-shared', '-fPIC', str(here / 'plugin.c'), '-o', plugin],
                        check=True)
         subprocess.run([sys.executable, str(here / 'replay.py'), 'record', inputs], check=True)
-        # Once without counting, so that what is compiled is there.
+        # Once without counting, so that the compiled code exists.
         emulated(sysroot, str(here / 'replay.py'), 'replay', inputs, '--steps', '2', check=True)
         done = emulated(sysroot, str(here / 'replay.py'), 'replay', inputs, plugin=plugin,
                         capture_output=True)
@@ -269,7 +269,7 @@ def count(sysroot: Path, console: Console) -> list[dict]:
 
 
 def main():
-    """Run what is asked for; status 1 when a wheel is missing or a test fails."""
+    """Run the requested parts; status 1 if a wheel is missing or a test fails."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('what', choices=['wheels', 'tests', 'count', 'all'])
     parser.add_argument('tests', nargs='*', default=TESTS)

@@ -3,7 +3,7 @@ Size and CPU time of a recording: with and without frames, with and without comp
 
     python benchmarks/bags.py RUN
 
-Writes the messages of a recorded flight again, each way, and sets both against the flight's time.
+Writes the messages of a recorded flight in each variant; numbers are relative to the flight time.
 """
 
 from __future__ import annotations

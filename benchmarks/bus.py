@@ -3,9 +3,9 @@ Loop rate, latency and CPU of both actuator drivers: `python benchmarks/bus.py`.
 
 Each driver runs at 200 Hz in this process against its emulated device in a process of its own.
 "to last byte" is the time from the call that takes a command until its last byte is written,
-"to rotor target" until the emulated board has it; CPU is that of this process, the driver's own
-threads included. --faults adds what each fault of the servo bus costs, --wire lets the servos'
-answers take the time of 1 Mbit/s. Where it is permitted, all run with the lowest real-time
+"to rotor target" until the emulated board receives it; CPU is that of this process, including the
+threads of the driver. --faults adds runs with each fault of the servo bus. With --wire the answers
+of servos take the time of 1 Mbit/s. If permitted, all processes have the lowest real-time
 priority, as the nodes do.
 """
 
@@ -34,7 +34,7 @@ from beetle_omni_ros.robot.parameters import RobotParameters  # noqa: E402
 
 PERIOD = 0.005          # [s]
 POLL_TICKS = 2          # of the motor board, as rotor_bridge_node does
-# What both bridges together may need is 30 %; benchmarks/graph.py has the nodes.
+# Both bridges together may need 30 %; benchmarks/graph.py measures the nodes.
 TARGETS = {'to last byte [ms]': 'p99 2', 'missed cycles': '0', 'CPU [%]': '15'}
 FAULTS = (('servo 3 silent from 1 s to 2 s', 'silent 3', 'silent'),
           ('all silent from 1 s to 2 s', 'silent 1 2 3 4', 'silent'),
@@ -58,7 +58,7 @@ def serve_servos(pipe, wire):
 
 
 def serve_board(pipe):
-    """Run the emulated board until told to stop; then tell when which target came."""
+    """Run the emulated board until a message; then send the arrival times of the targets."""
     from beetle_omni_ros.sim.emulated.motor_board import EmulatedMotorBoard
     with EmulatedMotorBoard() as board:
         arrivals = []
@@ -69,7 +69,7 @@ def serve_board(pipe):
 
 
 class Device:
-    """An emulated device in a process of its own; ``port`` is where to open it."""
+    """An emulated device in its own process, with its serial ``port``."""
 
     def __init__(self, serve, *arguments):
         context = multiprocessing.get_context('spawn')
@@ -78,23 +78,23 @@ class Device:
         self._process.start()
         self.port = self.pipe.recv()
 
-    def tell(self, text):
-        """Return a function that tells it ``text``."""
+    def sender(self, text):
+        """Return a function that sends ``text`` to the device."""
         return lambda: self.pipe.send(text)
 
     def close(self):
-        """Let it end."""
+        """Wait for the end of the process."""
         self._process.join(5)
 
 
 def run(tick, seconds, script=()):
     """
-    Call ``tick(k, elapsed)`` at 200 Hz; cycles that passed meanwhile are missed.
+    Call ``tick(k, elapsed)`` at 200 Hz; periods without a call are missed cycles.
 
     Args:
         tick: one cycle.
         seconds: [s].
-        script: (time [s], function) to call on the way, in order.
+        script: functions to call, as (time [s], function) in order of time.
 
     Returns:
         rate [Hz], missed cycles, CPU of this process as a share of a core.
@@ -151,7 +151,7 @@ def servo_loop(bus, seconds, script=()):
 
 
 def measure_servos(seconds, wire, faults):
-    """Title -> numbers of the servo bus, healthy and, if asked, with each fault."""
+    """Title -> numbers of the servo bus: healthy and, if requested, with each fault."""
     device = Device(serve_servos, wire)
     bus = ServoBus(replace(ServoBusParameters.load(), port=device.port),
                    RobotParameters.load().joints)
@@ -161,12 +161,12 @@ def measure_servos(seconds, wire, faults):
         bus.enable()
         found = {'servo bus': servo_loop(bus, seconds)}
         for title, begin, end in FAULTS if faults else ():
-            found[title] = servo_loop(bus, 3.0, [(1.0, device.tell(begin)),
-                                                 (2.0, device.tell(end))])
+            found[title] = servo_loop(bus, 3.0, [(1.0, device.sender(begin)),
+                                                 (2.0, device.sender(end))])
             bus.take_events()
     finally:
         bus.close()
-        device.tell('')()
+        device.sender('')()
         device.close()
     return found
 
@@ -190,7 +190,7 @@ def measure_board(seconds):
 
         measured = run(tick, seconds)
         lost = board.poll().link.received.lost
-        device.tell('end')()
+        device.sender('end')()
         arrivals, refused = device.pipe.recv()
     device.close()
     arrived = dict(arrivals)
@@ -205,7 +205,7 @@ def measure_board(seconds):
 
 
 def main():
-    """Measure and print a table; write the numbers where asked."""
+    """Measure and print a table; write the numbers to a file if requested."""
     arguments = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     arguments.add_argument('--seconds', type=float, default=10, help='for each driver')
     arguments.add_argument('--wire', action='store_true', help='servos answer at 1 Mbit/s')

@@ -1,11 +1,11 @@
 """
-Flights in which a rotor stops or a tilt servo jams, in process, with the truth as estimate.
+Flights with a stopped rotor or a jammed tilt servo, in process, with the truth as estimate.
 
     python benchmarks/degraded_flight.py --what rotor --from hover --cases 12
 
-Each case flies healthy under the NMPC, loses one actuator, is told so 0.1 s later, flies on under
-the chosen controller to the nearest attitude with a margin, holds it, and from hover also
-descends in it until it touches the ground. Deterministic for a seed.
+Each case starts healthy under the NMPC and loses one actuator. The controller is informed 0.1 s
+later. The chosen controller flies to the nearest attitude with a margin and holds it. Flights from
+hover also descend in it to the ground. The results are deterministic for a seed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from beetle_omni_ros.sim.readings import Drive
 from beetle_omni_ros.sim.simulator import Simulator
 
 LEVELLING_RATE = SupervisorParameters.load().landing.level.rate     # [rad/s]
-NEWS = 0.02             # [rad] a stuck joint that is found elsewhere is told anew
+NEWS = 0.02             # [rad] change of a stuck joint's angle that updates the controller
 SETTLE = 4.0            # [s] to reach the first pose
 POSE_TIME = 8.0         # [s] between two poses of random100
 RECOVERY = 6.0          # [s] from the loss until the pose must be held
@@ -55,7 +55,7 @@ class Robot:
         self.broken = ALL_HEALTHY
 
     def state(self):
-        """Advance one tick; the state that a perfect estimator and the encoders give."""
+        """Advance one tick; return the state of a perfect estimator and of the encoders."""
         self._link.update(self.sim.time)
         tilt, thrust = self.broken.possible(self._link.tilt, self._link.thrust)
         frame = self.sim.step(Drive(tilt, POWERED, thrust))
@@ -73,7 +73,7 @@ class Robot:
 
 @dataclass
 class Case:
-    """What is flown and lost, drawn from a seed."""
+    """Poses and lost actuator of a flight, drawn from a seed."""
 
     first: PoseTarget
     second: PoseTarget
@@ -109,15 +109,15 @@ class Flight:
                           case.first.quaternion)
         self.controllers, self.flying = controllers, controllers[registry.pilot()]
         self.after = controllers[arguments.controller]
-        self.told_after = arguments.told_after
-        self.told = ALL_HEALTHY
+        self.delay = arguments.told_after
+        self.reported = ALL_HEALTHY
         self.trace = []
         for controller in controllers.values():
             controller.set_health(ALL_HEALTHY)
             controller.reset()
 
     def fly(self, target, until, watch=False):
-        """Follow a target; returns whether the floor was not touched."""
+        """Follow a target; return whether the floor was not touched."""
         ticks = round(self.flying.period / self.body.sim.tick)
         while self.body.sim.time < until - 1e-9:
             for _ in range(ticks):
@@ -128,25 +128,25 @@ class Flight:
             self.trace.append((state.stamp, *state.position, *state.velocity,
                                np.linalg.norm(reference.position - state.position),
                                rotations.geodesic_angle(reference.quaternion, state.quaternion)))
-            if not self.told.healthy:
-                self.tell(state.tilt)
+            if not self.reported.healthy:
+                self.update_health(state.tilt)
             self.body.send(self.flying.step(state, target))
         return True
 
-    def tell(self, tilt):
-        """Tell the controller what is broken; a stuck joint's angle is the measured one."""
+    def update_health(self, tilt):
+        """Update the controller's actuator health; stuck joints have their measured angles."""
         broken = self.body.broken
         known = ActuatorHealth(broken.rotors, tuple(
             None if angle is None else float(own) for own, angle in zip(tilt, broken.stuck)))
-        news = self.told.healthy or any(
-            abs(new - old) > NEWS for new, old in zip(known.stuck, self.told.stuck)
+        changed = self.reported.healthy or any(
+            abs(new - old) > NEWS for new, old in zip(known.stuck, self.reported.stuck)
             if new is not None)
-        if news:
-            self.told = known
+        if changed:
+            self.reported = known
             self.flying.set_health(known)
 
     def lose(self):
-        """Fly until the loss and until it is known."""
+        """Fly until the loss and until the controller is informed of it."""
         case = self.case
         self.fly(case.first, SETTLE)
         self.fly(case.second, case.loss)
@@ -157,11 +157,11 @@ class Flight:
         self.body.broken = broken
         self.start_height = self.body.sim.truth.position[2]
         self.upright = float(rotations.matrix(self.body.sim.truth.quaternion)[2, 2])
-        alive = self.fly(case.second, case.loss + self.told_after, watch=True)
+        alive = self.fly(case.second, case.loss + self.delay, watch=True)
         if self.after is not self.flying:
             self.after.reset()
         self.flying = self.after
-        self.tell(self.body.state().tilt)
+        self.update_health(self.body.state().tilt)
         self.holding = Holding(self.robot, broken)
         return alive
 
@@ -170,9 +170,9 @@ class Flight:
         alive = self.lose()
         truth = self.body.sim.truth
         margin = self.holding.parameters.flying_margin
-        wish = self.holding.quickest(truth.quaternion, truth.angular_velocity, truth.tilt,
-                                     margin, LEVELLING_RATE)
-        target = PoseTarget(self.case.second.position, wish)
+        attitude = self.holding.quickest(truth.quaternion, truth.angular_velocity, truth.tilt,
+                                         margin, LEVELLING_RATE)
+        target = PoseTarget(self.case.second.position, attitude)
         lost_at = len(self.trace)
         alive = alive and self.fly(target, self.case.loss + RECOVERY, watch=True)
         trace = np.array(self.trace)
@@ -183,14 +183,15 @@ class Flight:
                 'position_m': float(last[:, 7].max()),
                 'attitude_deg': float(np.degrees(last[:, 8].max())),
                 'upright': self.upright, 'height_m': float(self.start_height),
-                'turn_deg': float(np.degrees(rotations.geodesic_angle(wish, truth.quaternion))),
+                'turn_deg': float(np.degrees(rotations.geodesic_angle(attitude,
+                                                                      truth.quaternion))),
                 'margin_at_loss': self.holding.margin(truth.quaternion),
                 'lowest_m': float(trace[lost_at - 10:, 3].min()),
                 'time_s': float(self.body.sim.time - self.case.loss)}, target
 
     def pose(self):
-        """Fly to what is feasible of the pose asked for; how far off at the end, or None."""
-        target = feasible_target(self.case.second, self.told, self.robot, self.holding)
+        """Fly to the nearest feasible pose; return the final errors, or None."""
+        target = feasible_target(self.case.second, self.reported, self.robot, self.holding)
         if not self.fly(target, self.body.sim.time + RECOVERY, watch=True):
             return None
         last = np.array(self.trace)[-round(HELD / self.flying.period):, 7:]
@@ -221,10 +222,10 @@ def main():
     parser.add_argument('--stuck-at', choices=('random', 'here'), default='random')
     parser.add_argument('--controller', choices=CONTROLLERS, default=registry.DEFAULT)
     parser.add_argument('--told-after', type=float, default=0.1,
-                        help='from the loss until the controller knows [s]')
+                        help='from the loss until the controller is informed [s]')
     parser.add_argument('--conditions', choices=('nominal', 'published'), default='nominal')
     parser.add_argument('--poses', action='store_true',
-                        help='afterwards fly to what is feasible of the pose asked for')
+                        help='afterwards fly to the nearest feasible pose')
     parser.add_argument('--json', help='write all rows into this file')
     arguments = parser.parse_args()
     robot = RobotParameters.load()

@@ -1,9 +1,9 @@
 """
 CPU of the emulated devices beside a simulator: ``python benchmarks/emulated_actuators.py``.
 
-The drivers run in a process of their own and do in each cycle of 5 ms what the bridges do. Printed
+The drivers run in their own process and do the work of the bridges in each cycle of 5 ms. Printed
 are the CPU times of the two devices' threads and of their coupling with the simulator, in % of
-one core, and how the drivers fared.
+one core, and the cycle times of the drivers.
 """
 
 import argparse
@@ -31,7 +31,7 @@ TARGET = 15.0           # [% of one core]
 
 
 def drive(pipe, servo_port, board_port, seconds):
-    """Do the bridges' work; tell when it begins and what came of it."""
+    """Do the work of the bridges; send 'begin' and then (times, incomplete readings)."""
     robot = RobotParameters.load()
     bus = ServoBus(replace(ServoBusParameters.load(), port=servo_port, guard=False), robot.joints)
     board = MotorBoard(replace(MotorBoardParameters.load(), port=board_port))
@@ -64,25 +64,25 @@ def cpu_of(thread):
 
 
 def simulate(actuators, plant_time, pipe):
-    """Step until the drivers are done; return name -> CPU share, and what they told."""
-    due, began, before, told = time.monotonic(), None, None, None
+    """Step until the drivers are done; return name -> CPU share, and their results."""
+    due, began, before, result = time.monotonic(), None, None, None
 
     def times():
         return np.array([cpu_of(actuators.bus._thread), cpu_of(actuators.board._thread),
                          time.thread_time() - plant_time[0]])
 
-    while told is None:
+    while result is None:
         if pipe.poll():
             message = pipe.recv()
             if began is None:
                 began, before = time.monotonic(), times()
             else:
-                told = message
+                result = message
         actuators.step()
         due += PERIOD
         time.sleep(max(0.0, due - time.monotonic()))
     share = 100 * (times() - before) / (time.monotonic() - began)
-    return dict(zip(('servo bus', 'motor board', 'coupling'), share, strict=True)), told
+    return dict(zip(('servo bus', 'motor board', 'coupling'), share, strict=True)), result
 
 
 def main():

@@ -1,12 +1,11 @@
 """
-Speed of the training on this machine: environment, rollout, update; beside rsl-rl's own loop.
+Speed of environment, rollout and update in training, compared with the loop of rsl-rl.
 
     python benchmarks/environment.py [--device cuda] [--robots 4096,16384] [--json FILE]
 
-On a GPU the environment's steps, the rollout and the update run as captured graphs; rsl-rl's
-rollout and update are its own functions on the same robots, networks and samples, the rollout
-with the environment uncaptured, as rsl-rl steps it. On a CPU sizes are small, and no more than
-"it runs, and so fast" can be told.
+On a GPU the environment's steps, the rollout and the update run as captured graphs. Rollout and
+update of rsl-rl are its own functions on the same robots, networks and samples; its rollout steps
+the environment without captured graphs. On a CPU the sizes are small, without a target speed.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ def with_robots(robots: int) -> TrainParameters:
 
 
 def agreement(device: str) -> float | None:
-    """Largest difference of kernel and plain torch after a period, relative; None: no kernel."""
+    """Largest relative difference of kernel and torch after a period; None without kernel."""
     p = with_robots(1000)
     physics = Physics(ROBOT, p.episode.period, p.episode.substeps, device)
     if not physics.has_kernel:
@@ -76,7 +75,7 @@ def agreement(device: str) -> float | None:
 
 
 def environment_rate(robots: int, device: str) -> float:
-    """Steps of single robots a second."""
+    """Steps a second, summed over robots."""
     env = TiltableQuadrotorEnv(with_robots(robots), ROBOT, device)
     action = torch.zeros(robots, 8, device=device)
     if not device.startswith('cuda'):
@@ -95,7 +94,7 @@ def environment_rate(robots: int, device: str) -> float:
 
 
 def made_runner(robots: int, device: str, graphs: bool) -> Runner:
-    """Make a training that writes nothing."""
+    """Make a training without output files."""
     with redirect_stdout(io.StringIO()):    # rsl-rl prints its models
         runner = Runner(with_robots(robots), ROBOT, None, device, graphs=graphs)
     runner.apply_schedule(0.0)
@@ -148,7 +147,7 @@ def show(results: dict, console: Console) -> None:
 
 
 def main():
-    """Measure and print; status 1 when the environment misses its target on a GPU."""
+    """Measure and print; status 1 if the environment misses its target on a GPU."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--device', default='auto')
     parser.add_argument('--robots', help='sizes of the environment')
@@ -164,7 +163,7 @@ def main():
         sys.exit(2)
     torch.set_float32_matmul_precision('high')
     if not gpu:
-        torch.set_num_threads(1)    # several wait for each other on a computer that others use
+        torch.set_num_threads(1)    # several threads wait for each other on a shared computer
     ppo = TrainParameters.load().ppo
     robots = ppo.robots if gpu else CPU_PPO_ROBOTS
     results = {'device': torch.cuda.get_device_name(device) if gpu else 'CPU, one thread',

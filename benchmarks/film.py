@@ -1,9 +1,8 @@
 """
 Fly and draw the films of the pages: ``python benchmarks/film.py``, which `make film` calls.
 
-The first film shows both controllers at the published waypoints and upside down. The second one
-shows one flight of a robot with a weak rotor, over it the model before and after `gap` has named
-the rotor.
+The first film shows both controllers at the published waypoints and inverted. The second one shows
+a flight of a robot with a weak rotor, with the predictions of the model before and after `gap`.
 """
 
 import argparse
@@ -22,7 +21,7 @@ from beetle_omni_ros.robot.resources import share_path
 from beetle_omni_ros.runs.tasks import pose_target, Segment, Task, WAYPOINTS
 
 UPSIDE_DOWN = (0.0, 0.0, 1.0, 180.0, 0.0, 90.0)
-# Pose: x, y, z [m], roll, pitch, yaw [deg], and how long it is asked for [s].
+# Pose: x, y, z [m], roll, pitch, yaw [deg], and its duration [s].
 LEGS = [(WAYPOINTS[0], 1.2), *((pose, 2.7) for pose in WAYPOINTS[1:]), (UPSIDE_DOWN, 4.0),
         (WAYPOINTS[0], 4.0)]
 CONTROLLERS = {'RL policy': 'rl', 'NMPC': 'nmpc'}
@@ -38,14 +37,14 @@ def task() -> Task:
 
 
 def fly(folder: Path, name: str, controller: str, **given) -> Path:
-    """Record one flight anew."""
+    """Record one flight; an existing bag is replaced."""
     shutil.rmtree(folder / name, ignore_errors=True)
     run_evaluate(controllers=[controller], bag=folder / name, console=Console(quiet=True), **given)
     return folder / name
 
 
 def draw(*arguments) -> None:
-    """Call `beetle_omni film`, in a process of its own: MuJoCo chooses its OpenGL once."""
+    """Call `beetle_omni film` in its own process, because MuJoCo chooses its OpenGL once."""
     done = subprocess.run([sys.executable, '-m', 'beetle_omni_ros.cli', 'film',
                            *map(str, arguments)])
     if done.returncode:
@@ -53,7 +52,7 @@ def draw(*arguments) -> None:
 
 
 def find_gap(folder: Path, plant: Path, console: Console) -> Path:
-    """Let `gap` name what the plant hides; the corrected robot file."""
+    """Identify the hidden effect by `gap`; return the corrected robot file."""
     corrected = folder / 'corrected_model.yaml'
     corrected.unlink(missing_ok=True)
     runs = [fly(folder, f'gap_{k}', 'nmpc', plant=plant, seed=k,
@@ -63,7 +62,7 @@ def find_gap(folder: Path, plant: Path, console: Console) -> Path:
 
 
 def main():
-    """Fly, draw, save."""
+    """Fly, draw and save."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--bags', type=Path, default=Path('runs_out/film'))
     parser.add_argument('--output', type=Path, default=Path('docs/pictures'))

@@ -17,11 +17,11 @@ from beetle_omni_ros.runs.report import make_page, make_runs, results_of
 LEVEL = np.array([0, 0, 0, 1.0])
 ZERO = np.zeros(3)
 NUMBERS = (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-320, 0.0)
-PAGES = 8       # a page is drawn of one file in so many
+PAGES = 8       # number of files for each drawn page
 
 
 def bags(folder: Path) -> dict[str, bytes]:
-    """One short bag with every kind of message that a report is made from."""
+    """One short bag with every kind of message that a report uses."""
     with BagWriter(folder / 'bag', {'task': 'waypoints', 'seed': 1}) as writer:
         writer.write_target(PoseTarget(position=np.array([0, 0, 1.0]), quaternion=LEVEL,
                                        stamp=1.5))
@@ -72,7 +72,7 @@ def _spoil(rng, raw):
 
 
 def read_flight(path: Path, _name: str):
-    """Read a bag and judge it, of some draw the page, as ``beetle_omni report`` does."""
+    """Read a bag and compute metrics, for some also the page, like ``beetle_omni report``."""
     with np.errstate(all='ignore'):
         runs = make_runs([read_bag(path)], ['run'])
         results = results_of(runs)
@@ -81,7 +81,7 @@ def read_flight(path: Path, _name: str):
 
 
 def read_metadata(path: Path, _name: str):
-    """Read a sound bag beside which a metadata.yaml lies."""
+    """Read a sound bag with a given metadata.yaml."""
     with tempfile.TemporaryDirectory(prefix='fuzz_') as folder:
         place = Path(folder)
         bags(place)

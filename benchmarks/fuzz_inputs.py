@@ -1,9 +1,9 @@
 """
-Are damaged input files refused in one line? ``python benchmarks/fuzz_inputs.py --count 2000``.
+Refusal of damaged input files: ``python benchmarks/fuzz_inputs.py --count 2000``.
 
-Parameter files, CSV tasks, MCAP bags and ONNX policies are mutated and read. What is refused
-must be refused by an error class of the package, in one bounded line, and soon; everything else
-is printed, and the file that provoked it is kept.
+Parameter files, CSV tasks, MCAP bags and ONNX policies are mutated and read. A refusal must be an
+error class of the package with one bounded line, within a time limit. Every other outcome is
+printed, and its file is kept.
 """
 
 from __future__ import annotations
@@ -87,10 +87,10 @@ class Kind:
     One kind of input file.
 
     Attributes:
-        suffix: of the file's name.
+        suffix: suffix of the file name.
         sources: folder -> name -> bytes of sound files.
         mutate: (generator, bytes) -> bytes.
-        read: (path, name of the source): reads the file as the package does.
+        read: (path, name of the source): reads the file like the package.
 
     """
 
@@ -120,7 +120,7 @@ def mutate_bytes(rng: np.random.Generator, data: bytes) -> bytes:
 
 
 def mutate_yaml(rng: np.random.Generator, data: bytes) -> bytes:
-    """Put a hostile value or key in place of one; shuffle lines; or mutate bytes."""
+    """Replace a value or key by a hostile one, shuffle lines, or mutate bytes."""
     lines = data.decode().splitlines()
     at = int(rng.integers(len(lines)))
     value = VALUES[rng.integers(len(VALUES))]
@@ -140,7 +140,7 @@ def mutate_yaml(rng: np.random.Generator, data: bytes) -> bytes:
 
 
 def mutate_csv(rng: np.random.Generator, data: bytes) -> bytes:
-    """Put a hostile cell in place of one, or mutate bytes."""
+    """Replace a cell by a hostile one, or mutate bytes."""
     if rng.random() < 0.4:
         return mutate_bytes(rng, data)
     rows = [line.split(',') for line in data.decode().splitlines()]
@@ -151,7 +151,7 @@ def mutate_csv(rng: np.random.Generator, data: bytes) -> bytes:
 
 
 def mutate_onnx(rng: np.random.Generator, data: bytes) -> bytes:
-    """Spoil one entry of the metadata, or mutate bytes anywhere."""
+    """Corrupt one entry of the metadata, or mutate bytes anywhere."""
     keys = [key for key in (b'observations', b'action_scale', b'robot_hash', b'rate_hz',
                             b'training', b'format') if key in data]
     if not keys or rng.random() < 0.5:
@@ -202,7 +202,7 @@ def fuzz(kind: Kind, count: int, seed: int, folder: Path) -> tuple[int, list[str
     Read ``count`` mutated files.
 
     Returns:
-        how many were refused as they should, and a text for each that was not.
+        number of correct refusals, and a text for each other outcome.
 
     """
     sources = kind.sources(folder)
@@ -222,7 +222,7 @@ def fuzz(kind: Kind, count: int, seed: int, folder: Path) -> tuple[int, list[str
 
 
 def ask(kind: Kind, path: Path, name: str) -> str | None:
-    """None: accepted; '': refused in one line; else what is wrong with the answer."""
+    """None: accepted; '': refused in one line; else a description of the defect."""
     try:
         with limited():
             kind.read(path, name)
@@ -241,7 +241,7 @@ def ask(kind: Kind, path: Path, name: str) -> str | None:
 @contextmanager
 def limited():
     """
-    Give the context ``LONGEST_TIME``, in the main thread of Unix.
+    Limit a context to ``LONGEST_TIME``; needs Unix and the main thread.
 
     Raises:
         Hang: it took longer.
@@ -260,7 +260,7 @@ def limited():
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Fuzz all kinds, or those that were asked for; status 1 where one found something."""
+    """Fuzz all or the given kinds; status 1 after a finding."""
     parser = argparse.ArgumentParser(description=__doc__.strip().split('\n\n')[0])
     parser.add_argument('--count', type=int, default=2000, help='files of each kind')
     parser.add_argument('--seed', type=int, default=0)

@@ -1,9 +1,9 @@
 """
-Does any packet or message break a reader? ``python benchmarks/fuzz_packets.py --count 1000000``.
+Robustness of message readers: ``python benchmarks/fuzz_packets.py --count 1000000``.
 
-Frames of the motor board, packets of the servos and ROS messages are mutated, or hold hostile
-numbers behind a good checksum. Drivers and emulated devices must take them without an exception,
-and ROS messages must be read or refused by ``MessageError``, in one bounded line.
+Frames of the motor board, packets of the servos and ROS messages are mutated, or contain hostile
+numbers with a valid checksum. Drivers and emulated devices must not raise an exception. ROS
+messages must be read, or refused by ``MessageError`` with one bounded line.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Board:
         number = list(mavlink.MESSAGES)[rng.integers(len(mavlink.MESSAGES))]
         _, layout = mavlink.MESSAGES[number]
         values = layout.unpack(rng.bytes(layout.size))      # nan and inf among them
-        if number == mavlink.TIMESYNC:      # an answer to a question, with any time
+        if number == mavlink.TIMESYNC:      # an answer to a request, with any time
             values = values[0], self._asked
         frame = mavlink.pack(number, values, next(self._sequence) % 256, 1, 1)
         if rng.random() < 0.5:
@@ -93,7 +93,7 @@ class Board:
 
 
 class Wire(ServoPort):
-    """A port that plays back answers; where none is left, its time is over at once."""
+    """A port that plays back answers and times out at once after the last one."""
 
     def __init__(self):
         super().__init__('wire', 1_000_000, 0.001)
@@ -101,14 +101,14 @@ class Wire(ServoPort):
         self.tx_time_per_byte = 0.01
 
     def clearPort(self):
-        """Nothing is kept."""
+        """Discard nothing, for there is no buffer."""
 
     def writePort(self, data):
-        """All is written."""
+        """Accept all bytes."""
         return len(data)
 
     def readPort(self, length):
-        """Give what is left."""
+        """Return the remaining bytes."""
         taken, self.waiting = self.waiting[:length], self.waiting[length:]
         if not taken:
             self._late += 100.0
@@ -144,7 +144,7 @@ class Servos:
 
 
 class Messages:
-    """Hostile fields in every message that a node reads."""
+    """Hostile fields in every message type of a node."""
 
     def __init__(self):
         zero = np.zeros(3)
@@ -209,7 +209,7 @@ def copied(message):
 
 
 def spoil(rng: np.random.Generator, message) -> None:
-    """Change one field at random, of the message or of what it holds."""
+    """Change one random field of the message or of its parts."""
     fields = list(message.get_fields_and_field_types())
     field = fields[rng.integers(len(fields))]
     value = getattr(message, field)
@@ -251,14 +251,14 @@ KINDS = {'board': Board, 'servos': Servos, 'messages': Messages}
 
 
 def fuzz(kind: Callable, number: int, seed: int) -> Counter:
-    """Feed so many; what went wrong, and how often."""
+    """Feed ``number`` inputs; return finding -> count."""
     feed, findings = kind(), Counter()
     rng = np.random.default_rng(seed)
     with np.errstate(all='ignore'):
         for _ in range(number):
             try:
                 feed(rng)
-            except Exception as error:      # whatever it is, it is a finding
+            except Exception as error:      # any exception is a finding
                 place = traceback.extract_tb(error.__traceback__)[-1]
                 findings[f'{type(error).__name__} in {Path(place.filename).name}:{place.lineno}: '
                          f'{str(error)[:150]}'] += 1
@@ -266,7 +266,7 @@ def fuzz(kind: Callable, number: int, seed: int) -> Counter:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Fuzz all kinds, or those that were asked for; status 1 where one found something."""
+    """Fuzz all or the given kinds; status 1 after a finding."""
     parser = argparse.ArgumentParser(description=__doc__.strip().split('\n\n')[0])
     parser.add_argument('--count', type=int, default=1_000_000, help='in all')
     parser.add_argument('--seed', type=int, default=0)

@@ -61,7 +61,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--folder', type=Path, default=Path('runs_out/gap_campaign'))
     parser.add_argument('--sealed', type=Path, help='where labels are kept (FOLDER/sealed)')
     parser.add_argument('--output', type=Path, help='where the report goes (FOLDER)')
-    parser.add_argument('--robot', type=Path, default=ROBOT_FILE, help='what workflows are told')
+    parser.add_argument('--robot', type=Path, default=ROBOT_FILE, help='file for the workflows')
     parser.add_argument('--command-age', type=float, default=load_numbers()['command_age'],
                         metavar='S', help="from a command's stamp until it acts (%(default)s)")
     parser.add_argument('--backend', default='processes', help='processes or ray')
@@ -79,9 +79,9 @@ def choose_workflows(given: argparse.Namespace) -> list[Workflow]:
     texts = given.workflow or [WORKFLOW]
     if not given.no_baselines:
         texts = texts + [name for name in BASELINES if name not in texts]
-    # kept answers of the package are those of its code as it stands
-    told = hashlib.sha256(given.robot.read_bytes()).hexdigest()
-    version, plain = (code_key([root]) + told
+    # kept answers depend on the present code of the package
+    robot = hashlib.sha256(given.robot.read_bytes()).hexdigest()
+    version, plain = (code_key([root]) + robot
                       for root in (PACKAGE, HERE / 'gap_data' / 'baselines'))
     workflows = [Workflow.parse(text, given.timeout) for text in texts]
     for workflow in workflows:

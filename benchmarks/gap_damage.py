@@ -134,7 +134,7 @@ def answered(case: Case, code: str, fresh: bool) -> dict:
     found = None if fresh else ask.kept(file, case.key(code))
     if found is None:
         found = ask_damaged(case)
-        if found['status'] != ask.TIMEOUT:     # on a busy computer it says little
+        if found['status'] != ask.TIMEOUT:     # on a busy computer a timeout proves little
             ask.keep(file, case.key(code), found)
     return found
 
@@ -200,7 +200,7 @@ def place_of(folder: Path, name: str | None, k: int) -> Path:
 
 
 def named(asked: dict) -> tuple[str, ...]:
-    """All effects that are named in undamaged flights."""
+    """All effects named in undamaged flights."""
     effects = (asked['answer'] or {}).get('effects') or ()
     return tuple(name for effect in effects for name in effect['names'])
 

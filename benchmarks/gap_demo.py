@@ -99,9 +99,9 @@ def show(names: list[str], folder: Path, through_ros: bool, console: Console) ->
         for k in numbers:
             console.print(f'{names[0]}: flight {k} of {FLIGHTS}, in real time through ROS')
             record(folder, names[0], k, True)
-    told = share_path('params/robot.yaml')
+    shipped = share_path('params/robot.yaml')
     flown = on_all_cores({
-        **{f'{name}: lemniscate': (lemniscate, (plants[name], told)) for name in names},
+        **{f'{name}: lemniscate': (lemniscate, (plants[name], shipped)) for name in names},
         **{f'{name}: flight {k} of {FLIGHTS}': (record, (folder, name, k))
            for name in names[1 if through_ros else 0:] for k in numbers}}, console)
     results = {}

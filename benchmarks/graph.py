@@ -10,9 +10,9 @@ but the bridges in one process, and prints for each
   the arrival of the command that answers it at the actuators, in the simulator's callback.
 
 With the bridges the devices are emulated in the simulator's process, and the latency ends with the
-last byte of the command to the motor board; the bridges' own numbers stand beside it. What the
-machine itself holds up is told by a bare timer: a process of the same priority that does nothing
-but sleep for 5 ms, while the flight goes on.
+last byte of the command to the motor board; the numbers of the bridges are printed too. A separate
+timer process measures the delays of the machine: it has the same priority and only sleeps for
+5 ms at a time during the flight.
 """
 
 import argparse
@@ -69,7 +69,7 @@ def measure(folder: Path, name: str, seconds: float) -> dict:
 
 @contextmanager
 def bare_timer():
-    """Run a bare timer in a process of its own; its counts are in the dict afterwards."""
+    """Run a timer in its own process; fill the dict with its counts at the end."""
     process = subprocess.Popen([sys.executable, __file__, '--bare-timer'],
                                stdout=subprocess.PIPE, text=True)
     counted = {}
@@ -82,7 +82,7 @@ def bare_timer():
 
 
 def sleep_on():
-    """Be that timer until SIGINT; what is late by more than half a period is missed."""
+    """Sleep until SIGINT; count periods that are late by more than half a period."""
     use_real_time_priority()
     due, cycles, missed = time.monotonic() + PERIOD, 0, 0
     try:

@@ -121,7 +121,7 @@ def made_log(log: JointLog, robot: RobotParameters, residual, rng) -> JointLog:
 
 
 def scored(made: dict, wanted: set) -> dict:
-    """Which wanted entries are named (alone, or in a set), and which others."""
+    """Named entries of the expected ones (alone or in a set), and other named entries."""
     named = [({(name, effect.get('joint')) for name in effect['names']}) for effect in
              made['effects']]
     found = {w for w in wanted if any(w in names for names in named)}

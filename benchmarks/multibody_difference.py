@@ -1,10 +1,10 @@
 """
-How far the true modules take the plant from the one-rigid-body model of the controller.
+Differences between the multibody plant and the single rigid body of the controller.
 
-``python benchmarks/multibody_difference.py``: at random states, the multibody plant (MuJoCo)
-against the CasADi model, as a force on the mass and a torque on the inertia. First with the
-joints held or turning evenly (only the shifted centre of mass and inertia remain), then with
-the servos braking them, which throws the modules' momentum into the body.
+``python benchmarks/multibody_difference.py`` compares the plant (MuJoCo) with the CasADi model at
+random states, as a force on the mass and a torque on the inertia. Joints are held or turn at
+constant rate, so that only the shifted centre of mass and inertia remain. Then servos brake the
+joints, which adds the reaction of the modules.
 """
 
 import argparse

@@ -5,8 +5,8 @@ Cost of one NMPC cycle: CPU time, QP status, iterations; compiled and interprete
 
 Flies random poses in process (plant, sensors, estimator and supervisor included) and
 prints the CPU time of everything the controller does for one command. Medians and
-percentiles are of CPU time, because wall time on a shared computer holds the slices of
-other programs; wall time stands beside it.
+percentiles are of CPU time, because wall time on a shared computer includes other programs;
+wall time is printed too.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from beetle_omni_ros.sim.simulator import Simulator
 
 
 class Watched:
-    """A controller whose steps are timed by wall clock and asked for their iterations."""
+    """A controller with wall time and iterations of its steps."""
 
     def __init__(self, controller):
         self.controller, self.name, self.period = controller, controller.name, controller.period
@@ -47,7 +47,7 @@ class Watched:
         self.controller.reset()
 
     def step(self, state, target):
-        """Pass on, timed."""
+        """Step, timed."""
         cpu, wall = time.thread_time(), time.perf_counter()
         command = self.controller.step(state, target)
         self.cpu.append(time.thread_time() - cpu)
@@ -75,8 +75,8 @@ def measure(parameters: NmpcParameters, poses: int, seed: int) -> Watched:
 def row(name: str, watched: Watched) -> list[str]:
     """One line of the table."""
     cpu, wall = 1e3 * np.array(watched.cpu), 1e3 * np.array(watched.wall)
-    told = watched.diagnostics()
-    solved = 100 * (1 - told['unsolved'] / max(1, told['steps']))
+    counts = watched.diagnostics()
+    solved = 100 * (1 - counts['unsolved'] / max(1, counts['steps']))
     return [name, str(len(cpu)), *(f'{value:.2f}' for value in (
         np.median(cpu), np.percentile(cpu, 99), cpu.max(), np.median(wall),
         np.percentile(wall, 99))), str(int((cpu > 1e3 * watched.period).sum())),

@@ -3,15 +3,14 @@ Cost of one step of the policy, side by side with the NMPC's, on one core.
 
     python benchmarks/policy.py [--poses 20] [--seed 0] [--policy FILE] [--json FILE]
 
-The NMPC flies random poses in process and the policy stands by: both answer the same states, with
-everything else of the flight (plant, sensors, estimator, supervisor) between two steps, so that
-caches are as cold as on board. `step` is all that a controller does for one command; `inference`
-is the part of the policy's step that asks the network: building the observation, the network,
-limits (and, with memory, the estimate); what is left is the guidance, which decides the pose
-target that the policy is shown. CPU time, because wall time on a shared computer holds the slices
-of other programs; wall time stands beside it. CPU time, too, is longer while other programs use
-the caches that the core shares: the last lines say in how many of the poses the limits were held,
-and what the quietest of them took.
+The NMPC flies random poses in process, with the policy on standby. Both get the same states. The
+rest of the flight (plant, sensors, estimator, supervisor) runs between two steps, so that caches
+are as cold as on board. `step` is all work for one command. `inference` is its part with the
+network: observation, network, limits and, with memory, the disturbance estimate. The remainder is
+guidance, which selects the pose target of the policy. Times are CPU times, because wall time on a
+shared computer includes other programs; wall time is printed too. CPU time also grows while other
+programs use shared caches. The last lines therefore state the share of poses within the limits
+and the times of the fastest pose.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ class Clock:
         self.times: dict[str, list] = {}
 
     def call(self, name, function, *arguments):
-        """Call ``function`` and keep how long it took."""
+        """Call ``function`` and record its duration."""
         cpu, wall = time.thread_time(), time.perf_counter()
         result = function(*arguments)
         self.times.setdefault(name, []).append(
@@ -94,7 +93,7 @@ class TimedPolicy(PolicyController):
 
 
 def measure(parameters: PolicyParameters, poses: int, seed: int) -> tuple[Clock, str]:
-    """Fly; return the times and what the policy is."""
+    """Fly; return the times and the policy's properties."""
     robot, estimator, clock = RobotParameters.load(), EkfParameters.load(), Clock()
     policy = TimedPolicy(robot, parameters, clock)
     supervisor = Supervisor(SupervisorParameters.load(), robot, HoverController(robot))
@@ -117,12 +116,12 @@ def summary(times: list) -> dict[str, float]:
 
 
 def within(numbers: dict[str, float]) -> bool:
-    """Whether inference is as fast as it shall be."""
+    """Whether inference meets its target."""
     return all(numbers[key] <= limit for key, limit in TARGETS.items())
 
 
 def main():
-    """Measure and print; status 1 when inference is slower than its target."""
+    """Measure and print; status 1 if inference is slower than its target."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--poses', type=int, default=20)
     parser.add_argument('--seed', type=int, default=0)

@@ -1,16 +1,15 @@
 """
-Thousands of moves of a policy from random pose to random pose: how deep it dives, how often.
+Loss of height and errors of a policy in thousands of moves between random poses.
 
     python benchmarks/policy_moves.py [--policy FILE] [--robots 2048] [--moves 5] [--seed 0]
                                       [--conditions nominal|published] [--without PART ...]
                                       [--jobs -1] [--json FILE]
 
-Rare failures need more moves than flights of the whole simulation give in an hour. Here the
-robots of the training environment fly (one rigid body and its moments, no estimator, no floor)
-with everything that stands around a policy on board: each robot has its own guidance, which sees
-the true state. `--without` leaves parts of it out (unwinding, routing, turning, trimming). Poses
-are drawn as random100's are; the first move of each robot, from its start, is not counted. Needs
-torch, rsl-rl-lib and onnx (the `train` extra).
+Rare failures need more moves than flights of the whole simulation give in an hour. Therefore the
+robots of the training environment fly: one rigid body without estimator and floor. Each robot has
+its own guidance, as on board, which gets the true state. `--without` omits parts of the guidance
+(unwinding, routing, turning, trimming). Poses have the distribution of random100. The first move
+of each robot is not counted. Needs torch, rsl-rl-lib and onnx (the `train` extra).
 """
 
 from __future__ import annotations
@@ -55,12 +54,12 @@ OFF = {'unwinding': {'attempts': 0}, 'routing': {'tilt': 100.0}, 'trimming': {'r
 
 class Batched:
     """
-    A policy's file for any number of observations.
+    A policy file for any number of observations.
 
-    Graphs that were written for a single one with fixed shapes are called row by row.
+    Graphs with fixed shapes for a single observation are called row by row.
 
     Args:
-        path: of the ONNX file.
+        path: path of the ONNX file.
 
     """
 
@@ -90,13 +89,13 @@ class Batched:
 def _session(graph):
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    options.log_severity_level = 4      # what fails is raised
+    options.log_severity_level = 4      # exceptions of workers are raised
     return onnxruntime.InferenceSession(graph.SerializeToString(), options,
                                         providers=['CPUExecutionProvider'])
 
 
 def environment(robots: int, name: str, memory: bool, robot: RobotParameters):
-    """Robots that hover, whose targets are set from outside."""
+    """Robots that start in hover, with external targets."""
     p = TrainParameters.load()
     still = {entry.name: 0.0 for entry in fields(StartParameters)}
     env = TiltableQuadrotorEnv(replace(
@@ -115,8 +114,8 @@ class Fleet:
     Robots with their guidance.
 
     Args:
-        env: where they fly.
-        parameters: of the policy.
+        env: training environment.
+        parameters: guidance parameters of the policy.
         axes: (4, 3) tilt axes.
 
     """
@@ -127,7 +126,7 @@ class Fleet:
         self._steps = 0
 
     def show(self, targets: list[PoseTarget]) -> None:
-        """Put what each policy is to see into the environment."""
+        """Put the target from guidance of each robot into the environment."""
         s, stamp = self.env.state, 0.01 * self._steps
         self._steps += 1
         x = s['x'].double().numpy()
@@ -158,7 +157,7 @@ def fly(fleet: Fleet, policy: Batched, moves: int, seed: int) -> dict[str, np.nd
 
     Returns:
         name -> (moves, N): errors in the windows of the task metrics [m], [rad], depth below
-        start and target and lowest height [m]; and `lost` (N,), robots that were started anew.
+        start and target and lowest height [m]; and `lost` (N,), robots that were reset.
 
     """
     env, count = fleet.env, fleet.env.num_envs
@@ -202,18 +201,18 @@ def summary(flown: dict[str, np.ndarray]) -> dict[str, float]:
     kept = {name: values[:, ~flown['lost']].ravel() for name, values in flown.items()
             if name != 'lost'}
     reached = (kept['U_position'] < REACHED[0]) & (kept['U_attitude'] < REACHED[1])
-    told = {'moves': len(reached), 'robots_lost': int(flown['lost'].sum()),
-            'missed': int((~reached).sum())}
+    counts = {'moves': len(reached), 'robots_lost': int(flown['lost'].sum()),
+              'missed': int((~reached).sum())}
     for name in ('U_position', 'U_attitude', 'L_position', 'L_attitude'):
         mean = float(kept[name].mean())
-        told.update({f'{name}_deg': np.degrees(mean)} if 'attitude' in name
-                    else {f'{name}_m': mean})
-    told.update({f'deeper_than_{limit}_m': int((kept['depth'] > limit).sum())
-                 for limit in DEPTHS})
-    told.update({f'below_{HEIGHT}_m': int((kept['lowest'] < HEIGHT).sum()),
-                 'deepest_m': float(kept['depth'].max()),
-                 'lowest_m': float(kept['lowest'].min())})
-    return told
+        counts.update({f'{name}_deg': np.degrees(mean)} if 'attitude' in name
+                      else {f'{name}_m': mean})
+    counts.update({f'deeper_than_{limit}_m': int((kept['depth'] > limit).sum())
+                   for limit in DEPTHS})
+    counts.update({f'below_{HEIGHT}_m': int((kept['lowest'] < HEIGHT).sum()),
+                   'deepest_m': float(kept['depth'].max()),
+                   'lowest_m': float(kept['lowest'].min())})
+    return counts
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""Speed of the simulator on one core, and its step's error: ``python benchmarks/sim.py``."""
+"""Speed of the simulator on one core, and its integration error: ``python benchmarks/sim.py``."""
 
 import argparse
 from dataclasses import replace

@@ -1,12 +1,12 @@
 """
-Does anything grow in a long flight? ``python benchmarks/soak.py [--minutes 60]``.
+Growth of memory, threads and files in a long flight: ``python benchmarks/soak.py [--minutes 60]``.
 
-Flies the whole ROS graph, with recorder and both buses, and reads every 10 s from /proc how much
-memory, how many threads and how many open files each of its processes has. After a warm-up a line
-is fitted through the memory. Exit status 1 where one grows by more than 5 MB an hour, has more
-threads or files at the end than after the warm-up, died, or the flight ended early.
+Flies the whole ROS graph with recorder and both buses. Every 10 s, memory, threads and open files
+of each process are read from /proc. After a warm-up, a line is fitted to the memory. Exit status 1
+if a process grows by more than 5 MB an hour, has more threads or files at the end than after the
+warm-up, or died, or if the flight ended early.
 
-The pack is made so large that it lasts; the bag is thrown away.
+The capacity of the pack is raised to last for the flight. The bag is deleted.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ MEGA = 1 / 1024         # of a kB of /proc
 
 @dataclass(frozen=True)
 class Sample:
-    """What one process has at one time."""
+    """Memory, threads and files of one process at one time."""
 
     t: float            # s since the take-off
     memory: float       # MB, resident
@@ -57,7 +57,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Growth:
-    """What became of one process after the warm-up."""
+    """Growth of one process after the warm-up."""
 
     process: str
     memory_start_MB: float
@@ -71,13 +71,13 @@ class Growth:
 
     @property
     def grows(self) -> bool:
-        """Whether it has more than it may."""
+        """Whether the growth exceeds its limits."""
         return not self.memory_MB_per_hour <= LIMIT or self.threads_end > self.threads_start \
             or self.files_end > self.files_start
 
 
 def read_sample(pid: int, t: float) -> Sample | None:
-    """Read what a process has; None where it is gone."""
+    """Read a sample of a process; None if it has ended."""
     place = Path(f'/proc/{pid}')
     try:
         status = dict(line.split(':', 1) for line in
@@ -89,7 +89,7 @@ def read_sample(pid: int, t: float) -> Sample | None:
 
 
 def growth(process: str, samples: list[Sample], warm_up: float) -> Growth | None:
-    """Fit the samples after ``warm_up`` [s]; None where there are fewer than three."""
+    """Fit the samples after ``warm_up`` [s]; None for fewer than three."""
     kept = [sample for sample in samples if sample.t >= warm_up]
     if len(kept) < 3:
         return None
@@ -101,7 +101,7 @@ def growth(process: str, samples: list[Sample], warm_up: float) -> Growth | None
 
 
 def make_graph(folder: Path, number: int, given) -> Graph:
-    """Make the graph of ``fly`` in ``folder``, with a pack that lasts."""
+    """Make the graph of ``fly`` in ``folder``, with a larger pack."""
     simulator = yaml.safe_load(share_path('params/simulator.yaml').read_text())
     simulator['/**/sim_node']['ros__parameters']['battery']['capacity'] = CAPACITY
     (folder / 'simulator.yaml').write_text(yaml.safe_dump(simulator))
@@ -121,7 +121,7 @@ def make_graph(folder: Path, number: int, given) -> Graph:
 
 
 def take_off(operator: Operator, bridges: list[str]) -> None:
-    """Arm and wait for the task's begin; ends the program where that fails."""
+    """Arm and wait for the start of the task; exit on failure."""
     if not operator.wait(lambda: operator.ready and not operator.waits_for(bridges), READY):
         sys.exit(f'the graph is not ready: {operator.waits_for(bridges) or operator.state}')
     operator.spin(2.0)
@@ -134,7 +134,7 @@ def take_off(operator: Operator, bridges: list[str]) -> None:
 
 def watch(graph: Graph, operator: Operator, seconds: float, say: Callable[[str], None]
           ) -> tuple[dict[str, list[Sample]], str]:
-    """Sample every process until the time is over; samples, and why it ended early or ''."""
+    """Sample every process for the time; return samples and the reason of an early end or ''."""
     samples: dict[str, list[Sample]] = {name: [] for name in graph.processes}
     begin = time.monotonic()
     due = begin
@@ -158,7 +158,7 @@ def watch(graph: Graph, operator: Operator, seconds: float, say: Callable[[str],
 
 
 def soak(given, console: Console) -> dict:
-    """Fly, watch, land, stop; the numbers."""
+    """Fly, sample, land and stop; return the results."""
     confine()
     folder = Path(tempfile.mkdtemp(prefix='soak_'))
     operator, graph, ended = None, None, 'no take-off'
@@ -206,7 +206,7 @@ def print_table(result: dict, console: Console) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Fly so long, print what grew; status 1 where something did."""
+    """Fly and print the growth; status 1 if a limit is exceeded."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--minutes', type=float, default=60.0, help='of flight')
     parser.add_argument('--actuators', choices=('emulated', 'direct'), default='emulated')

@@ -1,14 +1,14 @@
 """
-What the viewer costs: ``python benchmarks/viewer.py [RUN] [--seconds 24] [--rounds 6]``.
+Cost of the viewer: ``python benchmarks/viewer.py [RUN] [--seconds 24] [--rounds 6]``.
 
 Two parts, best on a computer that does nothing else:
 
-- Flights of the same poses without viewer, with it, and with a browser that looks on, in rounds
-  of three whose order turns: latency from the stamp of an IMU sample to its command at the
+- Flights of the same poses without viewer, with it, and with a connected browser, in rounds of
+  three in rotating order: latency from the stamp of an IMU sample to its command at the
   actuators, and CPU of all nodes. The noise is the range of the flights without viewer.
 - Playback of RUN, a long bag: time from the command to the first picture in a headless browser,
-  after that moments of the scene that arrive and pictures that are drawn a second, and CPU of
-  reader, server and browser. The browser draws with the processor.
+  then scene updates and drawn pictures a second, and CPU of reader, server and browser. The
+  browser draws without a GPU.
 
 Without RUN, a bag of 13 minutes is flown first, in simulated time, and kept in runs_out/.
 """
@@ -44,7 +44,7 @@ ROWS = {'latency_median_ms': 'latency, median [ms]', 'latency_p99_ms': '99 %',
 SETTLE, WATCH = 4.0, 15.0       # [s] of playback before and while pictures are counted
 ADDRESS = re.compile(r'http://localhost:\d+')
 PICTURES = '(window.__viserTestpoints?.rendererInfo?.render?.frame ?? 0)'
-# Each moment places the robot once; the page takes the messages of a moment from its queue.
+# Each update places the robot once; the page takes its messages from a queue.
 COUNT_MOMENTS = """() => {
     window.moments = window.seen = 0;
     const queue = window.__viserMutable.messageQueue, push = queue.push.bind(queue);
@@ -73,22 +73,22 @@ def fly(folder: Path, kind: str, seconds: float) -> dict:
     rows = [POSES[k % len(POSES)] for k in range(max(1, round(seconds / POSE_SECONDS)))]
     task.write_text('\n'.join(['x_m,y_m,z_m,roll_deg,pitch_deg,yaw_deg', *rows]) + '\n')
     result.unlink(missing_ok=True)
-    told = io.StringIO()
-    with looking_on(told) if kind == KINDS[2] else nullcontext():
+    output = io.StringIO()
+    with with_browser(output) if kind == KINDS[2] else nullcontext():
         status = run_fly(task=str(task), actuators='direct', clock='system', json_path=result,
-                         view=kind != KINDS[0], console=Console(file=told, width=200))
+                         view=kind != KINDS[0], console=Console(file=output, width=200))
     if status or not result.exists():
         sys.exit(f'flight {kind} failed (status {status})')
     return json.loads(result.read_text())['meta']['graph']
 
 
 @contextmanager
-def looking_on(told):
-    """Open the page of a flight as soon as its address is told."""
+def with_browser(output):
+    """Open the page of a flight as soon as its address is printed."""
     over = threading.Event()
 
     def look():
-        url = until(lambda: over.is_set() or ADDRESS.search(told.getvalue()), 'an address')
+        url = until(lambda: over.is_set() or ADDRESS.search(output.getvalue()), 'an address')
         if url is not True:
             with opened(url.group()):
                 over.wait()
@@ -102,13 +102,13 @@ def looking_on(told):
 
 
 def play(run: Path, ratio: float) -> dict:
-    """Play a bag in a headless browser that runs already; return what was measured."""
+    """Play a bag in a running headless browser; return the measurements."""
     with opened('about:blank', 1280, 720) as (browser, _):
         return watch(run, browser, f'/?fixedDpr={ratio}' if ratio else '')
 
 
 def watch(run, browser, query):
-    """Measure from the command on."""
+    """Measure from the start of the command."""
     begin = time.monotonic()
     process = subprocess.Popen(
         [sys.executable, '-m', 'beetle_omni_ros.start', 'beetle_omni', 'view', str(run)],
@@ -166,7 +166,7 @@ def show_flights(flights: dict[str, list[dict]], console: Console) -> None:
 
 
 def long_bag() -> Path:
-    """Bag of 13 minutes; flown where there is none."""
+    """Bag of 13 minutes; flown if it does not exist."""
     bag = ROOT / 'runs_out' / 'viewer' / 'long'
     if not (bag / 'metadata.yaml').exists():
         bag.parent.mkdir(parents=True, exist_ok=True)
@@ -178,7 +178,7 @@ def long_bag() -> Path:
 
 
 def tree(pid: int) -> list[int]:
-    """Process and those that it has started."""
+    """Processes of a tree."""
     found = [pid]
     for entry in Path('/proc').glob('[0-9]*'):
         try:
@@ -191,7 +191,7 @@ def tree(pid: int) -> list[int]:
 
 
 def browser_cpu(viewer: set[int]) -> float:
-    """CPU time of all that this benchmark has started, without itself and the viewer [s]."""
+    """CPU time of all started processes, without this one and the viewer [s]."""
     return sum(cpu_seconds(pid) for pid in tree(os.getpid())
                if pid != os.getpid() and pid not in viewer)
 

@@ -1,9 +1,9 @@
 """
-Find what the model misses, from two bags: one is fitted, the other one judges.
+Find the effect that the model lacks, from two bags: one is fitted, the other one validates.
 
-    python examples/gap_two_bags.py [FITTED JUDGING]
+    python examples/gap_two_bags.py [FITTED VALIDATION]
 
-Without bags, two flights in a wind of which the robot file knows nothing are recorded first.
+Without bags, two flights in a wind that is not in the robot file are recorded first.
 """
 
 from dataclasses import replace
@@ -29,7 +29,7 @@ def record(folder):
 
 
 def explain(fitted, judging):
-    """Print what was found."""
+    """Print the result."""
     found = beetle_omni_ros.find_gap([fitted], [judging], quiet=True)
     if found['verdict'] == 'bad_data':
         sys.exit('no flights to be judged by; beetle_omni gap says why')

@@ -22,13 +22,13 @@ class PoseController:
     period = 0.01                                   # [s] between two steps
     KP, KD = 6.0, 4.0                               # position [1/s^2], [1/s]
     KP_TURN, KD_TURN = 25.0, 9.0                    # attitude
-    FARTHEST = 0.6                                  # [m], [rad] errors are shortened to this
+    FARTHEST = 0.6                                  # [m], [rad] limit of the errors
 
     def __init__(self, robot):
         self.robot, self.allocator = robot, Allocator(robot)
 
     def reset(self):
-        """Nothing is remembered."""
+        """Do nothing, for there is no state."""
 
     def step(self, state, target):
         """Command: tilts (4,) [rad] and thrusts (4,) [N], stamped with the state it answers."""
@@ -44,7 +44,7 @@ class PoseController:
         return Command(state.stamp, allocation.tilt, allocation.thrust)
 
     def shortened(self, error):
-        """Keep the direction of an error, and its length up to a limit."""
+        """Limit the length of an error and keep its direction."""
         return error * min(1.0, self.FARTHEST / max(np.linalg.norm(error), 1e-9))
 
 

@@ -1,9 +1,9 @@
 """
-Fly a robot of your own: a file with what differs, here a heavier robot with weaker rotors.
+Fly a robot of your own from a file with its differences: a heavier robot with weaker rotors.
 
     python examples/own_robot.py [TASK]
 
-The first flight believes that it flies the shipped robot; the second one knows better.
+In the first flight, estimator and controller use the shipped robot; in the second, the true one.
 """
 
 from pathlib import Path

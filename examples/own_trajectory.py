@@ -1,5 +1,5 @@
 """
-Fly a trajectory of your own: a circle on which the robot rolls over, once a round.
+Fly a trajectory of your own: a circle with one full roll a round.
 
     python examples/own_trajectory.py [SECONDS]
 """
@@ -15,7 +15,7 @@ RADIUS, HEIGHT, ROUND = 0.8, 1.5, 20.0          # [m], [m], [s]
 
 
 def circle(duration):
-    """Times [s], positions [m] and attitudes (x, y, z, w) of a start from rest and a circle."""
+    """Times [s], positions [m] and attitudes (x, y, z, w) of a circle that starts at rest."""
     times = np.arange(0.0, duration + 0.01, 0.02)
     phase = 2 * np.pi / ROUND * np.where(times < 4, times ** 2 / 8, times - 2)     # 4 s to speed
     positions = np.column_stack([RADIUS * np.cos(phase), RADIUS * np.sin(phase),

@@ -14,7 +14,7 @@ import beetle_omni_ros
 
 
 def summary(bag):
-    """Print what a bag holds, and how well the robot was where it believed to be."""
+    """Print the contents of a bag, and the error of the estimated position."""
     log = beetle_omni_ros.read_run(bag)
     print(f'{log.end - log.start:.1f} s, task {log.meta.get("task")}, '
           f'{len(log.imu_t)} IMU samples, {len(log.mocap_t)} poses, {len(log.targets)} targets')

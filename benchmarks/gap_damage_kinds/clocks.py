@@ -24,19 +24,19 @@ def stepped(bag, name, part, by):
 
 @damage('MoCap clock 0.3 s back from half way', MOCAP, scope=FIRST, causes=[(CLOCK, STEP)])
 def mocap_clock_back(bag, random, other):
-    """A time server corrects the MoCap computer."""
+    """The clock of the MoCap computer is set back by a time server."""
     return stepped(bag, MOCAP, 0.5, -0.3)
 
 
 @damage('encoder clock 0.15 s late from half way', JOINTS, scope=FIRST, causes=[(CLOCK, STEP)])
 def encoder_clock_late(bag, random, other):
-    """Stamps 0.15 s later than the positions."""
+    """The stamps are 0.15 s later than the positions."""
     return stepped(bag, JOINTS, 0.5, 0.15)
 
 
 @damage('MoCap clock 0.3 s forward at a third', MOCAP, scope=FIRST, causes=[(CLOCK, STEP)])
 def mocap_clock_forward(bag, random, other):
-    """Looks like a short silence."""
+    """The stamps look like those of a short gap."""
     return stepped(bag, MOCAP, 1 / 3, 0.3)
 
 
@@ -53,7 +53,7 @@ def command_clock_forward(bag, random, other):
 
 
 def ramp(bag, name, rate):
-    """Stamps that run away by ``rate`` seconds a second."""
+    """Shift stamps by ``rate`` seconds a second."""
     t = bag.stamps(name)
     return t + rate * (t - t[0])
 
@@ -61,14 +61,14 @@ def ramp(bag, name, rate):
 @damage('MoCap clock 1 % too fast', MOCAP, causes=[
     (CLOCK, r'drift|fast|slow|\brate|diverg|percent|%')])
 def mocap_drift(bag, random, other):
-    """Times of recording are as they were."""
+    """Times of recording are unchanged."""
     bag.put_stamps(MOCAP, ramp(bag, MOCAP, 0.01))
 
 
 @damage('MoCap later and later: stamped on arrival, by 0.5 s in the end', MOCAP, causes=[
     (f'{CLOCK}|mocap', r'drift|grow|increas|\blate|delay|progress|diverg|slow|fast|\brate')])
 def mocap_delay_growing(bag, random, other):
-    """A queue that fills: stamps and times of recording."""
+    """A queue fills: times of recording grow later than the stamps."""
     t = bag.stamps(MOCAP)
     later = 0.5 * (t - t[0]) / (t[-1] - t[0])
     bag.put_stamps(MOCAP, t + later)
@@ -80,12 +80,12 @@ def mocap_delay_growing(bag, random, other):
 @damage('all IMU stamps zero', IMU, causes=[
     (CLOCK, r'zero|\b0(\.0*)? s|\b0\b|1970|epoch|not set|unset|same|equal|empty|constant')])
 def imu_stamps_zero(bag, random, other):
-    """The driver does not set them."""
+    """The driver does not set the stamps."""
     bag.put_stamps(IMU, np.zeros(len(bag.on(IMU))))
 
 
 def moved(bag, by):
-    """Let a recording begin later: stamps of every message that has one, and times."""
+    """Shift all stamps and times of recording."""
     for m in bag.messages:
         m.received += by
         if hasattr(m.content, 'header'):
@@ -95,7 +95,7 @@ def moved(bag, by):
 @damage('joint stamps of 1970, since the board was switched on; all others of today', JOINTS,
         causes=[(CLOCK, '1970|zero|epoch|apart|overlap|years?|days?|boot|another clock|differ')])
 def joint_stamps_1970(bag, random, other):
-    """A board without a clock."""
+    """The board has no clock."""
     t = bag.stamps(JOINTS)
     bag.put_stamps(JOINTS, t - t[0] + BOOTED)
 
@@ -103,14 +103,14 @@ def joint_stamps_1970(bag, random, other):
 @damage('MoCap stamps an hour ahead', MOCAP, causes=[
     (CLOCK, r'hour|3600|apart|overlap|ahead|another clock|differ|offset|future|3[56]\d\d')])
 def mocap_hour_ahead(bag, random, other):
-    """Summer time on the MoCap computer."""
+    """The MoCap computer uses summer time."""
     bag.put_stamps(MOCAP, bag.stamps(MOCAP) + 3600.0)
 
 
 @damage('times of recording an hour after all stamps', harm=REPAIRABLE, causes=[
     ('clock|stamp|time|record|receiv', r'hour|3600|3[56]\d\d|apart|\blate|after|ahead|differ')])
 def received_hour_late(bag, random, other):
-    """The recorder's clock; the stamps agree with each other."""
+    """The clock of the recorder is late; the stamps agree with each other."""
     for m in bag.messages:
         m.received += 3600.0
 
@@ -125,14 +125,14 @@ def _count_in_seconds(bag, topic, unit):
 @damage('MoCap nanoseconds in the seconds of the stamp', MOCAP, causes=[
     (CLOCK, r'nanosec|unit|overflow|order|jump|\bback|monoton|\brange|implausib|factor|apart')])
 def mocap_stamps_nanoseconds(bag, random, other):
-    """They do not fit in 32 bits and wrap."""
+    """The counts exceed 32 bits and wrap."""
     _count_in_seconds(bag, MOCAP, 1e9)
 
 
 @damage('joint milliseconds in the seconds of the stamp', JOINTS, causes=[
     (CLOCK, r'millisec|unit|factor|1000|scale|\brate|fast|slow|drift|apart|jump|overlap')])
 def joint_stamps_milliseconds(bag, random, other):
-    """A thousand times too fast; today's date wraps."""
+    """The stamps run a thousand times too fast, and today's date wraps."""
     _count_in_seconds(bag, JOINTS, 1e3)
 
 

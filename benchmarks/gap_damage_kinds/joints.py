@@ -13,7 +13,7 @@ DEGREES = r'\bin deg|deg\w* (instead|in place|rather|not)|deg.*unit|unit.*deg|no
 
 
 def scaled(bag, factors):
-    """Positions and velocities of joints 1 to 4 times (4,) factors."""
+    """Multiply positions and velocities of joints 1 to 4 by (4,) factors."""
     values = bag.values(JOINTS)
     bag.put(JOINTS, values * np.tile(factors, values.shape[1] // 4))
 
@@ -22,7 +22,7 @@ def scaled(bag, factors):
         causes=[(JOINT, 'swap|exchang|interchang|mixed|permut|order'),
                 (JOINT, 'follows? (the )?(command|target)s? of')])
 def joints_swapped(bag, random, other):
-    """Two plugs."""
+    """Two plugs are exchanged."""
     values = bag.values(JOINTS)
     columns = np.arange(values.shape[1]).reshape(-1, 4)[:, [1, 0, 2, 3]].ravel()
     bag.put(JOINTS, values[:, columns])
@@ -31,20 +31,20 @@ def joints_swapped(bag, random, other):
 @damage('joint 3 with the opposite sign', JOINTS,
         causes=[(JOINT, 'sign|negat|revers|invert|opposite|mirror|flip')])
 def joint_sign(bag, random, other):
-    """Its direction of turn was set the other way."""
+    """The servo has the opposite direction."""
     scaled(bag, [1, 1, -1, 1])
 
 
 @damage('joints in degrees', JOINTS, causes=[(JOINT, DEGREES)])
 def joints_degrees(bag, random, other):
-    """Positions and velocities."""
+    """Positions and velocities are in degrees."""
     scaled(bag, np.full(4, np.degrees(1)))
 
 
 @damage('joints in encoder counts', JOINTS, causes=[
     r'\bcounts?\b|\bticks?\b|\braw\b|encoder steps'])
 def joints_counts(bag, random, other):
-    """4096 for a turn, 2048 at 0 rad."""
+    """A turn has 4096 counts, and 0 rad is 2048."""
     values = bag.values(JOINTS)
     values[:, :4] = np.round(values[:, :4] * COUNTS / (2 * np.pi)) + COUNTS / 2
     values[:, 4:] = np.round(values[:, 4:] * COUNTS / (2 * np.pi))
@@ -55,7 +55,7 @@ def joints_counts(bag, random, other):
         causes=['freez|froze|stuck|repeat|constant|stale|not change|unchang|same|stands? still|'
                 'not move|never mov|does not follow'])
 def joint_frozen(bag, random, other):
-    """Its encoder is not read any more."""
+    """The encoder is no longer read."""
     begin = bag.moment(1 / 3)
     values, late = bag.values(JOINTS), bag.stamps(JOINTS) >= begin
     values[late, 1] = values[np.flatnonzero(late)[0], 1]
@@ -66,7 +66,7 @@ def joint_frozen(bag, random, other):
 
 @damage('control: joints in another order, with their names', JOINTS, harm=HARMLESS)
 def joints_reordered(bag, random, other):
-    """A JointState says by its names which is which."""
+    """The names of the JointState have the same order, so that no data change."""
     for m in bag.on(JOINTS):
         m.content.name = m.content.name[::-1]
         m.content.position = m.content.position[::-1].copy()

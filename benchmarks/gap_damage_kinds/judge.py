@@ -70,19 +70,19 @@ def judge(kind: Kind, asked: dict, known: tuple[str, ...] = ()) -> Judged:
     names = tuple(dict.fromkeys(
         name for effect in answer.get('effects') or () for name in effect['names'][:1]))
     false = tuple(n for n in names if n not in SENSORS and n not in known)
-    told = [s for s in statements(answer, asked['folder']) if kind.told_by(s['text'])]
+    stated = [s for s in statements(answer, asked['folder']) if kind.is_stated_in(s['text'])]
     cause = topic = None
     if kind.causes:
-        cause = bool(told)
-        topic = any(on_topic(kind, s) for s in told)
+        cause = bool(stated)
+        topic = any(on_topic(kind, s) for s in stated)
     refused = verdict == 'bad_data' and asked['status'] == BAD_DATA
     used = verdict not in ('bad_data', 'timeout', 'no answer') and asked['status'] == 0
     right = not false and not asked['crash'] and (
         used if kind.harm == HARMLESS else
         bool(cause) and (refused or (kind.harm == REPAIRABLE and used)))
     return Judged(verdict, asked['status'], names, false, cause, topic,
-                  told_moment(asked, told), right,
-                  (told[0]['text'] if told else answer.get('reason')) or asked['message'],
+                  states_onset(asked, stated), right,
+                  (stated[0]['text'] if stated else answer.get('reason')) or asked['message'],
                   asked['seconds'])
 
 
@@ -120,11 +120,11 @@ def on_topic(kind: Kind, statement: dict) -> bool:
     return any(topic in statement['text'] for topic in kind.topics)
 
 
-def told_moment(asked: dict, told: list[dict]) -> bool | None:
+def states_onset(asked: dict, stated: list[dict]) -> bool | None:
     """Whether a statement of the cause has its onset; None without one."""
     if asked['onset'] is None:
         return None
-    return any(near(s, asked['onset'], asked['begin']) for s in told)
+    return any(near(s, asked['onset'], asked['begin']) for s in stated)
 
 
 def near(statement: dict, onset: float, begin: float) -> bool:

@@ -64,13 +64,13 @@ class Kind:
         return made, onset
 
     def key(self) -> str:
-        """Changes with what the damage does, not with the words that are looked for."""
+        """Hash of the code of the damage, without the expected words."""
         code = self.change.__code__
         parts = [code.co_code, *(repr(c).encode() for c in code.co_consts[1:]
                                  if not isinstance(c, CodeType)), self.scope.encode()]
         return f'{zlib.crc32(b" ".join(parts)):08x}'
 
-    def told_by(self, statement: str) -> bool:
+    def is_stated_in(self, statement: str) -> bool:
         """Whether a statement contains the words of the cause."""
         return any(all(re.search(pattern, statement, re.IGNORECASE) for pattern in patterns)
                    for patterns in self.causes)

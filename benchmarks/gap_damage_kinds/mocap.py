@@ -16,7 +16,7 @@ UNIT = 'unit|scale|factor|instead|in place'
 @damage('MoCap quaternion in the order w, x, y, z', MOCAP,
         causes=[('quaternion|orientation', r'\bw\b|wxyz|order')])
 def mocap_wxyz(bag, random, other):
-    """The first number of the message is w."""
+    """The quaternion has the order w, x, y, z."""
     pose = bag.values(MOCAP)
     pose[:, 3:] = pose[:, [6, 3, 4, 5]]
     bag.put(MOCAP, pose)
@@ -25,21 +25,21 @@ def mocap_wxyz(bag, random, other):
 @damage('MoCap position in millimetres', MOCAP, causes=[
     'millimet', (r'\bmm\b', f'{UNIT}|in mm|1000')])
 def mocap_millimetres(bag, random, other):
-    """Positions times 1000."""
+    """The positions are multiplied by 1000."""
     bag.put(MOCAP, bag.values(MOCAP) * [1e3, 1e3, 1e3, 1, 1, 1, 1])
 
 
 @damage('MoCap position in centimetres', MOCAP, causes=[
     'centimet', (r'\bcm\b', f'{UNIT}|in cm|100')])
 def mocap_centimetres(bag, random, other):
-    """Positions times 100."""
+    """The positions are multiplied by 100."""
     bag.put(MOCAP, bag.values(MOCAP) * [1e2, 1e2, 1e2, 1, 1, 1, 1])
 
 
 @damage('MoCap positions with 30 mm of white noise', MOCAP,
         causes=['noise|nois|scatter'])
 def mocap_noisy(bag, random, other):
-    """Every position."""
+    """Every position has noise."""
     pose = bag.values(MOCAP).copy()
     pose[:, :3] += random.normal(0.0, 0.03, (len(pose), 3))
     bag.put(MOCAP, pose)
@@ -49,7 +49,7 @@ def mocap_noisy(bag, random, other):
         causes=['freez|froze|stuck|repeat|constant|stale|not change|unchang|same|stands? still'],
         scope=FIRST)
 def mocap_frozen(bag, random, other):
-    """From 45 % of the recording on."""
+    """The pose is constant from 45 % of the recording on."""
     begin, end = bag.moment(0.45), bag.moment(0.45 + 1 / 7)
     t, pose = bag.stamps(MOCAP), bag.values(MOCAP)
     held = (t >= begin) & (t < end)
@@ -61,7 +61,7 @@ def mocap_frozen(bag, random, other):
 @damage('MoCap world with y up, the body as it was', MOCAP,
         causes=['y.?up', 'z.?up', ('up|vertical|gravity', 'ax[ei]s|frame|world|turned|tilt')])
 def mocap_y_up(bag, random, other):
-    """Motive's default: x stays, z becomes y, y becomes -z."""
+    """The axes are those of Motive by default: x stays, z becomes y, y becomes -z."""
     turn = Rotation.from_euler('x', -90, degrees=True)
     pose = bag.values(MOCAP)
     pose[:, :3] = turn.apply(pose[:, :3])
@@ -72,7 +72,7 @@ def mocap_y_up(bag, random, other):
 @damage('MoCap world and body with y up', MOCAP,
         causes=['y.?up', 'z.?up', ('up|vertical|gravity', 'ax[ei]s|frame|world|turned|tilt')])
 def mocap_y_up_body(bag, random, other):
-    """Position and the quaternion's vector, both permuted."""
+    """The vectors of position and quaternion are permuted."""
     pose = bag.values(MOCAP)
     pose = pose[:, [0, 2, 1, 3, 5, 4, 6]] * [1, 1, -1, 1, 1, -1, 1]
     bag.put(MOCAP, pose)
@@ -81,21 +81,21 @@ def mocap_y_up_body(bag, random, other):
 @damage('MoCap in left-handed axes: y mirrored, the quaternion after it', MOCAP,
         causes=['left.?hand|handed|mirror', ('sign|flip|invert|negat|reflect', r'\by\b')])
 def mocap_left_handed(bag, random, other):
-    """Unity's way: turns about x and z change their sign."""
+    """The axes are those of Unity: rotations about x and z change their sign."""
     bag.put(MOCAP, bag.values(MOCAP) * [1, -1, 1, -1, 1, -1, 1])
 
 
 @damage('MoCap quaternion from world to body instead of from body to world', MOCAP,
         causes=[('quaternion|orientation|attitude|rotation', 'conjugat|invers|invert|transpos')])
 def mocap_conjugate(bag, random, other):
-    """The vector's sign."""
+    """The vector of the quaternion has the opposite sign."""
     bag.put(MOCAP, bag.values(MOCAP) * [1, 1, 1, -1, -1, -1, 1])
 
 
 @damage('markers turned by 90 deg about z against the body', MOCAP,
         causes=[('mocap|marker|pose|orientation|rigid', TURNED)])
 def mocap_body_turned(bag, random, other):
-    """The rigid body was defined when the robot stood turned."""
+    """The rigid body was defined with a rotated robot."""
     pose = bag.values(MOCAP)
     turn = Rotation.from_euler('z', 90, degrees=True)
     pose[:, 3:] = (Rotation.from_quat(pose[:, 3:]) * turn).as_quat()
@@ -105,14 +105,14 @@ def mocap_body_turned(bag, random, other):
 @damage('MoCap quaternion of length 2', MOCAP, harm=REPAIRABLE,
         causes=[('quaternion|orientation', r'norm|unit|length|\b2\b')])
 def mocap_unnormalised(bag, random, other):
-    """Scaled."""
+    """The quaternions have another norm."""
     bag.put(MOCAP, bag.values(MOCAP) * [1, 1, 1, 2, 2, 2, 2])
 
 
 @damage('a zero quaternion now and then', MOCAP, scope=FIRST, harm=REPAIRABLE,
         causes=[('quaternion|orientation', 'zero|norm|unit|length')])
 def mocap_zero_quaternion(bag, random, other):
-    """Fifteen samples: the body was lost."""
+    """The body is lost for fifteen samples."""
     pose = bag.values(MOCAP)
     rows = np.sort(random.choice(np.arange(len(pose) // 5, len(pose)),
                                  min(15, len(pose) // 10), replace=False))
@@ -125,7 +125,7 @@ def mocap_zero_quaternion(bag, random, other):
         harm=REPAIRABLE,
         causes=['outlier|jump|flip|spike|implausibl|leap|swap|teleport|too fast|faster than'])
 def mocap_outliers(bag, random, other):
-    """Single samples, turned about a body axis and moved by some centimetres."""
+    """Single samples are rotated about a body axis and moved by some centimetres."""
     pose = bag.values(MOCAP)
     rows = np.sort(random.choice(np.arange(len(pose) // 4, len(pose)),
                                  min(OUTLIERS, len(pose) // 10), replace=False))
@@ -140,7 +140,7 @@ def mocap_outliers(bag, random, other):
 @damage('control: another sign of some quaternions, which is the same orientation', MOCAP,
         harm=HARMLESS)
 def mocap_quaternion_sign(bag, random, other):
-    """What drivers do that keep w positive."""
+    """The driver keeps w positive."""
     pose = bag.values(MOCAP)
     pose[pose[:, 6] < 0, 3:] *= -1
     some = len(pose) // 3
@@ -151,7 +151,7 @@ def mocap_quaternion_sign(bag, random, other):
 @damage('control: MoCap world turned by 90 deg about the vertical, and moved', MOCAP,
         harm=HARMLESS)
 def mocap_world_turned(bag, random, other):
-    """Nothing in physics knows where x points."""
+    """The heading of the world frame has no physical effect."""
     turn = Rotation.from_euler('z', 90, degrees=True)
     pose = bag.values(MOCAP)
     pose[:, :3] = turn.apply(pose[:, :3]) + [0.4, -0.7, 0.0]

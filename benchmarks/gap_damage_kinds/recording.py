@@ -20,7 +20,7 @@ from beetle_omni_ros.runs.bag_reader import META_KEY
 
 MOCAP, IMU, JOINTS, COMMAND = 'mocap/pose', 'imu/data_raw', 'joint_states', 'command'
 BATTERY = 'battery_state'
-MEASURED = (MOCAP, IMU, JOINTS, COMMAND)    # what is judged
+MEASURED = (MOCAP, IMU, JOINTS, COMMAND)    # topics of the analysis
 WITHHELD = ('odom', 'ground_truth/odom', 'nmpc/command', 'rl/command')
 SECOND = 1_000_000_000  # [ns]
 

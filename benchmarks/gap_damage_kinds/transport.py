@@ -1,4 +1,4 @@
-"""What recorders, networks and people do to whole bags."""
+"""Damage of whole bags by recorders, networks and operators."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gap_damage_kinds.recording import BATTERY, IMU, JOINTS, MEASURED, MOCAP
 @damage('messages of two flights, one between the other', *MEASURED, scope=FIRST, causes=[
     r'\btwo\b|interleav|several|mixed|more than one|another flight|second (flight|publisher)'])
 def two_flights(bag, random, other):
-    """Two recordings merged, the other one half a millisecond later."""
+    """Two recordings are merged, the second one half a millisecond later."""
     begin = bag.messages[0].received - other.messages[0].received + 5e-4
     for m in other.copy().messages:
         m.received += begin
@@ -24,14 +24,14 @@ def two_flights(bag, random, other):
 @damage('every message twice', *MEASURED, harm=REPAIRABLE,
         causes=['duplicat|twice|repeat|same (stamp|time)|double|two messages'])
 def duplicates(bag, random, other):
-    """Two recorders, or two paths of one network."""
+    """Messages are recorded twice, by two recorders or two network paths."""
     bag.messages = [made for m in bag.messages for made in (m, copy(m))]
 
 
 @damage('IMU messages in the wrong order', IMU, harm=REPAIRABLE,
         causes=['order|sort|earlier|backward|jumps? back|not rising|monoton'])
 def out_of_order(bag, random, other):
-    """Shuffled among neighbours; each keeps its stamp."""
+    """Neighbouring messages are shuffled with their stamps."""
     places = [k for k, m in enumerate(bag.messages) if m.name == IMU]
     for begin in range(0, len(places) - 8, 8):
         block = places[begin:begin + 8]
@@ -44,21 +44,21 @@ def out_of_order(bag, random, other):
 @damage('the bag is cut off at 60 %', scope=FIRST, harm=REPAIRABLE,
         causes=[r'\bcut|truncat|ends early|incomplete|metadata|not finish|unfinished'])
 def cut_off(bag, random, other):
-    """The recorder was killed."""
+    """The recorder is killed."""
     bag.keep = 0.6
 
 
 @damage('no MoCap', MOCAP, causes=[
     (r'mocap', r'\bno\b|missing|without|absent|lacks|empty|never|not recorded|0 messages')])
 def mocap_missing(bag, random, other):
-    """Its driver did not run."""
+    """The driver does not run."""
     bag.drop(MOCAP)
 
 
 @damage('no MoCap for 3 s', MOCAP, scope=FIRST, harm=REPAIRABLE,
         causes=['gap|hole|missing|drop|silen|without|lost|absent|no message'])
 def mocap_silent(bag, random, other):
-    """Out of the cameras' sight."""
+    """The robot is out of sight of the cameras."""
     begin = bag.moment(0.5)
     bag.messages = [m for m in bag.messages
                     if m.name != MOCAP or not begin <= m.stamp < begin + 3.0]
@@ -67,32 +67,32 @@ def mocap_silent(bag, random, other):
 
 @damage('control: nothing is changed', harm=HARMLESS)
 def nothing(bag, random, other):
-    """As it was."""
+    """The recording is unchanged."""
 
 
 @damage('control: battery current with the opposite sign', BATTERY, harm=HARMLESS)
 def battery_current(bag, random, other):
-    """Only the voltage matters."""
+    """Only the voltage is used."""
     for m in bag.on(BATTERY):
         m.content.current = -m.content.current
 
 
 @damage('control: no battery', BATTERY, harm=HARMLESS)
 def battery_missing(bag, random, other):
-    """It is optional."""
+    """The topic is optional."""
     bag.drop(BATTERY)
 
 
 @damage('control: all topics in a namespace', harm=HARMLESS)
 def in_namespace(bag, random, other):
-    """/robot1/..."""
+    """The topics are in the namespace /robot1."""
     for m in bag.messages:
         m.topic = '/robot1' + m.topic
 
 
 @damage('control: a tenth of the joint feedback is lost', JOINTS, harm=HARMLESS)
 def joints_lossy(bag, random, other):
-    """Single messages, as best effort loses them."""
+    """Single messages are lost, as with best effort."""
     lost = random.random(len(bag.messages)) < 0.1
     bag.messages = [m for m, gone in zip(bag.messages, lost, strict=True)
                     if not (gone and m.name == JOINTS)]

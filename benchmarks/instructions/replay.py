@@ -1,5 +1,5 @@
 """
-Steps of both controllers from a recorded flight, with marks for the plugin that counts.
+Steps of both controllers from a recorded flight, with marks for the counting plugin.
 
     python benchmarks/instructions/replay.py record FILE [--poses N]   # here
     python benchmarks/instructions/replay.py replay FILE               # under qemu
@@ -20,7 +20,7 @@ NMPC, POLICY, INFERENCE = 2, 4, 6       # marks at the begin; one more at the en
 
 
 class Kept:
-    """A controller whose inputs are kept."""
+    """A controller that records its inputs."""
 
     def __init__(self, controller, inputs):
         self.controller, self.name, self.period = controller, controller.name, controller.period
@@ -31,7 +31,7 @@ class Kept:
         self.controller.reset()
 
     def step(self, state, target):
-        """Keep and pass on."""
+        """Record the inputs and step."""
         self._inputs.append((state, target))
         return self.controller.step(state, target)
 
@@ -41,7 +41,7 @@ class Kept:
 
 
 def record(poses: int) -> list:
-    """Inputs of the steps of a flight to random poses."""
+    """Record the inputs of a flight to random poses."""
     from beetle_omni_ros.control.hover import HoverController
     from beetle_omni_ros.estimation.ekf import ErrorStateEkf
     from beetle_omni_ros.estimation.parameters import EkfParameters
@@ -60,7 +60,7 @@ def record(poses: int) -> list:
 
 
 def mark(number: int) -> None:
-    """Tell the plugin; the descriptor does not exist, and nothing is closed."""
+    """Mark for the plugin: close a descriptor that does not exist."""
     try:
         os.close(MARK + number)
     except OSError:
@@ -71,7 +71,7 @@ class MarkedPolicy(PolicyController):
     """A policy with marks around its inference."""
 
     def infer(self, state, reference):
-        """Pass on, marked."""
+        """Infer, with marks."""
         mark(INFERENCE)
         result = super().infer(state, reference)
         mark(INFERENCE + 1)

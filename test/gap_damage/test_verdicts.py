@@ -83,7 +83,7 @@ def test_totals_and_files(tmp_path):
 
 def test_folder_names_of_damaged_bags_reveal_no_cause():
     place = gap_damage.place_of(Path('x'), 'mocap_millimetres', 0)
-    assert not MILLIMETRES.told_by(str(place))
+    assert not MILLIMETRES.is_stated_in(str(place))
 
 
 def test_unknown_kinds_are_refused(capsys):
